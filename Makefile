@@ -43,7 +43,7 @@ else
 	$(PIP) install --constraint requirements.lock -r requirements-explain.txt hatchling editables $(filter-out $(LEFT_OUT),$(LARGE))
 	$(PIP) install --no-deps --no-build-isolation --editable .
 endif
-	$(BIN)/python -m bench.gap.prediction_error.precompile
+	$(BIN)/python -m bench.diagnosis.kalman.precompile
 	@echo "$(strip $(LEFT_OUT))" > $@
 
 TARGETS ?= 10
@@ -83,23 +83,23 @@ check: $(STAMP)
 	$(BIN)/python -m tests.language
 
 benchmark: $(STAMP)
-	$(BIN)/python -m tests.benchmarks.air
-	$(BIN)/python -m tests.benchmarks.harness
-	$(BIN)/python -m tests.benchmarks.engines
-	$(BIN)/python -m tests.benchmarks.scale
-	$(BIN)/python -m tests.benchmarks.peers
-	$(BIN)/python -m tests.benchmarks.sealed
+	$(BIN)/python -m tests.benchmarks.ball_with_drag
+	$(BIN)/python -m tests.benchmarks.harness_overhead
+	$(BIN)/python -m tests.benchmarks.engine_speed
+	$(BIN)/python -m tests.benchmarks.comparison_scaling
+	$(BIN)/python -m tests.benchmarks.peer_libraries
+	$(BIN)/python -m tests.benchmarks.isolation_overhead
 
 chaos: $(STAMP)
-	$(BIN)/python -m tests.chaos --kills 100
+	$(BIN)/python -m tests.kill_and_resume --kills 100
 
 malformed: $(STAMP)
-	$(BIN)/python -m tests.malformed $(KINDS)
+	$(BIN)/python -m tests.malformed_input $(KINDS)
 
 JOBS ?= 2
 
 mutants: $(STAMP)
-	$(BIN)/python -m tests.mutants $(ONLY) --jobs $(JOBS)
+	$(BIN)/python -m tests.mutation_testing $(ONLY) --jobs $(JOBS)
 
 PROBLEMS := ball-drop slider-push pendulum-swing servo-step ball-wind ball-crossengine
 REFERENCE := results/comparison
@@ -114,14 +114,14 @@ MULTI := results/multi
 multi: $(STAMP)
 	for e in $(SEVERAL); do $(BIN)/simgap compare $$e --targets 3 --seeds 2 --budget 50 --salt public $(if $(TUNERS),--tuners $(TUNERS)) --out $(MULTI)/$$e --allow-failures || exit 1; done
 	$(BIN)/simgap plot $(SEVERAL:%=$(MULTI)/%) --out $(MULTI)/all
-	$(BIN)/python -m tests.benchmarks.multi $(MULTI) > $(MULTI)/tables.md
+	$(BIN)/python -m tests.benchmarks.multi_problem_tables $(MULTI) > $(MULTI)/tables.md
 
 docs: $(STAMP)
-	$(BIN)/python -m tests.docs.generate
-	$(BIN)/python -m tests.docs.site --notebooks
+	$(BIN)/python -m tests.docs.generate_pages
+	$(BIN)/python -m tests.docs.documentation_site --notebooks
 
 exam: $(STAMP)
-	$(BIN)/python -m tests.exam $(QUICK)
+	$(BIN)/python -m tests.simple_exam $(QUICK)
 
 wheel: $(STAMP)
-	$(BIN)/python -m tests.wheel $(if $(WITHOUT),--without $(WITHOUT)) $(PYTHON)
+	$(BIN)/python -m tests.packaging $(if $(WITHOUT),--without $(WITHOUT)) $(PYTHON)

@@ -17,35 +17,48 @@ Names are imported when they are first used; `dir(simgap)` lists them.
 from __future__ import annotations
 
 import sys
+import warnings
 from importlib import import_module
 from importlib.machinery import PathFinder
 from os.path import abspath, dirname, realpath
 
 _WHERE = {
     "bench": ("__version__",),
-    "bench.api.compare": ("Compared", "compare", "sweep"),
+    "bench.api.compare": ("ComparisonResult", "compare", "sweep"),
     "bench.api.datasheet": ("datasheet",),
     "bench.api.design": ("NextRecording", "design"),
     "bench.api.explain": ("explain", "score"),
     "bench.api.recordings": ("import_logs", "read_recording", "simulate"),
-    "bench.checks": ("parametrize",),
-    "bench.gap.explanation": ("Explanation",),
-    "bench.gap.sheet.sheet": ("DataSheet",),
-    "bench.diagnoser": ("Answer", "Case", "Diagnoser", "Lesson", "Named"),
-    "bench.problem.experiment": ("Experiment",),
-    "bench.registry": ("diagnosers", "effects", "load_plugins", "simulators", "tuners"),
-    "methods.base": (
-        "Ask",
+    "bench.conformance": ("parametrize",),
+    "bench.diagnosis.explanation": ("Explanation",),
+    "bench.diagnosis.datasheet.datasheet": ("DataSheet",),
+    "bench.core.diagnoser": (
+        "Answer",
+        "DiagnosisCase",
+        "Diagnoser",
+        "DiagnoserTrainingTask",
+        "NamedCause",
+    ),
+    "bench.benchmark.problem.experiment": ("Experiment",),
+    "bench.core.plugin_registries": (
+        "diagnosers",
+        "effects",
+        "load_plugins",
+        "simulators",
+        "tuners",
+    ),
+    "methods.tuner": (
+        "Proposal",
         "BudgetExceededError",
         "Evaluation",
-        "Practice",
-        "Scene",
-        "Steps",
+        "TrainingSimulator",
+        "ScenarioInfo",
+        "TunerGenerator",
         "Task",
         "Tuner",
         "from_callback",
     ),
-    "sims.base": (
+    "sims.core.simulator": (
         "Array",
         "Channel",
         "Constant",
@@ -54,28 +67,43 @@ _WHERE = {
         "Scenario",
         "Simulator",
     ),
-    "sims.extended": ("Extended",),
-    "sims.own": ("BulletWorld", "OwnSimulator"),
+    "sims.extended_simulator": ("ExtendedSimulator",),
+    "sims.own_simulator": ("BulletWorld", "OwnSimulator"),
     "sims.recording.recording": ("Recording", "Run"),
-    "sims.system": (
+    "sims.core.system": (
         "Coefficient",
         "Contact",
         "Effect",
         "Force",
         "Friction",
-        "Hidden",
+        "HiddenStateEffect",
         "Input",
         "Level",
-        "Moment",
+        "StateSnapshot",
         "Sensor",
         "Signal",
-        "State",
+        "HiddenState",
         "System",
     ),
 }
 """Public names by module; simgap.pyi declares the same for type checkers, and a test compares."""
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 __all__ = sorted([*_MODULE_OF, "main"])
+_RENAMED = {
+    "Ask": "Proposal",
+    "Case": "DiagnosisCase",
+    "Compared": "ComparisonResult",
+    "Extended": "ExtendedSimulator",
+    "Hidden": "HiddenStateEffect",
+    "Lesson": "DiagnoserTrainingTask",
+    "Moment": "StateSnapshot",
+    "Named": "NamedCause",
+    "Practice": "TrainingSimulator",
+    "Scene": "ScenarioInfo",
+    "State": "HiddenState",
+    "Steps": "TunerGenerator",
+}
+"""New name of each public name that has been renamed; the old name still works, with a warning."""
 
 
 def _hidden_package() -> str:
@@ -108,12 +136,18 @@ if _hidden := _hidden_package():
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, and return the exit code."""
-    from bench.cli import main as run
+    from bench.cli.main import main as run
 
     return run(arguments)
 
 
 def __getattr__(name: str) -> object:
+    if name in _RENAMED:
+        new = _RENAMED[name]
+        warnings.warn(
+            f"simgap.{name} has been renamed: use simgap.{new}", DeprecationWarning, stacklevel=2
+        )
+        return getattr(sys.modules[__name__], new)
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'simgap' has no attribute {name!r}")
     value = getattr(import_module(_MODULE_OF[name]), name)

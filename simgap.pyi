@@ -2,100 +2,92 @@
 from collections.abc import Sequence
 
 from bench import __version__
-from bench.api.compare import Compared, compare, sweep
+from bench.api.compare import ComparisonResult, compare, sweep
 from bench.api.datasheet import datasheet
 from bench.api.design import NextRecording, design
 from bench.api.explain import explain, score
 from bench.api.recordings import import_logs, read_recording, simulate
-from bench.checks import parametrize
-from bench.diagnoser import Answer, Case, Diagnoser, Lesson, Named
-from bench.gap.explanation import Explanation
-from bench.gap.sheet.sheet import DataSheet
-from bench.problem.experiment import Experiment
-from bench.registry import diagnosers, effects, load_plugins, simulators, tuners
-from methods.base import (
-    Ask,
+from bench.benchmark.problem.experiment import Experiment
+from bench.conformance import parametrize
+from bench.core.diagnoser import Answer, Diagnoser, DiagnoserTrainingTask, DiagnosisCase, NamedCause
+from bench.core.plugin_registries import diagnosers, effects, load_plugins, simulators, tuners
+from bench.diagnosis.datasheet.datasheet import DataSheet
+from bench.diagnosis.explanation import Explanation
+from methods.tuner import (
     BudgetExceededError,
     Evaluation,
-    Practice,
-    Scene,
-    Steps,
+    Proposal,
+    ScenarioInfo,
     Task,
+    TrainingSimulator,
     Tuner,
+    TunerGenerator,
     from_callback,
 )
-from sims.base import (
-    Array,
-    Channel,
-    Constant,
-    InputError,
-    Parameter,
-    Scenario,
-    Simulator,
-)
-from sims.extended import Extended
-from sims.own import BulletWorld, OwnSimulator
-from sims.recording.recording import Recording, Run
-from sims.system import (
+from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
+from sims.core.system import (
     Coefficient,
     Contact,
     Effect,
     Force,
     Friction,
-    Hidden,
+    HiddenState,
+    HiddenStateEffect,
     Input,
     Level,
-    Moment,
     Sensor,
     Signal,
-    State,
+    StateSnapshot,
     System,
 )
+from sims.extended_simulator import ExtendedSimulator
+from sims.own_simulator import BulletWorld, OwnSimulator
+from sims.recording.recording import Recording, Run
 
 __all__ = [
     "Answer",
     "Array",
-    "Ask",
     "BudgetExceededError",
     "BulletWorld",
-    "Case",
     "Channel",
     "Coefficient",
-    "Compared",
+    "ComparisonResult",
     "Constant",
     "Contact",
     "DataSheet",
     "Diagnoser",
+    "DiagnoserTrainingTask",
+    "DiagnosisCase",
     "Effect",
     "Evaluation",
     "Experiment",
     "Explanation",
-    "Extended",
+    "ExtendedSimulator",
     "Force",
     "Friction",
-    "Hidden",
+    "HiddenState",
+    "HiddenStateEffect",
     "Input",
     "InputError",
-    "Lesson",
     "Level",
-    "Moment",
-    "Named",
+    "NamedCause",
     "NextRecording",
     "OwnSimulator",
     "Parameter",
-    "Practice",
+    "Proposal",
     "Recording",
     "Run",
     "Scenario",
-    "Scene",
+    "ScenarioInfo",
     "Sensor",
     "Signal",
     "Simulator",
-    "State",
-    "Steps",
+    "StateSnapshot",
     "System",
     "Task",
+    "TrainingSimulator",
     "Tuner",
+    "TunerGenerator",
     "__version__",
     "compare",
     "datasheet",

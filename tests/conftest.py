@@ -33,15 +33,15 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background; c
 def pytest_configure(config):
     """Machine code is made before there are workers that would each wait for it."""
     if not hasattr(config, "workerinput"):
-        from sims.engines.compiled import machine
+        from sims.engines.compiled import kernel
 
-        machine.machine()
+        kernel.get_kernel()
 
 
 @pytest.fixture(scope="session")
 def spring():
     """The test simulator, registered."""
-    from bench.registry import load_plugins, simulators
+    from bench.core.plugin_registries import load_plugins, simulators
 
     load_plugins([PLUGINS / "spring.py"])
     return simulators.get("spring")
@@ -66,7 +66,7 @@ def recordings():
 @pytest.fixture(scope="module", autouse=True)
 def registries_as_before():
     """What a module's tests register is gone after it, but for the test simulator."""
-    from bench.registry import REGISTRIES, simulators
+    from bench.core.plugin_registries import REGISTRIES, simulators
 
     before = [registry.snapshot() for registry in REGISTRIES]
     yield
@@ -80,7 +80,7 @@ def registries_as_before():
 @pytest.fixture
 def fresh_registries():
     """What a test registers is gone after it."""
-    from bench.registry import REGISTRIES
+    from bench.core.plugin_registries import REGISTRIES
 
     before = [registry.snapshot() for registry in REGISTRIES]
     yield
@@ -91,9 +91,9 @@ def fresh_registries():
 @pytest.fixture
 def undrawn():
     """Comparisons of this process write their tables alone."""
-    from tests import undrawn
+    from tests import without_drawing
 
-    with undrawn.undrawn():
+    with without_drawing.undrawn():
         yield
 
 

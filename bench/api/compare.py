@@ -8,34 +8,34 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from bench import study
-from bench.diagnosis import columns as diagnosis
-from bench.figures import comparison
-from bench.figures.formats import pdf_figures
-from bench.misspecified.calibration import MODELS
-from bench.problem.asked import asked
-from bench.problem.experiment import Experiment, load, names
-from bench.problem.problem import Problem
-from bench.problem.robots import completed
-from bench.registry import diagnosers
-from bench.registry import tuners as registered
-from bench.report import tables
-from bench.runs.runner import Progress
-from bench.runs.size import check_comparison
-from bench.runs.survey import admit
-from bench.store.csvs import Csv
-from bench.store.folder import Stored, read
-from bench.store.reference import find
-from bench.store.schema import (
-    MISSPECIFIED_RANKING,
-    MISSPECIFIED_RANKS,
-    MISSPECIFIED_TABLE,
-    SHOT_STATUS,
-    SHOT_TABLE,
-    SHOTS,
+from bench.benchmark.figures import comparison_figures
+from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
+from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
+from bench.benchmark.problem.robot_experiment import make_robot_experiment
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.results_report import build_tables
+from bench.benchmark.runner.experiment_runner import ProgressFactory
+from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.resource_checks import check_comparison_size
+from bench.benchmark.storage.csv_reader import CsvTable
+from bench.benchmark.storage.reference_results import find_reference
+from bench.benchmark.storage.result_folder import StoredComparison, read_comparison
+from bench.benchmark.storage.table_schemas import (
+    MISSPECIFICATION_RANK_COLUMNS,
+    MISSPECIFICATION_TABLE_COLUMNS,
+    RANK_AGREEMENT_COLUMNS,
+    SHOT_COLUMNS,
+    SHOT_STATUS_COLUMNS,
+    SHOT_TABLE_COLUMNS,
 )
-from methods.base import Tuner
-from sims.arguments import (
+from bench.core.plugin_registries import diagnosers
+from bench.core.plugin_registries import tuners as registered
+from bench.diagnosis_benchmark import table_columns as diagnosis
+from bench.figures.figure_files import pdf_figures
+from bench.misspecification.calibration import MODEL_LABELS
+from bench.studies import study
+from methods.tuner import Tuner
+from sims.core.argument_checks import (
     Count,
     Expected,
     Files,
@@ -45,20 +45,24 @@ from sims.arguments import (
     Seconds,
     check_arguments,
 )
-from sims.base import InputError, unknown
+from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from bench.runs.pools import Pool
+    from bench.benchmark.runner.worker_pools import Pool
 
-_OF_SHOTS = {"status": SHOT_STATUS, "shots": SHOTS, "table": SHOT_TABLE}
+_SHOT_TABLE_COLUMNS = {
+    "status": SHOT_STATUS_COLUMNS,
+    "shots": SHOT_COLUMNS,
+    "table": SHOT_TABLE_COLUMNS,
+}
 """Columns of the tables of a bounce shot."""
-_OF_TWO = {
-    "table": MISSPECIFIED_TABLE,
-    "ranks": MISSPECIFIED_RANKS,
-    "ranking": MISSPECIFIED_RANKING,
+_MISSPECIFICATION_TABLE_COLUMNS = {
+    "table": MISSPECIFICATION_TABLE_COLUMNS,
+    "ranks": MISSPECIFICATION_RANK_COLUMNS,
+    "ranking": RANK_AGREEMENT_COLUMNS,
 }
 """Columns of the tables of a study of a missing effect."""
 _ROWS = 200
@@ -102,10 +106,10 @@ def compare(
     out: str | Path | None = None,
     plugins: Files = (),
     cluster: str | None = None,
-    progress: Progress | None = None,
+    progress: ProgressFactory | None = None,
     force: bool = False,
     pdf: bool = False,
-) -> Compared:
+) -> ComparisonResult:
     """Run an experiment: every tuner on every target with every seed.
 
     Args:
@@ -150,11 +154,16 @@ def compare(
         raise InputError(
             "compare: expected an experiment, as simgap.compare('ball-drop'), or a robot, as "
             "simgap.compare(model='robot.xml', free=['damping@*']); experiments are "
-            f"{', '.join(names())}"
+            f"{', '.join(list_experiment_names())}"
         )
     files = [str(Path(plugin).resolve()) for plugin in plugins]
-    chosen = choose(
-        given(wanted(experiment, model, recording, free), files, trust or not jobs, isolation),
+    chosen = apply_changes(
+        load_experiment_plugins(
+            resolve_experiment(experiment, model, recording, free),
+            files,
+            trust or not jobs,
+            isolation,
+        ),
         None if tuners is None else [_label(tuner) for tuner in tuners],
         seeds,
         targets=targets,
@@ -168,11 +177,11 @@ def compare(
     if chosen.experiments:
         raise InputError(f"experiment {chosen.name} names several: use simgap.sweep")
     folder = None if out is None else Path(out)
-    check_comparison(chosen, folder, jobs, cluster is not None, force)
+    check_comparison_size(chosen, folder, jobs, cluster is not None, force)
     pool = _cluster(cluster)
-    begun = study.begin(chosen, files, folder, jobs, salt)
+    begun = study.begin_study(chosen, files, folder, jobs, salt)
     with pdf_figures(pdf):
-        return _made(begun, jobs, progress, pool)
+        return _run_study(begun, jobs, progress, pool)
 
 
 @check_arguments
@@ -184,10 +193,10 @@ def sweep(
     salt: str | None = None,
     out: str | Path | None = None,
     plugins: Files = (),
-    progress: Progress | None = None,
+    progress: ProgressFactory | None = None,
     force: bool = False,
     pdf: bool = False,
-) -> list[Compared]:
+) -> list[ComparisonResult]:
     """Run one by one the experiments of a ``[sweep]`` or of an ``experiments`` list.
 
     Args:
@@ -208,18 +217,18 @@ def sweep(
         InputError: An argument is invalid; the message is one line, and nothing has been run then.
     """
     files = [str(Path(plugin).resolve()) for plugin in plugins]
-    chosen = choose(given(experiment, files, trust or not jobs))
+    chosen = apply_changes(load_experiment_plugins(experiment, files, trust or not jobs))
     folder = None if out is None else Path(out)
-    check_comparison(chosen, folder, jobs, force=force)
-    begun = study.begin_all(chosen, files, folder, jobs, salt)
+    check_comparison_size(chosen, folder, jobs, force=force)
+    begun = study.begin_studies(chosen, files, folder, jobs, salt)
     with pdf_figures(pdf):
-        made = [_made(one, jobs, progress, None) for one in begun]
+        made = [_run_study(one, jobs, progress, None) for one in begun]
         if len(begun) > 1:
-            study.conclude(begun[0].folder.parent, _unsaid)
+            study.report_jointly(begun[0].folder.parent, _discard_line)
     return made
 
 
-def wanted(
+def resolve_experiment(
     experiment: str | Path | Experiment | None,
     model: str | Path | None = None,
     recording: str | Path | None = None,
@@ -250,10 +259,10 @@ def wanted(
             "expected an experiment (see `simgap list experiments`), or --resume DIR, or a robot: "
             "--model FILE --free A,B"
         )
-    return asked(model, recording, free)
+    return make_robot_experiment(model, recording, free)
 
 
-def given(
+def load_experiment_plugins(
     experiment: str | Path | Experiment,
     plugins: Sequence[str | Path],
     trust: bool,
@@ -270,38 +279,40 @@ def given(
     Raises:
         InputError: The experiment does not exist, or a plugin cannot be used.
     """
-    whole = experiment if isinstance(experiment, Experiment) else load(str(experiment))
+    whole = experiment if isinstance(experiment, Experiment) else load_experiment(str(experiment))
     whole = whole.chosen(trusted=whole.trusted or trust, isolation=isolation)
-    admit([str(Path(plugin).resolve()) for plugin in plugins], whole)
+    load_plugins_for_experiment([str(Path(plugin).resolve()) for plugin in plugins], whole)
     # The robot's default commands are filled in, so that the result folder contains them.
-    return completed(whole)
+    return complete_robot_experiment(whole)
 
 
 def _cluster(address: str | None) -> Pool | None:
     if address is None:
         return None
-    from bench.runs.cluster import ClusterPool
+    from bench.benchmark.runner.dask_cluster import ClusterPool
 
     return ClusterPool(address)
 
 
-def _made(begun: study.Study, jobs: int, progress: Progress | None, pool: Pool | None) -> Compared:
+def _run_study(
+    begun: study.Study, jobs: int, progress: ProgressFactory | None, pool: Pool | None
+) -> ComparisonResult:
     """Run and report a study."""
-    made = begun.make(jobs, progress, pool)
+    made = begun.run(jobs, progress, pool)
     if made.skipped:
         raise InputError(f"{begun.configuration.experiment.name}: skipped: {made.skipped}")
-    begun.finish(_unsaid)
+    begun.report(_discard_line)
     if made.interrupted:
         # A notebook's cell ends as the user requested; finished runs are stored in the folder.
         raise KeyboardInterrupt(f"what was finished is kept in {begun.folder}")
-    return Compared(begun.folder)
+    return ComparisonResult(begun.folder)
 
 
-def _unsaid(_line: str) -> None:
+def _discard_line(_line: str) -> None:
     """Discard a line that the command would print; in Python the tables are available."""
 
 
-def choose(
+def apply_changes(
     experiment: str | Path | Experiment,
     labels: Sequence[str] | None = None,
     seeds: int | None = None,
@@ -318,7 +329,7 @@ def choose(
     Raises:
         InputError: The experiment or a tuner does not exist.
     """
-    whole = experiment if isinstance(experiment, Experiment) else load(str(experiment))
+    whole = experiment if isinstance(experiment, Experiment) else load_experiment(str(experiment))
     if whole.diagnosis:
         return _choose_diagnosers(whole, labels, changes)
     whole = whole.chosen(**changes)
@@ -329,7 +340,7 @@ def choose(
     known = {*registered.names(), *(entry.label for entry in whole.tuners)}
     for label in labels:
         if label not in known:
-            raise unknown("tuner", label, sorted(known))
+            raise make_unknown_name_error("tuner", label, sorted(known))
     return whole.with_tuners(labels)
 
 
@@ -344,7 +355,7 @@ def _choose_diagnosers(
     if labels is not None:
         for label in labels:
             if label not in diagnosers.names():
-                raise unknown("diagnoser", label, diagnosers.names())
+                raise make_unknown_name_error("diagnoser", label, diagnosers.names())
         table["diagnosers"] = list(labels)
     rest = {name: value for name, value in changes.items() if name != "targets"}
     return whole.chosen(diagnosis=table, **rest)
@@ -359,7 +370,7 @@ def _label(tuner: str | type[Tuner]) -> str:
     return registered.register(tuner).name
 
 
-class Compared:
+class ComparisonResult:
     """A comparison that has been run, read from its folder.
 
     Args:
@@ -377,17 +388,17 @@ class Compared:
     @check_arguments
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
-        self.experiment: Experiment = study.opened(self.folder).configuration.experiment
+        self.experiment: Experiment = study.open_study(self.folder).configuration.experiment
 
     @cached_property
-    def _stored(self) -> Stored:
-        return read(self.folder)
+    def _stored(self) -> StoredComparison:
+        return read_comparison(self.folder)
 
     @cached_property
-    def _labels(self) -> comparison.Labels:
-        problem = Problem(self.experiment)
+    def _labels(self) -> comparison_figures.AxisLabels:
+        problem = TuningProblem(self.experiment)
         try:
-            return comparison.labels_of(problem)
+            return comparison_figures.make_axis_labels(problem)
         finally:
             problem.close()
 
@@ -395,8 +406,10 @@ class Compared:
         """Read a table file of a bounce shot or of a study of two comparisons."""
         remedy = f"simgap plot {self.folder} writes it again"
         path = self.folder / f"{name}.csv"
-        columns = (_OF_SHOTS if self.experiment.shot else _OF_TWO)[name]
-        table: pd.DataFrame = Csv(path, columns, remedy).table.to_pandas()
+        columns = (
+            _SHOT_TABLE_COLUMNS if self.experiment.shot else _MISSPECIFICATION_TABLE_COLUMNS
+        )[name]
+        table: pd.DataFrame = CsvTable(path, columns, remedy).table.to_pandas()
         return table
 
     @property
@@ -412,13 +425,13 @@ class Compared:
             return "a comparison of diagnosers"
         return "a bounce shot" if self.experiment.shot else "a study of two comparisons"
 
-    def _both(self, rows: Callable[[Stored], pd.DataFrame]) -> pd.DataFrame:
+    def _both(self, rows: Callable[[StoredComparison], pd.DataFrame]) -> pd.DataFrame:
         """Concatenate rows of a study's two comparisons, with the simulator's name first."""
         import pandas as pd
 
         parts = []
-        for model in MODELS:
-            part = rows(read(self.folder / model)).copy()
+        for model in MODEL_LABELS:
+            part = rows(read_comparison(self.folder / model)).copy()
             part.insert(0, "model", model)
             parts.append(part)
         return pd.concat(parts, ignore_index=True)
@@ -433,12 +446,14 @@ class Compared:
         (docs/diagnosers.md).
         """
         if self.experiment.diagnosis:
-            return {name: diagnosis.read_table(self.folder, name) for name in diagnosis.TABLES}
+            return {
+                name: diagnosis.read_table(self.folder, name) for name in diagnosis.TABLE_COLUMNS
+            }
         if self.experiment.shot:
             return {name: self._csv(name) for name in ("table", "shots")}
         if self.experiment.calibration:
-            return {name: self._csv(name) for name in _OF_TWO}
-        return tables(self._stored)
+            return {name: self._csv(name) for name in _MISSPECIFICATION_TABLE_COLUMNS}
+        return build_tables(self._stored)
 
     @property
     def table(self) -> pd.DataFrame:
@@ -464,7 +479,7 @@ class Compared:
     def statuses(self) -> pd.DataFrame:
         """A row for each run or answer with its status and reason, as in status.csv."""
         if self.experiment.diagnosis:
-            return self.tables["items"][list(diagnosis.STATUS)]
+            return self.tables["items"][list(diagnosis.STATUS_COLUMNS)]
         if self.experiment.calibration:
             return self._both(lambda stored: stored.statuses)
         return self._csv("status") if self.experiment.shot else self._stored.statuses
@@ -476,7 +491,7 @@ class Compared:
         The figures of a bounce shot, of a study of a missing effect and of diagnosers are files in
         the folder instead.
         """
-        return [] if self._in_files else comparison.names(self._stored)
+        return [] if self._in_files else comparison_figures.list_figure_names(self._stored)
 
     def figure(self, name: str = "error", behind: str | Sequence[str] = ()) -> Figure:
         """Draw one of the figures; a notebook shows it inline.
@@ -492,8 +507,8 @@ class Compared:
         if self._in_files:
             raise InputError(f"figures of {self._what} are files: {self.folder / 'figures'}")
         asked = [behind] if isinstance(behind, str) else behind
-        references = [find(one) for one in asked]
-        return comparison.figure(self._stored, self._labels, name, behind=references)
+        references = [find_reference(one) for one in asked]
+        return comparison_figures.draw_figure(self._stored, self._labels, name, behind=references)
 
     def summary(self) -> pd.DataFrame:
         """Return each tuner's last error in ranking order, with verdict and failures.
@@ -502,7 +517,7 @@ class Compared:
         """
         table = self.table
         if self.experiment.diagnosis:
-            return diagnosis.board(table)
+            return diagnosis.build_leaderboard(table)
         if self._in_files:
             return table
         last = table[table["simulations"] == table["simulations"].max()]

@@ -8,19 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from bench.api.explain import Source, Sources, Units, explain, sources_of
-from bench.gap.causes.rules import MEANING
-from bench.gap.explanation import Explanation
-from bench.gap.sheet.sheet import DataSheet, sheet
-from bench.gap.sheet.subject import subject_of
-from bench.gap.verdict import Verdict
-from bench.recordings.frames import FrameDescription
-from bench.recordings.joined import load_all
-from bench.registry import simulators
-from sims.arguments import Count, Expected, Name, Names, Seconds, check_arguments
-from sims.base import InputError
-from sims.extended import Extended, opened
-from sims.simulated import Simulated
+from bench.api.explain import RecordingSource, Sources, Units, explain, list_sources
+from bench.core.plugin_registries import simulators
+from bench.diagnosis.datasheet.datasheet import DataSheet, build_datasheet
+from bench.diagnosis.datasheet.subject import make_subject
+from bench.diagnosis.explanation import Explanation
+from bench.diagnosis.search.verdict_rules import VERDICT_MEANINGS
+from bench.diagnosis.verdict import Verdict
+from bench.logs.data_frames import FrameDescription
+from bench.logs.joined_recordings import load_joined
+from sims.core.argument_checks import Count, Expected, Name, Names, Seconds, check_arguments
+from sims.core.simulator import InputError
+from sims.extended_simulator import ExtendedSimulator, open_extended
+from sims.system_simulator import SystemSimulator
 
 Explained: TypeAlias = Annotated[
     str | Path | Explanation,
@@ -75,9 +75,9 @@ def datasheet(
             explain, or belongs to other logs.
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
-    sources = sources_of(recording, about)
+    sources = list_sources(recording, about)
     if explained is None:
-        refuse_joint(sources, joint, system, model, free)
+        check_joint_exists(sources, joint, system, model, free)
         explained = explain(
             sources,
             system=system,
@@ -93,20 +93,20 @@ def datasheet(
     if isinstance(explained, Explanation):
         extended, verdict = explained.extended, explained.answer
     else:
-        extended, verdict = _read(Path(explained))
+        extended, verdict = _read_explanation_folder(Path(explained))
     free = extended.robot.free if extended.robot is not None else ()
-    loaded, kind = load_all(sources, system, model, free)
+    loaded, kind = load_joined(sources, system, model, free)
     if extended.kind is None or kind.name != extended.kind.name:
         raise InputError(
             f"{loaded.path}: expected a recording of {extended.system}, as what was explained; "
             f"found one of {kind.name}"
         )
     say("asking what these data would have shown")
-    return sheet(loaded, extended, verdict, joint, name)
+    return build_datasheet(loaded, extended, verdict, joint, name)
 
 
-def refuse_joint(
-    recording: Source | Sequence[Source],
+def check_joint_exists(
+    recording: RecordingSource | Sequence[RecordingSource],
     joint: str | None,
     system: str | None = None,
     model: str | Path | None = None,
@@ -124,13 +124,13 @@ def refuse_joint(
     Raises:
         InputError: There is no joint with this name, or there are several and none is named.
     """
-    loaded, kind = load_all(sources_of(recording), system, model, free)
-    if not issubclass(kind, Simulated):
+    loaded, kind = load_joined(list_sources(recording), system, model, free)
+    if not issubclass(kind, SystemSimulator):
         raise InputError(f"{loaded.path}: simulator {loaded.system} takes no effects")
-    subject_of(kind, joint)
+    make_subject(kind, joint)
 
 
-def _sound(verdict: Verdict) -> Verdict:
+def _check_verdict(verdict: Verdict) -> Verdict:
     """Check the types of those parts of a verdict that are used here, and return it.
 
     Raises:
@@ -144,18 +144,20 @@ def _sound(verdict: Verdict) -> Verdict:
     for candidate in verdict.candidates:
         texts.append(candidate.effect)
         numbers += [candidate.p_value, candidate.heldout_gain or 0.0]
-    if not all(isinstance(text, str) for text in texts) or verdict.verdict not in MEANING:
+    if not all(isinstance(text, str) for text in texts) or verdict.verdict not in VERDICT_MEANINGS:
         raise ValueError("a name is no text")
     if not all(isinstance(number, int | float) for number in numbers):
         raise ValueError("a number is none")
     return verdict
 
 
-def _read(folder: Path) -> tuple[Extended, Verdict]:
+def _read_explanation_folder(folder: Path) -> tuple[ExtendedSimulator, Verdict]:
     """Read the results that explain has written to a folder."""
     path = folder / "verdict.json"
     try:
-        verdict = _sound(Verdict.of(json.loads(path.read_text(encoding="utf-8"))))
+        verdict = _check_verdict(
+            Verdict.from_document(json.loads(path.read_text(encoding="utf-8")))
+        )
     except OSError as error:
         remedy = "name a folder that simgap explain has written"
         raise InputError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
@@ -163,5 +165,5 @@ def _read(folder: Path) -> tuple[Extended, Verdict]:
         raise InputError(
             f"{path}: expected a verdict of simgap explain, found other text"
         ) from None
-    extended, kind, _ = opened(folder / "extended.toml", simulators.get)
+    extended, kind, _ = open_extended(folder / "extended.toml", simulators.get)
     return replace(extended, kind=kind), verdict

@@ -10,26 +10,26 @@ from typing import Any
 
 import numpy as np
 
-from bench.api.explain import Sources, Units, sources_of
-from bench.gap import explain as explaining
-from bench.gap.design import Design
-from bench.gap.explanation import Explanation
-from bench.gap.model.crew import cores
-from bench.gap.model.progress import ProgressListener
-from bench.gap.model.watch import Watch
-from bench.gap.rig.worth import SPLITS
-from bench.recordings.frames import FrameDescription
-from sims.arguments import Count, Name, Names, check_arguments
-from sims.base import InputError
-from sims.recording.write import publish, refuse_existing
+from bench.api.explain import Sources, Units, list_sources
+from bench.diagnosis import explain as explaining
+from bench.diagnosis.evaluation.progress_events import ProgressListener
+from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.evaluation.worker_pool import count_available_cores
+from bench.diagnosis.experiment_design.information_gain import DISCRIMINATION_THRESHOLD
+from bench.diagnosis.experiment_design.next_run import NextRunDesign
+from bench.diagnosis.explanation import Explanation
+from bench.logs.data_frames import FrameDescription
+from sims.core.argument_checks import Count, Name, Names, check_arguments
+from sims.core.simulator import InputError
+from sims.recording.recording_writer import check_absent, write_files
 
-LONGEST = 600.0
+MAX_RUN_SECONDS = 600.0
 """Maximum duration of a designed run, in seconds."""
 
 
-LONGER = 5.0
+MAX_LENGTH_FACTOR = 5.0
 """Maximum ratio of a run's duration to the requested one, if that settles a question."""
-REPEATS = 8
+MAX_REPEATS = 8
 """Maximum number of repetitions of a run that is recommended."""
 
 
@@ -43,7 +43,7 @@ class NextRecording:
     """
 
     explanation: Explanation
-    design: Design | None
+    design: NextRunDesign | None
 
     def lines(self) -> list[str]:
         """Format the recommended run and its expected benefit as text."""
@@ -54,7 +54,7 @@ class NextRecording:
         lasting = f"{found.times[-1]:.3g} s"
         lines = [f"record next, {lasting}: {found.says}; begin near {begin}"]
         if found.by == "T":
-            return [*lines, *_told(found)]
+            return [*lines, *_format_discrimination(found)]
         factor = math.exp(min(found.gain, 50.0))
         what = f"it narrows what is known of all numbers together {factor:.3g} times"
         return [*lines, f"nothing is open: {what}"]
@@ -75,29 +75,34 @@ class NextRecording:
         if self.design is None:
             raise InputError("there is no run to write")
         path = Path(path)
-        refuse_existing([path])
+        check_absent([path])
         columns = [self.design.times, *self.design.inputs.values()]
         rows = ["t," + ",".join(self.design.inputs) if self.design.inputs else "t"]
         rows += [",".join(f"{value:.9g}" for value in row) for row in np.column_stack(columns)]
-        publish({path: "\n".join(rows) + "\n"})
+        write_files({path: "\n".join(rows) + "\n"})
 
 
-def _told(found: Design) -> list[str]:
+def _format_discrimination(found: NextRunDesign) -> list[str]:
     """Format which causes a run distinguishes, and which it does not."""
     lines = []
-    if found.split:
-        sizes = [f"{name} ({math.sqrt(found.told[name]):.3g})" for name in found.split]
+    if found.distinguished_effects:
+        sizes = [
+            f"{name} ({math.sqrt(found.discrimination_by_effect[name]):.3g})"
+            for name in found.distinguished_effects
+        ]
         lines.append(
             f"it tells {found.effect} from {', '.join(sizes)}: by so many noises, once every "
             "number is fitted again, whichever is true"
         )
-    stays = [name for name in found.told if name not in found.split]
+    stays = [
+        name for name in found.discrimination_by_effect if name not in found.distinguished_effects
+    ]
     if stays:
         lines.append(f"no run of this kind tells it from {', '.join(stays)}")
-    best = max((found.told[name] for name in stays), default=0.0)
-    if best > 0 and (times := math.ceil(SPLITS / best)) <= REPEATS:
+    best = max((found.discrimination_by_effect[name] for name in stays), default=0.0)
+    if best > 0 and (times := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
         lines.append(f"recorded {times} times it would tell it from one more of these")
-    if found.settles:
+    if found.settles_all:
         lines.append("that settles it")
     others = [group for group in found.groups if len(group) > 1 and found.effect not in group]
     lines += [f"should it be one of {', '.join(group)}: these stay open" for group in others]
@@ -147,13 +152,13 @@ def design(
     Raises:
         InputError: As for `explain`, or a duration is out of range.
     """
-    if not 0 < seconds <= LONGEST:
-        raise InputError(f"seconds: expected 0 to {LONGEST:g}, found {seconds!r}")
-    most = min(LONGER * seconds, LONGEST) if longest is None else longest
-    if not seconds <= most <= LONGEST:
-        raise InputError(f"longest: expected {seconds:g} to {LONGEST:g}, found {most!r}")
-    watch = Watch(None, stop, progress, listener)
+    if not 0 < seconds <= MAX_RUN_SECONDS:
+        raise InputError(f"seconds: expected 0 to {MAX_RUN_SECONDS:g}, found {seconds!r}")
+    most = min(MAX_LENGTH_FACTOR * seconds, MAX_RUN_SECONDS) if longest is None else longest
+    if not seconds <= most <= MAX_RUN_SECONDS:
+        raise InputError(f"longest: expected {seconds:g} to {MAX_RUN_SECONDS:g}, found {most!r}")
+    watch = SearchControl(None, stop, progress, listener)
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
-    sources = sources_of(recording, about)
-    given = sources, seconds, most, system, model, free, say, watch, jobs or cores()
+    sources = list_sources(recording, about)
+    given = sources, seconds, most, system, model, free, say, watch, jobs or count_available_cores()
     return NextRecording(*explaining.explain_and_design(*given))

@@ -7,30 +7,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, cast
 
-from bench.gap import explain as explaining
-from bench.gap.explanation import Explanation
-from bench.gap.model.crew import cores
-from bench.gap.model.progress import ProgressListener
-from bench.gap.model.watch import Watch
-from bench.gap.score_model import MODEL_FILES, scored
-from bench.recordings.frames import FrameDescription, recording_of
-from bench.recordings.simulate import SimulatedRecording
-from sims import extended as extended_file
-from sims.arguments import Count, Expected, Name, Names, Seconds, check_arguments
-from sims.base import InputError
-from sims.recording.frame import Frame
+from bench.diagnosis import explain as explaining
+from bench.diagnosis.evaluation.progress_events import ProgressListener
+from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.evaluation.worker_pool import count_available_cores
+from bench.diagnosis.explanation import Explanation
+from bench.diagnosis.score_extended import MODEL_FILES, score_model
+from bench.logs.data_frames import FrameDescription, recording_of
+from bench.logs.synthetic_recording import SimulatedRecording
+from sims import extended_simulator as extended_file
+from sims.core.argument_checks import Count, Expected, Name, Names, Seconds, check_arguments
+from sims.core.simulator import InputError
 from sims.recording.recording import Recording
+from sims.recording.recording_frame import Frame
 
 _RECORDING = (
     "the path of NAME.csv, a Recording (of read_recording), a SimulatedRecording (of simulate) or "
     "a pandas DataFrame"
 )
-Source: TypeAlias = Annotated[
+RecordingSource: TypeAlias = Annotated[
     str | Path | Recording | SimulatedRecording | Frame, Expected(_RECORDING)
 ]
 """A source of one recording."""
 Sources: TypeAlias = Annotated[
-    Source | Sequence[Source], Expected(f"{_RECORDING}, or a list of these")
+    RecordingSource | Sequence[RecordingSource], Expected(f"{_RECORDING}, or a list of these")
 ]
 """A source of one recording, or several."""
 Units: TypeAlias = Annotated[
@@ -104,15 +104,15 @@ def explain(
             simulator that takes no effects; or the search ended before the first simulation.
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
-    sources = sources_of(recording, about)
-    watch = Watch(budget, stop, progress, listener)
+    sources = list_sources(recording, about)
+    watch = SearchControl(budget, stop, progress, listener)
     given = system, engine, seed, free, tuner, say, force
-    more = jobs or cores(), model, whole, pieces, thorough
+    more = jobs or count_available_cores(), model, whole, pieces, thorough
     return explaining.explain(sources, *given, watch, *more)
 
 
-def sources_of(
-    recording: Source | Sequence[Source], about: FrameDescription | None = None
+def list_sources(
+    recording: RecordingSource | Sequence[RecordingSource], about: FrameDescription | None = None
 ) -> list[str | Path | Recording]:
     """Return recordings as a list of paths and of recordings in memory.
 
@@ -126,7 +126,7 @@ def sources_of(
     """
     about = about or FrameDescription()
     single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
-    each: list[Any] = [recording] if single else [*cast(Sequence[Source], recording)]
+    each: list[Any] = [recording] if single else [*cast(Sequence[RecordingSource], recording)]
     if not each:
         raise InputError(f"recording: expected {_RECORDING}, found an empty list")
     frames = [one for one in each if isinstance(one, Frame)]
@@ -145,7 +145,7 @@ def sources_of(
 @check_arguments
 def score(
     model: str | Path,
-    recording: Source,
+    recording: RecordingSource,
     *,
     units: Units | None = None,
     constants: Mapping[str, float] | None = None,
@@ -175,15 +175,15 @@ def score(
     about = FrameDescription(None, None, units or {}, constants or {}, description or {})
     if isinstance(recording, Frame):
         about = _of_model(Path(model), about)
-    (source,) = sources_of(recording, about)
-    return scored(Path(model), source, held_out, force)
+    (source,) = list_sources(recording, about)
+    return score_model(Path(model), source, held_out, force)
 
 
 def _of_model(model: Path, about: FrameDescription) -> FrameDescription:
     """Complete the description of a data frame by the system or robot of a model."""
     if model.suffix in MODEL_FILES:
         return replace(about, model=model)
-    extended = extended_file.read(model)
+    extended = extended_file.read_extended(model)
     robot = extended.robot
     if robot is None:
         return replace(about, system=extended.system)

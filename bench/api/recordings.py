@@ -6,19 +6,29 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from bench.api.explain import Source, Units, sources_of
-from bench.recordings.frames import FrameDescription
-from bench.recordings.importing import Imported, ImportOptions, checked, describe
-from bench.recordings.inspection import load
-from bench.recordings.simulate import Coefficients, SimulatedRecording, Wish, make
-from sims.arguments import Expected, Name, Names, check_arguments
-from sims.base import InputError
+from bench.api.explain import RecordingSource, Units, list_sources
+from bench.logs.data_frames import FrameDescription
+from bench.logs.importing.log_import import (
+    ImportOptions,
+    ImportResult,
+    describe_logs,
+    write_checked_description,
+)
+from bench.logs.inspection import load_recording
+from bench.logs.synthetic_recording import (
+    EffectCoefficients,
+    SimulatedRecording,
+    SimulationSpec,
+    simulate_recording,
+)
+from sims.core.argument_checks import Expected, Name, Names, check_arguments
+from sims.core.simulator import InputError
 from sims.recording.recording import Recording
-from sims.recording.write import refuse_existing
-from sims.robot.reading import read
+from sims.recording.recording_writer import check_absent
+from sims.robot.parsing.read_model_file import read_robot
 
 Effects: TypeAlias = Annotated[
-    Mapping[str, Coefficients],
+    Mapping[str, EffectCoefficients],
     Expected("coefficients by the names of effects, as {'drag.linear': 2e-4}"),
 ]
 """Active effects with their coefficients, by name."""
@@ -82,8 +92,8 @@ def simulate(
     Raises:
         InputError: An argument is invalid; the message is one line.
     """
-    return make(
-        Wish(
+    return simulate_recording(
+        SimulationSpec(
             system,
             model=model,
             actuators=actuators or {},
@@ -107,7 +117,7 @@ def simulate(
 
 @check_arguments
 def read_recording(
-    path: Source,
+    path: RecordingSource,
     system: Name | None = None,
     *,
     model: str | Path | None = None,
@@ -134,8 +144,8 @@ def read_recording(
         InputError: The recording is malformed; the message is one line.
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
-    (source,) = sources_of(path, about)
-    return load(source, system, model)[0]
+    (source,) = list_sources(path, about)
+    return load_recording(source, system, model)[0]
 
 
 @check_arguments
@@ -148,7 +158,7 @@ def import_logs(
     rate: float | None = None,
     position_unit: Name = "",
     calibration: str | Path | None = None,
-) -> Imported:
+) -> ImportResult:
     """Write a description (TOML) of a robot's raw logs, so that all commands can read them.
 
     Args:
@@ -173,10 +183,10 @@ def import_logs(
     path = Path(out)
     if path.suffix != ".toml":
         raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
-    refuse_existing([path])
+    check_absent([path])
     paths = [Path(log) for log in given]
     file = None if calibration is None else Path(calibration)
     options = ImportOptions(held_out, rate, position_unit, file)
-    made = describe(paths, read(Path(model)), Path(model), path.parent, options)
-    checked(path, made.text)
+    made = describe_logs(paths, read_robot(Path(model)), Path(model), path.parent, options)
+    write_checked_description(path, made.text)
     return made

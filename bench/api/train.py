@@ -8,35 +8,47 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.figures.training import draw
-from bench.problem.experiment import Entry, Experiment, load, names
-from bench.problem.problem import Problem
-from bench.problem.robots import completed
-from bench.registry import simulators, tuners
-from bench.runs.housing import tuned_of
-from bench.runs.runner import Progress
-from bench.runs.survey import admit, unbuildable
-from bench.runs.training import Lesson, Training, folder, train
-from bench.sealing.ended import EndedError
-from methods.base import Practice, Watch
-from methods.learning.rehearsal import TooFewError
-from sims import files
-from sims.base import InputError
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.problem.experiment import (
+    Experiment,
+    TunerEntry,
+    list_experiment_names,
+    load_experiment,
+)
+from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.experiment_runner import ProgressFactory
+from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment, must_build_isolated
+from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
+from bench.benchmark.runner.tuner_training import (
+    TrainingRequest,
+    TrainingResult,
+    get_weights_folder,
+)
+from bench.benchmark.runner.tuner_training import (
+    train_or_load as train,
+)
+from bench.core.plugin_registries import simulators, tuners
+from bench.figures.loss_figure import write_loss_figure
+from methods.learning.training_data import TrainingBudgetTooSmallError
+from methods.tuner import TrainingCallback, TrainingSimulator
+from sims.core import atomic_files
+from sims.core.simulator import InputError
 
-HEAD = ("seed", "stage", "epoch", "training_loss", "held_out_loss")
+LOSS_COLUMNS = ("seed", "stage", "epoch", "training_loss", "held_out_loss")
 """Columns of loss.csv."""
-_HELD_OUT = 160
+_HELD_OUT_SIMULATIONS = 160
 """Number of simulations for the held-out loss, in addition to the training budget."""
 
 
-def choose(
+def select_training(
     tuner: str,
     simulator: str,
     experiment: str | None = None,
     budget: int | None = None,
     plugins: Sequence[str | Path] = (),
     trust: bool = False,
-) -> tuple[Experiment, Entry]:
+) -> tuple[Experiment, TunerEntry]:
     """Select the experiment and the tuner to train.
 
     Args:
@@ -52,17 +64,19 @@ def choose(
     Raises:
         InputError: The arguments do not fit together, or the tuner does not learn.
     """
-    if experiment is None and simulator in set(names()) - set(simulators.names()):
+    if experiment is None and simulator in set(list_experiment_names()) - set(simulators.names()):
         experiment = simulator
-        simulator = load(experiment).simulator
+        simulator = load_experiment(experiment).simulator
     # A robot's simulator is not registered; it is defined by its experiment.
-    robotic = experiment is not None and load(experiment).model
+    robotic = experiment is not None and load_experiment(experiment).model
     if not plugins and not robotic:
         simulators.get(simulator)
-    chosen = load(experiment or default_experiment(simulator)).chosen(training_budget=budget)
+    chosen = load_experiment(experiment or default_experiment(simulator)).chosen(
+        training_budget=budget
+    )
     chosen = chosen.chosen(trusted=trust or chosen.trusted)
-    admit([str(Path(plugin).resolve()) for plugin in plugins], chosen)
-    chosen = completed(chosen)
+    load_plugins_for_experiment([str(Path(plugin).resolve()) for plugin in plugins], chosen)
+    chosen = complete_robot_experiment(chosen)
     if not chosen.model:
         simulators.get(simulator)
     if chosen.simulator != simulator:
@@ -70,18 +84,22 @@ def choose(
             f"experiment {chosen.name}: its simulator is {chosen.simulator}, not {simulator}"
         )
     entries = {entry.label: entry for entry in chosen.tuners}
-    entry = entries.get(tuner, Entry(tuner, tuner))
+    entry = entries.get(tuner, TunerEntry(tuner, tuner))
     if not tuners.get(entry.tuner).learned:
         raise InputError(f"tuner {entry.label} does not learn: there is nothing to train")
     if not chosen.trusted:
-        unbuildable(entry)
+        must_build_isolated(entry)
     return chosen, entry
 
 
-def taught(
-    experiment: Experiment, entry: Entry, seed: int, watch: Watch | None, again: bool
-) -> Training:
-    """Train a tuner, or load its earlier training; see `bench.runs.training.train`.
+def train_or_load(
+    experiment: Experiment,
+    entry: TunerEntry,
+    seed: int,
+    watch: TrainingCallback | None,
+    again: bool,
+) -> TrainingResult:
+    """Train a tuner, or load its earlier training; see `tuner_training.train_or_load`.
 
     Args:
         experiment: Experiment in whose settings it is trained.
@@ -93,16 +111,18 @@ def taught(
     Raises:
         TooFewError: The training budget is too small.
     """
-    lesson = Lesson(entry, seed)
+    lesson = TrainingRequest(entry, seed)
     if not experiment.trusted:
-        lesson = Lesson(entry, seed, tuned_of(entry), (str(folder().resolve()),))
+        lesson = TrainingRequest(
+            entry, seed, make_tuner_spec(entry), (str(get_weights_folder().resolve()),)
+        )
     try:
         return train(experiment, lesson, watch, again)
-    except EndedError as ended:
+    except RunEndedError as ended:
         # The error from the isolated process arrives as text: its name and its message.
         name, _, said = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")
-        if name.endswith(TooFewError.__name__):
-            raise TooFewError(said) from None
+        if name.endswith(TrainingBudgetTooSmallError.__name__):
+            raise TrainingBudgetTooSmallError(said) from None
         raise
 
 
@@ -126,7 +146,7 @@ def default_experiment(simulator: str) -> str:
     """
     if simulator in DEFAULT_EXPERIMENTS:
         return DEFAULT_EXPERIMENTS[simulator]
-    shipped = [load(name) for name in names()]
+    shipped = [load_experiment(name) for name in list_experiment_names()]
     fitting = [e.name for e in shipped if e.simulator == simulator and e.calibration is None]
     if len(fitting) == 1:
         return fitting[0]
@@ -137,33 +157,33 @@ def default_experiment(simulator: str) -> str:
 
 
 @dataclass
-class Losses:
-    """Training callback that records the losses; see `methods.base.Watch`.
+class LossRecorder:
+    """Training callback that records the losses; see `methods.tuner.TrainingCallback`.
 
     Attributes:
         experiment: Experiment in whose settings the tuner is trained.
         start: Starts a progress bar with a title and a number of steps; returns the function that
             advances it.
-        rows: Rows of loss.csv, see `HEAD`.
+        rows: Rows of loss.csv, see `LOSS_COLUMNS`.
     """
 
     experiment: Experiment
-    start: Progress
+    start: ProgressFactory
     rows: list[tuple[int, str, int, float, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.begin("", 0)
+        self.start_training("", 0)
 
-    def begin(self, title: str, seed: int) -> None:
+    def start_training(self, title: str, seed: int) -> None:
         """Set the title and seed of the next training."""
         self._title, self._seed, self._stage = title, seed, ""
 
     @property
-    def ground(self) -> Practice:
+    def evaluation_simulator(self) -> TrainingSimulator:
         """Counted simulator for evaluating the held-out loss."""
-        return Problem(self.experiment).practice(_HELD_OUT)
+        return TuningProblem(self.experiment).make_training_simulator(_HELD_OUT_SIMULATIONS)
 
-    def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+    def on_epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         """Record one pass over the training data.
 
         Args:
@@ -197,6 +217,6 @@ class Losses:
         except OSError as error:
             raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
         text = io.StringIO(newline="")
-        csv.writer(text).writerows([HEAD, *self.rows])
-        files.write(folder / "loss.csv", text.getvalue())
-        return [folder / "loss.csv", draw(folder, title, self.rows)]
+        csv.writer(text).writerows([LOSS_COLUMNS, *self.rows])
+        atomic_files.write_atomically(folder / "loss.csv", text.getvalue())
+        return [folder / "loss.csv", write_loss_figure(folder, title, self.rows)]

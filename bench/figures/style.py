@@ -15,27 +15,27 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.analysis.rounding import FLOOR
-from bench.figures.formats import is_pdf_wanted
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.statistics.error_floor import ERROR_FLOOR
+from bench.figures.figure_files import is_pdf_wanted
 from bench.figures.png_encoder import encoded_png
-from bench.problem.experiment import Experiment
-from sims.base import InputError
-from sims.files import write_all
+from sims.core.atomic_files import write_all_atomically
+from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    from bench.analysis.statistics import Statistics
-    from bench.store.reference import Reference
+    from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+    from bench.benchmark.storage.reference_results import ReferenceResult
 
 # Palette of eight colours safe for colour-blind readers: M. Okabe, K. Ito, Color Universal Design,
 # 2002.
 BLACK = "#000000"
 ORANGE = "#E69F00"
 BLUE = "#0072B2"
-SKY = "#56B4E9"
+SKY_BLUE = "#56B4E9"
 VERMILION = "#D55E00"
 GREEN = "#009E73"
 PURPLE = "#CC79A7"
@@ -51,37 +51,37 @@ PALE_RUST = "#FBE6DA"
 """Background where a drive moves backwards."""
 
 # Greys by their use, from dark to light.
-INK = "#333333"
+NEUTRAL_MARK = "#333333"
 """Colour of marks that belong to no tuner."""
-SOFT = "#444444"
+CAPTION_GREY = "#444444"
 """Colour of captions, and of lines at a threshold."""
-ZERO = "#555555"
+ZERO_LINE_GREY = "#555555"
 """Colour of the zero line of a residual."""
-APART = "#888888"
+RUN_SEPARATOR_GREY = "#888888"
 """Colour of lines between runs."""
-JOIN = "#999999"
+CONNECTOR_GREY = "#999999"
 """Colour of lines that join related marks."""
-CHANCE = "#A8A8A8"
+CHANCE_LEVEL_GREY = "#A8A8A8"
 """Colour of bars over the range expected under the null hypothesis."""
-SLOPE = "#BBBBBB"
+INCLINE_GREY = "#BBBBBB"
 """Colour of the incline of a bounce shot."""
-BAND = "#CFCFCF"
+NOISE_BAND_GREY = "#CFCFCF"
 """Colour of bands of noise, and of parts that are not needed."""
-BEHIND = ("#9C9C9C", "#C2C2C2")
+REFERENCE_GREYS = ("#9C9C9C", "#C2C2C2")
 """Colours of the first and the second reference result behind the user's own."""
-GROUND = "#E4E4E4"
+HELD_OUT_GREY = "#E4E4E4"
 """Background of held-out runs."""
-SHADE = "#EEEEEE"
+RECORDED_PART_GREY = "#EEEEEE"
 """Background of the recorded part of a film, and of errors that count as equal."""
 
 # Dark and light colours alternate, so that neighbours differ in greyscale, too.
-_COLOURS = (BLACK, ORANGE, BLUE, SKY, VERMILION, GREEN, PURPLE, GREY, VIOLET, BROWN)
+_COLOURS = (BLACK, ORANGE, BLUE, SKY_BLUE, VERMILION, GREEN, PURPLE, GREY, VIOLET, BROWN)
 
 _DARK = {
     BLACK: "#FFFFFF",
     ORANGE: "#F2B632",
     BLUE: "#4D94FF",
-    SKY: "#7CC8F5",
+    SKY_BLUE: "#7CC8F5",
     VERMILION: "#FF7A3D",
     GREEN: "#2CC79A",
     PURPLE: "#E39CC6",
@@ -112,17 +112,17 @@ _DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 
 """Dashes of Matplotlib's named line styles, in line widths."""
 
 
-def colour(place: int) -> str:
+def get_colour(place: int) -> str:
     """Return the colour of the tuner or diagnoser at this index."""
     return _COLOURS[place % len(_COLOURS)]
 
 
-def marker(place: int) -> str:
+def get_marker(place: int) -> str:
     """Return the marker of the tuner or diagnoser at this index."""
     return _marker(place)
 
 
-def line(place: int) -> Any:
+def get_line_style(place: int) -> Any:
     """Return the line style of the tuner or diagnoser at this index."""
     return _LINES[place % len(_LINES)]
 
@@ -130,13 +130,13 @@ def line(place: int) -> Any:
 DPI = 160
 """Resolution of the PNG files in dots per inch."""
 
-CAPTION = (
+MEDIAN_LINE_CAPTION = (
     "Line: median over targets of the recommendation's error (mean over seeds). "
     "Band or bar: 95 % bootstrap interval of the median. "
-    f"Errors below {FLOOR:g} are drawn there."
+    f"Errors below {ERROR_FLOOR:g} are drawn there."
 )
 
-TITLES = {
+PANEL_TITLES = {
     "in": "Targets in the training range",
     "wide": "Targets anywhere in the bounds",
     "real": "Recording",
@@ -146,7 +146,7 @@ TITLES = {
 """Panel titles: ranges of targets, or kinds of runs of a recording."""
 
 
-class Look(NamedTuple):
+class MarkStyle(NamedTuple):
     """Style of a name's marks on a page.
 
     Attributes:
@@ -168,31 +168,32 @@ def _marker(place: int) -> str:
     return _MARKERS[(place + 3 * rounds) % len(_MARKERS)]
 
 
-def look(place: int) -> Look:
+def get_mark_style(place: int) -> MarkStyle:
     """Return the style at an index of a list; neighbours differ in greyscale, too."""
     colour, line = _COLOURS[place % len(_COLOURS)], _LINES[place % len(_LINES)]
     dashes = _DASHES[line] if isinstance(line, str) else tuple(map(float, line[1]))
-    return Look(colour, _DARK[colour], dashes, _marker(place))
+    return MarkStyle(colour, _DARK[colour], dashes, _marker(place))
 
 
-def drawn(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> Look:
+def make_mark_style(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> MarkStyle:
     """Return the style for a colour of the palette.
 
     Args:
         colour: A colour of the palette that has a dark variant.
-        dashes: As in `Look`.
-        marker: As in `Look`.
+        dashes: As in `MarkStyle`.
+        marker: As in `MarkStyle`.
     """
-    return Look(colour, _DARK[colour], dashes, marker)
+    return MarkStyle(colour, _DARK[colour], dashes, marker)
 
 
-class Styles:
+class TunerStyles:
     """Colour, marker and line of each tuner, fixed by its index in the experiment.
 
     Args:
         experiment: The experiment.
         order: Tuners that have runs, in the order of the legend: best first.
-        behind: Reference results drawn behind the curves; at most as many as `BEHIND` has colours.
+        behind: Reference results drawn behind the curves; at most as many as `REFERENCE_GREYS` has
+            colours.
         notes: Text of the legend below a tuner's name.
     """
 
@@ -200,7 +201,7 @@ class Styles:
         self,
         experiment: Experiment,
         order: Sequence[str],
-        behind: Sequence[Reference] = (),
+        behind: Sequence[ReferenceResult] = (),
         notes: Mapping[str, str] | None = None,
     ) -> None:
         self.experiment, self.behind, self.notes = experiment, behind, notes or {}
@@ -209,7 +210,7 @@ class Styles:
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
         self.order = [label for label in order if label in self._places]
 
-    def of(self, tuner: str) -> dict[str, Any]:
+    def get_plot_style(self, tuner: str) -> dict[str, Any]:
         """Return keyword arguments for plotting `tuner`."""
         i = self._places[tuner]
         return {
@@ -220,11 +221,11 @@ class Styles:
             "label": tuner,
         }
 
-    def look(self, tuner: str) -> Look:
+    def get_mark_style(self, tuner: str) -> MarkStyle:
         """Return the style of `tuner` on a page."""
-        return look(self._places[tuner])
+        return get_mark_style(self._places[tuner])
 
-    def grey(self, reference: Reference, tuner: str) -> dict[str, Any]:
+    def get_reference_style(self, reference: ReferenceResult, tuner: str) -> dict[str, Any]:
         """Return keyword arguments for plotting `tuner` of a reference.
 
         The line is grey and thin, with the marker and line style of the user's own tuner of that
@@ -239,7 +240,7 @@ class Styles:
         taken = 1 + max(self._places.values(), default=-1)
         i = self._places[tuner] if tuner in self._places else taken + others.index(tuner)
         return {
-            "color": BEHIND[self.behind.index(reference)],
+            "color": REFERENCE_GREYS[self.behind.index(reference)],
             "marker": _marker(i),
             "markerfacecolor": "white",
             "markersize": 3.5,
@@ -248,17 +249,17 @@ class Styles:
             "zorder": 1.5,
         }
 
-    def offset(self, tuner: str) -> float:
+    def get_category_offset(self, tuner: str) -> float:
         """Return a small shift along a category axis that places error bars side by side."""
         return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
 
 
 def style_of(
     experiment: Experiment,
-    statistics: Statistics,
-    behind: Sequence[Reference] = (),
+    statistics: ComparisonStatistics,
+    behind: Sequence[ReferenceResult] = (),
     shown: Sequence[tuple[str, str]] = (),
-) -> Styles:
+) -> TunerStyles:
     """Return the styles of a comparison's tuners, in the order of its ranking.
 
     Args:
@@ -270,10 +271,10 @@ def style_of(
     """
     notes = [statistics.notes, statistics.coinciding(shown)]
     joined = {t: "\n".join(n[t] for n in notes if t in n) for t in {*notes[0], *notes[1]}}
-    return Styles(experiment, statistics.order, behind, joined)
+    return TunerStyles(experiment, statistics.order, behind, joined)
 
 
-def blank(
+def make_panel_grid(
     rows: int,
     columns: int,
     size: tuple[float, float],
@@ -290,38 +291,38 @@ def blank(
         **options: Options of `matplotlib.figure.Figure.subplots`.
     """
     # Matplotlib takes most of a second to load, and most commands draw nothing.
-    from bench.figures.picture import Picture
+    from bench.figures.notebook_figure import NotebookFigure
 
-    figure = Picture(figsize=size, layout=layout)
+    figure = NotebookFigure(figsize=size, layout=layout)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def canvas(panels: int) -> tuple[Figure, list[Axes]]:
+def make_panel_row(panels: int) -> tuple[Figure, list[Axes]]:
     """Make a figure with panels side by side that share their vertical axis."""
-    figure, axes = blank(1, panels, (1.2 + 4.3 * panels, 4.6), sharey=True)
+    figure, axes = make_panel_grid(1, panels, (1.2 + 4.3 * panels, 4.6), sharey=True)
     for axis in axes[0]:
-        plain(axis)
+        style_axis(axis)
     return figure, list(axes[0])
 
 
-def titled(axis: Axes, title: str) -> None:
+def set_title(axis: Axes, title: str) -> None:
     """Set a title above a panel that has no ticks there."""
     # Without a fixed position, every drawing measures all ticks for the title.
     axis.set_title(title, fontsize=10, y=1.0)
 
 
-def plain(axis: Axes) -> None:
+def style_axis(axis: Axes) -> None:
     """Draw a faint grid, and remove the frame at the top and right."""
     axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def finish(
+def finish_figure(
     figure: Figure,
     axes: list[Axes],
-    style: Styles,
+    style: TunerStyles,
     experiment: Experiment,
-    caption: str = CAPTION,
+    caption: str = MEDIAN_LINE_CAPTION,
     heading: str = "best over all targets first",
 ) -> None:
     """Add legend, title and caption to a figure.
@@ -361,7 +362,7 @@ def finish(
         if axis.get_ylabel() == axes[0].get_ylabel():
             axis.set_ylabel("")
     figure.suptitle(experiment.title or experiment.name, fontsize=11)
-    below(figure, caption, letters=17)
+    add_caption(figure, caption, letters=17)
 
 
 _ROWS = 18
@@ -369,7 +370,7 @@ _ROWS = 18
 
 
 def _behind_entries(
-    axes: list[Axes], style: Styles, reference: Reference
+    axes: list[Axes], style: TunerStyles, reference: ReferenceResult
 ) -> list[tuple[Line2D, str]]:
     """Make the legend entries of a reference: a heading, and its tuners that are drawn."""
     from matplotlib.lines import Line2D
@@ -379,43 +380,47 @@ def _behind_entries(
     return [
         (Line2D([], [], linestyle="none"), heading),
         *(
-            (Line2D([], [], **style.grey(reference, tuner)), tuner)
+            (Line2D([], [], **style.get_reference_style(reference, tuner)), tuner)
             for tuner in reference.tuners
-            if behind_id(reference, tuner) in drawn
+            if make_reference_id(reference, tuner) in drawn
         ),
     ]
 
 
-def _behind_caption(reference: Reference, experiment: Experiment) -> str:
-    differs = reference.mismatches(experiment)
+def _behind_caption(reference: ReferenceResult, experiment: Experiment) -> str:
+    differs = reference.find_mismatches(experiment)
     told = f"; differs in {'; '.join(differs)}" if differs else ""
-    return f" Grey: medians of the reference {reference.provenance}{told}."
+    return f" Grey: medians of the reference {reference.provenance_text}{told}."
 
 
-def behind_id(reference: Reference, tuner: str) -> str:
+def make_reference_id(reference: ReferenceResult, tuner: str) -> str:
     """Return the identifier of a reference's line in a figure."""
     return f"behind {reference.name} {tuner}"
 
 
-def below(figure: Figure, caption: str, letters: int) -> None:
+def add_caption(figure: Figure, caption: str, letters: int) -> None:
     """Add a caption below a figure, with `letters` characters per inch of its width."""
     lines = textwrap.fill(caption, int(letters * figure.get_figwidth()))
-    figure.supxlabel(lines, fontsize=7.5, color=SOFT)
+    figure.supxlabel(lines, fontsize=7.5, color=CAPTION_GREY)
 
 
-TRUSTED = "trusted: the tuners ran inside the harness, where nothing is out of their reach"
+TRUSTED_TUNERS_NOTE = (
+    "trusted: the tuners ran inside the harness, where nothing is out of their reach"
+)
 """Warning for results whose tuners were not isolated."""
 
 
-def mark(figure: Figure, trusted: bool) -> Figure:
+def add_trust_note(figure: Figure, trusted: bool) -> Figure:
     """Mark a figure in its title and caption if its tuners were not isolated, and return it."""
     if trusted:
         figure.suptitle(f"{figure.get_suptitle()} (trusted)", fontsize=11)
-        below(figure, f"{TRUSTED.capitalize()}. {figure.get_supxlabel()}", letters=17)
+        add_caption(
+            figure, f"{TRUSTED_TUNERS_NOTE.capitalize()}. {figure.get_supxlabel()}", letters=17
+        )
     return figure
 
 
-def png(figure: Figure, dpi: int = DPI) -> bytes:
+def render_png(figure: Figure, dpi: int = DPI) -> bytes:
     """Render a figure as the bytes of a PNG file."""
     file = _Pixels()
     figure.savefig(file, format="rgba", dpi=dpi)
@@ -438,7 +443,7 @@ class _Pixels(BytesIO):
         return super().write(pixels)
 
 
-def pdf(figure: Figure) -> bytes:
+def render_pdf(figure: Figure) -> bytes:
     """Render a figure as the bytes of a PDF file."""
     file = BytesIO()
     # Without a date the file is identical whenever it is made.
@@ -446,7 +451,7 @@ def pdf(figure: Figure) -> bytes:
     return file.getvalue()
 
 
-def svg(figure: Figure) -> bytes:
+def render_svg(figure: Figure) -> bytes:
     """Render a figure as the bytes of an SVG file."""
     from matplotlib import rc_context
 
@@ -459,24 +464,24 @@ def svg(figure: Figure) -> bytes:
     return _LONG.sub(lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue())
 
 
-def printed(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
-    """Render a figure as PNG, and as PDF if requested (`bench.figures.formats`).
+def render_png_and_pdf(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
+    """Render a figure as PNG, and as PDF if requested (`bench.figures.figure_files`).
 
     Returns:
         The bytes of the PNG file, and those of the PDF file or None.
     """
     with _laid_out_once(figure, dpi):
-        return png(figure, dpi), _asked_pdf(figure)
+        return render_png(figure, dpi), _asked_pdf(figure)
 
 
-def taken(figure: Figure, dpi: int = DPI) -> Pictures:
+def render_all_formats(figure: Figure, dpi: int = DPI) -> FigureFiles:
     """Render a figure as PNG, as SVG for a page, and as PDF if requested."""
     with _laid_out_once(figure, dpi):
-        return Pictures(png(figure, dpi), svg(figure), _asked_pdf(figure))
+        return FigureFiles(render_png(figure, dpi), render_svg(figure), _asked_pdf(figure))
 
 
-class Pictures(NamedTuple):
-    """One figure as the bytes of its files; `pdf` is None if no PDF is requested."""
+class FigureFiles(NamedTuple):
+    """One figure as the bytes of its files; `render_pdf` is None if no PDF is requested."""
 
     png: bytes
     svg: bytes
@@ -484,7 +489,7 @@ class Pictures(NamedTuple):
 
 
 def _asked_pdf(figure: Figure) -> bytes | None:
-    return pdf(figure) if is_pdf_wanted() else None
+    return render_pdf(figure) if is_pdf_wanted() else None
 
 
 @contextmanager
@@ -504,7 +509,7 @@ def _laid_out_once(figure: Figure, dpi: int) -> Iterator[None]:
         figure.set_layout_engine(engine)
 
 
-def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
+def write_figure(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
     """Write a figure as PNG, and as PDF if requested: all files or none.
 
     Missing folders are made.
@@ -520,10 +525,10 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
     Raises:
         InputError: The folder cannot be made or written to.
     """
-    return keep(path, *printed(figure, dpi))
+    return write_figure_files(path, *render_png_and_pdf(figure, dpi))
 
 
-def keep(path: Path, as_png: bytes, as_pdf: bytes | None) -> list[Path]:
+def write_figure_files(path: Path, as_png: bytes, as_pdf: bytes | None) -> list[Path]:
     """Write a figure's files, all or none.
 
     Args:
@@ -542,7 +547,7 @@ def keep(path: Path, as_png: bytes, as_pdf: bytes | None) -> list[Path]:
         contents[path.with_name(f"{path.name}.pdf")] = as_pdf
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_all(contents)
+        write_all_atomically(contents)
     except OSError as error:
         raise InputError(f"{path.parent}: cannot be written ({error.strerror})") from None
     return list(contents)

@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from bench.figures.style import Look
+from bench.figures.style import MarkStyle
 
 Scale = Literal["linear", "log", "symlog"]
 """Scale of an axis; symlog is linear from 0 to 1 and logarithmic above."""
-Draw = Literal["line", "steps", "points", "bars"]
+SeriesKind = Literal["line", "steps", "points", "bars"]
 
 
 @dataclass(frozen=True)
@@ -61,17 +61,17 @@ class Series:
 
     name: str
     y: str
-    look: Look
+    look: MarkStyle
     where: Mapping[str, str] = field(default_factory=dict)
     low: str = ""
     high: str = ""
-    draw: Draw = "line"
+    draw: SeriesKind = "line"
     shift: float = 0.0
     under: bool = False
 
 
 @dataclass(frozen=True)
-class Tell:
+class TooltipLine:
     """A line of the text at the cursor: the value of a column, optionally also in another unit.
 
     Attributes:
@@ -86,13 +86,13 @@ class Tell:
     says: str
     y: str
     unit: str = ""
-    look: Look | None = None
+    look: MarkStyle | None = None
     times: float = 0.0
     also: str = ""
 
 
 @dataclass(frozen=True)
-class Rule:
+class ReferenceLine:
     """A line across a panel at a value of one axis, with a short text."""
 
     value: float
@@ -101,7 +101,7 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class Span:
+class AxisSpan:
     """A part of an axis: a background behind the curves, or a strip below them.
 
     Attributes:
@@ -116,7 +116,7 @@ class Span:
     low: float
     high: float
     says: str
-    look: Look | None = None
+    look: MarkStyle | None = None
     foot: bool = False
     along: Literal["x", "y"] = "x"
 
@@ -148,14 +148,14 @@ class Panel:
     across: Axis
     up: Axis
     facets: Mapping[str, str] = field(default_factory=dict)
-    rules: tuple[Rule, ...] = ()
-    spans: tuple[Span, ...] = ()
-    tells: tuple[Tell, ...] = ()
+    rules: tuple[ReferenceLine, ...] = ()
+    spans: tuple[AxisSpan, ...] = ()
+    tells: tuple[TooltipLine, ...] = ()
     height: int = 0
 
 
 @dataclass(frozen=True)
-class Static:
+class PrintedFigure:
     """A printed version of a figure.
 
     Attributes:
@@ -197,7 +197,7 @@ class Chart:
     title: str
     caption: str
     panels: tuple[Panel, ...]
-    static: Static | None = None
+    static: PrintedFigure | None = None
     beside: str = ""
     link: str = ""
     columns: int = 0
@@ -207,7 +207,7 @@ class Chart:
     lights: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
 
-    def spec(self) -> dict[str, Any]:
+    def build_spec(self) -> dict[str, Any]:
         """Build the chart's JSON specification for the page's script."""
         return {
             "name": self.name,

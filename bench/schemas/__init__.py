@@ -12,12 +12,12 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from sims.base import unknown
+from sims.core.simulator import make_unknown_name_error
 
 _ENDING = ".schema.json"
 
 
-def names() -> list[str]:
+def list_schema_names() -> list[str]:
     """Every schema's name, sorted."""
     files = [file.name for file in resources.files(__name__).iterdir()]
     return sorted(name.removesuffix(_ENDING) for name in files if name.endswith(_ENDING))
@@ -28,19 +28,19 @@ def _read(name: str) -> str:
     return resources.files(__name__).joinpath(f"{name}{_ENDING}").read_text(encoding="utf-8")
 
 
-def schema(name: str) -> dict[str, Any]:
+def load_schema(name: str) -> dict[str, Any]:
     """One of them.
 
     Raises:
         InputError: there is none of that name.
     """
-    if name not in names():
-        raise unknown("schema", name, names())
+    if name not in list_schema_names():
+        raise make_unknown_name_error("schema", name, list_schema_names())
     found: dict[str, Any] = json.loads(_read(name))
     return found
 
 
-def faults(document: Any, name: str) -> list[str]:
+def find_violations(document: Any, name: str) -> list[str]:
     """What in a document is not as the schema says: a line each, with its place.
 
     Raises:
@@ -50,7 +50,10 @@ def faults(document: Any, name: str) -> list[str]:
     from referencing import Registry, Resource
 
     # Schemas name each other by their files' names.
-    known = [(f"{each}{_ENDING}", Resource.from_contents(schema(each))) for each in names()]
-    validator = Draft202012Validator(schema(name), registry=Registry().with_resources(known))
+    known = [
+        (f"{each}{_ENDING}", Resource.from_contents(load_schema(each)))
+        for each in list_schema_names()
+    ]
+    validator = Draft202012Validator(load_schema(name), registry=Registry().with_resources(known))
     found = sorted(validator.iter_errors(document), key=lambda error: error.json_path)
     return [f"{error.json_path}: {error.message}" for error in found]

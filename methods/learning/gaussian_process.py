@@ -19,11 +19,11 @@ from typing import Literal
 
 import numpy as np
 
-from methods.base import Array
+from methods.tuner import Array
 
 
 @dataclass(frozen=True)
-class Settings:
+class KernelSettings:
     """Kernel and log-normal priors of the hyper-parameters.
 
     Attributes:
@@ -54,7 +54,7 @@ class GaussianProcess:
         self,
         points: Array,
         values: Array,
-        settings: Settings,
+        settings: KernelSettings,
         hyper: Array | None = None,
         fit: bool = True,
     ) -> None:

@@ -22,35 +22,35 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from methods.base import Array
+from methods.tuner import Array
 
 if TYPE_CHECKING:
     import torch
 
-LAYERS = ("proposed", "target", "joined", "output")
+LAYER_NAMES = ("proposed", "target", "joined", "output")
 """Names of the fully connected layers.
 
 Each has a `.weight` (inputs, outputs) and a `.bias` (outputs,).
 """
 
-_LOG_2 = float(np.log(2.0))
+_SOFTPLUS_AT_ZERO = float(np.log(2.0))
 """Softplus at zero; it is subtracted, so that a unit with input zero has output zero."""
-_TAMED = 30.0
+_LOSS_SCALE = 30.0
 """Divisor of relative squared errors; for Adam only their ratio to the penalty matters."""
 _SPREAD = 1.7
 """Limit of initial weights times the root of the number of inputs of a layer.
 
 It gives a variance close to 1 / inputs.
 """
-_COOLING = 0.99
+_LEARNING_RATE_DECAY = 0.99
 """Factor by which the published learning rate decreases in each epoch."""
 
 
 @dataclass(frozen=True)
-class Design:
+class PairNetworkDesign:
     """Design of a network and of its training.
 
-    The defaults are this project's, those of `PUBLISHED` the authors'.
+    The defaults are this project's, those of `PUBLISHED_DESIGN` the authors'.
 
     Attributes:
         width: number of units of each branch and of the joined layer.
@@ -82,7 +82,7 @@ class Design:
     batch: int = 10
 
 
-PUBLISHED = Design(
+PUBLISHED_DESIGN = PairNetworkDesign(
     smooth=False,
     antisymmetric=False,
     bounded=True,
@@ -96,7 +96,7 @@ PUBLISHED = Design(
 )
 
 
-def shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int, ...]]:
+def get_weight_shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of every weight array by name, in the order of the network.
 
     Args:
@@ -111,17 +111,19 @@ def shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int
         (width, dim),
     )
     named: dict[str, tuple[int, ...]] = {}
-    for layer, (fan_in, fan_out) in zip(LAYERS, sizes, strict=True):
+    for layer, (fan_in, fan_out) in zip(LAYER_NAMES, sizes, strict=True):
         named[f"{layer}.weight"] = fan_in, fan_out
         named[f"{layer}.bias"] = (fan_out,)
     return named
 
 
-def estimate(weights: dict[str, Array], design: Design, proposed: Array, target: Array) -> Array:
+def estimate_difference(
+    weights: dict[str, Array], design: PairNetworkDesign, proposed: Array, target: Array
+) -> Array:
     """Compute h(proposed, target), the estimated parameter difference target - proposed.
 
     Args:
-        weights: weight arrays as in `shapes`.
+        weights: weight arrays as in `get_weight_shapes`.
         design: design of the network.
         proposed: (n, D) or (D,) input rows of the proposed simulations.
         target: (n, E) or (E,) input rows of the targets; E is D if the network is antisymmetric.
@@ -133,7 +135,7 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
 
     def unit(x: Array) -> Array:
         # Softplus is smooth beyond the training range, where rectified linear units have a corner.
-        return np.logaddexp(0.0, x) - _LOG_2 if design.smooth else np.maximum(x, 0.0)
+        return np.logaddexp(0.0, x) - _SOFTPLUS_AT_ZERO if design.smooth else np.maximum(x, 0.0)
 
     def branch(x: Array, layer: str) -> Array:
         return unit(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
@@ -149,7 +151,7 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
     return joined(proposed, target)
 
 
-class Sides(NamedTuple):
+class PairInputs(NamedTuple):
     """Input rows of simulations for both sides of the network.
 
     Attributes:
@@ -162,7 +164,7 @@ class Sides(NamedTuple):
     target: Array
 
 
-class Watched(NamedTuple):
+class PairValidationMonitor(NamedTuple):
     """Held-out data, and a callback for the losses.
 
     Attributes:
@@ -171,18 +173,18 @@ class Watched(NamedTuple):
         epoch: called with the epoch from 1, the number of epochs, training and held-out loss.
     """
 
-    rows: Sides
+    rows: PairInputs
     parameters: Array
     epoch: Callable[[int, int, float, float], None]
 
 
-def train(
-    rows: Sides,
+def train_pair_network(
+    rows: PairInputs,
     parameters: Array,
-    design: Design,
+    design: PairNetworkDesign,
     rng: np.random.Generator,
     alone: bool = False,
-    watched: Watched | None = None,
+    watched: PairValidationMonitor | None = None,
 ) -> dict[str, Array]:
     """Train the weights by Eq. 1 on the CPU; equal generators give bit-identical weights.
 
@@ -197,16 +199,16 @@ def train(
             weights do not depend on it.
 
     Returns:
-        Weight arrays as in `shapes`.
+        Weight arrays as in `get_weight_shapes`.
     """
     import torch
 
     # Layers this small do not use a GPU well: an H100 takes 1.6 to 2.7 times as long as its host.
-    with reproducible(), torch.enable_grad():
+    with deterministic_training(), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
         weights = _initial(inputs, parameters.shape[-1], design, generator)
-        _descend(
+        _run_optimiser(
             _loss(design, weights, alone),
             list(weights.values()),
             _data(rows, parameters),
@@ -221,7 +223,7 @@ def train(
 
 
 @contextmanager
-def reproducible() -> Iterator[None]:
+def deterministic_training() -> Iterator[None]:
     """Make torch reproducible: one thread, so that sums have a fixed order.
 
     Other runs can use the machine's other cores.
@@ -237,7 +239,7 @@ def reproducible() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _data(rows: Sides, parameters: Array) -> tuple[Any, Any, Any]:
+def _data(rows: PairInputs, parameters: Array) -> tuple[Any, Any, Any]:
     """Convert rows of both sides and parameters to tensors; equal sides share one tensor."""
     import torch
 
@@ -251,14 +253,14 @@ def _data(rows: Sides, parameters: Array) -> tuple[Any, Any, Any]:
 
 
 def _initial(
-    inputs: tuple[int, int], dim: int, design: Design, generator: torch.Generator
+    inputs: tuple[int, int], dim: int, design: PairNetworkDesign, generator: torch.Generator
 ) -> dict[str, Any]:
     """Draw initial weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
     import torch
 
     weights: dict[str, Any] = {}
     fan_in = 1
-    for name, shape in shapes(inputs, design.width, dim).items():
+    for name, shape in get_weight_shapes(inputs, design.width, dim).items():
         is_weight = name.endswith("weight")
         # A layer's bias follows its weights and has the same number of inputs.
         fan_in = shape[0] if is_weight else fan_in
@@ -271,7 +273,9 @@ def _initial(
     return weights
 
 
-def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any, Any], Any]:
+def _loss(
+    design: PairNetworkDesign, w: dict[str, Any], alone: bool
+) -> Callable[[Any, Any, Any], Any]:
     """Return the data term of (3) as a function of both sides' rows and the parameters.
 
     The function's arguments are rows (n, m, D), (n, m, E) and parameters (n, m, dim).
@@ -280,7 +284,7 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any,
     from torch.nn.functional import softplus
 
     def unit(x: Any) -> Any:
-        return softplus(x) - _LOG_2 if design.smooth else torch.relu(x)
+        return softplus(x) - _SOFTPLUS_AT_ZERO if design.smooth else torch.relu(x)
 
     def branch(x: Any, layer: str) -> Any:
         return unit(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
@@ -308,19 +312,19 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any,
         if design.relative:
             # Small differences matter in the last steps of tuning, so they must have enough weight.
             sizes = (difference**2).sum(dim=-1) + design.relative**2
-            squares = squares / sizes / _TAMED  # (3)
+            squares = squares / sizes / _LOSS_SCALE  # (3)
         return squares.mean()
 
     return objective
 
 
-def _descend(
+def _run_optimiser(
     loss: Callable[[Any, Any, Any], Any],
     weights: list[Any],
     data: tuple[Any, Any, Any],
-    design: Design,
+    design: PairNetworkDesign,
     generator: torch.Generator,
-    watched: Watched | None,
+    watched: PairValidationMonitor | None,
 ) -> None:
     """Minimise (3) by gradient steps that change the weights in place."""
     import torch
@@ -330,7 +334,7 @@ def _descend(
     kind = torch.optim.Adam if design.adam else torch.optim.SGD
     optimiser: Any = kind(weights, lr=design.rate)
     for epoch in range(design.epochs):
-        falling = _COOLING**epoch
+        falling = _LEARNING_RATE_DECAY**epoch
         if design.adam:
             falling = 0.5 + 0.5 * np.cos(np.pi * epoch / design.epochs)
         for group in optimiser.param_groups:

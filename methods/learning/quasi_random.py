@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from methods.base import Array
+from methods.tuner import Array
 
-_PASSES = 60
+_FIXED_POINT_ITERATIONS = 60
 """Number of fixed-point iterations for (1); each one more than halves the error."""
 
 
-def spread(count: int, shift: Array) -> Array:
+def generate_quasi_random_points(count: int, shift: Array) -> Array:
     """Return quasi-random points of the unit cube.
 
     Args:
@@ -29,7 +29,7 @@ def spread(count: int, shift: Array) -> Array:
     """
     dim = len(shift)
     ratio = 2.0
-    for _ in range(_PASSES):
+    for _ in range(_FIXED_POINT_ITERATIONS):
         ratio = (1.0 + ratio) ** (1.0 / (dim + 1))  # (1)
     steps = ratio ** -np.arange(1.0, dim + 1)
     numbers = np.arange(1, count + 1)[:, None]

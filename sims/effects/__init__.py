@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-from sims.registry import Registry, SkippedError
-from sims.system import Effect, System
+from sims.core.registry import PartUnavailableError, Registry
+from sims.core.system import Effect, System
 
 registry: Registry[Effect] = Registry("effect", "simgap.effects", Effect)
 
 # Users of the library call `effects.get("drag.linear")`.
-names = registry.names
-get = registry.get
-register = registry.register
+list_names = registry.names
+get_effect = registry.get
+register_effect = registry.register
 
 
-def library(system: type[System]) -> dict[str, type[Effect]]:
+def list_effects_for(system: type[System]) -> dict[str, type[Effect]]:
     """Return every usable effect that the system can have, by name."""
     usable = {}
     for name in registry.names():
         try:
             effect = registry.get(name)
-        except SkippedError:  # the list of effects shows the reason; explain works without it
+        except (
+            PartUnavailableError
+        ):  # the list of effects shows the reason; explain works without it
             continue
-        for placed in system.placed(effect):
+        for placed in system.expand_to_places(effect):
             usable[placed.name] = placed
     return usable
 
 
-def find(name: str, system: type[System]) -> type[Effect]:
+def find_effect(name: str, system: type[System]) -> type[Effect]:
     """Return the effect of this name on a system: at one of its places, or a registered one.
 
     Args:
@@ -36,4 +38,4 @@ def find(name: str, system: type[System]) -> type[Effect]:
     Raises:
         InputError: no such effect exists.
     """
-    return system.effect(name) or registry.get(name)
+    return system.find_effect(name) or registry.get(name)

@@ -15,15 +15,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.base import Array
-from sims.system import Coefficient, Force, Moment
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Force, StateSnapshot
 
 _FLUIDS = "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
 _FLUID = ("1/m", "N*s^2/m^2", "N*m*s^2/rad^2")
 """Units of the coefficient of drag that is quadratic in speed."""
 
 
-class Linear(Force):
+class LinearDrag(Force):
     """Viscous drag: -c v."""
 
     name = "drag.linear"
@@ -34,7 +34,7 @@ class Linear(Force):
         Coefficient("coefficient", ("1/s", "N*s/m", "N*m*s/rad"), ((0, 0.5), (0, 5), (0, 0.1))),
     )
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the velocity.
 
         Args:
@@ -44,7 +44,7 @@ class Linear(Force):
         return -c[0] * moment.v  # (1)
 
 
-class Quadratic(Force):
+class QuadraticDrag(Force):
     """Drag of a fluid at high Reynolds number: -c |v| v."""
 
     name = "drag.quadratic"
@@ -53,7 +53,7 @@ class Quadratic(Force):
     source = "J. R. Taylor, Classical Mechanics (2005), section 2.4"
     coefficients = (Coefficient("coefficient", _FLUID, ((0, 0.3), (0, 5), (0, 0.02))),)
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the velocity.
 
         Args:
@@ -76,7 +76,7 @@ class Wind(Force):
         Coefficient("y", ("m/s", None, None), ((-10, 10), (0, 0), (0, 0))),
     )
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), opposite to the velocity relative to the air.
 
         Args:
@@ -91,9 +91,9 @@ def _squared(v: Array) -> Array:
     return np.sqrt((v * v).sum(axis=1, keepdims=True)) * v
 
 
-def _air(c: Array, moment: Moment) -> Array:
+def _air(c: Array, moment: StateSnapshot) -> Array:
     """Return the velocity (L, D) of the air along the system's coordinates."""
     # `push` is the force of 1 m/s^2 of acceleration: divided by the mass, it gives the direction of
     # the axis
-    mass = moment.system.mass(moment.theta, moment.constants)
+    mass = moment.system.inertia(moment.theta, moment.constants)
     return (c[1] * moment.push("x") + c[2] * moment.push("y")) / mass

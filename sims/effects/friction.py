@@ -27,8 +27,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sims.base import Array
-from sims.system import Coefficient, Force, Friction, Moment
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Force, Friction, StateSnapshot
 
 _SURVEY = (
     "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"
@@ -74,7 +74,7 @@ _COLD = (
 """Coefficients of friction that decreases by warming."""
 
 
-class Coulomb(Friction):
+class CoulombFriction(Friction):
     """Friction that does not depend on speed: c sign(v)."""
 
     name = "friction.coulomb"
@@ -84,7 +84,7 @@ class Coulomb(Friction):
     needs = "guide"
     coefficients = (Coefficient("coefficient", _USUAL, _DRY),)
 
-    def limit(self, c: Array, moment: Moment) -> Array:  # noqa: ARG002
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:  # noqa: ARG002
         """Return the limit (L, 1), equal to the coefficient.
 
         Args:
@@ -94,7 +94,7 @@ class Coulomb(Friction):
         return np.maximum(c[0], 0.0)  # (1)
 
 
-class Stribeck(Friction):
+class StribeckFriction(Friction):
     """Friction that decreases with speed: coulomb + extra exp(-(v / speed)^2)."""
 
     name = "friction.stribeck"
@@ -107,17 +107,17 @@ class Stribeck(Friction):
         Coefficient("speed", ("m/s", "m/s", "rad/s"), ((0.005, 0.5), (0.005, 0.5), (0.02, 2))),
     )
 
-    def limit(self, c: Array, moment: Moment) -> Array:
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1): `coulomb` in fast motion, `coulomb` + `extra` at rest.
 
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        return np.maximum(c[0] + c[1] * _falling(moment.speed, c[2]), 0.0)  # (2)
+        return np.maximum(c[0] + c[1] * _stribeck_factor(moment.speed, c[2]), 0.0)  # (2)
 
 
-class Load(Friction):
+class LoadFriction(Friction):
     """Friction of a loaded transmission, proportional to |drive - load|."""
 
     name = "friction.load"
@@ -127,17 +127,17 @@ class Load(Friction):
     needs = "input"
     coefficients = (_LOAD,)
 
-    def limit(self, c: Array, moment: Moment) -> Array:
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1), proportional to the load.
 
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        return np.maximum(c[0], 0.0) * moment.load  # (3)
+        return np.maximum(c[0], 0.0) * moment.transmission_load  # (3)
 
 
-class LoadDirection(Friction):
+class DirectionalLoadFriction(Friction):
     """Load-dependent friction with separate coefficients for motor and external load.
 
     The limit is |motor drive - external load|.
@@ -149,18 +149,18 @@ class LoadDirection(Friction):
     needs, contains, source = "input", ("friction.load",), _SERVOS + "M5"
     coefficients = (replace(_LOAD, name="motor"), replace(_LOAD, name="external"))
 
-    def limit(self, c: Array, moment: Moment) -> Array:
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1): absolute weighted sum of drive and external load.
 
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        drive, against = moment.sides
+        drive, against = moment.transmission_sides
         return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * against)  # (4)
 
 
-class LoadQuadratic(Friction):
+class QuadraticLoadFriction(Friction):
     """Load-dependent friction with a term quadratic in the force transmitted by the gears."""
 
     name = "friction.load_quadratic"
@@ -169,18 +169,18 @@ class LoadQuadratic(Friction):
     needs, contains, source = "input", ("friction.load",), _SERVOS + "M6"
     coefficients = (_LOAD, Coefficient("quadratic", *_SQUARE))
 
-    def limit(self, c: Array, moment: Moment) -> Array:
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1) from the load and the square of the transmitted force.
 
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        through = _transmitted(*moment.sides)
-        return np.maximum(c[0] * moment.load + c[1] * through**2, 0.0)  # (5)
+        through = _transmitted(*moment.transmission_sides)
+        return np.maximum(c[0] * moment.transmission_load + c[1] * through**2, 0.0)  # (5)
 
 
-class Position(Friction):
+class PositionFriction(Friction):
     """Dry friction of eccentric gears and bearings: a wave over position that is never negative."""
 
     name = "friction.position"
@@ -189,7 +189,7 @@ class Position(Friction):
     needs, contains, source = "guide", ("friction.coulomb",), _PLACE
     coefficients = (Coefficient("least", _USUAL, _DRY), *_OVER)
 
-    def limit(self, c: Array, moment: Moment) -> Array:
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the limit (L, 1), periodic in the primary coordinate.
 
         Args:
@@ -201,7 +201,7 @@ class Position(Friction):
         return np.maximum(mean + c[1] * np.sin(angle) + c[2] * np.cos(angle), 0.0)  # (6)
 
 
-class Warming(Friction):
+class WarmingFriction(Friction):
     """Additional dry and viscous friction of a cold joint, which decays as the joint warms."""
 
     name = "friction.warming"
@@ -210,7 +210,7 @@ class Warming(Friction):
     needs, contains, source = "guide", ("friction.coulomb", "drag.linear"), _WARM
     coefficients = _COLD
 
-    def limit(self, c: Array, moment: Moment) -> Array:
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the remaining limit (L, 1); the viscous part is zero at rest.
 
         Args:
@@ -221,7 +221,7 @@ class Warming(Friction):
         return (np.maximum(c[0], 0.0) + np.maximum(c[1], 0.0) * moment.speed) * left  # (7)
 
 
-class Direction(Force):
+class DirectionalViscousFriction(Force):
     """Viscous friction that depends on the direction of motion."""
 
     name = "friction.direction"
@@ -231,7 +231,7 @@ class Direction(Force):
     needs, contains = "guide", ("drag.linear",)
     coefficients = tuple(Coefficient(f"viscous{way}", _VISCOUS, _DAMPED) for way in "+-")
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), proportional to speed, with a coefficient per direction.
 
         Args:
@@ -248,7 +248,7 @@ def _transmitted(drive: Array, against: Array) -> Array:
     return np.maximum(low, 0.0) - np.minimum(high, 0.0)
 
 
-def _falling(speed: Array, scale: Array) -> Array:
+def _stribeck_factor(speed: Array, scale: Array) -> Array:
     """Return the remaining fraction (L, 1) of the extra friction of (2) at a speed."""
     ratio = speed / np.maximum(scale, _SMALLEST)
     left: Array = np.exp(-np.square(ratio))

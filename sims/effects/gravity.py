@@ -6,8 +6,8 @@
 
 from __future__ import annotations
 
-from sims.base import Array
-from sims.system import Coefficient, Force, Moment
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Force, StateSnapshot
 
 _PURE = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""
@@ -15,7 +15,7 @@ _FIFTH = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
 """Plausible relative changes of gravity: up to a fifth."""
 
 
-class Scale(Force):
+class GravityScale(Force):
     """Gravity g (1 + c)."""
 
     name = "gravity.scale"
@@ -25,7 +25,7 @@ class Scale(Force):
     needs, at = "gravity", "world"
     coefficients = (Coefficient("coefficient", _PURE, _FIFTH),)
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), a fraction of the weight.
 
         Args:
@@ -35,7 +35,7 @@ class Scale(Force):
         return c[0] * moment.weight  # (1): the system's own force already contains the weight
 
 
-class Tilt(Force):
+class GravityTilt(Force):
     """Tilted gravity: accelerations of x g and y g along the horizontal axes."""
 
     name = "gravity.tilt"
@@ -48,7 +48,7 @@ class Tilt(Force):
         Coefficient("y", ("1", None, None), ((-0.2, 0.2), (0, 0), (0, 0))),
     )
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D) of gravity along the horizontal axes.
 
         Args:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.base import Array
-from sims.system import Coefficient, Force, Moment
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Force, StateSnapshot
 
 _SPINNING = "G. Robinson, I. Robinson, Physica Scripta 88, 018101 (2013), "
 _SPINNING += "doi:10.1088/0031-8949/88/01/018101"
@@ -18,7 +18,7 @@ _EITHER_WAY = ((-1, 1), (0, 0), (0, 0))
 """Plausible lift in 1/s; spin has two directions."""
 
 
-class Magnus(Force):
+class MagnusLift(Force):
     """Lift of a spinning ball: c times spin axis x velocity, about -y (backspin lifts) and z."""
 
     name = "lift.magnus"
@@ -30,7 +30,7 @@ class Magnus(Force):
         Coefficient("vertical", _FLYING, _EITHER_WAY),
     )
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), perpendicular to the velocity, so that it does no work.
 
         Args:

@@ -6,8 +6,8 @@
 
 from __future__ import annotations
 
-from sims.base import Array
-from sims.system import Coefficient, Force, Moment
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Force, StateSnapshot
 
 _DUFFING = (
     "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
@@ -18,7 +18,7 @@ _EITHER_WAY = ((-5, 5), (-50, 50), (-0.5, 0.5))
 """Plausible cubic terms, in the units of `_CUBIC`: springs harden or soften."""
 
 
-class Linear(Force):
+class LinearSpring(Force):
     """Linear spring (Hooke's law): -c x."""
 
     name = "spring.linear"
@@ -30,7 +30,7 @@ class Linear(Force):
         Coefficient("coefficient", ("1/s^2", "N/m", "N*m/rad"), ((0, 10), (0, 50), (0, 1))),
     )
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), towards zero.
 
         Args:
@@ -40,7 +40,7 @@ class Linear(Force):
         return moment.along_primary(-c[0] * moment.primary)  # (1)
 
 
-class Cubic(Force):
+class CubicSpring(Force):
     """Cubic term of a spring that hardens (or softens, c < 0): -c x^3."""
 
     name = "spring.cubic"
@@ -50,7 +50,7 @@ class Cubic(Force):
     needs = "guide"
     coefficients = (Coefficient("coefficient", _CUBIC, _EITHER_WAY),)
 
-    def force(self, c: Array, moment: Moment) -> Array:
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
         """Return the force (L, D), towards zero for c > 0.
 
         Args:

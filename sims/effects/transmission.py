@@ -8,9 +8,10 @@ of the load, W the weight of both, U all other forces, and T the force between d
 
 * (3) flexibility: T = s M (w^2 (x - y) + 2 z w (x' - y')), with w the frequency at which the load
   oscillates while the drive is fixed, and z its damping ratio
-* (4) backlash: T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + `SOFT` gap)), with d the
-  excess over the gap and k `CONTACT`; flanks push and never pull, so that the load stays on a flank
-  after contact and does not bounce
+* (4) backlash: T = s (1 - s) M (k^2 d + 4 k (x' - y') |d| / (|d| + `CONTACT_DAMPING_DEPTH` gap)),
+with d the
+  excess over the gap and k `CONTACT_FREQUENCY`; flanks push and never pull, so that the load stays
+  on a flank after contact and does not bounce
 
 All other effects of the library act on x, where the drive acts.
 
@@ -32,15 +33,22 @@ from typing import ClassVar
 
 import numpy as np
 
-from sims.base import Array
-from sims.system import Coefficient, Element, Hidden, Moment, State, Value
+from sims.core.simulator import Array
+from sims.core.system import (
+    Coefficient,
+    HiddenState,
+    HiddenStateEffect,
+    ModelValueEffect,
+    SeriesElement,
+    StateSnapshot,
+)
 
-CONTACT = 150.0
+CONTACT_FREQUENCY = 150.0
 """Frequency in rad/s of two inertias that oscillate against closed, undamped flanks.
 
 It is far above the frequencies visible in a log, and low enough to be integrated.
 """
-SOFT = 0.01
+CONTACT_DAMPING_DEPTH = 0.01
 """Penetration of a flank at which half of its damping acts, as a fraction of the gap."""
 _MOST = 0.98
 """Maximum share of the inertia on the load side of a transmission."""
@@ -87,7 +95,7 @@ _SPRING = (
 _FLANKS = (Coefficient("gap", ("m", "m", "rad"), _GAP, of="travel"), _ROTOR)
 
 
-class Carried(Hidden):
+class DrivenLoad(HiddenStateEffect):
     """Load behind a drive, with its own motion.
 
     Attributes:
@@ -96,11 +104,11 @@ class Carried(Hidden):
 
     share: ClassVar[int] = 0
 
-    def behind(self, c: Array) -> Array:
+    def get_inertia_share(self, c: Array) -> Array:
         """Return the load's share of the inertia (L, 1), limited to its maximum."""
         return np.clip(c[self.share], 0.0, _MOST)
 
-    def element(self, c: Array) -> Element:
+    def make_series_element(self, c: Array) -> SeriesElement:
         """Return the series element: a spring with damper for a compliance, else backlash."""
         numbers = {one.name: values for one, values in zip(self.between, c, strict=True)}
         none = np.zeros_like(c[0])
@@ -108,19 +116,21 @@ class Carried(Hidden):
         # A compliance of zero is off; it adds no spring to a batch in which others are on.
         stiffness = np.where(gives > 0, 1.0 / np.maximum(gives, _LEAST), 0.0)
         gap = np.maximum(numbers.get("gap", none), 0.0)
-        return Element(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
+        return SeriesElement(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
 
-    def begin(self, c: Array, moment: Moment) -> State:
+    def get_initial_state(self, c: Array, moment: StateSnapshot) -> HiddenState:
         """Return the initial state: moving with the drive, at the static deflection.
 
         Args:
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        away = self.hangs(c, _fall(moment, moment.primary))
-        return State(moment.primary + away, moment.v[:, :1])
+        away = self.compute_static_deflection(c, _fall(moment, moment.primary))
+        return HiddenState(moment.primary + away, moment.v[:, :1])
 
-    def act(self, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
+    def compute_force_and_rate(
+        self, c: Array, moment: StateSnapshot, state: HiddenState
+    ) -> tuple[Array, Array]:
         """Return the force (L, D) on the drive side and the acceleration (L, 1) of the load.
 
         Args:
@@ -128,12 +138,12 @@ class Carried(Hidden):
             moment: state snapshot of L batch elements.
             state: position and velocity of the load.
         """
-        pull, share = self.pull(c, moment, state), self.behind(c)
+        pull, share = self.compute_coupling_force(c, moment, state), self.get_inertia_share(c)
         # The load carries its share of the weight.
         near = -share * moment.inertia * (pull + _fall(moment, moment.primary))  # (1)
         return moment.along_primary(near), pull + _fall(moment, state.x)  # (2)
 
-    def hangs(self, c: Array, fall: Array) -> Array:
+    def compute_static_deflection(self, c: Array, fall: Array) -> Array:
         """Return the static deflection (L, 1) of the load under an acceleration of gravity.
 
         Args:
@@ -143,7 +153,7 @@ class Carried(Hidden):
         return 0.0 * c[0] * fall
 
     @abstractmethod
-    def pull(self, c: Array, moment: Moment, state: State) -> Array:
+    def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:
         """Return the force (L, 1) between drive and load per unit of load inertia.
 
         Args:
@@ -153,14 +163,14 @@ class Carried(Hidden):
         """
 
 
-class Flexibility(Carried):
+class JointFlexibility(DrivenLoad):
     """Spring with a damper between the drive and its load."""
 
     name, noun = "joint.flexibility", "a flexible transmission"
     says = "what the drive carries hangs on it by a spring, and swings"
     source, coefficients, between = _ELASTIC, _SPRUNG, _SPRING
 
-    def hangs(self, c: Array, fall: Array) -> Array:
+    def compute_static_deflection(self, c: Array, fall: Array) -> Array:
         """Return the static deflection (L, 1) of the spring.
 
         Args:
@@ -169,7 +179,7 @@ class Flexibility(Carried):
         """
         return fall / (c[1] * c[1])
 
-    def pull(self, c: Array, moment: Moment, state: State) -> Array:
+    def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:
         """Return the force (L, 1) of spring and damper per unit of load inertia.
 
         Args:
@@ -181,7 +191,7 @@ class Flexibility(Carried):
         return c[1] * (c[1] * (moment.primary - state.x) + damped)  # (3)
 
 
-class Coupling(Value):
+class JointCoupling(ModelValueEffect):
     """Coupled drive of a joint that also turns the previous joint, c times as much."""
 
     name, noun = "joint.coupling", "a coupled drive"
@@ -190,15 +200,15 @@ class Coupling(Value):
     coefficients = (Coefficient("coefficient", _PURE, ((-1, 1), (-1, 1), (-1, 1))),)  # (5)
 
 
-class Play(Carried):
+class JointBacklash(DrivenLoad):
     """Backlash between the drive and its load: no force is transmitted between the flanks."""
 
     name, noun = "joint.backlash", "play in the transmission"
     says = "there is a gap between the drive and what it carries, which knocks from flank to flank"
     source, coefficients, between = _PLAY, _GAPPED, _FLANKS
-    share, fastest = 1, CONTACT
+    share, fastest = 1, CONTACT_FREQUENCY
 
-    def pull(self, c: Array, moment: Moment, state: State) -> Array:
+    def compute_coupling_force(self, c: Array, moment: StateSnapshot, state: HiddenState) -> Array:
         """Return the force (L, 1) of the flanks per unit of load inertia.
 
         Damping increases with the penetration, so that the force is continuous.
@@ -210,13 +220,13 @@ class Play(Carried):
         """
         apart = moment.primary - state.x
         beyond = apart - np.clip(apart, -0.5 * c[0], 0.5 * c[0])
-        pressed = np.abs(beyond) / (np.abs(beyond) + SOFT * c[0])
-        push = CONTACT * beyond + 4.0 * pressed * (moment.v[:, :1] - state.v)
-        pull = (1.0 - self.behind(c)) * CONTACT * push  # (4)
+        pressed = np.abs(beyond) / (np.abs(beyond) + CONTACT_DAMPING_DEPTH * c[0])
+        push = CONTACT_FREQUENCY * beyond + 4.0 * pressed * (moment.v[:, :1] - state.v)
+        pull = (1.0 - self.get_inertia_share(c)) * CONTACT_FREQUENCY * push  # (4)
         return np.where(beyond > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
 
 
-def _fall(moment: Moment, y: Array) -> Array:
+def _fall(moment: StateSnapshot, y: Array) -> Array:
     """Return the acceleration (L, 1) by gravity alone at positions y (L, 1)."""
     there = replace(moment, x=moment.along_primary(y))
     weight = moment.system.weight(there)[:, moment.system.primary, None]

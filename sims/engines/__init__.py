@@ -9,20 +9,20 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from sims.base import InputError, unknown
-from sims.system import Engine, System
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.system import Engine, System
 
-NAMES = {
+ENGINE_MODULES = {
     "batch": "sims.engines.batch",
-    "mujoco": "sims.engines.mujoco",
-    "pybullet": "sims.engines.bullet",
+    "mujoco": "sims.engines.adapters.mujoco_engine",
+    "pybullet": "sims.engines.adapters.bullet_engine",
 }
 """Module of each engine by name; a module is imported when its engine is first requested."""
-HIDING = ("batch",)
-"""Engines that can integrate the hidden states of effects (`sims.engines.hidden`)."""
+HIDDEN_STATE_ENGINES = ("batch",)
+"""Engines that can integrate the hidden states of effects (`sims.engines.hidden_states`)."""
 
 
-def stepping() -> str:
+def describe_stepping() -> str:
     """Return how the engine `batch` steps in this process, for a record of the run.
 
     If the machine code does not exist yet, it is compiled, once after an installation. Therefore
@@ -31,26 +31,26 @@ def stepping() -> str:
     Returns:
         ``machine code``, ``numpy``, or ``none`` if the engine is not in use.
     """
-    if NAMES["batch"] not in sys.modules:
+    if ENGINE_MODULES["batch"] not in sys.modules:
         return "none"
-    from sims.engines.compiled import machine
+    from sims.engines.compiled import kernel
 
-    return "numpy" if machine.machine() is None else "machine code"
+    return "numpy" if kernel.get_kernel() is None else "machine code"
 
 
 def missing_packages(name: str) -> list[str]:
-    """Return the packages that an engine of `NAMES` requires and that are not installed."""
-    required = import_module(NAMES[name]).REQUIRES
+    """Return the packages that an engine of `ENGINE_MODULES` requires and that are not installed."""
+    required = import_module(ENGINE_MODULES[name]).REQUIRED_PACKAGES
     return [package for package in required if importlib.util.find_spec(package) is None]
 
 
-def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
+def make_engine(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
     """Make a new engine for one simulator.
 
     The function `engine(system, **settings)` of the engine's module makes it.
 
     Args:
-        name: name of the engine in `NAMES`.
+        name: name of the engine in `ENGINE_MODULES`.
         system: system that the engine will integrate.
         settings: the engine's settings by name.
 
@@ -61,9 +61,9 @@ def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -
         InputError: the engine or a setting is unknown, a required package is not installed, or the
             engine cannot integrate the system.
     """
-    if name not in NAMES:
-        raise unknown("engine", name, list(NAMES))
-    module = import_module(NAMES[name])
+    if name not in ENGINE_MODULES:
+        raise make_unknown_name_error("engine", name, list(ENGINE_MODULES))
+    module = import_module(ENGINE_MODULES[name])
     if missing := missing_packages(name):
         raise InputError(
             f"engine {name} needs {', '.join(missing)}, not installed"
@@ -71,12 +71,12 @@ def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -
         )
     # An engine's settings are the keyword-only arguments of its factory, so that they are declared
     # once.
-    parameters = inspect.signature(module.engine).parameters
+    parameters = inspect.signature(module.make_engine).parameters
     known = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
     for setting in settings:
         if setting not in known:
-            raise unknown(f"setting of engine {name}", setting, known)
-    engine: Engine = module.engine(system, **settings)
-    if reason := engine.refuses(system):
+            raise make_unknown_name_error(f"setting of engine {name}", setting, known)
+    engine: Engine = module.make_engine(system, **settings)
+    if reason := engine.find_unsupported_reason(system):
         raise InputError(f"engine {name} cannot carry system {system.name}: {reason}")
     return engine

@@ -10,6 +10,6 @@ The main modules, in the order in which to read them:
 * `write`: write a recording such that reading gives it back unchanged
 """
 
-from sims.recording.recording import Recording, Run, read_recording, system_of
+from sims.recording.recording import Recording, Run, read_recording, read_system_name
 
-__all__ = ["Recording", "Run", "read_recording", "system_of"]
+__all__ = ["Recording", "Run", "read_recording", "read_system_name"]

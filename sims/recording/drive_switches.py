@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.base import Array, InputError, unknown
-from sims.user_toml import table, text, toml_key
+from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.core.toml_validation import check_table, check_text, toml_key
 
 Mask = NDArray[np.bool_]
 Run: TypeAlias = Any
@@ -81,12 +81,12 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
         InputError: A column name is not a text, or a drive has both keys.
     """
     found = []
-    for name, own in table(path, "actuators", meta.get("actuators", {})).items():
+    for name, own in check_table(path, "actuators", meta.get("actuators", {})).items():
         keys = [key for key in KEYS if isinstance(own, dict) and key in own]
         if len(keys) > 1:
             raise InputError(f"{path}: actuators.{name}: expected enable or disable, found both")
         for key in keys:
-            column = text(path, f"actuators.{name}.{key}", own[key], "the name of a column")
+            column = check_text(path, f"actuators.{name}.{key}", own[key], "the name of a column")
             found.append(DriveSwitch(name, column, key == "enable"))
     return tuple(found)
 
@@ -128,7 +128,7 @@ def check_switches(
         where = f"{path}: actuators.{switch.actuator}"
         if switch.actuator not in actuators:
             raise InputError(
-                f"{where}: {unknown('actuator', switch.actuator, list(actuators) or ['none'])}"
+                f"{where}: {make_unknown_name_error('actuator', switch.actuator, list(actuators) or ['none'])}"
             )
         if switch.column in taken:
             raise InputError(

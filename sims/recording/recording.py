@@ -16,32 +16,32 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.base import Array, InputError, frozen
-from sims.recording.description import (
-    Declared,
-    Description,
-    ModelFile,
-    RunMarks,
+from sims.core.simulator import Array, InputError, make_read_only
+from sims.recording.angle_unwrapping import unwrapped
+from sims.recording.column_mapping import RecordingSources, read_logs
+from sims.recording.csv_table import CsvRun, has_run_column, read_table
+from sims.recording.drive_switches import switched_runs
+from sims.recording.recording_description import (
+    DeclaredSignals,
+    ModelFileReference,
+    RecordingDescription,
+    RunMetadata,
     check_description,
-    check_names,
+    check_run_names,
     model_in,
     read_meta,
-    system_of,
+    read_system_name,
 )
-from sims.recording.drive_switches import switched_runs
-from sims.recording.frame import Frame, described, read_frame, with_index
-from sims.recording.mapping import Sources, read_logs
-from sims.recording.table import TableRun, has_run_column, read_table
-from sims.recording.turns import unwrapped
-from sims.recording.units import SAME, Scale
+from sims.recording.recording_frame import Frame, described, read_frame, with_index
+from sims.recording.unit_conversion import IDENTITY_SCALE, UnitScale
 
-__all__ = ["Declared", "Recording", "Run", "read_recording", "system_of"]
+__all__ = ["DeclaredSignals", "Recording", "Run", "read_recording", "read_system_name"]
 
 
 Mask = NDArray[np.bool_]
 Number = TypeVar("Number", bound=np.generic)
 
-REMEMBERED = 2.0
+INPUT_HISTORY_SECONDS = 2.0
 """Input history stored with a part of a run, in seconds.
 
 Delays, rate limits and motion profiles do not depend on earlier inputs.
@@ -86,7 +86,7 @@ class Run:
     fold: int | None = None
     before: Mapping[str, Array] = field(default_factory=dict)
     off: Mapping[str, Mask] = field(default_factory=dict)
-    memory: float = REMEMBERED
+    memory: float = INPUT_HISTORY_SECONDS
 
     def __repr__(self) -> str:
         # Without this, a notebook cell that ends in a run would print all of its samples.
@@ -161,7 +161,7 @@ class Recording:
     noise: Mapping[str, float]
     runs: tuple[Run, ...]
     extra: Mapping[str, str] = field(default_factory=dict)
-    model: ModelFile | None = None
+    model: ModelFileReference | None = None
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -186,7 +186,7 @@ class Recording:
 
 
 def read_recording(
-    path: str | Path, declared: Declared, whole: bool = False, folds: bool = False
+    path: str | Path, declared: DeclaredSignals, whole: bool = False, folds: bool = False
 ) -> Recording:
     """Read `NAME.csv` and `NAME.toml` and check them against a system.
 
@@ -194,7 +194,8 @@ def read_recording(
 
     Args:
         path: Path of the table.
-        declared: System, or simulator of it; `system_of` reads which system the recording states.
+        declared: System, or simulator of it; `read_system_name` reads which system the recording
+            states.
         whole: Whether to hold out only the marked runs, and not to split a single run.
         folds: Whether to number two or three unmarked runs as cross-validation folds instead of
             holding one of them out.
@@ -215,7 +216,7 @@ def read_recording(
     else:
         table = own
         parts = read_table(own, *columns, list(about.extra))
-    check_names(description, about.runs, [part.name for part in parts])
+    check_run_names(description, about.runs, [part.name for part in parts])
     switched = switched_runs(table, [_run(table, part, about) for part in parts], about.switches)
     kept = switched.runs if whole else _split(description, switched.runs, folds)
     return Recording(
@@ -233,11 +234,11 @@ def read_recording(
 
 def _read_renamed(
     path: Path,
-    sources: Sources,
+    sources: RecordingSources,
     channels: Sequence[str],
     inputs: Sequence[str],
     extra: Sequence[str],
-) -> list[TableRun]:
+) -> list[CsvRun]:
     """Read a table whose columns are renamed by the description.
 
     Args:
@@ -262,7 +263,7 @@ def _read_renamed(
 
 def recording_of_frame(
     frame: Frame,
-    declared: Declared,
+    declared: DeclaredSignals,
     meta: Mapping[str, Any],
     units: Mapping[str, str],
     name: str = "DataFrame",
@@ -288,7 +289,7 @@ def recording_of_frame(
     stated = described(path, whole, declared, meta, units)
     about = check_description(path, stated, declared)
     parts = read_frame(path, whole, about)
-    check_names(path, about.runs, [part.name for part in parts])
+    check_run_names(path, about.runs, [part.name for part in parts])
     switched = switched_runs(path, [_run(path, part, about) for part in parts], about.switches)
     return Recording(
         path,
@@ -303,7 +304,7 @@ def recording_of_frame(
     )
 
 
-def divided(recording: Recording, folds: bool = False) -> Recording:
+def split_held_out(recording: Recording, folds: bool = False) -> Recording:
     """Divide the runs of a recording into runs for fitting and held-out runs.
 
     Marked runs are held out; without marks every third run, or the last third of a single run.
@@ -323,22 +324,26 @@ def divided(recording: Recording, folds: bool = False) -> Recording:
 
 MAX_FOLDS = 3
 """Maximum number of unmarked runs for cross-validation; of more, every third is held out."""
-_UNMARKED = RunMarks({}, {}, None)
+_UNMARKED = RunMetadata({}, {}, None)
 """Metadata of a run that the description does not mention."""
-_THIRD = 3
+_HELD_OUT_STRIDE = 3
 """Every third run, or the last third of the samples of a single run, is held out."""
 
 
-def _run(table: Path, part: TableRun, about: Description) -> Run:
+def _run(table: Path, part: CsvRun, about: RecordingDescription) -> Run:
     """Make a run in SI units from its table and the metadata of the description."""
     marks = about.runs.get(part.name, _UNMARKED)
     channels = {n: _converted(table, part, n, s) for n, s in about.channels.items()}
     inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
     for name, command in about.wrapped.items():
-        channels[name] = frozen(unwrapped(channels[name], inputs.get(command)))
+        channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
     # Extra columns keep their unit, because no system reads them; runs read from logs have none.
     extra = {name: part.columns[name] for name in about.extra if name in part.columns}
-    first = {n: s.gain * extra[n][0] + s.offset for n, s in about.begins.items() if n in extra}
+    first = {
+        n: s.gain * extra[n][0] + s.offset
+        for n, s in about.initial_pose_scales.items()
+        if n in extra
+    }
     begins = {name: float(value) for name, value in first.items() if np.isfinite(value)}
     return Run(
         part.name,
@@ -354,14 +359,14 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
     )
 
 
-def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
+def _converted(table: Path, part: CsvRun, name: str, scale: UnitScale) -> Array:
     """Convert a column to SI units.
 
     Raises:
         InputError: A value is too large for that.
     """
     values = part.columns[name]
-    if scale == SAME:
+    if scale == IDENTITY_SCALE:
         return values
     # An overflow is reported below with the name of its column, which a warning would not have.
     with np.errstate(over="ignore"):
@@ -371,11 +376,11 @@ def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
             f"{table}: run {part.name!r}, column {name}: "
             "a value is too large to convert to SI units"
         )
-    return frozen(result)
+    return make_read_only(result)
 
 
 def _split(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
-    """Divide the runs into runs for fitting and held-out runs, as described for `divided`."""
+    """Divide the runs into runs for fitting and held-out runs, as described for `split_held_out`."""
     runs = [replace(run, fold=None) for run in runs]
     if any(run.held_out for run in runs):
         if all(run.held_out for run in runs):
@@ -385,19 +390,22 @@ def _split(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
             )
         return tuple(runs)
     if len(runs) == 1:
-        return _halves(path, runs[0])
+        return _split_run(path, runs[0])
     if folds and len(runs) <= MAX_FOLDS:
         return tuple(replace(run, fold=number) for number, run in enumerate(runs))
     # Hold out the last of every three runs, so that early and late ones are fitted; of two, the
     # second.
-    marked = [i % _THIRD == _THIRD - 1 or (len(runs) == 2 and i == 1) for i in range(len(runs))]
+    marked = [
+        i % _HELD_OUT_STRIDE == _HELD_OUT_STRIDE - 1 or (len(runs) == 2 and i == 1)
+        for i in range(len(runs))
+    ]
     return tuple(replace(run, held_out=mark) for run, mark in zip(runs, marked, strict=True))
 
 
-def _halves(path: Path, run: Run) -> tuple[Run, ...]:
+def _split_run(path: Path, run: Run) -> tuple[Run, ...]:
     """Split a run into its first two thirds and its last third, which is held out."""
     count = len(run.times)
-    cut = (2 * count) // _THIRD
+    cut = (2 * count) // _HELD_OUT_STRIDE
     parts = (
         replace(run.part(slice(cut)), held_out=False),
         replace(run.part(slice(cut, None)), held_out=True),

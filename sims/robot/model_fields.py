@@ -1,6 +1,7 @@
 """Fields of MuJoCo's compiled model that store the numbers changed by effect coefficients.
 
-`sims.robot.native` writes these fields, `sims.robot.totals` reads the numbers in them.
+`robot.model_field_effects` writes these fields, `export.model_file_totals` reads the numbers in
+them.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from sims.robot.model import Robot
-from sims.robot.native import gain_pulls
+from sims.robot.model_field_effects import gain_pulls
+from sims.robot.robot_model import RobotModel
 
 Operation = Literal["abs", "add", "scale"]
 """Operation that applies a random number to a field: replace, add to, or multiply its number."""
@@ -32,7 +33,7 @@ class ModelField:
     sign: int = 1
 
 
-Find = Callable[[Robot, str], "list[list[ModelField]]"]
+Find = Callable[[RobotModel, str], "list[list[ModelField]]"]
 """Function that finds the elements of each coefficient, by robot and place."""
 
 
@@ -48,13 +49,13 @@ def _body(name: str) -> Find:
     return lambda robot, place: [[ModelField(name, (robot.body(place).id,))]]
 
 
-def _center(robot: Robot, place: str) -> list[list[ModelField]]:
+def _center(robot: RobotModel, place: str) -> list[list[ModelField]]:
     number = robot.body(place).id
     return [[ModelField("body_ipos", (number, axis))] for axis in range(3)]
 
 
 def _servo(term: int) -> Find:
-    def find(robot: Robot, place: str) -> list[list[ModelField]]:
+    def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
         number = robot.actuator(place).id
         found = [ModelField("actuator_biasprm", (number, term), -1)]
         if gain_pulls(robot, number, term):
@@ -64,7 +65,7 @@ def _servo(term: int) -> Find:
     return find
 
 
-def _force_range(robot: Robot, place: str) -> list[list[ModelField]]:
+def _force_range(robot: RobotModel, place: str) -> list[list[ModelField]]:
     number = robot.actuator(place).id
     ends = [ModelField("actuator_forcerange", (number, end), (-1, 1)[end]) for end in (1, 0)]
     return [ends]
@@ -101,7 +102,7 @@ A position is shifted. A tensor or a vector is scaled, so that it keeps its dire
 """
 
 
-def model_fields(robot: Robot, effect: str, place: str) -> list[list[ModelField]]:
+def model_fields(robot: RobotModel, effect: str, place: str) -> list[list[ModelField]]:
     """Find the elements of the compiled model that an effect changes, by coefficient.
 
     Args:

@@ -18,16 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.gap import explain as explaining
-from bench.gap.causes.candidates import Directions, Probe
-from bench.gap.causes.score_test import ScoreTest
-from bench.gap.model.noise import Noise
-from bench.gap.model.surrogates import surrogates
-from bench.gap.model.world import World
+from bench.diagnosis import explain as explaining
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
+from bench.diagnosis.search.candidate_directions import CandidateDirection, DirectionSet
+from bench.diagnosis.search.score_test import ScoreTest
 from sims import effects
-from sims.slider.system import SliderSystem
-from tests.bench.gap.made import linear_fit
-from tests.wishes import Wish, write
+from sims.systems.slider import SliderSystem
+from tests.bench.diagnosis.explained_samples import linear_fit
+from tests.simulation_arguments import Wish, write
 
 USUAL = Wish(
     # The engine that explains, so that a long recording hides nothing more than a short one.
@@ -65,10 +65,17 @@ def problem(samples, candidates, runs):
     values = (
         rng.normal(size=(len(waves), runs))[:, :, None, None] * np.stack(waves)[:, None, :, None]
     )
-    probes = [Probe(f"effect {k // 2}", 0, k % 2, np.ones(2), True) for k in range(len(waves))]
+    probes = [
+        CandidateDirection(f"effect {k // 2}", 0, k % 2, np.ones(2), True)
+        for k in range(len(waves))
+    ]
     residual = np.cumsum(rng.normal(size=(runs, length, 1)), axis=1)
     residual -= residual.mean(axis=1, keepdims=True)
-    return linear_fit(jacobian, 1), Directions(tuple(probes), np.moveaxis(values, 0, -1)), residual
+    return (
+        linear_fit(jacobian, 1),
+        DirectionSet(tuple(probes), np.moveaxis(values, 0, -1)),
+        residual,
+    )
 
 
 def scoring(samples=SAMPLES, candidates=CANDIDATES, runs=RUNS):
@@ -85,9 +92,9 @@ def scoring(samples=SAMPLES, candidates=CANDIDATES, runs=RUNS):
 
 def _scored(fit, directions, residual):
     seen = np.ones(residual.shape, dtype=bool)
-    meaningless = surrogates(residual, seen, SURROGATES, np.random.default_rng(1))
-    test = ScoreTest(fit, directions, seen, Noise(np.ones(1), np.zeros(1)))
-    return test.scores(residual, meaningless)
+    meaningless = draw_surrogates(residual, seen, SURROGATES, np.random.default_rng(1))
+    test = ScoreTest(fit, directions, seen, NoiseModel(np.ones(1), np.zeros(1)))
+    return test.compute_scores(residual, meaningless)
 
 
 def memory(samples, candidates):
@@ -102,12 +109,14 @@ def memory(samples, candidates):
 
 def explained(samples=SAMPLES, candidates=None, runs=RUNS):
     """Processor seconds of explain on a recording: the least of two, of a long one the only."""
-    usual, best = explaining.World, np.inf
+    usual, best = explaining.RunEvaluator, np.inf
     if candidates is not None:
-        names = [n for n in effects.names() if effects.get(n).fits(SliderSystem)]
+        names = [n for n in effects.list_names() if effects.get_effect(n).fits(SliderSystem)]
         names.sort(key=lambda name: name != "friction.coulomb")
         chosen = names[:candidates]
-        explaining.World = lambda *given, **more: World(*given, **more, candidates=chosen)
+        explaining.RunEvaluator = lambda *given, **more: RunEvaluator(
+            *given, **more, candidates=chosen
+        )
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "data.csv"
@@ -117,7 +126,7 @@ def explained(samples=SAMPLES, candidates=None, runs=RUNS):
                 explaining.explain(path)
                 best = min(best, time.process_time() - begin)
     finally:
-        explaining.World = usual
+        explaining.RunEvaluator = usual
     return best
 
 

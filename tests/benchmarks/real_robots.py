@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.gap.model.world import World
-from bench.recordings.inspection import load
-from bench.registry import simulators
-from sims.extended import opened
+from bench.core.plugin_registries import simulators
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.logs.inspection import load_recording
+from sims.extended_simulator import open_extended
 
 ROBOTS = Path(os.environ.get("SIMGAP_ROBOTS", Path(__file__).parents[3] / "shared" / "robots"))
 FITTED = ("chirp_sweep", "multisine")
@@ -65,23 +65,25 @@ def so101(out, explained):
         explained = out / "explained"
         shutil.rmtree(explained, ignore_errors=True)
         simgap("explain", log, "--out", explained)
-    recording, _ = load(log)
+    recording, _ = load_recording(log)
     runs = recording.held_out()
-    extended, of_file, _ = opened(explained / "extended.toml", simulators.get)
-    world = World(of_file, recording, runs, None, candidates=list(extended.effects))
-    after = world.nominal()
+    extended, of_file, _ = open_extended(explained / "extended.toml", simulators.get)
+    world = RunEvaluator(of_file, recording, runs, None, candidates=list(extended.effects))
+    after = world.get_nominal_theta()
     for place, parameter in enumerate(world.parameters[: world.own]):
         after[place] = extended.parameters[parameter.name].value
     # A search that its budget has ended says nothing of the base model's numbers.
     known = tuned(explained) if (explained / "apart.csv").exists() else {}
-    before = world.nominal()
+    before = world.get_nominal_theta()
     for place, parameter in enumerate(world.parameters[: world.own]):
         before[place] = known.get(parameter.name, np.nan)
     for name, numbers in extended.effects.items():
-        coefficients = world.effects[name].on(world.simulator.system)
-        for place, coefficient in zip(world.places(name), coefficients, strict=True):
+        coefficients = world.available_effects[name].on(world.simulator.system)
+        for place, coefficient in zip(
+            world.get_coefficient_indices(name), coefficients, strict=True
+        ):
             after[place] = numbers[coefficient.name].value
-    models = {"as imported": world.nominal(), "gains tuned": before, "extended": after}
+    models = {"as imported": world.get_nominal_theta(), "gains tuned": before, "extended": after}
     models = {name: theta for name, theta in models.items() if np.isfinite(theta).all()}
     errors = {name: by_run(world, theta) for name, theta in models.items()}
     table(

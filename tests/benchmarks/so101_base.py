@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from bench.gap.model.world import World
-from bench.recordings.inspection import load
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.logs.inspection import load_recording
 
 LOG = Path(__file__).parents[2] / "results/reference/real/datasheets/so101-base/base.toml"
 PLACE, JOINT, FITTED, UPTO = "m_shoulder_pan", "shoulder_pan", "chirp_sweep", 80.0
@@ -47,9 +47,9 @@ PARTS = (0.0, 80.0, 95.0, 105.0, 112.0, 121.0)
 
 
 def main():
-    recording, kind = load(LOG)
+    recording, kind = load_recording(LOG)
     asked = [ZONE, LEAD, LATE, WAY, BRAKE, DRY, DRAG, MOST]
-    world = World(kind, recording, recording.runs, None, candidates=asked)
+    world = RunEvaluator(kind, recording, recording.runs, None, candidates=asked)
     column = {parameter.name: i for i, parameter in enumerate(world.parameters)}
     names = [run.name for run in recording.runs]
     chirp = names.index(FITTED)
@@ -75,7 +75,7 @@ def main():
         cases.append((free, {}, every))
     cases.append((COASTS, {}, whole))
     for free, held, seen in cases:
-        theta = fitted(errors, world.nominal(), column, free, held, seen)
+        theta = fitted(errors, world.get_nominal_theta(), column, free, held, seen)
         found = {name: round(float(theta[column[name]]), 4) for name in free}
         print(held, found, dict(zip(names, rms(theta), strict=True)), flush=True)
         gap = errors(theta[None], chirp)[0][: times.size]

@@ -15,25 +15,33 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.figures.style import BLACK, BLUE, JOIN, ORANGE, VERMILION, blank, save
-from bench.problem.experiment import load
-from bench.problem.problem import Problem
-from bench.problem.seeds import rng_for
-from bench.runs.drive import drive
-from bench.runs.evaluate import Evaluator
-from methods.base import NOTHING, Ask, Task
-from methods.learning.pair_fit import Fitted, PairTuner
-from methods.learning.pair_network import PUBLISHED, Design
-from methods.learning.reader import Reading
-from methods.learning.rehearsal import rehearse
-from methods.tunenet import SETTLED, RootSearch, TuneNet, TuneNetPublished
+from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
+from bench.benchmark.runner.tuner_loop import drive_tuner
+from bench.core.random_streams import make_rng
+from bench.figures.style import (
+    BLACK,
+    BLUE,
+    CONNECTOR_GREY,
+    ORANGE,
+    VERMILION,
+    make_panel_grid,
+    write_figure,
+)
+from methods.learning.input_features import FeatureConfig
+from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
+from methods.learning.pair_tuner import PairTuner, TrainedPairNetwork
+from methods.learning.training_data import generate_training_data
+from methods.tuner import EMPTY_SCENE, Proposal, Task
+from methods.tuners.tunenet import MIN_STEP, BroydenSearch, TuneNet, TuneNetPublished
 
 AT = (1, 2, 3, 5, 10)
 SEEDS, TARGETS, MEMBERS = 2, 100, 5
 NOISE = 0.01
 """Sensor noise of the noisy targets, m."""
-OURS = Design(epochs=300)
-RAW, WEIGHED = Reading(noise=0.0, raw=True), Reading(noise=0.0)
+OURS = PairNetworkDesign(epochs=300)
+RAW, WEIGHED = FeatureConfig(noise=0.0, raw=True), FeatureConfig(noise=0.0)
 
 
 @dataclass(eq=False)
@@ -44,32 +52,32 @@ class Variant(PairTuner):
 
     name = "variant"
     says: str = ""
-    built: Design = OURS
-    reads: Reading = WEIGHED
+    built: PairNetworkDesign = OURS
+    reads: FeatureConfig = WEIGHED
     spread: tuple[int, int] = (100, 8)
     step: str = "broyden"
-    members: list[Fitted] = field(default_factory=list)
+    members: list[TrainedPairNetwork] = field(default_factory=list)
 
-    def design(self):
+    def make_network_design(self):
         return self.built
 
-    def reading(self):
+    def make_feature_config(self):
         return self.reads
 
     def estimator(self, task):
         if not self.members:
-            return self.fitted().suited(task).estimator(task)
-        each = [m.estimator(task) for m in self.members]
+            return self.get_trained_network().select_for(task).make_estimator(task)
+        each = [m.make_estimator(task) for m in self.members]
         return lambda seen: np.mean([estimate(seen) for estimate in each], axis=0)
 
     def tune(self, task, rng):
-        estimate, search, guess = self.estimator(task), RootSearch(task), task.start
+        estimate, search, guess = self.estimator(task), BroydenSearch(task), task.start
         while True:
-            seen = yield Ask(guess, recommend=guess)
+            seen = yield Proposal(guess, recommend=guess)
             difference = estimate(seen.observations)
             if self.step == "broyden":
-                guess = search.after(seen.proposals[0], difference)
-                if np.abs(guess - search.best).max() <= SETTLED:
+                guess = search.propose_next(seen.proposals[0], difference)
+                if np.abs(guess - search.best).max() <= MIN_STEP:
                     return "the estimate no longer changes"
             else:
                 guess = np.clip(seen.proposals[0] + difference, 0.0, 1.0)
@@ -77,7 +85,7 @@ class Variant(PairTuner):
 
 def path():
     """From the published network to this project's, one change added after another."""
-    sgd = replace(PUBLISHED)
+    sgd = replace(PUBLISHED_DESIGN)
     linear = replace(sgd, bounded=False)
     adam = replace(linear, adam=True, rate=3e-3, weight_decay=1e-5, epochs=300, batch=10)
     pairs = replace(adam)
@@ -104,7 +112,7 @@ def without():
         "rate": 0.1,
         "batch": 50,
         "epochs": 200,
-        "weight_decay": PUBLISHED.weight_decay,
+        "weight_decay": PUBLISHED_DESIGN.weight_decay,
     }
     return [
         Variant("tunenet, tanh at the output", replace(OURS, bounded=True)),
@@ -116,8 +124,12 @@ def without():
         Variant("tunenet, rectified units", replace(OURS, smooth=False)),
         Variant("tunenet, raw inputs", OURS, RAW),
         Variant("tunenet, Algorithm 1's step", OURS, WEIGHED, step="plain"),
-        Variant("published, 1000 epochs", replace(PUBLISHED, epochs=1000), RAW, (800, 2), "plain"),
-        Variant("published, batches of 10", replace(PUBLISHED, batch=10), RAW, (800, 2), "plain"),
+        Variant(
+            "published, 1000 epochs", replace(PUBLISHED_DESIGN, epochs=1000), RAW, (800, 2), "plain"
+        ),
+        Variant(
+            "published, batches of 10", replace(PUBLISHED_DESIGN, batch=10), RAW, (800, 2), "plain"
+        ),
     ]
 
 
@@ -125,19 +137,24 @@ class Study:
     """Targets and training simulations, made once."""
 
     def __init__(self, targets=TARGETS):
-        self.problem = Problem(load("ball-drop").chosen(targets=targets))
-        self.targets = self.problem.targets()
+        self.problem = TuningProblem(load_experiment("ball-drop").chosen(targets=targets))
+        self.targets = self.problem.draw_targets()
         self._data = {}
 
     def data(self, spread, seed):
         if (spread, seed) not in self._data:
-            practice, rng = self.problem.practice(1600), rng_for("tunenet study", *spread, seed)
-            self._data[spread, seed] = rehearse(practice, rng, 1600, *spread)
+            practice, rng = (
+                self.problem.make_training_simulator(1600),
+                make_rng("tunenet study", *spread, seed),
+            )
+            self._data[spread, seed] = generate_training_data(practice, rng, 1600, *spread)
         return self._data[spread, seed]
 
     def train(self, variant, seed):
         begin = time.perf_counter()
-        variant.learn(self.data(variant.spread, seed), rng_for("tunenet study", variant.says, seed))
+        variant.learn(
+            self.data(variant.spread, seed), make_rng("tunenet study", variant.says, seed)
+        )
         return time.perf_counter() - begin
 
     def errors(self, tuner, budget=10, noise=0.0):
@@ -146,8 +163,8 @@ class Study:
         """
         rows, seconds = [], []
         for target in self.targets:
-            sealed, side = target.sealed, target.sealed.fitting
-            observed = side.observed + noise * rng_for("noise", sealed.name).standard_normal(
+            sealed, side = target.blinded, target.blinded.fitting
+            observed = side.observed + noise * make_rng("noise", sealed.name).standard_normal(
                 side.observed.shape
             )
             cube = self.problem.cube
@@ -160,9 +177,11 @@ class Study:
                 budget,
                 (len(observed),),
             )
-            trace = drive(tuner, task, Evaluator(self.problem, side), rng_for("study", sealed.name))
+            trace = drive_tuner(
+                tuner, task, ProposalEvaluator(self.problem, side), make_rng("study", sealed.name)
+            )
             assert trace.status in ("done", "converged"), trace.reason
-            error = np.abs(cube.physical(trace.recommendations) - target.truth)[:, 0]
+            error = np.abs(cube.to_physical(trace.recommendations) - target.truth)[:, 0]
             rows.append(np.append(error, np.full(budget + 1 - len(error), error[-1])))
             seconds += trace.tuner_seconds[1:].tolist()
         return np.array(rows), seconds
@@ -170,7 +189,7 @@ class Study:
     def rows(self, what, tuners, noise=0.0, seconds=0.0):
         """Lines of a table: mean errors of trained tuners, one a seed, by range."""
         found = np.mean([self.errors(tuner, noise=noise)[0] for tuner in tuners], axis=0)
-        kinds = np.array([target.sealed.range for target in self.targets])
+        kinds = np.array([target.blinded.range for target in self.targets])
         for kind in ("in", "wide"):
             part = found[kinds == kind]
             means = {f"mean_{k}": part[:, k].mean() for k in AT} | {
@@ -201,7 +220,7 @@ def ablation(study):
 
 def noisy(study, kept):
     """Rows of targets with sensor noise."""
-    both = Variant("tunenet, with a second network for noise", OURS, Reading(noise=0.01))
+    both = Variant("tunenet, with a second network for noise", OURS, FeatureConfig(noise=0.01))
     study.train(both, 0)
     variants = [kept["published"], kept["+ Broyden's step = tunenet"], both]
     names = ["published", "tunenet, trained without noise", both.says]
@@ -217,10 +236,12 @@ def ensemble(study):
     data, members = study.data((100, 8), 0), []
     for seed in range(MEMBERS):
         one = Variant(f"member {seed}")
-        one.learn(data, rng_for("member", seed))
+        one.train_on(data, make_rng("member", seed))
         members.append(one)
     rows = list(study.rows("one network (mean over members)", members))
-    together = Variant("mean of the members", members=[m.fitted().clean for m in members])
+    together = Variant(
+        "mean of the members", members=[m.get_trained_network().clean for m in members]
+    )
     rows += study.rows(f"{together.says} ({MEMBERS})", [together])
     spread = []
     for target in study.targets:
@@ -230,7 +251,12 @@ def ensemble(study):
         study.problem.cube.training, 1,
                     (len(side.observed),))  # fmt: skip
         seen = study.problem.simulate(target.sealed.start[None], side.scenarios)
-        h = np.array([m.fitted().suited(task).estimator(task)(seen)[0] for m in members])
+        h = np.array(
+            [
+                m.get_trained_network().select_for(task).make_estimator(task)(seen)[0]
+                for m in members
+            ]
+        )
         off = abs(h.mean() - (truth[0] - target.sealed.start[0]))
         spread.append((target.sealed.range, h.std(ddof=1), off))
     return pd.DataFrame(rows), pd.DataFrame(spread, columns=["range", "spread", "error"])
@@ -243,7 +269,7 @@ def cost(study):
     rows = []
     for tuner in (TuneNet(), TuneNetPublished()):
         begin = time.perf_counter()
-        tuner.fit(study.problem.practice(1600), rng_for("cost"), 1600)
+        tuner.fit(study.problem.practice(1600), make_rng("cost"), 1600)
         seconds = time.perf_counter() - begin
         each = study.errors(tuner)[1]
         rows.append((tuner.name, seconds, 1e3 * np.median(each), 1e3 * np.percentile(each, 95)))
@@ -254,7 +280,7 @@ def cost(study):
 
 def path_figure(table):
     names = [v.says for v in path()]
-    figure, grid = blank(1, 2, (10.0, 4.6), sharey=True)
+    figure, grid = make_panel_grid(1, 2, (10.0, 4.6), sharey=True)
     axes = grid[0]
     kinds = {"in": "Targets in the training range", "wide": "Targets anywhere"}
     curves = ((1, ORANGE, "s", ":"), (3, BLUE, "o", "-"), (10, BLACK, "^", "--"))
@@ -281,22 +307,22 @@ def path_figure(table):
 
 
 def differences_figure(study, kept):
-    figure, grid = blank(1, 2, (9.0, 4.2), sharex=True, sharey=True)
+    figure, grid = make_panel_grid(1, 2, (9.0, 4.2), sharex=True, sharey=True)
     axes = grid[0]
     names = {
         "published": "Published network",
         "+ Broyden's step = tunenet": "This project's network",
     }
-    rng, low, high = rng_for("differences"), *study.problem.cube.training[:, 0]
+    rng, low, high = make_rng("differences"), *study.problem.cube.training[:, 0]
     points = rng.uniform(size=(400, 2))
     (scenario,) = study.problem.scenarios(rng)
     seen = study.problem.simulate(points.reshape(-1, 1), (scenario,)).reshape(400, 2, -1, 1)
     inside = ((points > low) & (points < high)).all(axis=1)
     for ax, (key, title) in zip(axes, names.items(), strict=True):
         network = kept[key].fitted().clean
-        pairs = [network.read(seen[:, i], (seen.shape[2],), NOTHING) for i in (0, 1)]
+        pairs = [network.read(seen[:, i], (seen.shape[2],), EMPTY_SCENE) for i in (0, 1)]
         h, true = network.difference(*pairs)[:, 0], points[:, 1] - points[:, 0]
-        ax.plot([-1, 1], [-1, 1], color=JOIN, lw=1)
+        ax.plot([-1, 1], [-1, 1], color=CONNECTOR_GREY, lw=1)
         ax.plot(
             true[~inside],
             h[~inside],
@@ -317,7 +343,7 @@ def differences_figure(study, kept):
 
 
 def spread_figure(spread):
-    figure, grid = blank(1, 1, (5.2, 4.2))
+    figure, grid = make_panel_grid(1, 1, (5.2, 4.2))
     ax = grid[0, 0]
     marks = (
         ("in", "o", BLUE, "targets in the training range"),
@@ -334,7 +360,7 @@ def spread_figure(spread):
             label=f"{label} ({len(part)})",
         )
     line = np.array([spread["spread"].min(), spread["spread"].max()])
-    ax.plot(line, line, color=JOIN, label="error = spread")
+    ax.plot(line, line, color=CONNECTOR_GREY, label="error = spread")
     ax.set(
         xscale="log",
         yscale="log",
@@ -373,9 +399,9 @@ def main():
             f"{kind}: rank correlation {ranks:.2f}, within 2 spreads {within:.0%}, median "
             f"error/spread {ratio:.2g}"
         )
-    save(path_figure(table), options.out / "figures" / "path")
-    save(differences_figure(study, kept), options.out / "figures" / "differences")
-    save(spread_figure(spread), options.out / "figures" / "spread")
+    write_figure(path_figure(table), options.out / "figures" / "path")
+    write_figure(differences_figure(study, kept), options.out / "figures" / "differences")
+    write_figure(spread_figure(spread), options.out / "figures" / "spread")
 
 
 if __name__ == "__main__":

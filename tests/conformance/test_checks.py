@@ -9,21 +9,21 @@ import re
 import numpy as np
 import pytest
 
-from bench.checks import (
+from bench.conformance import (
     EFFECT_CHECKS,
     SIMULATOR_CHECKS,
     TUNER_CHECKS,
     CheckError,
     parametrize,
-    simulators,
-    tuners,
+    simulator_checks,
+    tuner_checks,
 )
-from bench.checks.command import attempt
-from bench.checks.suites import SUITES, failed_need
-from methods.base import Ask, Tuner
-from sims.base import Channel, Constant, Parameter, Simulator
-from sims.own import OwnSimulator
-from sims.system import Coefficient, Force
+from bench.conformance.check_suites import SUITES, failed_need
+from bench.conformance.run_checks import run_check
+from methods.tuner import Proposal, Tuner
+from sims.core.simulator import Channel, Constant, Parameter, Simulator
+from sims.core.system import Coefficient, Force
+from sims.own_simulator import OwnSimulator
 from tests.conftest import PLUGINS
 
 
@@ -54,7 +54,7 @@ class ChokesOnSmallBudgets(Sound):
 
 class LeavesTheCube(Sound):
     def tune(self, task, rng):
-        yield Ask(task.start, recommend=task.start + 2.0)
+        yield Proposal(task.start, recommend=task.start + 2.0)
         yield from super().tune(task, rng)
 
 
@@ -120,7 +120,7 @@ class ChokesOnFailures(Sound):
 class NeverBetter(Sound):
     def tune(self, task, rng):
         while True:
-            yield Ask(rng.uniform(size=(1, task.dim)), recommend=task.start)
+            yield Proposal(rng.uniform(size=(1, task.dim)), recommend=task.start)
 
 
 class ForgetsWhatItLearned(Sound):
@@ -170,8 +170,8 @@ def test_tuner_check_rejects_its_broken_subject_and_no_sound_one(check):
     check(Sound)
     broken = BROKEN_TUNERS[check.__name__]
     if isinstance(broken, str):
-        from bench.registry import load_plugins
-        from bench.registry import tuners as registered
+        from bench.core.plugin_registries import load_plugins
+        from bench.core.plugin_registries import tuners as registered
 
         load_plugins([PLUGINS / "awkward.py"])
         check(registered.get("over_asking"))
@@ -194,9 +194,9 @@ def test_a_learned_tuner_without_storage_and_a_tune_that_does_not_yield_are_reje
             return [task.start]
 
     with pytest.raises(CheckError, match="no state, restore"):
-        tuners.check_api_is_complete(Unfinished)
+        tuner_checks.check_api_is_complete(Unfinished)
     with pytest.raises(CheckError, match=r"expected a generator .* found list"):
-        tuners.check_api_is_complete(Returns)
+        tuner_checks.check_api_is_complete(Returns)
 
 
 def test_training_outside_the_training_range_or_beyond_the_budget_is_rejected():
@@ -207,7 +207,7 @@ def test_training_outside_the_training_range_or_beyond_the_budget_is_rejected():
             simulator.simulate(rng, np.full((1, simulator.dim), 0.9))
 
     with pytest.raises(CheckError, match="training range"):
-        tuners.check_budget_is_exact(Greedy)
+        tuner_checks.check_budget_is_exact(Greedy)
 
 
 class Wave(Simulator):
@@ -314,7 +314,7 @@ class Cart(OwnSimulator):
     def inertia(self):
         return np.eye(2)
 
-    def put(self, levels):
+    def set_levels(self, levels):
         self.now |= levels
 
 
@@ -415,7 +415,7 @@ class KeepsForces(Cart):
 class IgnoresPut(Cart):
     name = "ignores_put"
 
-    def put(self, levels):
+    def set_levels(self, levels):
         pass
 
 
@@ -498,13 +498,13 @@ def test_simulator_check_rejects_its_broken_subject_and_no_sound_one(check):
     ],
 )
 def test_one_cause_gives_one_failure(kind, failing, says, fresh_registries):
-    from bench.registry import simulators as registered
+    from bench.core.plugin_registries import simulators as registered
 
     registered.register(kind)
     failed = {}
     for place, check in enumerate(SUITES["simulator"]):
         if failed_need(check, failed) is None:
-            line = attempt("simulator", kind.name, place)
+            line = run_check("simulator", kind.name, place)
             if line and not line.startswith("not applicable"):
                 failed[check] = line
     assert [check.__name__ for check in failed] == [failing], failed
@@ -531,20 +531,20 @@ def test_parametrized_tests_skip_what_means_nothing_without_a_check_that_failed(
 def test_the_test_simulator_conforms(spring):
     for check in SIMULATOR_CHECKS:
         if (
-            check is not simulators.check_unknown_names_are_refused
+            check is not simulator_checks.check_unknown_names_are_refused
         ):  # it takes neither inputs nor constants
             check(spring)
 
 
 def test_awkward_tuners_do_not_conform():
-    from bench.registry import load_plugins
-    from bench.registry import tuners as registered
+    from bench.core.plugin_registries import load_plugins
+    from bench.core.plugin_registries import tuners as registered
 
     load_plugins([PLUGINS / "awkward.py"])
     with pytest.raises(CheckError, match="boom"):
-        tuners.check_runs_in_one_and_in_ten_dimensions(registered.get("crashing"))
+        tuner_checks.check_runs_in_one_and_in_ten_dimensions(registered.get("crashing"))
     with pytest.raises(CheckError, match="not finite"):
-        tuners.check_runs_in_one_and_in_ten_dimensions(registered.get("nan_proposing"))
+        tuner_checks.check_runs_in_one_and_in_ten_dimensions(registered.get("nan_proposing"))
 
 
 class Breeze(Force):
@@ -668,9 +668,11 @@ def test_effect_check_rejects_its_broken_subject_and_no_sound_one(
     check(Breeze)
     broken = BROKEN_EFFECTS[check.__name__]
     if broken is Elsewhere:
-        from sims.simulated import Simulated
+        from sims.system_simulator import SystemSimulator
 
         broken.asked = True
-        monkeypatch.setattr(Simulated, "_effect", lambda self, name: effects.get(name)())
+        monkeypatch.setattr(
+            SystemSimulator, "_effect", lambda self, name: effects.get_effect(name)()
+        )
     with pytest.raises(CheckError, match=r"(?s)expected .*; found .*; see "):
         check(broken)

@@ -5,9 +5,9 @@ import random
 import numpy as np
 import pytest
 
-from bench.checks import CheckError
-from bench.checks import diagnosers as checks
-from bench.diagnoser import Answer, Diagnoser, Named
+from bench.conformance import CheckError
+from bench.conformance import diagnoser_checks as checks
+from bench.core.diagnoser import Answer, Diagnoser, NamedCause
 
 
 class Right(Diagnoser):
@@ -29,12 +29,12 @@ class NamesNothing(Right):
 
 class NamesTheWind(Right):
     def diagnose(self, case):
-        return Answer("named", (Named("restitution.speed"),))  # of a slider
+        return Answer("named", (NamedCause("restitution.speed"),))  # of a slider
 
 
 class NamesTwice(Right):
     def diagnose(self, case):
-        return Answer("ambiguous", (Named("drag.linear", ("drag.linear",)),))
+        return Answer("ambiguous", (NamedCause("drag.linear", ("drag.linear",)),))
 
 
 class ChangesItsMind(Right):
@@ -61,7 +61,7 @@ class Spends(Right):
     """It takes the error for a crash of its own, and says what it would have said."""
 
     def diagnose(self, case):
-        checks.TALLY.most = None
+        checks.SIMULATION_COUNTER.limit = None
         for run in case.recording.runs * 20:
             case.simulate(run)
         return "adequate"

@@ -2,21 +2,21 @@
 
 import pytest
 
-from bench.checks import (
+from bench.conformance import (
     DIAGNOSER_CHECKS,
     EFFECT_CHECKS,
     SIMULATOR_CHECKS,
     TUNER_CHECKS,
     CheckError,
 )
-from bench.registry import SkippedError, diagnosers, simulators, tuners
+from bench.core.plugin_registries import PartUnavailableError, diagnosers, simulators, tuners
 from sims import effects
 
 
 def subject(registry, name):
     try:
         return registry.get(name)
-    except SkippedError as reason:
+    except PartUnavailableError as reason:
         pytest.skip(f"{name}: {reason}")
 
 
@@ -45,9 +45,9 @@ def test_simulator(name, check):
 
 
 @pytest.mark.parametrize("check", EFFECT_CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", effects.names())
+@pytest.mark.parametrize("name", effects.list_names())
 def test_effect(name, check):
-    made(check, effects.get(name))
+    made(check, effects.get_effect(name))
 
 
 @pytest.mark.parametrize("name", diagnosers.names())

@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from tests.docs.pages import ROOT, quoted, section, tables, text_of
+from tests.docs.documentation_pages import ROOT, quoted, section, tables, text_of
 
 PAGE = text_of("choosing-a-tuner.md")
 REFERENCE = ROOT / "results" / "reference"

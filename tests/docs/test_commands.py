@@ -5,8 +5,8 @@ import shlex
 
 import pytest
 
-from bench.cli import parser
-from tests.docs.pages import ROOT, blocks, pages
+from bench.cli.main import build_parser
+from tests.docs.documentation_pages import ROOT, blocks, pages
 
 SYNOPSIS = re.compile(r" \[-")
 """What stands in no command: an option in brackets."""
@@ -25,7 +25,7 @@ def commands(text):
 def refused(words):
     """Whether the program's parser refuses a command line."""
     try:
-        parser().parse_args(words)
+        build_parser().parse_args(words)
     except SystemExit as end:  # --help
         return bool(end.code)
     except Exception:  # whatever the parser says of it
@@ -48,23 +48,23 @@ def test_commands_in_the_table_of_the_readme_are_taken(capsys):
 
 def named_wrongly(words):
     """What a command line names that does not exist; empty where all does, or is a user's file."""
-    from bench.api.train import choose
-    from bench.datasets import catalogue
-    from bench.problem.experiment import load
-    from bench.registry import tuners
-    from sims.base import InputError
+    from bench.api.train import select_training
+    from bench.benchmark.problem.experiment import load_experiment
+    from bench.core.plugin_registries import tuners
+    from bench.datasets import dataset_catalogue
+    from sims.core.simulator import InputError
 
-    options = parser().parse_args(words)
+    options = build_parser().parse_args(words)
     own = getattr(options, "plugin", None)
     try:
         if words[0] == "train" and not own:
-            choose(options.tuner, options.simulator, options.experiment)
+            select_training(options.tuner, options.simulator, options.experiment)
         elif words[0] == "download":
-            [catalogue.get(name) for name in options.names if name != "all"]
+            [dataset_catalogue.get(name) for name in options.names if name != "all"]
         elif words[0] == "compare" and (name := options.experiment) and not name.endswith(".toml"):
-            labels = {entry.label for entry in load(name).tuners}
+            labels = {entry.label for entry in load_experiment(name).tuners}
             for label in [] if own or not options.tuners else options.tuners.split(","):
-                if label not in labels and not load(name).diagnosis:
+                if label not in labels and not load_experiment(name).diagnosis:
                     tuners.get(label)
     except InputError as error:
         return str(error)

@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from bench.problem.experiment import load
-from tests.docs.pages import FENCE, ROOT, blocks, quoted, section, tables, text_of
+from bench.benchmark.problem.experiment import load_experiment
+from tests.docs.documentation_pages import FENCE, ROOT, blocks, quoted, section, tables, text_of
 
 SIMGAP = [sys.executable, "-m", "simgap"]
 
@@ -32,7 +32,7 @@ def test_the_tuner_of_the_page_keeps_the_contract(tmp_path):
 def test_the_experiment_of_the_page_reads_as_it_says(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(block("compare.md", "mine.toml"), encoding="utf-8")
-    experiment = load(str(path))
+    experiment = load_experiment(str(path))
     assert experiment.targets == 3
     assert str(experiment.recording.path).endswith("swing.csv")
     assert [entry.tuner for entry in experiment.tuners] == ["least_squares", "cma_es", "random"]
@@ -65,7 +65,7 @@ def test_the_simulator_of_the_page_does_what_the_page_says(tmp_path):
 
 
 def test_every_attribute_and_method_of_an_own_simulator_is_on_its_page():
-    from sims.own import OwnSimulator
+    from sims.own_simulator import OwnSimulator
 
     page = text_of("own-simulator.md")
     rows = [row[0] for table in tables(page) for row in table]

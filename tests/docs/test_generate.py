@@ -3,9 +3,9 @@
 import pytest
 
 import simgap
-from tests.docs import names, tuners
-from tests.docs.generate import COMMAND, PAGES, ROWS, row_schema
-from tests.docs.pages import ROOT, text_of
+from tests.docs import documented_names, tuner_table
+from tests.docs.documentation_pages import ROOT, text_of
+from tests.docs.generate_pages import COMMAND, PAGES, ROWS, row_schema
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -21,20 +21,20 @@ def test_the_schema_of_a_row_is_what_the_columns_say(name):
 
 def test_every_public_name_is_on_its_page():
     public = {name for name in dir(simgap) if name in simgap.__all__}
-    assert set(names.listed()) | names.UNDOCUMENTED == public
+    assert set(documented_names.listed()) | documented_names.UNDOCUMENTED == public
 
 
 def test_every_tuner_is_on_its_page():
     page = text_of("reference/tuners.md")
-    assert len(tuners.registered()) > 12
-    assert [name for name, *_ in tuners.registered() if f"`{name}`" not in page] == []
+    assert len(tuner_table.registered()) > 12
+    assert [name for name, *_ in tuner_table.registered() if f"`{name}`" not in page] == []
 
 
 def test_every_equation_is_set_once_and_used():
     page = text_of("reference/tuners.md")
-    assert [words for words, latex in tuners.SET.items() if latex not in page] == []
+    assert [words for words, latex in tuner_table.SET.items() if latex not in page] == []
 
 
 def test_an_equation_that_is_changed_in_the_code_has_to_be_set_anew():
     with pytest.raises(KeyError, match="EI = f"):
-        list(tuners.paragraphs("With m the mean:\n\n    (1)  EI = f - m"))
+        list(tuner_table.paragraphs("With m the mean:\n\n    (1)  EI = f - m"))

@@ -7,8 +7,8 @@ import re
 import pandas as pd
 import pytest
 
-from bench.pages.page import _policy
-from tests.docs.pages import ROOT
+from bench.pages.html_page import _policy
+from tests.docs.documentation_pages import ROOT
 
 REFERENCE = ROOT / "results" / "reference"
 PAGES = sorted(page.parent for page in REFERENCE.rglob("report.html"))

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.docs.pages import DOCS, FENCE, LINK, ROOT, anchors, pages
+from tests.docs.documentation_pages import DOCS, FENCE, LINK, ROOT, anchors, pages
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))

@@ -7,7 +7,7 @@ import os
 import pytest
 
 import simgap
-from tests.docs.pages import DOCS, ROOT, blocks, text_of
+from tests.docs.documentation_pages import DOCS, ROOT, blocks, text_of
 
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 

@@ -4,11 +4,11 @@ import re
 
 import pytest
 
-from bench.recordings.inspection import summary
-from sims.base import InputError
-from sims.pendulum.simulator import Pendulum
-from sims.recording.recording import read_recording, system_of
-from tests.docs.pages import blocks, quoted, section, tables, text_of
+from bench.logs.inspection import format_summary
+from sims.core.simulator import InputError
+from sims.recording.recording import read_recording, read_system_name
+from sims.systems.pendulum import Pendulum
+from tests.docs.documentation_pages import blocks, quoted, section, tables, text_of
 
 PAGE = text_of("recording.md")
 BLOCKS = dict(blocks(PAGE))
@@ -27,7 +27,7 @@ def files(tmp_path, monkeypatch):
 def test_the_example_reads_as_the_page_says(files):
     recording = read_recording("swing.csv", Pendulum)
     light, heavy, last = recording.runs
-    assert system_of("swing.csv") == "pendulum"
+    assert read_system_name("swing.csv") == "pendulum"
     assert recording.noise == {"q": pytest.approx(0.2 * 3.141592653589793 / 180)}
     assert recording.extra == {"temperature": "degC"}
     assert light.inputs["u"].tolist() == pytest.approx([0, 0, 0.05, 0.05])
@@ -37,7 +37,7 @@ def test_the_example_reads_as_the_page_says(files):
 
 
 def test_inspect_says_what_the_page_shows(files):
-    lines = [*summary(read_recording("swing.csv", Pendulum), Pendulum)]
+    lines = [*format_summary(read_recording("swing.csv", Pendulum), Pendulum)]
     assert "\n".join(lines) + "\n" == BLOCKS["inspect"]
 
 

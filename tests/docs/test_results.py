@@ -7,25 +7,25 @@ import pandas as pd
 import pytest
 import tomli_w
 
-from bench.analysis.amortisation import EVEN_COLUMNS
-from bench.analysis.paired import PAIR_COLUMNS
-from bench.analysis.table import METRICS
-from bench.cli import main
-from bench.compare import Comparison
-from bench.figures.comparison import FILES
-from bench.problem.experiment import load
-from bench.shot.deal import deals
-from bench.shot.settings import settings_of
-from bench.shot.table import COLUMNS as SHOT_COLUMNS
-from bench.shot.throw import thrown
-from bench.shot.tune import TunedModel
-from bench.store.status import FAILURES
-from sims.camera.camera import Camera
-from sims.camera.files import Filmed, described
-from sims.user_toml import read_toml
+from bench.benchmark.comparison import Comparison
+from bench.benchmark.figures.comparison_figures import FIGURE_FILES
+from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.statistics.error_table import ERROR_METRICS
+from bench.benchmark.statistics.paired_tests import PAIR_COLUMNS
+from bench.benchmark.statistics.training_amortisation import BREAK_EVEN_COLUMNS
+from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
+from bench.bounce_shot.hit_rate_table import RESULT_COLUMNS as SHOT_COLUMNS
+from bench.bounce_shot.shot_config import read_shot_config
+from bench.bounce_shot.shot_execution import build_shot_rows
+from bench.bounce_shot.shot_planning import TunedModel
+from bench.bounce_shot.shot_sampling import draw_shots
+from bench.cli.main import main
+from sims.core.toml_validation import read_toml
+from sims.vision.camera_file import FilmDescription, format_camera_file
+from sims.vision.pinhole_camera import PinholeCamera
 from tests.conftest import PLUGINS
-from tests.docs.pages import quoted, section, tables, text_of
-from tests.experiments import SPRING, spring_experiment
+from tests.docs.documentation_pages import quoted, section, tables, text_of
+from tests.sample_experiments import SPRING, spring_experiment
 
 PAGES = ("results.md", "results-explain.md", "results-films.md")
 PAGE = "\n".join(text_of(page) for page in PAGES)
@@ -87,8 +87,8 @@ def folder(tmp_path_factory, spring):
     )
     path = tmp_path_factory.mktemp("results") / "spring"
     comparison = Comparison.begin(experiment, [SPRING_PLUGIN], path, jobs=1)
-    comparison.make(jobs=1)
-    comparison.finish(lambda _: None)
+    comparison.run(jobs=1)
+    comparison.report(lambda _: None)
     return path
 
 
@@ -116,10 +116,10 @@ def test_every_metric_and_status_is_on_the_page(folder):
     rows = tables(section(PAGE, "### `table.csv`"))[0]
     # In the cell the metrics stand beside the file whose columns they are.
     (metrics,) = [row[2] for row in rows if row[0] == "`metric`"]
-    assert set(quoted(metrics)) - {"runs.parquet"} == set(METRICS)
+    assert set(quoted(metrics)) - {"runs.parquet"} == set(ERROR_METRICS)
     statuses = tables(section(PAGE, "### `status.csv`"))[1][1:]
     failed = {quoted(row[0])[0] for row in statuses if row[2] != "no"}
-    assert failed == set(FAILURES)
+    assert failed == set(FAILED_OR_SKIPPED_STATUSES)
 
 
 def test_the_environment_is_described(folder):
@@ -134,7 +134,7 @@ def test_every_figure_is_described(folder):
     # of targets from another simulator, beyond the training range, and with sloppy directions
     assert names - figures <= {"misfit-vs-simulations", "error-vs-distance"}
     rows = tables(section(PAGE, "### Figures of a comparison"))[0][1:]
-    assert {quoted(row[1])[0]: quoted(row[0])[0] for row in rows} == FILES
+    assert {quoted(row[1])[0]: quoted(row[0])[0] for row in rows} == FIGURE_FILES
 
 
 def test_several_comparisons(folder, tmp_path, capsys):
@@ -145,16 +145,16 @@ def test_several_comparisons(folder, tmp_path, capsys):
     names = written_out(told("### `ranks.csv`"), TUNER=TUNERS)
     assert set(columns(tmp_path / "all" / "ranks.csv")) == set(names)
     assert {*PAIR_COLUMNS, "trusted"} == set(columns(tmp_path / "all" / "pairs.csv"))
-    assert {*EVEN_COLUMNS, "trusted"} == set(told("### `break_even.csv`"))
+    assert {*BREAK_EVEN_COLUMNS, "trusted"} == set(told("### `compute_break_even_targets.csv`"))
 
 
 def test_the_tables_of_the_bounce_shot():
     assert told("### `table.csv` of shots") == [*SHOT_COLUMNS, "trusted"]
-    experiment = load("bounce-shot")
-    settings = settings_of(experiment)
+    experiment = load_experiment("bounce-shot")
+    settings = read_shot_config(experiment)
     # Without a plan no shot is flown, and the row has its columns all the same.
     nothing = vars(TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan"))
-    (row,) = thrown(deals(experiment, settings)[0], settings, [nothing])
+    (row,) = build_shot_rows(draw_shots(experiment, settings)[0], settings, [nothing])
     assert [*row, "seen", "trusted"] == told("### `shots.csv`")
 
 
@@ -200,7 +200,9 @@ def test_the_score(explained, capsys):
 
 def test_the_camera_of_a_film(tmp_path):
     path = tmp_path / "film.camera.toml"
-    path.write_text(described(Filmed(Camera(0.0, 5.0, 2.0), 0.1)), encoding="utf-8")
+    path.write_text(
+        format_camera_file(FilmDescription(PinholeCamera(0.0, 5.0, 2.0), 0.1)), encoding="utf-8"
+    )
     keys = {f"{table}.{key}" for table, entries in read_toml(path).items() for key in entries}
     assert keys == set(told("### `NAME.camera.toml`"))
 

@@ -6,9 +6,9 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 from tests.browser import WIDTHS, Opened
-from tests.docs.pages import DOCS, pages
-from tests.docs.site import build
-from tests.docs.stage import Stage, place
+from tests.docs.documentation_pages import DOCS, pages
+from tests.docs.documentation_site import build
+from tests.docs.example_folder import Stage, place
 
 tomllib = pytest.importorskip("tomllib")  # the site's tool, too, is for Python 3.11 and newer
 pytest.importorskip("zensical")

@@ -2,10 +2,10 @@ import cma
 import numpy as np
 import pytest
 
-from bench.runs.drive import drive
-from methods.base import Array, Evaluation
-from methods.cma_es import CMAES
-from tests.methods.problems import START, TRUTH, decays, errors, problem, run, smooth
+from bench.benchmark.runner.tuner_loop import drive_tuner
+from methods.tuner import Array, Evaluation
+from methods.tuners.cma_es import CMAES
+from tests.methods.analytic_problems import START, TRUTH, decays, errors, problem, run, smooth
 
 PUBLISHED = CMAES(sigma=0.1, population=10, recommend="mean", evaluate_start=False)
 
@@ -76,6 +76,6 @@ def test_restarts_with_twice_the_population_when_pycma_stops() -> None:
         seen = steps.send(Evaluation(points, *flat[1](points)))
     assert sizes[0] == 1
     assert sorted(set(sizes[1:])) == [6, 12, 24, 48, 96, 192, 384, 400]  # no more than the budget
-    trace = drive(CMAES(restarts=False), *flat, np.random.default_rng(0))
+    trace = drive_tuner(CMAES(restarts=False), *flat, np.random.default_rng(0))
     assert trace.status == "converged"
     assert trace.reason.startswith("pycma: tol")

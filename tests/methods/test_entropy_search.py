@@ -1,17 +1,17 @@
 import numpy as np
 import pytest
 
-from methods.base import Array
-from methods.entropy_search import (
+from methods.learning.gaussian_process import GaussianProcess, KernelSettings
+from methods.tuner import Array
+from methods.tuners.entropy_search import (
     EntropySearch,
-    finite,
-    logarithm,
-    minimiser_probability,
-    spread,
-    uncertainty,
+    compute_entropy_terms,
+    compute_log_losses,
+    compute_minimiser_probability,
+    generate_quasi_random_points,
+    replace_failed_losses,
 )
-from methods.learning.gaussian_process import GaussianProcess, Settings
-from tests.methods.problems import START, TRUTH, decays, errors, run, smooth
+from tests.methods.analytic_problems import START, TRUTH, decays, errors, run, smooth
 
 PUBLISHED = EntropySearch(published=True)
 
@@ -19,22 +19,24 @@ PUBLISHED = EntropySearch(published=True)
 def bowl(centre: float) -> GaussianProcess:
     points = np.linspace(0.0, 1.0, 8)[:, None]
     return GaussianProcess(
-        points, (points[:, 0] - centre) ** 2, Settings(kernel="rbf", noise=(1e-8, 0.1))
+        points, (points[:, 0] - centre) ** 2, KernelSettings(kernel="rbf", noise=(1e-8, 0.1))
     )
 
 
 @pytest.mark.parametrize("truth", [0.0, 0.3, 0.77])
 def test_probability_of_the_minimiser_sums_to_one_and_peaks_at_the_truth(truth: float) -> None:
     grid = np.linspace(0.0, 1.0, 101)[:, None]
-    p = minimiser_probability(bowl(truth), grid, 400, np.random.default_rng(0))
+    p = compute_minimiser_probability(bowl(truth), grid, 400, np.random.default_rng(0))
     assert p.sum() == pytest.approx(1.0, abs=1e-12)
     assert p.min() >= 0.0
     assert abs(grid[p.argmax(), 0] - truth) <= 0.021
 
 
 def test_probability_is_even_where_nothing_is_known() -> None:
-    process = GaussianProcess(np.array([[0.5]]), np.array([1.0]), Settings(length=(1e-3, 1.0)))
-    p = minimiser_probability(
+    process = GaussianProcess(
+        np.array([[0.5]]), np.array([1.0]), KernelSettings(length=(1e-3, 1.0))
+    )
+    p = compute_minimiser_probability(
         process, np.linspace(0.0, 0.4, 10)[:, None], 20000, np.random.default_rng(0)
     )
     assert np.allclose(p, 0.1, atol=0.01)
@@ -42,8 +44,8 @@ def test_probability_is_even_where_nothing_is_known() -> None:
 
 def test_uncertainty_is_minus_p_log_p() -> None:
     expected = [0.5 * np.log(2.0), 0.25 * np.log(4.0), 0.25 * np.log(4.0), -1.0]
-    assert uncertainty(np.array([0.5, 0.25, 0.25, 0.0])) == pytest.approx(expected)
-    assert uncertainty(np.array([0.0, 1.0, 0.0])).argmax() == 1
+    assert compute_entropy_terms(np.array([0.5, 0.25, 0.25, 0.0])) == pytest.approx(expected)
+    assert compute_entropy_terms(np.array([0.0, 1.0, 0.0])).argmax() == 1
 
 
 def test_published_search_stays_on_its_grid_and_stops_when_its_estimate_repeats() -> None:
@@ -84,7 +86,7 @@ def test_spread_points_are_even() -> None:
         return float(np.diff(np.sort(points[:, 0])).max())
 
     for dim in (1, 2, 10):
-        points = spread(200, np.full(dim, 0.3))
+        points = generate_quasi_random_points(200, np.full(dim, 0.3))
         assert points.shape == (200, dim)
         assert points.min() >= 0.0
         assert points.max() < 1.0
@@ -93,6 +95,11 @@ def test_spread_points_are_even() -> None:
 
 
 def test_failed_simulations_count_as_the_worst() -> None:
-    assert finite(np.array([1.0, np.nan, 3.0, np.inf])).tolist() == [1.0, 3.0, 3.0, 3.0]
-    assert finite(np.array([np.nan])).tolist() == [0.0]
-    assert np.isfinite(logarithm(np.zeros(3))).all()
+    assert replace_failed_losses(np.array([1.0, np.nan, 3.0, np.inf])).tolist() == [
+        1.0,
+        3.0,
+        3.0,
+        3.0,
+    ]
+    assert replace_failed_losses(np.array([np.nan])).tolist() == [0.0]
+    assert np.isfinite(compute_log_losses(np.zeros(3))).all()

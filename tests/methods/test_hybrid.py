@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 
-from bench.runs.drive import drive
-from methods.base import Evaluation, Task
-from methods.hybrid import Hybrid, _complement
-from methods.least_squares import History, LeastSquares
-from methods.tunenet import TuneNet
+from bench.benchmark.runner.tuner_loop import drive_tuner
+from methods.tuner import Evaluation, Task
+from methods.tuners.hybrid import TuneNetLeastSquares, _orthogonal_complement
+from methods.tuners.least_squares import EvaluationHistory, LeastSquares
+from methods.tuners.tunenet import TuneNet
 from tests.methods.test_tunenet import TRAINING, Toy, run
 
 
 def trained(toy, **options):
-    tuner = Hybrid(**{"scenarios": 40, "points": 60, "epochs": 100, **options})
+    tuner = TuneNetLeastSquares(**{"scenarios": 40, "points": 60, "epochs": 100, **options})
     tuner.fit(toy, np.random.default_rng(0), toy.budget)
     return tuner
 
@@ -63,7 +63,7 @@ def test_noise_is_averaged_as_least_squares_does(two):
 def seen_so_far(points, matrix, offset=0.0):
     """A run whose residuals are linear in the points."""
     task = Task(2, np.zeros(2), np.zeros((4, 1)), np.ones(1), TRAINING[2], 9, (4,))
-    run = History(task, 0.0)
+    run = EvaluationHistory(task, 0.0)
     residuals = points @ matrix.T + offset
     for point, residual in zip(points, residuals, strict=True):
         run.tried.append(point)
@@ -74,7 +74,7 @@ def seen_so_far(points, matrix, offset=0.0):
 
 def modelled(run, matrix):
     """The model, and the points that had to be simulated for it."""
-    steps, asked = Hybrid()._model(run, LeastSquares()), []
+    steps, asked = TuneNetLeastSquares()._model(run, LeastSquares()), []
     try:
         points = next(steps)
         while True:
@@ -110,7 +110,7 @@ def test_model_simulates_only_the_directions_that_are_missing():
 
 def test_complement_is_orthonormal():
     basis = [np.array([0.6, 0.8, 0.0])]
-    directions = _complement(basis, 3)
+    directions = _orthogonal_complement(basis, 3)
     assert directions.shape == (2, 3)
     assert np.allclose(directions @ directions.T, np.eye(2))
     assert np.allclose(directions @ basis[0], 0.0)
@@ -120,7 +120,7 @@ def test_everything_fails_and_it_still_uses_its_budget(two):
     toy = Toy(2, runs=3)
     toy.observe = lambda points, scenario: np.full((len(points), 180, 2), np.nan)
     task = Task(2, np.full(2, 0.5), np.zeros((180, 2)), np.ones(2), TRAINING[2], 9, (60, 60, 60))
-    trace = drive(
+    trace = drive_tuner(
         two,
         task,
         lambda p: (toy.observe(p, None), np.full(len(p), np.inf)),

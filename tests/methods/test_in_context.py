@@ -1,15 +1,23 @@
 import numpy as np
 import pytest
 
-from methods.in_context import InContext
-from methods.learning.histories import binary_search, in_order, shuffled
-from methods.learning.sequence_network import Design, proposals, shapes
+from methods.learning.history_transformer import (
+    HistoryTransformerDesign,
+    get_weight_shapes,
+    predict_proposals,
+)
+from methods.learning.tuning_histories import (
+    draw_binary_search,
+    make_ordered_histories,
+    make_shuffled_histories,
+)
+from methods.tuners.in_context import InContextTransformer
 from tests.methods.test_tunenet import Toy, errors, run
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    tuner = InContext(scenarios=40, points=60, noise=0.0)
+    tuner = InContextTransformer(scenarios=40, points=60, noise=0.0)
     tuner.fit(Toy(), np.random.default_rng(0), 10_000)
     return tuner
 
@@ -44,28 +52,37 @@ def test_a_simulation_that_shows_the_target_is_where_it_stays(fitted):
     toy = Toy()
     truth, scenario = np.array([0.55]), np.array([1.3])
     network = fitted._prepared.clean
-    row = network.seen(network.read(toy.observe(truth[None], scenario), toy.lengths, toy.scene))[0]
-    far = network.seen(network.read(toy.observe(truth[None] - 0.2, scenario), (60,), toy.scene))
+    row = network.apply_weights(
+        network.input_features(toy.observe(truth[None], scenario), toy.lengths, toy.scene)
+    )[0]
+    far = network.apply_weights(
+        network.input_features(toy.observe(truth[None] - 0.2, scenario), (60,), toy.scene)
+    )
     found = network.following(row, [*far, row], [truth - 0.2, truth])
     assert found == pytest.approx(truth, abs=1e-7)
 
 
 def test_no_token_hears_a_later_one():
-    design = Design(published=True)
+    design = HistoryTransformerDesign(published=True)
     rng = np.random.default_rng(0)
-    w = {name: 0.3 * rng.normal(size=shape) for name, shape in shapes(5, 2, design).items()}
+    w = {
+        name: 0.3 * rng.normal(size=shape)
+        for name, shape in get_weight_shapes(5, 2, design).items()
+    }
     target, shown = rng.normal(size=design.seen), rng.normal(size=(4, design.seen))
     tried = rng.normal(size=(4, 2))
-    whole = proposals(np, w, design, target, shown, tried)
+    whole = predict_proposals(np, w, design, target, shown, tried)
     for k in range(4):
-        assert proposals(np, w, design, target, shown[:k], tried[:k]) == pytest.approx(
+        assert predict_proposals(np, w, design, target, shown[:k], tried[:k]) == pytest.approx(
             whole[: k + 1], abs=1e-12
         )
 
 
 def test_the_published_aim_searches_and_begins_at_the_start():
     toy = Toy()
-    tuner = InContext(published=True, window=3, scenarios=20, points=60, noise=0.0, epochs=20)
+    tuner = InContextTransformer(
+        published=True, window=3, scenarios=20, points=60, noise=0.0, epochs=20
+    )
     tuner.fit(toy, np.random.default_rng(0), 10_000)
     assert toy.calls == [8] * 20
     trace, _ = run(tuner, toy, 0)
@@ -82,7 +99,7 @@ def test_histories_are_binary_searches_for_their_first_point():
 
     widths = []
     for seed in range(200):
-        target, *points = binary_search(Box(), np.random.default_rng(seed), 8)
+        target, *points = draw_binary_search(Box(), np.random.default_rng(seed), 8)
         low, high = Box.training.copy()
         for point in points:
             assert ((low <= point) & (point <= high)).all()
@@ -93,9 +110,9 @@ def test_histories_are_binary_searches_for_their_first_point():
 
 
 def test_histories_name_no_target_among_what_was_tried():
-    drawn = shuffled(np.random.default_rng(0), 8, 7)
+    drawn = make_shuffled_histories(np.random.default_rng(0), 8, 7)
     assert all(sorted([t, *rest]) == list(range(8)) for t, rest in zip(*drawn, strict=True))
     assert not np.array_equal(drawn.tried[0], np.sort(drawn.tried[0]))
-    ordered = in_order(8, 3)
+    ordered = make_ordered_histories(8, 3)
     assert ordered.targets.tolist() == [0] * 5
     assert ordered.tried[[0, -1]].tolist() == [[1, 2, 3], [5, 6, 7]]

@@ -3,9 +3,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from methods.base import Array, Evaluation
-from methods.least_squares import History, LeastSquares, _Damping
-from tests.methods.problems import START, TRUTH, decays, errors, logistic, problem, run, smooth
+from methods.tuner import Array, Evaluation
+from methods.tuners.least_squares import EvaluationHistory, LeastSquares, _Damping
+from tests.methods.analytic_problems import (
+    START,
+    TRUTH,
+    decays,
+    errors,
+    logistic,
+    problem,
+    run,
+    smooth,
+)
 
 PLAIN = LeastSquares(horizons=(1.0,), secant=False, difference=1e-6, damping=1e-12, restart=False)
 
@@ -45,10 +54,10 @@ def test_horizon_is_a_share_of_each_run() -> None:
     task, _ = problem(decays, TRUTH[:2], START[:2], 5, observed=np.zeros((6, 2)))
     task = type(task)(2, task.start, task.observed, task.scale, task.training, 5, (4, 2))
     assert (
-        History(task, 0.0).samples(0.5).tolist()
+        EvaluationHistory(task, 0.0).select_samples(0.5).tolist()
         == [True] * 4 + [False] * 4 + [True] * 2 + [False] * 2
     )
-    assert History(task, 0.0).samples(1.0).all()
+    assert EvaluationHistory(task, 0.0).select_samples(1.0).all()
 
 
 def test_finite_differences_are_one_batch_and_step_inward_at_the_border() -> None:
@@ -110,8 +119,8 @@ def test_new_start_leaves_a_local_minimum() -> None:
 
 def test_new_starts_are_far_from_what_was_tried() -> None:
     task, _ = smooth(1, 5)
-    record = History(task, 0.0, tried=[np.array([0.0]), np.array([0.5])])
-    assert record.untried(np.random.default_rng(0))[0] == pytest.approx(1.0, abs=0.05)
+    record = EvaluationHistory(task, 0.0, tried=[np.array([0.0]), np.array([0.5])])
+    assert record.find_untried_point(np.random.default_rng(0))[0] == pytest.approx(1.0, abs=0.05)
 
 
 def test_noise_leaves_the_least_squares_estimate() -> None:

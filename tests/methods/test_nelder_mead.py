@@ -4,9 +4,9 @@ import nlopt
 import numpy as np
 import pytest
 
-from methods.base import Array
-from methods.nelder_mead import NelderMead
-from tests.methods.problems import START, TRUTH, decays, errors, problem, run, smooth
+from methods.tuner import Array
+from methods.tuners.nelder_mead import NelderMead
+from tests.methods.analytic_problems import START, TRUTH, decays, errors, problem, run, smooth
 
 
 @pytest.mark.parametrize("dim", [1, 2, 5])

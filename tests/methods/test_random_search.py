@@ -1,7 +1,7 @@
 import numpy as np
 
-from methods.random_search import RandomSearch
-from tests.methods.problems import run, smooth
+from methods.tuners.random_search import RandomSearch
+from tests.methods.analytic_problems import run, smooth
 
 
 def test_draws_are_the_generators_uniform_ones() -> None:

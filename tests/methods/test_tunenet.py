@@ -3,12 +3,22 @@ import sys
 import numpy as np
 import pytest
 
-from bench.runs.drive import drive
-from methods.base import NOTHING, Array, BudgetExceededError, Task
-from methods.learning.pair_inputs import resample, roughness, weighed_inputs
-from methods.learning.pair_network import PUBLISHED, Design, Sides, estimate, train
-from methods.learning.rehearsal import Rehearsal
-from methods.tunenet import RootSearch, TuneNet, TuneNetPublished
+from bench.benchmark.runner.tuner_loop import drive_tuner
+from methods.learning.observation_features import (
+    estimate_noise_sigma,
+    make_weighted_features,
+    resample_runs,
+)
+from methods.learning.pair_network import (
+    PUBLISHED_DESIGN,
+    PairInputs,
+    PairNetworkDesign,
+    estimate_difference,
+    train_pair_network,
+)
+from methods.learning.training_data import TrainingData
+from methods.tuner import EMPTY_SCENE, Array, BudgetExceededError, Task
+from methods.tuners.tunenet import BroydenSearch, TuneNet, TuneNetPublished
 
 TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
 
@@ -39,7 +49,7 @@ class Toy:
 
     def known(self, scenario):
         """What a tuner is told of a scenario."""
-        return NOTHING
+        return EMPTY_SCENE
 
     def observe(self, points, scenario):
         return np.concatenate([swing(points, amplitude) for amplitude in scenario], axis=1)
@@ -72,7 +82,7 @@ def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
         seen = toy.observe(points, scenario)
         return seen, np.sqrt(np.nanmean((seen - observed) ** 2, axis=(1, 2)))
 
-    trace = drive(tuner, task, evaluate, rng)
+    trace = drive_tuner(tuner, task, evaluate, rng)
     assert trace.status in ("done", "converged"), trace.reason
     return trace, truth
 
@@ -150,23 +160,24 @@ def test_a_noisy_target_is_left_to_the_network_that_knows_noise(one):
 def test_roughness_is_the_noise_and_sees_no_motion():
     t = np.linspace(0.0, 6.0, 2000)
     smooth = np.stack([np.sin(t), t**2], axis=1)[None]
-    assert roughness(smooth, (1000, 1000)).max() < 1e-7
+    assert estimate_noise_sigma(smooth, (1000, 1000)).max() < 1e-7
     rough = smooth + np.array([0.01, 0.3]) * np.random.default_rng(0).standard_normal(smooth.shape)
     rough[0, 5:50] = np.nan
-    share = roughness(rough, (1000, 1000))[0] / [
+    share = estimate_noise_sigma(rough, (1000, 1000))[0] / [
         0.01,
         0.3,
     ]  # the calmest of eight parts is a little calmer
     assert ((share > 0.75) & (share < 1.0)).all()
-    assert (roughness(np.full((1, 9, 1), np.nan), (3, 6)) == 0.0).all()
+    assert (estimate_noise_sigma(np.full((1, 9, 1), np.nan), (3, 6)) == 0.0).all()
 
 
 def test_same_observation_means_no_difference(one):
     fitted = one._fitted.clean
     seen = fitted.read.seen(Toy().simulate(np.random.default_rng(0), np.full((3, 1), 0.5)), (60,))
-    assert (fitted.difference(seen, seen) == 0.0).all()
+    assert (fitted.predict_difference(seen, seen) == 0.0).all()
     assert (
-        fitted.difference(seen[0], seen[0] + 1.0) == -fitted.difference(seen[0] + 1.0, seen[0])
+        fitted.predict_difference(seen[0], seen[0] + 1.0)
+        == -fitted.predict_difference(seen[0] + 1.0, seen[0])
     ).all()
 
 
@@ -200,7 +211,7 @@ def test_published_is_clamped_at_zero_only_and_does_not_settle():
     tuner = TuneNetPublished(points=60)
     tuner.fit(Toy(), np.random.default_rng(0), 400)
     seen = tuner._fitted.clean.read.seen(Toy().observe(np.array([[0.5]]), [1.5]), (60,))[0]
-    assert np.abs(tuner._fitted.clean.difference(seen, seen)).max() > 1e-6
+    assert np.abs(tuner._fitted.clean.predict_difference(seen, seen)).max() > 1e-6
     steps = tuner.tune(
         Task(1, np.zeros(1), swing(np.ones((1, 1)), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)),
         None,
@@ -213,7 +224,7 @@ def test_published_is_clamped_at_zero_only_and_does_not_settle():
 
 
 def evaluation(at):
-    from methods.base import Evaluation
+    from methods.tuner import Evaluation
 
     point = np.full((1, 1), at)
     return Evaluation(point, swing(point, 1.5), np.zeros(1))
@@ -281,7 +292,7 @@ def test_weight_decay_is_that_of_equation_1():
     """A step of gradient descent on data alike: w <- w - rate * 2 * lambda * w where the data have
     no say.
     """
-    rows, parameters = Sides(*[np.zeros((4, 2, 5))] * 2), np.full((4, 2, 1), 0.5)
+    rows, parameters = PairInputs(*[np.zeros((4, 2, 5))] * 2), np.full((4, 2, 1), 0.5)
     design = {
         "smooth": False,
         "antisymmetric": False,
@@ -291,13 +302,20 @@ def test_weight_decay_is_that_of_equation_1():
         "batch": 4,
     }
     free, decayed = (
-        train(rows, parameters, Design(**design, weight_decay=decay), np.random.default_rng(0))
+        train_pair_network(
+            rows,
+            parameters,
+            PairNetworkDesign(**design, weight_decay=decay),
+            np.random.default_rng(0),
+        )
         for decay in (0.0, 0.5)
     )
     assert np.allclose(
         decayed["proposed.weight"], free["proposed.weight"] * (1 - 0.1 * 2 * 0.5), rtol=1e-5
     )
-    assert PUBLISHED.weight_decay * 2 == 1e-2  # torch's weight_decay is the factor in the gradient
+    assert (
+        PUBLISHED_DESIGN.weight_decay * 2 == 1e-2
+    )  # torch's weight_decay is the factor in the gradient
 
 
 def test_estimate_by_hand():
@@ -310,18 +328,18 @@ def test_estimate_by_hand():
         f"{layer}.bias": np.zeros(1) for layer in ("proposed", "target", "joined", "output")
     }
     weights["joined.weight"] = np.array([[-1.0], [1.0]])
-    value = estimate(weights, PUBLISHED, np.array([1.0]), np.array([2.0]))
+    value = estimate_difference(weights, PUBLISHED_DESIGN, np.array([1.0]), np.array([2.0]))
     assert value == pytest.approx(np.tanh(0.5 * (3.0 * 2.0 - 2.0 * 1.0)))
 
 
 def test_resampling_is_linear_run_by_run_and_bridges_gaps():
     observed = np.array([0.0, 1.0, 2.0, 10.0, np.nan, 30.0, 40.0, 50.0])[None, :, None]
-    assert resample(observed, (3, 5), 5)[0].tolist() == [
+    assert resample_runs(observed, (3, 5), 5)[0].tolist() == [
         [0.0, 0.5, 1.0, 1.5, 2.0],
         [10.0, 20.0, 30.0, 40.0, 50.0],
     ]
     with pytest.raises(ValueError, match="add up"):
-        resample(observed, (3, 4), 5)
+        resample_runs(observed, (3, 4), 5)
 
 
 def test_inputs_prefer_what_follows_the_parameters():
@@ -333,8 +351,8 @@ def test_inputs_prefer_what_follows_the_parameters():
         [parameters, jumping, circumstance], axis=-1
     )  # one channel each, a single sample
     observations = np.repeat(observations, 2, axis=2)
-    data = Rehearsal(parameters, observations, (2,), (NOTHING,) * 20)
-    inputs = weighed_inputs(data, 2, most=3 * 6, strictness=1000.0)
+    data = TrainingData(parameters, observations, (2,), (EMPTY_SCENE,) * 20)
+    inputs = make_weighted_features(data, 2, most=3 * 6, strictness=1000.0)
     gain = {int(number): gain for number, gain in zip(inputs.chosen, inputs.gain, strict=True)}
     assert gain[0] * np.std(parameters) > 1e3 * gain[6] * np.std(jumping)
     assert gain[12] * np.std(circumstance) > 1e3 * gain[6] * np.std(jumping)
@@ -343,20 +361,20 @@ def test_inputs_prefer_what_follows_the_parameters():
 def test_search_solves_a_linear_system_in_as_many_steps_as_it_must():
     matrix, root = np.array([[-0.6, 0.2], [0.1, -1.5]]), np.array([0.4, 0.7])
     task = Task(2, np.array([0.1, 0.9]), np.zeros((1, 1)), np.ones(1), TRAINING[2], 9, (1,))
-    search, guess = RootSearch(task), task.start
+    search, guess = BroydenSearch(task), task.start
     distances = []
     for _ in range(6):
-        guess = search.after(guess, matrix @ (guess - root))
+        guess = search.propose_next(guess, matrix @ (guess - root))
         distances.append(np.abs(guess - root).max())
     assert distances[0] > 0.05
     assert distances[5] < 1e-9
 
 
 def test_search_survives_a_failed_simulation():
-    search = RootSearch(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
-    assert search.after(np.zeros(1), np.array([np.nan])).tolist() == [0.25]
-    assert search.after(np.full(1, 0.2), np.array([0.4])).tolist() == pytest.approx([0.6])
-    assert search.after(np.full(1, 0.6), np.array([np.nan])).tolist() == pytest.approx([0.4])
+    search = BroydenSearch(Task(1, np.zeros(1), np.zeros((1, 1)), np.ones(1), TRAINING[1], 9, (1,)))
+    assert search.propose_next(np.zeros(1), np.array([np.nan])).tolist() == [0.25]
+    assert search.propose_next(np.full(1, 0.2), np.array([0.4])).tolist() == pytest.approx([0.6])
+    assert search.propose_next(np.full(1, 0.6), np.array([np.nan])).tolist() == pytest.approx([0.4])
 
 
 def test_failed_simulation_is_no_evidence(one):
@@ -374,7 +392,7 @@ def test_failed_simulation_is_no_evidence(one):
 def test_torch_stays_out_until_it_trains(one):
     import subprocess
 
-    code = "import methods.tunenet, methods.regressor, sys; print('torch' in sys.modules)"
+    code = "import methods.tuners.tunenet, methods.tuners.direct_regressor, sys; print('torch' in sys.modules)"
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from methods.base import Scene, Task
-from methods.tunenet_vision import TuneNetVision
+from methods.tuner import ScenarioInfo, Task
+from methods.tuners.tunenet_vision import TuneNetVision
 from tests.methods.test_tunenet import Toy, errors, run
 
 
@@ -17,7 +17,7 @@ class Filmed(Toy):
         return np.array([rng.uniform(1.0, 2.0), rng.uniform(0.5, 2.0), rng.uniform(-1.0, 1.0)])
 
     def known(self, scenario):
-        return Scene(scenario[1:], np.empty((60, 0)))
+        return ScenarioInfo(scenario[1:], np.empty((60, 0)))
 
     def observe(self, points, scenario):
         q = super().observe(points, scenario[:1])[:, :, 0]
@@ -44,7 +44,7 @@ def test_error_falls_although_the_target_is_seen_by_another_sensor_only(tuner):
 
 def test_there_is_one_network_which_is_prepared_for_the_sensor(tuner):
     assert not [name for name in tuner.state() if name.startswith("noisy.")]
-    assert tuner.fitted().noisy is tuner.fitted().clean
+    assert tuner.get_trained_network().noisy is tuner.get_trained_network().clean
 
 
 def test_gaps_are_bridged_by_the_proposed_model(tuner):
@@ -66,9 +66,9 @@ def test_gaps_are_bridged_by_the_proposed_model(tuner):
             toy.known(scenario),
         )
         return abs(
-            tuner.fitted()
+            tuner.get_trained_network()
             .suited(task)
-            .estimator(task)(toy.observe(np.array([[0.55]]), scenario))[0]
+            .make_estimator(task)(toy.observe(np.array([[0.55]]), scenario))[0]
         )
 
     hidden, held = target.copy(), target.copy()
@@ -93,7 +93,7 @@ def test_sides_read_their_own_channels(tuner):
             toy.lengths,
             toy.known(scenario),
         )
-        return tuner.fitted().suited(task).estimator(task)(shown)[0]
+        return tuner.get_trained_network().suited(task).make_estimator(task)(shown)[0]
 
     blind, deaf = target.copy(), proposed.copy()
     blind[..., 0], deaf[..., 1] = 7.0, -7.0

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from methods.base import Tuner
+from methods.tuner import Tuner
 
 STATUSES = {}
 

@@ -6,7 +6,7 @@ import subprocess
 from multiprocessing import Pool
 from pathlib import Path
 
-from methods.base import Tuner
+from methods.tuner import Tuner
 
 
 class ReadsBeside(Tuner):

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from methods.base import Ask, Tuner
+from methods.tuner import Proposal, Tuner
 
 SEEN = []
 """Of earlier runs in this process."""
@@ -50,7 +50,7 @@ class Late(Tuner):
         for i in range(task.budget):
             yield rng.uniform(size=(1, task.dim))
             time.sleep(0.05 if i == task.budget - 1 else 0.01)
-        yield Ask(task.start, task.start)
+        yield Proposal(task.start, task.start)
 
 
 class Drawing(Tuner):
@@ -81,8 +81,8 @@ class Boasting(Tuner):
         self.says = says
 
     def tune(self, task, rng):
-        from bench.sealing import inside
+        from bench.benchmark.isolation import tuner_server
 
         says = self.says
-        inside._tell_written = lambda channel, *_: channel.send(b"N", says.encode())
+        tuner_server._tell_written = lambda channel, *_: channel.send(b"N", says.encode())
         yield task.start

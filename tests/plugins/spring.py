@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sims.base import Channel, Parameter, Simulator
+from sims.core.simulator import Channel, Parameter, Simulator
 
 
 class Spring(Simulator):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sims.ball.simulator import Ball
-from sims.base import InputError, Scenario
+from sims.core.simulator import InputError, Scenario
+from sims.systems.ball import Ball
 
 GRAVITY, DAMPING, RADIUS = 9.8, 0.04, 0.5
 PUBLISHED = Scenario(np.arange(400) / 60)
@@ -403,7 +403,7 @@ def test_a_used_world_gives_the_same_bits_as_a_new_one(settings):
         theta = np.array([[rng.choice([0.0, 0.2, 0.5, 0.9, 1.0]), 0.0, 0.0, 0.0]])
         theta[0, 1:] = [0.1, 0.2, -0.1] * (rng.uniform(size=3) < 0.2)
         if i % 20 and settings["engine"] == "pybullet":
-            new.engine._world.discard()  # rebuilt, which is quicker than connecting anew
+            new.engine._world.invalidate()  # rebuilt, which is quicker than connecting anew
         else:
             new.close()
         np.testing.assert_array_equal(used.simulate(theta, scenario), new.simulate(theta, scenario))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.recordings.inspection import load, summary
-from sims.base import InputError
+from bench.logs.inspection import format_summary, load_recording
+from sims.core.simulator import InputError
 
 ROBOT = """
 <mujoco>
@@ -42,7 +42,7 @@ def written(folder, more, column="on", cells=("1", "1", "0", "0", "1")):
     ],
 )
 def test_samples_in_which_a_drive_is_off(tmp_path, more, cells, off):
-    recording, kind = load(written(tmp_path, more, cells=cells), divide=False)
+    recording, kind = load_recording(written(tmp_path, more, cells=cells), divide=False)
     for run in recording.runs:
         assert run.times.size == len(cells)
         if off is None:
@@ -50,14 +50,14 @@ def test_samples_in_which_a_drive_is_off(tmp_path, more, cells, off):
         else:
             assert "".join(str(int(value)) for value in run.off["m"]) == off
     assert len(recording.notes) == (off is not None)
-    assert set(recording.notes) <= set(summary(recording, kind))
+    assert set(recording.notes) <= set(format_summary(recording, kind))
     # The table adds no actuator.
     assert recording.model.actuators == {}
     assert [actuator.name for actuator in kind.robot.actuators] == ["m"]
 
 
 def test_the_message_says_where_and_why(tmp_path):
-    recording, _ = load(written(tmp_path, '[actuators.m]\nenable = "on"\n'), divide=False)
+    recording, _ = load_recording(written(tmp_path, '[actuators.m]\nenable = "on"\n'), divide=False)
     assert recording.notes == (
         "actuator m exerts nothing where on is 0: run a, 2 to 3 s; run b, 2 to 3 s",
     )
@@ -71,13 +71,13 @@ def test_an_actuator_of_the_recording_may_have_a_switch(tmp_path):
     path = written(tmp_path, more)
     text = path.read_text().replace("u.m,", "u.m,u.s,").replace(",0.1,", ",0.1,0.0,")
     path.write_text(text)
-    recording, kind = load(path, divide=False)
+    recording, kind = load_recording(path, divide=False)
     assert list(recording.runs[0].off) == ["s"]
     assert [actuator.name for actuator in kind.robot.actuators] == ["m", "s"]
 
 
 def test_parts_of_a_run_keep_their_own_samples(tmp_path):
-    recording, _ = load(written(tmp_path, '[actuators.m]\nenable = "on"\n'), divide=False)
+    recording, _ = load_recording(written(tmp_path, '[actuators.m]\nenable = "on"\n'), divide=False)
     part = recording.runs[0].part(slice(2, 5))
     assert part.off["m"].tolist() == [True, True, False]
     assert np.array_equal(part.times, [2, 3, 4])
@@ -99,17 +99,17 @@ def test_parts_of_a_run_keep_their_own_samples(tmp_path):
 )
 def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, more, message):
     with pytest.raises(InputError, match=message) as error:
-        load(written(tmp_path, more), divide=False)
+        load_recording(written(tmp_path, more), divide=False)
     assert "\n" not in str(error.value)
 
 
 def test_a_drive_that_is_never_on_is_refused(tmp_path):
     path = written(tmp_path, '[actuators.m]\nenable = "on"\n', cells="00000")
     with pytest.raises(InputError, match=r"on is 0 in all samples: actuator m is never on"):
-        load(path, divide=False)
+        load_recording(path, divide=False)
 
 
 def test_logs_have_no_such_column(tmp_path):
     more = '[actuators.m]\nenable = "on"\n[time]\ncolumn = "t"\n'
     with pytest.raises(InputError, match=r"column on: expected it in the table beside"):
-        load(written(tmp_path, more), divide=False)
+        load_recording(written(tmp_path, more), divide=False)

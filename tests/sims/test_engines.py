@@ -14,11 +14,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sims import effects
-from sims.base import InputError, Scenario
-from sims.engines.external import evened
-from sims.engines.scalar import resistance
-from sims.system import Coefficient, Force, Friction
-from tests.sims.agreement import (
+from sims.core.simulator import InputError, Scenario
+from sims.core.system import Coefficient, Force, Friction
+from sims.engines.external.external_engine import equalise_steps
+from sims.engines.external.resistance_laws import make_resistance
+from tests.sims.engine_agreement import (
     COEFFICIENTS,
     OTHERS,
     SIMULATORS,
@@ -74,7 +74,7 @@ def test_every_effect_of_the_library_is_measured():
     # What a model file states is the engine's own, and tested where robots are; what has levels
     # steps itself.
     own = ("model", "level")
-    general = {name for name in effects.names() if effects.get(name).needs not in own}
+    general = {name for name in effects.list_names() if effects.get_effect(name).needs not in own}
     assert set(COEFFICIENTS) == general
 
 
@@ -215,24 +215,24 @@ def test_sliding_to_a_stop_takes_the_closed_distance(engine, step):
 # effects
 
 
-class Linear(effects.get("drag.linear")):
+class Linear(effects.get_effect("drag.linear")):
     """The library's law by another name, which the engines do not know."""
 
     name = "elsewhere.linear"
 
 
-class Quadratic(effects.get("drag.quadratic")):
+class Quadratic(effects.get_effect("drag.quadratic")):
     name = "elsewhere.quadratic"
 
 
-class Coulomb(effects.get("friction.coulomb")):
+class Coulomb(effects.get_effect("friction.coulomb")):
     name = "elsewhere.coulomb"
 
 
 @pytest.fixture
 def elsewhere(fresh_registries):
     for effect in (Linear, Quadratic, Coulomb):
-        effects.register(effect)
+        effects.register_effect(effect)
 
 
 @pytest.mark.parametrize("engine", OTHERS)
@@ -251,10 +251,10 @@ def test_only_the_librarys_own_laws_are_taken_for_known():
             (effects.get("friction.coulomb")(), np.ones((1, 1, 1))),
         )
 
-    found = resistance(Lane)
-    assert (found.at(3.0), found.limit) == ((0.2, 0.2), 1.0)
+    found = make_resistance(Lane)
+    assert (found.compute(3.0), found.limit) == ((0.2, 0.2), 1.0)
     Lane.effects = ((Linear(), np.ones((1, 1, 1))),)
-    assert resistance(Lane) is None
+    assert make_resistance(Lane) is None
 
 
 # ---------------------------------------------------------------------- effects from elsewhere
@@ -282,8 +282,8 @@ class Rising(Friction):
 
 @pytest.mark.parametrize("engine", OTHERS)
 def test_any_effect_runs_on_any_engine(engine, fresh_registries):
-    effects.register(Stop)
-    effects.register(Rising)
+    effects.register_effect(Stop)
+    effects.register_effect(Rising)
     fixed = {"test.stop": 200.0, "test.rising": 1.5}
     exact = motion("slider", "batch", fixed, time_step=5e-4)
     errors = [apart(motion("slider", engine, fixed, time_step=h), exact) for h in STEPS["slider"]]
@@ -313,7 +313,7 @@ def test_lanes_of_different_runs_come_out_as_alone(system, engine, settings):
     kind = SIMULATORS[system]
     simulator, theta = kind(engine=engine, **settings), theta_for(kind, 3)
     runs = [Scenario(np.arange(n) * dt) for n, dt in ((60, 0.02), (40, 0.013), (1, 1.0))]
-    together = simulator.simulate_lanes(theta, runs)
+    together = simulator.simulate_batch(theta, runs)
     for row, run, found in zip(theta, runs, together, strict=True):
         n = run.times.size
         assert np.isnan(found[n:]).all()
@@ -404,7 +404,7 @@ def test_a_used_world_gives_the_same_bits_as_a_new_one(system, engine):
 
 FINGERPRINT = """
 import hashlib
-from tests.sims.agreement import SIMULATORS, THETA, scenario
+from tests.sims.engine_agreement import SIMULATORS, THETA, scenario
 import numpy as np
 for system, kind in SIMULATORS.items():
     for engine in ("pybullet", "mujoco"):
@@ -436,11 +436,11 @@ def test_a_fresh_process_gives_the_same_bits():
 @pytest.mark.parametrize("engine", OTHERS)
 def test_rounded_time_stamps_are_forgiven(engine):
     exact, rounded = np.arange(400) / 60, np.round(np.arange(400) / 60, 8)
-    assert len(set(evened(np.diff(rounded), 1).tolist())) == 1
-    assert set(evened(np.diff(exact), 1).tolist()) == {exact[-1] / 399}
+    assert len(set(equalise_steps(np.diff(rounded), 1).tolist())) == 1
+    assert set(equalise_steps(np.diff(exact), 1).tolist()) == {exact[-1] / 399}
     uneven = np.array([0.1, 0.1, 0.2])
-    np.testing.assert_array_equal(evened(uneven, 1), uneven)
-    assert evened(np.empty(0), 1).size == 0
+    np.testing.assert_array_equal(equalise_steps(uneven, 1), uneven)
+    assert equalise_steps(np.empty(0), 1).size == 0
     kind, theta = SIMULATORS["pendulum"], np.array([THETA["pendulum"]])
     found = [kind(engine=engine).simulate(theta, Scenario(t)) for t in (exact, rounded)]
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
@@ -448,14 +448,14 @@ def test_rounded_time_stamps_are_forgiven(engine):
 
 @pytest.mark.parametrize("engine", OTHERS)
 def test_what_an_engine_cannot_carry_is_named(engine):
-    from sims.simulated import Simulated
-    from sims.slider.system import SliderSystem
+    from sims.system_simulator import SystemSimulator
+    from sims.systems.slider import SliderSystem
 
     class Elsewhere(SliderSystem):
         __module__ = "a_plugin_file"
         name = "elsewhere"
 
-    class Ours(Simulated):
+    class Ours(SystemSimulator):
         system = Elsewhere
 
     with pytest.raises(

@@ -17,12 +17,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.base import Array
-from sims.engines.batch.field import Field
-from sims.engines.ground import Indices
+from sims.core.simulator import Array
+from sims.engines.batch.force_field import ForceField
+from sims.engines.ground_contact import Indices
 
 
-class Dynamics:
+class StepDynamics:
     """Accelerations of batch elements during their steps.
 
     Attributes:
@@ -34,7 +34,7 @@ class Dynamics:
             last call.
     """
 
-    def __init__(self, field: Field, shape: tuple[int, int]) -> None:
+    def __init__(self, field: ForceField, shape: tuple[int, int]) -> None:
         self.field = field
         self.rests = np.zeros((shape[0], 1), dtype=bool)
         self.sticks = np.zeros((shape[0], 1), dtype=bool)
@@ -45,7 +45,7 @@ class Dynamics:
         self._guided = field.guided
         self._along_guide = np.arange(shape[1]) < field.guided
 
-    def begin(self, t: Array, x: Array, v: Array) -> Array:
+    def begin_step(self, t: Array, x: Array, v: Array) -> Array:
         """Return the acceleration (L, D) at the beginning of a step.
 
         It also determines which elements stick, and the direction of motion of the others.
@@ -56,11 +56,11 @@ class Dynamics:
             v: (L, D) velocities.
         """
         pull = self._borne(t, x, v)
-        if not self.field.dry:
+        if not self.field.has_dry_friction:
             return pull / self.field.mass
-        limit = self.field.limit(t, x, v)
-        size = self.size(pull)
-        speed = self.size(v)
+        limit = self.field.compute_friction_limit(t, x, v)
+        size = self.compute_speed(pull)
+        speed = self.compute_speed(v)
         still = speed == 0
         excess = size - limit
         self.excess = (excess, excess)
@@ -74,7 +74,7 @@ class Dynamics:
             self.way = np.where(self._along_guide, self.way, 0.0)
         return self._rubbed(pull, limit, self.way)
 
-    def during(self, t: Array, x: Array, v: Array) -> Array:
+    def compute_acceleration(self, t: Array, x: Array, v: Array) -> Array:
         """Return the acceleration (L, D) within the present step.
 
         Args:
@@ -83,27 +83,27 @@ class Dynamics:
             v: (L, D) velocities.
         """
         pull = self._borne(t, x, v)
-        if not self.field.dry:
+        if not self.field.has_dry_friction:
             return pull / self.field.mass
-        limit = self.field.limit(t, x, v)
-        self.excess = (self.excess[0], self.size(pull) - limit)
+        limit = self.field.compute_friction_limit(t, x, v)
+        self.excess = (self.excess[0], self.compute_speed(pull) - limit)
         return self._rubbed(pull, limit, self._along(v))
 
-    def halted(self, v: Array, faint: Array) -> Array:
+    def zero_small_velocities(self, v: Array, faint: Array) -> Array:
         """Return velocities (n, D) without their part along the guide where it is negligible.
 
         Args:
             v: (n, D) velocities.
             faint: (n, 1) largest negligible speed.
         """
-        return np.where((self.size(v) <= faint) & self._along_guide, 0.0, v)
+        return np.where((self.compute_speed(v) <= faint) & self._along_guide, 0.0, v)
 
-    def lay(self, lanes: Indices) -> None:
+    def set_resting(self, lanes: Indices) -> None:
         """Mark the elements `lanes` (n,) as resting on the ground."""
         self.rests[lanes] = True
         self._any_rests = True
 
-    def lift(self, v: Array) -> None:
+    def clear_resting(self, v: Array) -> None:
         """Clear the resting state of elements that move upward, v (L, D)."""
         if self._any_rests:
             self.rests &= v[:, -1:] <= 0
@@ -111,7 +111,7 @@ class Dynamics:
 
     def _borne(self, t: Array, x: Array, v: Array) -> Array:
         """Return all forces except dry friction, without the part that the ground supports."""
-        pull = self.field.force(t, x, v)
+        pull = self.field.compute_force(t, x, v)
         if self._any_rests:
             pull = pull + 0.0  # a copy: a constant force is the same array in every call
             # The ground pushes but does not pull: an upward force remains.
@@ -125,7 +125,7 @@ class Dynamics:
             return self.way
         # In a plane the direction may turn within the step, but must not reverse: a reversal is an
         # event at which the step is cut.
-        speed = length(v)
+        speed = compute_norm(v)
         divisor = np.where(speed > 0, speed, 1.0)
         unit = np.where(speed > 0, v / divisor, self.way)
         side = np.where(dot(unit, self.way) < 0, -1.0, 1.0)
@@ -139,9 +139,9 @@ class Dynamics:
         result: Array = np.where(self.sticks & self._along_guide, 0.0, slipping)
         return result
 
-    def size(self, v: Array) -> Array:
+    def compute_speed(self, v: Array) -> Array:
         """Return the magnitudes (n, 1) along the guide."""
-        return length(v[:, : self._guided])
+        return compute_norm(v[:, : self._guided])
 
 
 def dot(a: Array, b: Array) -> Array:
@@ -152,7 +152,7 @@ def dot(a: Array, b: Array) -> Array:
     return result
 
 
-def length(v: Array) -> Array:
+def compute_norm(v: Array) -> Array:
     """Return the magnitudes (L, 1)."""
     if v.shape[1] == 1:
         return np.abs(v)

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.compiled.evaluate import execute, larger
-from sims.engines.compiled.events import length
-from sims.engines.compiled.kinds import (
+from sims.engines.compiled.data_layout import (
     AFTER,
     BEFORE,
     BOUNCES,
@@ -26,15 +24,17 @@ from sims.engines.compiled.kinds import (
     RESTS,
     STICKS,
     WAY,
-    Block,
-    Program,
+    BlockBuffers,
+    ProgramArrays,
     T,
     V,
     X,
 )
+from sims.engines.compiled.events import compute_norm
+from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 
 
-def present(program: Program, block: Block, w: int) -> None:
+def evaluate_forces(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     """Copy every element's state to the registers and evaluate the forces.
 
     Args:
@@ -52,10 +52,10 @@ def present(program: Program, block: Block, w: int) -> None:
         for i in range(w):
             r[rows[IN_X] + k, i] = a[X + k, i]
             r[rows[IN_V] + k, i] = a[V + k, i]
-    execute(program.code, program.ends[1], program.ends[2], r, w)
+    run_instructions(program.code, program.ends[1], program.ends[2], r, w)
 
 
-def begin(program: Program, block: Block, w: int) -> None:
+def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     """Compute the accelerations at the beginning of a step, in rows K1.
 
     This also determines which elements stick, and the direction of motion of the others.
@@ -67,10 +67,10 @@ def begin(program: Program, block: Block, w: int) -> None:
     """
     d = program.flags[DIMENSIONS]
     if program.flags[DRY] == 0:
-        free(program, block, w, K1)
+        compute_frictionless_acceleration(program, block, w, K1)
         return
     if d == 1 and program.flags[BOUNCES] == 0:
-        begin_on_a_line(program, block, w)
+        begin_step_1d(program, block, w)
         return
     a = block.a
     r = block.r
@@ -78,9 +78,9 @@ def begin(program: Program, block: Block, w: int) -> None:
     guided = program.flags[GUIDED]
     for i in range(w):
         limit = r[limits, i]
-        pulled(program, block, i, K1)
-        size = length(a, K1, guided, i)
-        speed = length(a, V, guided, i)
+        compute_pulling_force(program, block, i, K1)
+        size = compute_norm(a, K1, guided, i)
+        speed = compute_norm(a, V, guided, i)
         a[BEFORE, i] = size - limit
         a[AFTER, i] = size - limit
         still = speed == 0.0
@@ -97,11 +97,11 @@ def begin(program: Program, block: Block, w: int) -> None:
             a[WAY + k, i] = way
             a[F1 + k, i] = rub
             a[K1 + k, i] = 0.0 if sticks else (pull - rub) / a[MASS, i]
-        unguided(program, block, i, K1, F1)
+        compute_unguided_acceleration(program, block, i, K1, F1)
 
 
-def begin_on_a_line(program: Program, block: Block, w: int) -> None:
-    """Compute `begin` for one coordinate without ground: the same numbers, without branches.
+def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
+    """Compute `begin_step` for one coordinate without ground: the same numbers, without branches.
 
     Args:
         program: program of the system and its effects.
@@ -133,7 +133,9 @@ def begin_on_a_line(program: Program, block: Block, w: int) -> None:
         block.n[STICKS, i] = 1 if holds else 0
 
 
-def during(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
+def compute_acceleration(
+    program: ProgramArrays, block: BlockBuffers, w: int, to: int, rub_to: int
+) -> None:
     """Compute the accelerations within the present step.
 
     Args:
@@ -143,19 +145,21 @@ def during(program: Program, block: Block, w: int, to: int, rub_to: int) -> None
         to: first row of the accelerations.
         rub_to: first row of dry friction.
     """
-    execute(program.code, program.ends[1], program.ends[2], block.r, w)
+    run_instructions(program.code, program.ends[1], program.ends[2], block.r, w)
     if program.flags[DRY] == 0:
-        free(program, block, w, to)
+        compute_frictionless_acceleration(program, block, w, to)
         return
     if program.flags[DIMENSIONS] == 1 and program.flags[BOUNCES] == 0:
-        during_on_a_line(program, block, w, to, rub_to)
+        compute_acceleration_1d(program, block, w, to, rub_to)
         return
     for i in range(w):
-        in_space(program, block, i, to, rub_to)
+        compute_acceleration_nd(program, block, i, to, rub_to)
 
 
-def during_on_a_line(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
-    """Compute `during` for one coordinate without ground.
+def compute_acceleration_1d(
+    program: ProgramArrays, block: BlockBuffers, w: int, to: int, rub_to: int
+) -> None:
+    """Compute `compute_acceleration` for one coordinate without ground.
 
     Args:
         program: program of the system and its effects.
@@ -178,8 +182,10 @@ def during_on_a_line(program: Program, block: Block, w: int, to: int, rub_to: in
         a[to, i] = 0.0 if block.n[STICKS, i] != 0 else slips
 
 
-def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
-    """Compute `during` for an element of several coordinates.
+def compute_acceleration_nd(
+    program: ProgramArrays, block: BlockBuffers, i: int, to: int, rub_to: int
+) -> None:
+    """Compute `compute_acceleration` for an element of several coordinates.
 
     Args:
         program: program of the system and its effects.
@@ -192,8 +198,8 @@ def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> No
     guided = program.flags[GUIDED]
     velocity = program.rows[IN_V]
     limit = block.r[program.rows[OUT_LIMIT], i]
-    pulled(program, block, i, to)
-    a[AFTER, i] = length(a, to, guided, i) - limit
+    compute_pulling_force(program, block, i, to)
+    a[AFTER, i] = compute_norm(a, to, guided, i) - limit
     # The direction may turn within the step, but must not reverse: a reversal is an event at which
     # the step is cut.
     square = 0.0
@@ -212,10 +218,12 @@ def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> No
         a[rub_to + k, i] = rub
         slips = (a[to + k, i] - rub) / a[MASS, i]
         a[to + k, i] = 0.0 if block.n[STICKS, i] != 0 else slips
-    unguided(program, block, i, to, rub_to)
+    compute_unguided_acceleration(program, block, i, to, rub_to)
 
 
-def unguided(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
+def compute_unguided_acceleration(
+    program: ProgramArrays, block: BlockBuffers, i: int, to: int, rub_to: int
+) -> None:
     """Convert forces to accelerations for the coordinates without dry friction.
 
     Args:
@@ -232,7 +240,7 @@ def unguided(program: Program, block: Block, i: int, to: int, rub_to: int) -> No
         a[to + k, i] = a[to + k, i] / a[MASS, i]
 
 
-def pulled(program: Program, block: Block, i: int, to: int) -> None:
+def compute_pulling_force(program: ProgramArrays, block: BlockBuffers, i: int, to: int) -> None:
     """Compute all forces except dry friction, without the part that the ground supports.
 
     Args:
@@ -247,10 +255,12 @@ def pulled(program: Program, block: Block, i: int, to: int) -> None:
     if block.n[RESTS, i] != 0:
         # The ground pushes but does not pull: an upward force remains.
         up = to + d - 1
-        block.a[up, i] = larger(block.a[up, i], 0.0)
+        block.a[up, i] = nan_maximum(block.a[up, i], 0.0)
 
 
-def free(program: Program, block: Block, w: int, to: int) -> None:
+def compute_frictionless_acceleration(
+    program: ProgramArrays, block: BlockBuffers, w: int, to: int
+) -> None:
     """Compute accelerations without dry friction, in rows `to`.
 
     Args:
@@ -270,4 +280,4 @@ def free(program: Program, block: Block, w: int, to: int) -> None:
         up = to + d - 1
         for i in range(w):
             if block.n[RESTS, i] != 0:
-                a[up, i] = larger(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]
+                a[up, i] = nan_maximum(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]

@@ -1,16 +1,15 @@
 """Events of one element: impacts, standstill, break-away and step-size control.
 
-The rules are those of `sims.engines.batch.stepping`, `sims.engines.batch.roots` and
-`sims.engines.ground`; equation numbers refer to these modules. `i` is the index of a slot.
+The rules are those of `sims.engines.batch.runge_kutta`, `sims.engines.batch.event_roots` and
+`sims.engines.ground_contact`; equation numbers refer to these modules. `i` is the index of a slot.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.batch import stepping
-from sims.engines.compiled.evaluate import execute, larger
-from sims.engines.compiled.kinds import (
+from sims.engines.batch import runge_kutta
+from sims.engines.compiled.data_layout import (
     AFTER,
     BEFORE,
     BOUNCES,
@@ -55,28 +54,29 @@ from sims.engines.compiled.kinds import (
     STICKS,
     TRY,
     WAY,
-    Block,
+    BatchArrays,
+    BlockBuffers,
+    FloatArray,
     H,
-    Numbers,
-    Program,
+    ProgramArrays,
     T,
     V,
-    Work,
     X,
 )
-from sims.engines.ground import PATIENCE, SHORT, SHORTEST
+from sims.engines.compiled.interpreter import nan_maximum, run_instructions
+from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
 
-MANY = stepping.EVENTS
-FRICTION_BEND = 6.0 * stepping.FRICTION_BEND
-FORCE_BEND = (6.0 * stepping.FORCE_BEND) ** 2
-FAINT = stepping.FAINT
-SHORTENED = stepping.SHORTENED
-FINEST = stepping.FINEST
-PUNCTUAL = stepping.PUNCTUAL
-STILL = stepping.STILL
+MAX_EVENTS_PER_STEP = runge_kutta.MAX_EVENTS_PER_STEP
+FRICTION_NONLINEARITY_TOLERANCE = 6.0 * runge_kutta.FRICTION_NONLINEARITY_TOLERANCE
+FORCE_NONLINEARITY_TOLERANCE = (6.0 * runge_kutta.FORCE_NONLINEARITY_TOLERANCE) ** 2
+NEGLIGIBLE_ACCELERATION_SHARE = runge_kutta.NEGLIGIBLE_ACCELERATION_SHARE
+STEP_REDUCTION_FACTOR = runge_kutta.STEP_REDUCTION_FACTOR
+MIN_STEP_SHARE = runge_kutta.MIN_STEP_SHARE
+BREAK_AWAY_TIME_TOLERANCE = runge_kutta.BREAK_AWAY_TIME_TOLERANCE
+REST_SPEED_SHARE = runge_kutta.REST_SPEED_SHARE
 
 
-def dot(a: Numbers, one: int, other: int, d: int, i: int) -> float:
+def dot(a: FloatArray, one: int, other: int, d: int, i: int) -> float:
     """Return the inner product of two vectors.
 
     Args:
@@ -92,7 +92,7 @@ def dot(a: Numbers, one: int, other: int, d: int, i: int) -> float:
     return total  # type: ignore[no-any-return]
 
 
-def length(a: Numbers, one: int, d: int, i: int) -> float:
+def compute_norm(a: FloatArray, one: int, d: int, i: int) -> float:
     """Return the magnitude of a vector.
 
     Args:
@@ -106,8 +106,8 @@ def length(a: Numbers, one: int, d: int, i: int) -> float:
     return np.sqrt(dot(a, one, one, d, i))  # type: ignore[no-any-return]
 
 
-def root(value: float, rate: float, later: float, h: float) -> float:
-    """Return the seconds to the last root of a parabola; see `sims.engines.batch.roots`.
+def find_event_time(value: float, rate: float, later: float, h: float) -> float:
+    """Return the seconds to the last root of a parabola; see `sims.engines.batch.event_roots`.
 
     Args:
         value: value >= 0 at the beginning.
@@ -121,7 +121,7 @@ def root(value: float, rate: float, later: float, h: float) -> float:
     return float(seconds if abs(seconds) < np.inf else h)
 
 
-def bent(program: Program, block: Block, i: int) -> bool:
+def is_too_nonlinear(program: ProgramArrays, block: BlockBuffers, i: int) -> bool:
     """Return whether forces are too nonlinear in the step just tried; set the next step size.
 
     Args:
@@ -132,7 +132,7 @@ def bent(program: Program, block: Block, i: int) -> bool:
     a = block.a
     d = program.flags[DIMENSIONS]
     h = a[H, i]
-    a[PEAK, i] = larger(a[PEAK, i], dot(a, K1, K1, d, i))
+    a[PEAK, i] = nan_maximum(a[PEAK, i], dot(a, K1, K1, d, i))
     sharp = False
     if program.flags[PUSHED] != 0:
         square = 0.0
@@ -140,22 +140,24 @@ def bent(program: Program, block: Block, i: int) -> bool:
             outer = a[K1 + k, i] + a[K4 + k, i]
             inner = a[K2 + k, i] + a[K3 + k, i]
             square += (outer - inner) * (outer - inner)
-        sharp = square > FORCE_BEND * a[PEAK, i]
+        sharp = square > FORCE_NONLINEARITY_TOLERANCE * a[PEAK, i]
     if program.flags[DRY] != 0:
-        most = larger(length(a, F1, d, i), length(a, F4, d, i))
-        a[RUBBED, i] = larger(a[RUBBED, i], most)
-        faint = FAINT * np.sqrt(a[PEAK, i]) * a[MASS, i]
+        most = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
+        a[RUBBED, i] = nan_maximum(a[RUBBED, i], most)
+        faint = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[PEAK, i]) * a[MASS, i]
         square = 0.0
         for k in range(d):
             change = a[F1 + k, i] - a[F2 + k, i] - a[F3 + k, i] + a[F4 + k, i]
             square += change * change
         size = abs(change) if d == 1 else np.sqrt(square)
-        if block.n[STICKS, i] == 0 and size > FRICTION_BEND * larger(a[RUBBED, i], faint):
+        if block.n[STICKS, i] == 0 and size > FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(
+            a[RUBBED, i], faint
+        ):
             sharp = True
     if sharp:
-        sharp = h > FINEST * a[LONGEST, i] and is_open(block, i)
+        sharp = h > MIN_STEP_SHARE * a[LONGEST, i] and has_no_pending_event(block, i)
     if sharp:
-        a[LIMIT, i] = SHORTENED * h
+        a[LIMIT, i] = STEP_REDUCTION_FACTOR * h
     elif h >= a[LIMIT, i]:
         # The limit doubles with each accepted step of that length, as the nonlinearity may still be
         # near.
@@ -163,12 +165,12 @@ def bent(program: Program, block: Block, i: int) -> bool:
     return sharp
 
 
-def is_open(block: Block, i: int) -> bool:
+def has_no_pending_event(block: BlockBuffers, i: int) -> bool:
     """Return whether the element has no pending event and not too many events in its step."""
-    return bool(block.n[GOAL, i] == NOTHING and block.n[EVENTS, i] < MANY)
+    return bool(block.n[GOAL, i] == NOTHING and block.n[EVENTS, i] < MAX_EVENTS_PER_STEP)
 
 
-def interrupted(program: Program, work: Work, block: Block, i: int) -> bool:
+def detect_event(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int) -> bool:
     """Return whether an event is within the step just tried; schedule the event.
 
     Args:
@@ -180,7 +182,7 @@ def interrupted(program: Program, work: Work, block: Block, i: int) -> bool:
     a = block.a
     d = program.flags[DIMENSIONS]
     h = a[H, i]
-    watched = is_open(block, i)
+    watched = has_no_pending_event(block, i)
     found = False
     if watched and program.flags[BOUNCES] != 0:
         floor = work.ground[FLOOR, block.n[LANE, i]]
@@ -188,7 +190,7 @@ def interrupted(program: Program, work: Work, block: Block, i: int) -> bool:
         if later < floor:
             height = a[X + d - 1, i] - floor
             rate = a[V + d - 1, i]
-            expect(block, i, root(height, rate, later - floor, h), IMPACT)
+            schedule_event(block, i, find_event_time(height, rate, later - floor, h), IMPACT)
             found = True
     if program.flags[DRY] != 0:
         sticks = block.n[STICKS, i] != 0
@@ -197,21 +199,21 @@ def interrupted(program: Program, work: Work, block: Block, i: int) -> bool:
             if later < 0.0:
                 speed = dot(a, V, WAY, d, i)
                 rate = dot(a, K1, WAY, d, i)
-                expect(block, i, root(speed, rate, later, h), STANDSTILL)
+                schedule_event(block, i, find_event_time(speed, rate, later, h), STANDSTILL)
                 found = True
         to_loose = block.n[GOAL, i] == LOOSE
         if sticks and (watched or to_loose):
             before = a[BEFORE, i]
             after = a[AFTER, i]
             # A scheduled break-away is checked again with a tolerance.
-            if after > (PUNCTUAL * (after - before) if to_loose else 0.0):
-                seconds = h * (before / (before - after) + 0.1 * PUNCTUAL)
-                expect(block, i, seconds, LOOSE)
+            if after > (BREAK_AWAY_TIME_TOLERANCE * (after - before) if to_loose else 0.0):
+                seconds = h * (before / (before - after) + 0.1 * BREAK_AWAY_TIME_TOLERANCE)
+                schedule_event(block, i, seconds, LOOSE)
                 found = True
     return found
 
 
-def expect(block: Block, i: int, seconds: float, goal: int) -> None:
+def schedule_event(block: BlockBuffers, i: int, seconds: float, goal: int) -> None:
     """Schedule an event at the end of the next step; of two events the first counts.
 
     Args:
@@ -226,7 +228,7 @@ def expect(block: Block, i: int, seconds: float, goal: int) -> None:
         block.n[EVENTS, i] += 1
 
 
-def reach(program: Program, work: Work, block: Block, i: int) -> None:
+def handle_event(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int) -> None:
     """Apply the event to which the step led.
 
     Args:
@@ -237,15 +239,15 @@ def reach(program: Program, work: Work, block: Block, i: int) -> None:
     """
     goal = block.n[GOAL, i]
     if goal == IMPACT:
-        strike(program, work, block, i, K4)
+        handle_impact(program, work, block, i, K4)
     elif goal == STANDSTILL:
-        stop(program, block, i)
+        handle_standstill(program, block, i)
     # Break-away needs no action: the next step finds that the element slips.
     block.a[TRY, i] = np.inf
     block.n[GOAL, i] = NOTHING
 
 
-def correct(block: Block, i: int, seconds: float) -> float:
+def shift_time(block: BlockBuffers, i: int, seconds: float) -> float:
     """Move the element's clock, at most by one step.
 
     Args:
@@ -261,11 +263,13 @@ def correct(block: Block, i: int, seconds: float) -> float:
         seconds = 0.0
     seconds = min(max(seconds, -step), step)
     block.a[T, i] += seconds
-    block.a[LEFT, i] = larger(block.a[LEFT, i] - seconds, 0.0)
+    block.a[LEFT, i] = nan_maximum(block.a[LEFT, i] - seconds, 0.0)
     return seconds
 
 
-def strike(program: Program, work: Work, block: Block, i: int, k: int) -> None:
+def handle_impact(
+    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int, k: int
+) -> None:
     """Apply the impact to which a step led up to rounding.
 
     Args:
@@ -286,7 +290,7 @@ def strike(program: Program, work: Work, block: Block, i: int, k: int) -> None:
     if rate < 0.0:
         late = (floor - a[high, i]) / rate
         late *= 1.0 - 0.5 * late * pull / rate  # (8)
-    late = correct(block, i, late)
+    late = shift_time(block, i, late)
     for j in range(d):
         acceleration = a[k + j, i]
         a[X + j, i] += late * (a[V + j, i] + 0.5 * late * acceleration)
@@ -294,16 +298,18 @@ def strike(program: Program, work: Work, block: Block, i: int, k: int) -> None:
     # Exactly on the ground and not moving up, otherwise the next step would contain the same
     # impact.
     a[high, i] = floor
-    a[up, i] = smaller_than_nothing(a[up, i])
-    thrown(program, work, block, i, pull)
+    a[up, i] = clip_to_non_positive(a[up, i])
+    compute_rebound_velocity(program, work, block, i, pull)
 
 
-def smaller_than_nothing(rate: float) -> float:
+def clip_to_non_positive(rate: float) -> float:
     """Return the rate if it is negative, otherwise zero; NaN stays NaN."""
     return rate if rate <= 0.0 or rate != rate else 0.0
 
 
-def thrown(program: Program, work: Work, block: Block, i: int, pull: float) -> None:
+def compute_rebound_velocity(
+    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int, pull: float
+) -> None:
     """Compute the velocity after an impact.
 
     Args:
@@ -327,12 +333,12 @@ def thrown(program: Program, work: Work, block: Block, i: int, pull: float) -> N
         r[rows[IN_E], s] = work.ground[RESTITUTION, lane]
         r[rows[IN_MU], s] = work.ground[RUBBING, lane]
         r[rows[IN_SPEED], s] = speed
-    execute(program.code, program.ends[2], program.ends[3], r, width)
+    run_instructions(program.code, program.ends[2], program.ends[3], r, width)
     e = r[rows[OUT_E], i]
     mu = r[rows[OUT_MU], i]
     leaves = e * speed
     lost = mu * (1.0 + e) * speed
-    if is_over(block, i, leaves, -pull):
+    if is_bouncing_over(block, i, leaves, -pull):
         if e < 1.0:
             lost += mu * (1.0 + e) * leaves / (1.0 - e)
         leaves = 0.0
@@ -343,13 +349,13 @@ def thrown(program: Program, work: Work, block: Block, i: int, pull: float) -> N
             square += a[V + j, i] * a[V + j, i]
         along = abs(a[V, i]) if d == 2 else np.sqrt(square)
         share = 1.0 - lost / (along if along > 0.0 else 1.0)
-        kept = larger(share, work.ground[LEAST, lane])
+        kept = nan_maximum(share, work.ground[LEAST, lane])
         for j in range(d - 1):
             a[V + j, i] *= kept
     a[up, i] = leaves
 
 
-def is_over(block: Block, i: int, leaves: float, down: float) -> bool:
+def is_bouncing_over(block: BlockBuffers, i: int, leaves: float, down: float) -> bool:
     """Return whether bouncing is finished after an impact.
 
     Args:
@@ -362,11 +368,11 @@ def is_over(block: Block, i: int, leaves: float, down: float) -> bool:
         block.n[SHORTS, i] = 0
         return False
     flight = 2.0 * leaves / down
-    block.n[SHORTS, i] = block.n[SHORTS, i] + 1 if flight < SHORT else 0
-    return bool(flight < SHORTEST or block.n[SHORTS, i] > PATIENCE)
+    block.n[SHORTS, i] = block.n[SHORTS, i] + 1 if flight < SHORT_FLIGHT_SECONDS else 0
+    return bool(flight < MIN_FLIGHT_SECONDS or block.n[SHORTS, i] > MAX_SHORT_FLIGHTS)
 
 
-def stop(program: Program, block: Block, i: int) -> None:
+def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> None:
     """Stop the element, which has lost its speed along its direction up to rounding.
 
     Args:
@@ -378,7 +384,7 @@ def stop(program: Program, block: Block, i: int) -> None:
     d = program.flags[DIMENSIONS]
     slows = dot(a, K4, WAY, d, i)
     late = -dot(a, V, WAY, d, i) / slows if slows < 0.0 else 0.0
-    late = correct(block, i, late)
+    late = shift_time(block, i, late)
     for k in range(d):
         a[X + k, i] += late * a[V + k, i]
         a[V + k, i] += late * a[K4 + k, i]
@@ -387,6 +393,9 @@ def stop(program: Program, block: Block, i: int) -> None:
         a[V + k, i] -= a[WAY + k, i] * along
     # The speed becomes exactly zero, because only an element with zero speed can stick.
     guided = program.flags[GUIDED]
-    if length(a, V, guided, i) <= STILL * length(a, K4, guided, i) * a[LONGEST, i]:
+    if (
+        compute_norm(a, V, guided, i)
+        <= REST_SPEED_SHARE * compute_norm(a, K4, guided, i) * a[LONGEST, i]
+    ):
         for k in range(guided):
             a[V + k, i] = 0.0

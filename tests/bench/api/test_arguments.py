@@ -21,7 +21,7 @@ FUNCTIONS = [
     simgap.simulate,
     simgap.read_recording,
     simgap.import_logs,
-    simgap.Compared,
+    simgap.ComparisonResult,
 ]
 NEEDED = {
     simgap.sweep: {"experiment": "nope"},

@@ -7,10 +7,10 @@ import pytest
 import tomli_w
 
 import simgap
-from bench.cli import main
+from bench.cli.main import main
 from tests.conftest import PLUGINS
-from tests.docs.pages import ROOT
-from tests.experiments import SPRING
+from tests.docs.documentation_pages import ROOT
+from tests.sample_experiments import SPRING
 
 
 class Halving(simgap.Tuner):
@@ -121,7 +121,7 @@ def test_what_cannot_be_is_one_line_in_the_callers_language(experiment, tmp_path
 
 
 def test_a_bounce_shot_has_tables_too(tmp_path):
-    run = simgap.Compared(ROOT / "results" / "reference" / "bounce-shot")
+    run = simgap.ComparisonResult(ROOT / "results" / "reference" / "bounce-shot")
     assert len(run.runs) == len(run.statuses) == 300 * run.statuses["tuner"].nunique()
     assert run.table.set_index(["method", "ball"]).loc[("nominal", "table-tennis"), "shots"] == 50
     assert run.figures == []

@@ -8,7 +8,7 @@ import pytest
 
 import simgap
 from simgap import InputError
-from sims.user_toml import read_toml
+from sims.core.toml_validation import read_toml
 
 ROBOT = Path(simgap.__file__).parent / "examples" / "robot"
 UNITS = {"q": "rad", "qd": "rad/s"}

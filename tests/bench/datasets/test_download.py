@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from bench.cli import main
-from bench.datasets import catalogue
-from bench.datasets.catalogue import SourceFile
-from bench.problem.availability import availability
-from bench.problem.experiment import load, names
-from sims.pendulum.simulator import Pendulum
+from bench.benchmark.problem.availability import availability
+from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
+from bench.cli.main import main
+from bench.datasets import dataset_catalogue
+from bench.datasets.dataset_catalogue import SourceFile
 from sims.recording.recording import read_recording
+from sims.systems.pendulum import Pendulum
 
 MAT = "ParameterEstimation/SinglePendulum/SinglePendulumDataForParameterEstimation.mat"
 LICENCE = b"Anybody may use this.\n"
@@ -58,9 +58,9 @@ def repository(tmp_path, monkeypatch):
         SourceFile(path, len(data), hashlib.sha256(data).hexdigest())
         for path, data in files.items()
     )
-    made = replace(catalogue.get("pendulum_free_swing"), files=declared)
-    every = {**catalogue._catalogue(), made.name: made}
-    monkeypatch.setattr(catalogue, "_catalogue", lambda: every)
+    made = replace(dataset_catalogue.get("pendulum_free_swing"), files=declared)
+    every = {**dataset_catalogue._catalogue(), made.name: made}
+    monkeypatch.setattr(dataset_catalogue, "_catalogue", lambda: every)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("SIMGAP_DATA", raising=False)
     monkeypatch.delenv("SIMGAP_ROBOTS", raising=False)
@@ -125,7 +125,7 @@ def refused(capsys, *words):
     said = capsys.readouterr()
     assert said.out == ""
     assert len(said.err.splitlines()) == 1, said.err
-    folder = catalogue.user_folder()
+    folder = dataset_catalogue.user_folder()
     assert not folder.exists() or not list(folder.iterdir())
     return said.err
 
@@ -140,7 +140,7 @@ def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path,
     assert {path.name for path in folder.iterdir()} == names
     assert (folder / "LICENSE").read_bytes() == LICENCE
     source = (folder / "SOURCE.txt").read_text()
-    made = catalogue.get("pendulum_free_swing")
+    made = dataset_catalogue.get("pendulum_free_swing")
     assert all(word in source for word in (made.commit, made.repository, made.files[0].sha256))
     recording = read_recording(folder / "recording.csv", Pendulum)
     assert len(recording.runs) == 2
@@ -152,7 +152,7 @@ def test_a_download_is_a_recording_with_its_licence_and_source(served, tmp_path,
 
 
 def test_runs_from_the_seventh_on_are_held_out():
-    from bench.datasets.conversions import free_swing
+    from bench.datasets.dataset_conversion import free_swing
 
     swing = np.stack([np.linspace(3.0, 3.2, 40_000), np.linspace(-1.0, 1.0, 40_000)])
     content = io.BytesIO()
@@ -193,9 +193,9 @@ def test_an_experiment_finds_what_was_downloaded(repository, capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "run `simgap download pendulum_free_swing`" in said
-    assert availability(load("pendulum-real")).data_set.name == "pendulum_free_swing"
+    assert availability(load_experiment("pendulum-real")).data_set.name == "pendulum_free_swing"
     assert main(["download", "pendulum_free_swing", "--from", str(repository)]) == 0
-    assert availability(load("pendulum-real")).data_set is None
+    assert availability(load_experiment("pendulum-real")).data_set is None
 
 
 def test_an_address_that_lacks_the_file(served, repository, capsys):
@@ -228,7 +228,7 @@ def test_no_network(capsys, repository, monkeypatch):
     said = refused(capsys)
     assert "cannot be downloaded" in said
     assert "Name or service not known" in said
-    assert f"{catalogue.get('pendulum_free_swing').base_url}/{MAT}" in said
+    assert f"{dataset_catalogue.get('pendulum_free_swing').base_url}/{MAT}" in said
 
 
 def test_nobody_answers(repository, capsys):
@@ -290,8 +290,8 @@ def test_a_folder_that_cannot_be_written(repository, tmp_path, capsys):
 
 @pytest.mark.parametrize("content", [b"", b"MATLAB 5.0 MAT-file" * 20, None])
 def test_a_file_of_other_content_is_no_recording(content):
-    from bench.datasets.conversions import free_swing
-    from sims.base import InputError
+    from bench.datasets.dataset_conversion import free_swing
+    from sims.core.simulator import InputError
 
     if content is None:
         stream = io.BytesIO()
@@ -320,11 +320,15 @@ def test_the_list_says_what_there_is_where_and_for_what(repository, capsys):
 
 def test_every_experiment_that_lacks_a_file_of_the_project_names_a_data_set(repository):
     """In a clone without any data, experiments lack nothing that a command does not bring."""
-    for name in names():
-        lacks = availability(load(name))
+    for name in list_experiment_names():
+        lacks = availability(load_experiment(name))
         if lacks.data_set is None:
             assert not lacks.skipped, (name, lacks.skipped)
-    lacking = {n: d.name for n in names() if (d := availability(load(n)).data_set)}
+    lacking = {
+        n: d.name
+        for n in list_experiment_names()
+        if (d := availability(load_experiment(n)).data_set)
+    }
     assert lacking == {"pendulum-real": "pendulum_free_swing", "robot-so101": "so101"}
 
 
@@ -333,7 +337,7 @@ def test_the_published_swing_is_the_recording_that_results_were_made_with(record
     published = os.environ.get("SIMGAP_FREE_SWING")
     if not published:
         pytest.skip("SIMGAP_FREE_SWING does not name the published file")
-    from bench.datasets.conversions import free_swing
+    from bench.datasets.dataset_conversion import free_swing
 
     for name, content in free_swing({"x.mat": Path(published).read_bytes()}).items():
         assert content == (recordings / "pendulum_free_swing" / name).read_text(), name
@@ -342,7 +346,7 @@ def test_the_published_swing_is_the_recording_that_results_were_made_with(record
 def test_data_sets_are_those_that_results_were_made_with(recordings):
     robots = recordings.parent / "robots"
     for data_set, folder in (("so101", robots), ("pendulum_free_swing", recordings)):
-        for file in catalogue.get(data_set).files:
+        for file in dataset_catalogue.get(data_set).files:
             path = folder / data_set / file.name
             if not path.is_file():
                 continue  # what is converted is compared above

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from bench.figures.png_encoder import encoded_png
-from bench.figures.style import blank, png
+from bench.figures.style import make_panel_grid, render_png
 
 
 def test_pixels_and_dots_an_inch_are_kept():
@@ -20,9 +20,9 @@ def test_pixels_and_dots_an_inch_are_kept():
 
 @pytest.mark.parametrize("size", [(10.6875, 4.9700000000000006), (3.14159, 2.71828), (1.07, 1.01)])
 def test_a_figure_is_what_matplotlib_writes(size):
-    figure, axes = blank(1, 1, size, layout=None)
+    figure, axes = make_panel_grid(1, 1, size, layout=None)
     axes[0, 0].plot([0, 1], [0, 1])
     expected = BytesIO()
     figure.savefig(expected, format="png", dpi=150)
-    with Image.open(expected) as a, Image.open(BytesIO(png(figure, 150))) as b:
+    with Image.open(expected) as a, Image.open(BytesIO(render_png(figure, 150))) as b:
         np.testing.assert_array_equal(np.asarray(a)[:, :, :3], np.asarray(b))

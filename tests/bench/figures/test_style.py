@@ -12,22 +12,22 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import bench
-from bench.analysis.paired import nemenyi
-from bench.figures import style, training
-from bench.figures.comparison import figure, names
-from bench.figures.formats import pdf_figures
-from bench.figures.recording import recording_figure
-from bench.figures.runtimes import rank_figure
-from bench.figures.style import blank, png, save, taken
-from bench.figures.track import track_figure
-from bench.gap.report import pictures
-from bench.recordings.inspection import load
-from bench.recordings.metres import Heights
-from sims.base import InputError
-from sims.camera.track import Track
-from tests.bench.figures.made import LABELS, stored
-from tests.bench.gap.stories import story
-from tests.bench.gap.tables import swing, table
+from bench.benchmark.figures.comparison_figures import draw_figure, list_figure_names
+from bench.benchmark.figures.runtime_figures import draw_critical_difference_figure
+from bench.benchmark.statistics.paired_tests import compute_nemenyi_p_values
+from bench.diagnosis.report import explanation_figures
+from bench.figures import loss_figure, style
+from bench.figures.figure_files import pdf_figures
+from bench.figures.recording_figure import draw_recording_figure
+from bench.figures.style import make_panel_grid, render_all_formats, render_png, write_figure
+from bench.figures.track_figure import draw_track_figure
+from bench.logs.ball_heights import BallHeights
+from bench.logs.inspection import load_recording
+from sims.core.simulator import InputError
+from sims.vision.ball_tracker import BallTrack
+from tests.bench.diagnosis.report_tables import swing, table
+from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.figures.sample_comparisons import LABELS, stored
 
 ROOT = Path(bench.__file__).parents[1]
 SOURCES = [path for room in ("bench", "methods", "sims") for path in (ROOT / room).rglob("*.py")]
@@ -44,20 +44,24 @@ def ranks():
 
 
 def rank():
-    friedman, p_values = nemenyi(ranks())
-    return rank_figure(ranks(), p_values, friedman)
+    friedman, p_values = compute_nemenyi_p_values(ranks())
+    return draw_critical_difference_figure(ranks(), p_values, friedman)
 
 
 def loss():
-    return training.loss_figure("t", [(0, "clean", e, 1.0 / e, 2.0 / e) for e in range(1, 9)])
+    return loss_figure.draw_loss_figure(
+        "t", [(0, "clean", e, 1.0 / e, 2.0 / e) for e in range(1, 9)]
+    )
 
 
 def tracked():
     t = np.arange(30) / 30
     ball = np.full(30, 5.0)
     scene = np.zeros((60, 40, 3), dtype=np.uint8)
-    track = Track(t, 20.0 + 0 * t, 10 + 30 * t**2, ball, 0.1, (40, 60), (), scene, {3: scene})
-    return track_figure(track, Heights(1 - t**2, 0.03, "somehow"), slice(2, 28), "film.mp4")
+    track = BallTrack(t, 20.0 + 0 * t, 10 + 30 * t**2, ball, 0.1, (40, 60), (), scene, {3: scene})
+    return draw_track_figure(
+        track, BallHeights(1 - t**2, 0.03, "somehow"), slice(2, 28), "film.mp4"
+    )
 
 
 @pytest.fixture
@@ -81,13 +85,16 @@ def notebook(monkeypatch):
 def test_drawing_leaves_backend_settings_and_open_figures_alone(notebook, tmp_path):
     before = notebook()
     assert before[2] == [7]
-    drawn = [figure(stored(), LABELS, name) for name in names(stored())]
-    drawn += [pictures.figure(story(), name) for name in pictures.names(story())]
-    drawn += [rank(), loss(), tracked(), recording_figure(*load(swinging(tmp_path)))]
+    drawn = [draw_figure(stored(), LABELS, name) for name in list_figure_names(stored())]
+    drawn += [
+        explanation_figures.draw_figure(story(), name)
+        for name in explanation_figures.list_figure_names(story())
+    ]
+    drawn += [rank(), loss(), tracked(), draw_recording_figure(*load_recording(swinging(tmp_path)))]
     for i, one in enumerate(drawn):
         assert isinstance(one, Figure)
-        save(one, tmp_path / str(i), dpi=40)
-    pictures.printed(story())
+        write_figure(one, tmp_path / str(i), dpi=40)
+    explanation_figures.render_figures(story())
     assert notebook() == before
 
 
@@ -104,32 +111,34 @@ def test_colours_are_named_in_one_place():
 
 
 def test_a_notebook_can_show_a_figure_that_pyplot_does_not_know():
-    drawn, _ = blank(1, 2, (4, 3))
+    drawn, _ = make_panel_grid(1, 2, (4, 3))
     assert drawn._repr_png_().startswith(b"\x89PNG")
 
 
 def test_files_are_whole_and_the_same_whenever_they_are_made(tmp_path):
     with pdf_figures():
-        paths = save(loss(), tmp_path / "new" / "figures" / "loss")
-        again = save(loss(), tmp_path / "loss")
+        paths = write_figure(loss(), tmp_path / "new" / "figures" / "loss")
+        again = write_figure(loss(), tmp_path / "loss")
     assert [path.name for path in paths] == ["loss.png", "loss.pdf"]
     assert sorted((tmp_path / "new" / "figures").iterdir()) == sorted(paths)
     assert [p.read_bytes() for p in again] == [p.read_bytes() for p in paths]
-    assert paths[0].read_bytes() == png(loss())
+    assert paths[0].read_bytes() == render_png(loss())
 
 
 def test_a_pdf_is_made_only_where_one_is_asked_for(tmp_path, monkeypatch):
     rendered = []
-    plain = style.pdf
-    monkeypatch.setattr(style, "pdf", lambda figure: rendered.append(figure) or plain(figure))
-    assert [path.name for path in save(loss(), tmp_path / "loss")] == ["loss.png"]
-    assert taken(loss()).pdf is None
+    plain = style.render_pdf
+    monkeypatch.setattr(
+        style, "render_pdf", lambda figure: rendered.append(figure) or plain(figure)
+    )
+    assert [path.name for path in write_figure(loss(), tmp_path / "loss")] == ["loss.png"]
+    assert render_all_formats(loss()).pdf is None
     with pdf_figures(False):
-        assert taken(loss()).pdf is None
+        assert render_all_formats(loss()).pdf is None
     assert rendered == [], "what nobody asks for costs nothing"
     with pdf_figures(), pdf_figures(False):
-        assert taken(loss()).pdf.startswith(b"%PDF")
-    assert taken(loss()).pdf is None
+        assert render_all_formats(loss()).pdf.startswith(b"%PDF")
+    assert render_all_formats(loss()).pdf is None
 
 
 def test_of_png_and_pdf_neither_is_left_without_the_other(tmp_path, monkeypatch):
@@ -144,18 +153,20 @@ def test_of_png_and_pdf_neither_is_left_without_the_other(tmp_path, monkeypatch)
         pdf_figures(),
         pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"),
     ):
-        save(loss(), tmp_path / "loss")
+        write_figure(loss(), tmp_path / "loss")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_cannot_be_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file: cannot be written"):
-        save(loss(), tmp_path / "file" / "loss")
+        write_figure(loss(), tmp_path / "file" / "loss")
 
 
 def test_a_tuner_has_its_colour_in_the_diagram_of_ranks_too():
     figure = rank()
     dots = {tuple(dot) for one in figure.axes[0].collections for dot in one.get_facecolors()}
-    assert {to_hex(dot).upper() for dot in dots} == {style.colour(place) for place in range(4)}
-    assert {to_hex(text.get_color()).upper() for text in figure.axes[0].texts} == {style.INK}
+    assert {to_hex(dot).upper() for dot in dots} == {style.get_colour(place) for place in range(4)}
+    assert {to_hex(text.get_color()).upper() for text in figure.axes[0].texts} == {
+        style.NEUTRAL_MARK
+    }

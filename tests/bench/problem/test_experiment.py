@@ -3,27 +3,33 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from bench.problem.experiment import Entry, expand, load, names, parse
-from bench.problem.problem import Problem
-from bench.problem.recorded import find_recording
-from bench.runs.identity import Identities
-from bench.runs.training import key
-from bench.store.folder import _plain
-from sims.base import InputError
-from sims.user_toml import tomllib
-from tests.experiments import SPRING, spring_experiment
+from bench.benchmark.problem.experiment import (
+    TunerEntry,
+    expand_sweep,
+    list_experiment_names,
+    load_experiment,
+    parse_experiment,
+)
+from bench.benchmark.problem.recorded_runs import find_recording
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.run_ids import RunIds
+from bench.benchmark.runner.tuner_training import compute_training_key
+from bench.benchmark.storage.result_folder import _plain
+from sims.core.simulator import InputError
+from sims.core.toml_validation import tomllib
+from tests.sample_experiments import SPRING, spring_experiment
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", list_experiment_names())
 def test_document_of_every_shipped_experiment_gives_it_back(name):
-    experiment = load(name)
+    experiment = load_experiment(name)
     document = tomllib.loads(tomli_w.dumps(_plain(experiment.document())))
-    assert parse(name, document, Path("x.toml")) == experiment
+    assert parse_experiment(name, document, Path("x.toml")) == experiment
     assert experiment.says
 
 
 def test_published_setting_of_ball_drop():
-    experiment = load("ball-drop")
+    experiment = load_experiment("ball-drop")
     assert experiment.sampling.samples == 400
     assert experiment.sampling.rate == 60
     assert experiment.constants == {"gravity": 9.8, "radius": 0.5, "mass": 1.0}
@@ -67,7 +73,7 @@ def test_published_setting_of_ball_drop():
 )
 def test_faults_are_one_line_that_names_file_and_entry(change, message):
     with pytest.raises(InputError, match=message) as caught:
-        parse("e", {**SPRING, **change}, Path("mine.toml"))
+        parse_experiment("e", {**SPRING, **change}, Path("mine.toml"))
     assert "mine.toml" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -77,7 +83,7 @@ def test_unknown_experiment_lists_those_there_are():
         InputError,
         match=r"unknown experiment 'ball'; there are: arm-drive, .*pendulum-real",
     ):
-        load("ball")
+        load_experiment("ball")
 
 
 def test_seeds_on_the_command_line_never_exceed_an_entry_that_asks_for_fewer():
@@ -137,7 +143,7 @@ def test_a_sweep_is_an_experiment_for_each_combination():
         parameters={"rate": {"training": [2.0, 3.0]}},
         sweep={"budget": [3, 9], "noise.x": [0.001, 0.01], "parameters.rate.log": [True]},
     )
-    expanded = expand(swept)
+    expanded = expand_sweep(swept)
     assert [e.name for e in expanded] == [
         "spring-test[budget=3,noise.x=0.001,parameters.rate.log=true]",
         "spring-test[budget=3,noise.x=0.01,parameters.rate.log=true]",
@@ -150,18 +156,18 @@ def test_a_sweep_is_an_experiment_for_each_combination():
     assert last.tuners == swept.tuners
     assert last.tags == ("quick",)
     assert last.title.startswith("A spring (budget = 9, noise.x = 0.01, ")
-    assert [expand(e) for e in expanded] == [[e] for e in expanded]
+    assert [expand_sweep(e) for e in expanded] == [[e] for e in expanded]
 
 
 def test_experiments_of_a_sweep_meet_the_same_targets(spring):
     small, large = (
-        Problem(e).target("in", 1)
-        for e in expand(spring_experiment(sweep={"noise.x": [1e-9, 1e-3]}))
+        TuningProblem(e).draw_target("in", 1)
+        for e in expand_sweep(spring_experiment(sweep={"noise.x": [1e-9, 1e-3]}))
     )
-    alone = Problem(spring_experiment()).target("in", 1)
+    alone = TuningProblem(spring_experiment()).draw_target("in", 1)
     assert small.truth.tolist() == large.truth.tolist() == alone.truth.tolist()
-    assert small.sealed.start.tolist() == large.sealed.start.tolist()
-    apart = large.sealed.fitting.observed - small.sealed.fitting.observed
+    assert small.blinded.start.tolist() == large.blinded.start.tolist()
+    apart = large.blinded.fitting.observed - small.blinded.fitting.observed
     assert 1e-4 < apart.std() < 1e-2
 
 
@@ -170,7 +176,7 @@ def test_a_sweep_names_entries_whose_names_have_dots():
         parameters={"drag.linear": {"nominal": 0.5}},
         sweep={"parameters.drag.linear.nominal": [0.1], "observe": [["x"], ["x", "v"]]},
     )
-    first, second = expand(swept)
+    first, second = expand_sweep(swept)
     assert first.parameters == {"drag.linear": {"nominal": 0.1}}
     assert second.observe == ("x", "v")
     assert second.name == "spring-test[parameters.drag.linear.nominal=0.1,observe=x_v]"
@@ -197,25 +203,25 @@ def test_faults_in_a_sweep_are_one_line_that_names_the_file(sweep, message):
 
 def test_what_is_not_expanded_is_not_run(spring):
     with pytest.raises(InputError, match=r"spring-test: sweeps over budget; run those that"):
-        Problem(spring_experiment(sweep={"budget": [3]}))
+        TuningProblem(spring_experiment(sweep={"budget": [3]}))
 
 
 def test_what_only_describes_enters_no_name_of_a_run_or_of_weights(spring):
     described = {"title": "Another", "says": "Words.", "tags": ["quick"]}
     plain, told = spring_experiment(), spring_experiment(**described)
-    entry, target = plain.tuners[0], Problem(plain).target("in", 0).sealed
-    ids = [Identities(e).run(entry, target, 0, 12) for e in (plain, told)]
+    entry, target = plain.tuners[0], TuningProblem(plain).draw_target("in", 0).blinded
+    ids = [RunIds(e).make_run_id(entry, target, 0, 12) for e in (plain, told)]
     assert ids[0] == ids[1]
-    regressor = Entry("regressor", "regressor")
-    assert key(plain, regressor, 0) == key(told, regressor, 0)
+    regressor = TunerEntry("regressor", "regressor")
+    assert compute_training_key(plain, regressor, 0) == compute_training_key(told, regressor, 0)
 
 
 def test_every_shipped_experiment_has_tags():
-    assert {tag for name in names() for tag in load(name).tags} == {
+    assert {tag for name in list_experiment_names() for tag in load_experiment(name).tags} == {
         "diagnosis", "misspecified", "other-engine", "published", "quick", "real", "robot",
         "several-parameters", "video",
     }  # fmt: skip
-    assert all(load(name).tags for name in names())
+    assert all(load_experiment(name).tags for name in list_experiment_names())
 
 
 RECORDED = SPRING | {"ranges": ["real"], "recording": {"path": "logs/swing.csv"}}
@@ -230,12 +236,14 @@ def test_a_recording_is_looked_for_in_its_folder_and_beside_the_experiment(tmp_p
         (folder / "swing.csv").touch()
     file = tmp_path / "mine" / "mine.toml"
     document = {k: v for k, v in RECORDED.items() if k != "initial"}
-    found = parse("mine", document, file).recording.path
+    found = parse_experiment("mine", document, file).recording.path
     assert found == str(beside / "swing.csv")
-    again = parse("mine", {**document, "recording": {"path": found}}, tmp_path / "x" / "e.toml")
+    again = parse_experiment(
+        "mine", {**document, "recording": {"path": found}}, tmp_path / "x" / "e.toml"
+    )
     assert again.recording.path == found, "as from a folder of results"
     monkeypatch.setenv("SIMGAP_DATA", str(tmp_path / "data"))
-    assert parse("mine", document, file).recording.path == "logs/swing.csv"
+    assert parse_experiment("mine", document, file).recording.path == "logs/swing.csv"
     assert find_recording("logs/swing.csv") == data / "swing.csv"
     monkeypatch.chdir(tmp_path / "mine")
     monkeypatch.setenv("SIMGAP_DATA", str(tmp_path / "nowhere"))

@@ -6,25 +6,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.problem.problem import Problem
-from bench.problem.salt import Streams, check_commitment, commitment, fresh
-from bench.problem.seeds import rng_for
-from sims.base import InputError
-from tests.experiments import spring_experiment
+from bench.benchmark.problem.salt import (
+    TargetStreams,
+    check_commitment,
+    compute_commitment,
+    generate_salt,
+)
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.core.random_streams import make_rng
+from sims.core.simulator import InputError
+from tests.sample_experiments import spring_experiment
 
 pytestmark = pytest.mark.usefixtures("spring")
 
 
 def truths(salt, **changes):
-    return [t.truth for t in Problem(spring_experiment(salt="", **changes), salt).targets()]
+    return [
+        t.truth for t in TuningProblem(spring_experiment(salt="", **changes), salt).draw_targets()
+    ]
 
 
 def test_the_commitment_is_the_salts_sha_256_and_another_salt_is_refused():
-    assert commitment("hello") == hashlib.sha256(b"hello").hexdigest()
-    assert commitment("hello").startswith("2cf24dba5fb0a30e26e83b2ac5b9e29e")
-    check_commitment("e", "hello", commitment("hello"))
+    assert compute_commitment("hello") == hashlib.sha256(b"hello").hexdigest()
+    assert compute_commitment("hello").startswith("2cf24dba5fb0a30e26e83b2ac5b9e29e")
+    check_commitment("e", "hello", compute_commitment("hello"))
     with pytest.raises(InputError, match="one of the two was changed"):
-        check_commitment("e", "hallo", commitment("hello"))
+        check_commitment("e", "hallo", compute_commitment("hello"))
     with pytest.raises(InputError, match="64 hexadecimal digits"):
         check_commitment("e", "", "2cf2")
     with pytest.raises(InputError, match="1000 characters"):
@@ -32,7 +39,7 @@ def test_the_commitment_is_the_salts_sha_256_and_another_salt_is_refused():
 
 
 def test_fresh_salts_have_128_bits_and_are_never_the_same():
-    salts = {fresh() for _ in range(100)}
+    salts = {generate_salt() for _ in range(100)}
     assert len(salts) == 100
     assert {len(bytes.fromhex(salt)) for salt in salts} == {16}
 
@@ -47,33 +54,35 @@ def test_targets_follow_from_the_salt():
 
 def test_a_salt_draws_each_thing_from_a_stream_of_its_own():
     """What a tuner sees of one, as its start, is no part of the stream of another."""
-    streams = Streams("a", "e", "in", 0)
-    drawn = {w: streams.of(w).uniform(size=4) for w in ("start", "truth", "scenario", "noise")}
-    drawn |= {f"held-out {i}": streams.held_out(i).uniform(size=4) for i in range(2)}
+    streams = TargetStreams("a", "e", "in", 0)
+    drawn = {
+        w: streams.get_stream(w).uniform(size=4) for w in ("start", "truth", "scenario", "noise")
+    }
+    drawn |= {f"held-out {i}": streams.get_held_out_stream(i).uniform(size=4) for i in range(2)}
     numbers = np.concatenate(list(drawn.values()))
     assert len(np.unique(numbers)) == numbers.size
-    again = Streams("a", "e", "in", 0)
+    again = TargetStreams("a", "e", "in", 0)
     for what in ("truth", "start"):  # in another order
-        np.testing.assert_array_equal(again.of(what).uniform(size=4), drawn[what])
+        np.testing.assert_array_equal(again.get_stream(what).uniform(size=4), drawn[what])
 
 
 def test_public_targets_are_those_of_the_published_stream():
-    (target,) = Problem(spring_experiment(targets=1, ranges=["in"])).targets()
-    low, high = Problem(spring_experiment()).cube.training
-    rng = rng_for("spring-test", "target", "in", 0)
-    np.testing.assert_array_equal(target.sealed.start, rng.uniform(low, high))
+    (target,) = TuningProblem(spring_experiment(targets=1, ranges=["in"])).draw_targets()
+    low, high = TuningProblem(spring_experiment()).cube.training
+    rng = make_rng("spring-test", "target", "in", 0)
+    np.testing.assert_array_equal(target.blinded.start, rng.uniform(low, high))
 
 
 def test_nobody_draws_a_secret_target_from_public_names():
     """As a plugin tried: name, range and number are public, and give another target."""
-    problem = Problem(spring_experiment(salt="", targets=1, ranges=["in"]), fresh())
-    (target,) = problem.targets()
+    problem = TuningProblem(spring_experiment(salt="", targets=1, ranges=["in"]), generate_salt())
+    (target,) = problem.draw_targets()
     low, high = problem.cube.training
-    rng = rng_for("spring-test", "target", "in", 0)
-    drawn = problem.cube.physical(rng.uniform(low, high, size=(2, 2)))
+    rng = make_rng("spring-test", "target", "in", 0)
+    drawn = problem.cube.to_physical(rng.uniform(low, high, size=(2, 2)))
     assert not np.isclose(drawn, target.truth).any()
 
 
 def test_an_experiment_carries_no_secret():
-    experiment = replace(spring_experiment(salt=""), salt_sha256=commitment("secret"))
-    assert "secret" not in repr(Problem(experiment, "secret").experiment)
+    experiment = replace(spring_experiment(salt=""), salt_sha256=compute_commitment("secret"))
+    assert "secret" not in repr(TuningProblem(experiment, "secret").experiment)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.problem.experiment import parse
-from bench.problem.problem import Problem
-from bench.runs.runner import prepare, run
-from tests.experiments import spring_experiment
+from bench.benchmark.problem.experiment import parse_experiment
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
+from tests.sample_experiments import spring_experiment
 
 TIMES = np.arange(60) / 20
 BIAS = 0.4
@@ -30,7 +30,9 @@ def test_targets_of_another_experiment_are_met_whole(spring):
     other = spring_experiment(noise={"x": 0.05}, held_out={"scenarios": 2}, targets=2)
     met = replace(other, name="mine", same_targets_as="spring-test", budget=5, seeds=1)
     own = replace(other, name="mine")
-    for theirs, mine, apart in zip(*(Problem(e).targets() for e in (other, met, own)), strict=True):
+    for theirs, mine, apart in zip(
+        *(TuningProblem(e).draw_targets() for e in (other, met, own)), strict=True
+    ):
         np.testing.assert_array_equal(everything(mine), everything(theirs))
         assert len(np.unique(everything(mine))) == 2 + 2 + 3 + 3 * 60 - 2, (
             "each its own draw; held-out runs, without noise, begin with their initial state"
@@ -42,9 +44,9 @@ def test_a_comparison_meets_the_targets_of_another_and_searches_them_in_its_own_
     other = spring_experiment(noise={"x": 0.05}, targets=2, seeds=1)
     columns = []
     for name, met in (("spring-test", ""), ("mine", "spring-test"), ("mine", "")):
-        results = prepare(replace(other, name=name, same_targets_as=met))
-        run(results, jobs=0)
-        columns.append(results.kept.columns)
+        results = prepare_experiment(replace(other, name=name, same_targets_as=met))
+        run_experiment(results, jobs=0)
+        columns.append(results.run_sink.columns)
     theirs, mine, apart = columns
     for place in theirs:
         for name in ("true_rate", "true_decay"):
@@ -58,11 +60,11 @@ def test_a_comparison_meets_the_targets_of_another_and_searches_them_in_its_own_
 
 @pytest.mark.parametrize(("kind", "low", "high"), [("in", 2.0, 4.0), ("wide", 1.0, 5.0)])
 def test_start_and_truth_are_drawn_evenly_from_their_range(kind, low, high, spring):
-    problem = Problem(spring_experiment())
-    drawn = [problem.target(kind, i) for i in range(200)]
+    problem = TuningProblem(spring_experiment())
+    drawn = [problem.draw_target(kind, i) for i in range(200)]
     for rates in (
         np.array([target.truth[0] for target in drawn]),
-        np.array([1.0 + 4.0 * target.sealed.start[0] for target in drawn]),
+        np.array([1.0 + 4.0 * target.blinded.start[0] for target in drawn]),
     ):
         assert low <= rates.min() < low + 0.03 * (high - low)
         assert high >= rates.max() > high - 0.03 * (high - low)
@@ -71,12 +73,12 @@ def test_start_and_truth_are_drawn_evenly_from_their_range(kind, low, high, spri
 
 def test_every_channel_has_noise_of_its_own_size(spring):
     experiment = spring_experiment(observe=["x", "v"], noise={"x": 0.05, "v": 0.5})
-    problem = Problem(experiment)
+    problem = TuningProblem(experiment)
     assert problem.scale.tolist() == [0.05, 0.5]
     left = []
-    for target in problem.targets():
-        (scene,), theta = target.sealed.fitting.scenarios, target.truth[None]
-        left.append(target.sealed.fitting.observed - problem.simulator.simulate(theta, scene)[0])
+    for target in problem.draw_targets():
+        (scene,), theta = target.blinded.fitting.scenarios, target.truth[None]
+        left.append(target.blinded.fitting.observed - problem.simulator.simulate(theta, scene)[0])
     spread = np.concatenate(left).std(axis=0)
     np.testing.assert_allclose(spread, [0.05, 0.5], rtol=0.1)
     assert abs(np.corrcoef(np.concatenate(left).T)[0, 1]) < 0.15
@@ -93,20 +95,20 @@ def slider(**changes):
         "held_out": {"scenarios": 2, "initial": {"x": 0.3, "v": 0.5}},
         "tuners": ["nelder_mead"], **changes,
     }  # fmt: skip
-    return parse("pushed", document, "pushed.toml")
+    return parse_experiment("pushed", document, "pushed.toml")
 
 
 def test_held_out_runs_are_the_worlds_and_not_the_tuned_simulators():
     """The bias moves the mass by F t^2 / 2 m, in the fitted run and in those held out."""
-    results = prepare(slider())
-    held_out = results.plan[0].target.sealed.held_out
+    results = prepare_experiment(slider())
+    held_out = results.plan[0].target.blinded.held_out
     moved = 0.3 + 0.5 * TIMES + BIAS * TIMES**2 / 2
     np.testing.assert_allclose(held_out.observed[:, 0], [*moved, *moved], atol=1e-5)
-    run(results, jobs=0)
+    run_experiment(results, jobs=0)
     missing = np.sqrt(np.mean((BIAS * TIMES**2 / 2) ** 2))
     assert missing == pytest.approx(0.8, rel=0.05)
     for metric in ("obs_error", "heldout_error"):
-        (columns,) = results.kept.columns.values()
+        (columns,) = results.run_sink.columns.values()
         assert columns[metric][0] == pytest.approx(missing, rel=1e-5), metric
     away = np.abs(columns["recommendation_mass"] - columns["true_mass"])
     np.testing.assert_array_equal(columns["param_abs_error"], away)
@@ -114,7 +116,7 @@ def test_held_out_runs_are_the_worlds_and_not_the_tuned_simulators():
 
 
 def test_held_out_runs_of_an_equal_world_are_predicted_at_the_truth():
-    results = prepare(slider(world={}))
-    run(results, jobs=0)
-    (columns,) = results.kept.columns.values()
+    results = prepare_experiment(slider(world={}))
+    run_experiment(results, jobs=0)
+    (columns,) = results.run_sink.columns.values()
     assert columns["heldout_error"][0] < 1e-5

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sims.ball.simulator import Ball
-from sims.base import Scenario
-from tests.sims.effects.worlds import run
+from sims.core.simulator import Scenario
+from sims.systems.ball import Ball
+from tests.sims.effects.effect_systems import run
 
 G, RADIUS = 9.81, 0.5
 
@@ -15,7 +15,7 @@ def first_rebound(heights, fixed, e):
     times = np.arange(0, 2.4, 0.002)
     ball = Ball(observe=["z"], engine="batch", fixed=fixed)
     scenarios = [Scenario(times, {"z": RADIUS + h}) for h in heights]
-    z = ball.simulate_lanes(np.full((len(heights), 1), e), scenarios)[:, :, 0]
+    z = ball.simulate_batch(np.full((len(heights), 1), e), scenarios)[:, :, 0]
     apexes = []
     for row in z:
         up = int(np.argmax(np.diff(row) > 0)) + 1

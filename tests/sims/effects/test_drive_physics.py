@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from tests.sims.effects.effect_systems import moment, run
 from tests.sims.effects.test_force_laws import limit
-from tests.sims.effects.worlds import moment, run
 
 MASS, LENGTH, GRAVITY = 0.2, 0.5, 10.0  # of a pendulum that weighs sin q
 HEAVY = {"mass": MASS, "length": LENGTH, "gravity": GRAVITY}

@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 
 from sims import effects
-from tests.sims.effects.worlds import lanes, moment
+from tests.sims.effects.effect_systems import lanes, moment
 
 FLIGHT = {"x": [[1.0, 2.0, 3.0]], "v": [[3.0, 0.0, -4.0]]}  # |v| = 5
 ROLL = {"x": [[0.5]], "v": [[-2.0]], "theta": [2.0]}
 
 
 def force(name, now, *c):
-    effect = effects.get(name)
+    effect = effects.get_effect(name)
     return effect().force(
         lanes(*c, *[0.0] * (len(effect.coefficients) - len(c)), count=len(now.x)), now
     )[0]
 
 
 def limit(name, now, *c):
-    return effects.get(name)().limit(lanes(*c, count=len(now.x)), now)[0, 0]
+    return effects.get_effect(name)().limit(lanes(*c, count=len(now.x)), now)[0, 0]
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_load_counts_both_sides_of_the_transmission():
 
 
 def test_restitution_is_a_power_of_speed_that_makes_no_energy():
-    effect = effects.get("restitution.speed")()
+    effect = effects.get_effect("restitution.speed")()
 
     def at(e, speed, c):
         return effect.restitution(lanes(c), np.array([[e]]), np.array([[speed]]))[0, 0]
@@ -124,7 +124,7 @@ def test_restitution_is_a_power_of_speed_that_makes_no_energy():
 
 
 def test_contact_friction_is_its_coefficient():
-    effect = effects.get("contact.friction")()
+    effect = effects.get_effect("contact.friction")()
     assert effect.friction(lanes(0.3, count=2)).tolist() == [[0.3], [0.3]]
     assert effect.friction(lanes(-0.3)).tolist() == [[0.0]]
 
@@ -132,4 +132,4 @@ def test_contact_friction_is_its_coefficient():
 def test_lanes_keep_to_themselves():
     c = np.array([[[0.1], [0.2], [0.0]]])
     now = moment("slider", [[0.0]] * 3, [[1.0], [2.0], [3.0]])
-    assert effects.get("drag.quadratic")().force(c, now).tolist() == [[-0.1], [-0.8], [0.0]]
+    assert effects.get_effect("drag.quadratic")().force(c, now).tolist() == [[-0.1], [-0.8], [0.0]]

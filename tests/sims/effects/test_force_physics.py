@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
-from tests.sims.effects.worlds import run
+from tests.sims.effects.effect_systems import run
 
 G = 9.81
 FREE = {"gravity": 0.0}

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from sims.base import InputError, Scenario
-from sims.engines.hidden import enlarged
-from sims.pendulum.simulator import Pendulum
-from sims.slider.simulator import Slider
-from sims.slider.system import SliderSystem
-from tests.sims.effects.worlds import lanes, moment
+from sims.core.simulator import InputError, Scenario
+from sims.engines.hidden_states import make_augmented_system
+from sims.systems.pendulum import Pendulum
+from sims.systems.slider import Slider, SliderSystem
+from tests.sims.effects.effect_systems import lanes, moment
 
 TIMES = np.arange(200) / 100
 MASS = 1.3
@@ -124,19 +123,19 @@ def test_lanes_with_and_without_a_state_are_each_as_alone():
 
 
 def test_inertia_is_what_is_left_to_the_drives_side():
-    from sims.effects.hysteresis import Hysteresis
-    from sims.effects.transmission import Flexibility
+    from sims.effects.friction_hysteresis import FrictionHysteresis
+    from sims.effects.transmission import JointFlexibility
 
-    system = enlarged(SliderSystem, (Flexibility, Hysteresis))()
+    system = make_augmented_system(SliderSystem, (JointFlexibility, FrictionHysteresis))()
     theta = np.array([[2.0, 0.25, 30.0, 0.1, 0.5, 0.01]])
-    assert system.mass(theta, {})[0, 0] == pytest.approx(1.5)
+    assert system.inertia(theta, {})[0, 0] == pytest.approx(1.5)
     assert system.coordinates == ("x", "joint.flexibility", "friction.hysteresis")
 
 
 def test_a_share_beyond_all_leaves_something_to_either_side():
-    from sims.effects.transmission import Flexibility
+    from sims.effects.transmission import JointFlexibility
 
-    assert Flexibility().behind(lanes(5.0, 30.0, 0.1))[0, 0] == pytest.approx(0.98)
+    assert JointFlexibility().get_inertia_share(lanes(5.0, 30.0, 0.1))[0, 0] == pytest.approx(0.98)
     at = moment("slider", [[0.1]], [[0.2]], theta=[[2.0]])
     assert at.inertia[0, 0] == 2.0
 

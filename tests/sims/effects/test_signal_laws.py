@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sims import effects
-from sims.system import Signal
-from tests.robots.signals import profiled
-from tests.sims.effects.worlds import lanes
+from sims.core.system import Signal
+from tests.robot_exam.excitation_signals import profiled
+from tests.sims.effects.effect_systems import lanes
 
 
 def signal(values, step=0.1, start=None):
@@ -17,8 +17,8 @@ def signal(values, step=0.1, start=None):
 
 
 def through(name, c, *args, **kwargs):
-    effect, given = effects.get(name)(), signal(*args, **kwargs)
-    change = effect.feel if effect.hook == "input" else effect.read
+    effect, given = effects.get_effect(name)(), signal(*args, **kwargs)
+    change = effect.apply if effect.hook == "input" else effect.read
     return change(lanes(c, count=len(given.values)), given)[0]
 
 
@@ -56,14 +56,14 @@ def test_values_by_hand(name, c, expected):
 @pytest.mark.parametrize("name", ["input.delay", "sensor.delay"])
 def test_delays_look_back_and_a_negative_one_ahead(name):
     t = np.array([[0.0, 0.5, 1.0]])
-    assert effects.get(name)().times(lanes(0.25), t).tolist() == [[-0.25, 0.25, 0.75]]
-    assert effects.get(name)().times(lanes(-0.25), t).tolist() == [[0.25, 0.75, 1.25]]
+    assert effects.get_effect(name)().times(lanes(0.25), t).tolist() == [[-0.25, 0.25, 0.75]]
+    assert effects.get_effect(name)().times(lanes(-0.25), t).tolist() == [[0.25, 0.75, 1.25]]
 
 
 def test_a_slow_clock_lets_more_time_pass_between_its_stamps():
-    assert effects.get("clock.skew")().times(lanes(0.25), np.array([[0.0, 1.0, 4.0]])).tolist() == [
-        [0.0, 1.25, 5.0]
-    ]
+    assert effects.get_effect("clock.skew")().times(
+        lanes(0.25), np.array([[0.0, 1.0, 4.0]])
+    ).tolist() == [[0.0, 1.25, 5.0]]
 
 
 def test_backlash_plays_its_width():
@@ -129,9 +129,9 @@ def test_lags_stand_still_while_a_lane_waits(name):
     ["input.lag", "sensor.lag", "input.deadband", "backlash", "input.saturation", "servo.profile"],
 )
 def test_lanes_that_are_off_keep_every_bit_beside_lanes_that_are_on(name):
-    effect = effects.get(name)()
+    effect = effects.get_effect(name)()
     given = signal(np.random.default_rng(5).normal(size=(3, 40)))
-    change = effect.feel if effect.hook == "input" else effect.read
+    change = effect.apply if effect.hook == "input" else effect.read
     felt = change(np.array([[[0.0], [0.3], [0.0]]]), given)
     assert np.array_equal(felt[::2], given.values[::2])
     assert np.abs(felt[1] - given.values[1]).max() > 0.1

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sims.base import Scenario
-from sims.slider.simulator import Slider
-from tests.sims.effects.worlds import run
+from sims.core.simulator import Scenario
+from sims.systems.slider import Slider
+from tests.sims.effects.effect_systems import run
 
 TIMES = np.arange(0, 3, 0.02)
 STEP = np.where(TIMES >= 0.5 - 1e-9, 2.0, 0.0)  # N, from half a second on

@@ -4,13 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sims.ball.simulator import Ball
-from sims.base import Channel, Constant, InputError, Simulator
-from sims.pendulum.simulator import Pendulum
-from sims.recording.fast import read_fast
-from sims.recording.recording import Run, read_recording, system_of
-from sims.recording.write import write_recording
-from sims.servo.system import ServoSystem
+from sims.core.simulator import Channel, Constant, InputError, Simulator
+from sims.recording.fast_csv import read_csv_fast
+from sims.recording.recording import Run, read_recording, read_system_name
+from sims.recording.recording_writer import write_recording
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from sims.systems.servo import ServoSystem
 
 TOML = """
 system = "cart"
@@ -281,10 +281,10 @@ def test_the_table_may_order_columns_as_it_likes_and_hold_blank_lines(tmp_path):
 
 
 def test_system_of_and_names_that_cannot_be_a_table(tmp_path):
-    assert system_of(written(tmp_path)) == "cart"
-    assert system_of(tmp_path / "log.toml") == "cart"
+    assert read_system_name(written(tmp_path)) == "cart"
+    assert read_system_name(tmp_path / "log.toml") == "cart"
     with pytest.raises(InputError, match=r"expected a recording's table, NAME.csv, found "):
-        system_of("")
+        read_system_name("")
     (tmp_path / "folder.csv").mkdir()
     written(tmp_path, name="other")
     (tmp_path / "other.csv").unlink()
@@ -311,8 +311,8 @@ def test_large_tables_are_read_fast_and_the_same(tmp_path, monkeypatch):
         ]
     path = written(tmp_path, "\n".join(rows) + "\n")
     slow = read_recording(path, Cart)
-    monkeypatch.setattr("sims.recording.table.WORTHWHILE", 0)
-    assert read_fast(path, rows[0].split(","), ["t", "u", "x"], ["x"]) is not None
+    monkeypatch.setattr("sims.recording.csv_table.WORTHWHILE", 0)
+    assert read_csv_fast(path, rows[0].split(","), ["t", "u", "x"], ["x"]) is not None
     fast = read_recording(path, Cart)
     for a, b in zip(slow.runs, fast.runs, strict=True):
         assert a.name == b.name
@@ -417,7 +417,7 @@ def test_real_servo_with_its_gain_by_run(recordings):
 @pytest.mark.parametrize(("name", "runs", "held_out"), [("fall", 22, 11), ("up_down", 16, 8)])
 def test_real_phone(name, runs, held_out, recordings):
     path = recordings / "smartphone_fall" / f"{name}.csv"
-    assert system_of(path) == "ball"
+    assert read_system_name(path) == "ball"
     recording = read_recording(path, Ball)
     assert (len(recording.runs), len(recording.held_out())) == (runs, held_out)
     assert recording.noise == {"accel_z": 0.022}

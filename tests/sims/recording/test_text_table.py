@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from sims.base import InputError
-from sims.recording.logs import read_log
+from sims.core.simulator import InputError
+from sims.recording.log_formats.log_files import read_log
 
 ROWS = [(0.0, 1.5, -2.25), (0.01, 1.25, -2.5), (0.02, 1.0, -2.75)]
 
@@ -27,7 +27,7 @@ def read(tmp_path, text, name="log.csv", encoding="utf-8"):
 
 
 def rows(log):
-    return np.column_stack([log.column(name) for name in log.names()]).tolist()
+    return np.column_stack([log.get_column(name) for name in log.list_columns()]).tolist()
 
 
 LAYOUTS = {
@@ -55,7 +55,7 @@ LAYOUTS = {
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_a_table_of_any_layout_is_read(name, tmp_path):
     log = read(tmp_path, LAYOUTS[name])
-    seen = [name for name in log.names() if np.isfinite(log.column(name)).any()]
+    seen = [name for name in log.list_columns() if np.isfinite(log.get_column(name)).any()]
     assert seen == ["t", "q1", "q2"]
     np.testing.assert_array_equal(np.array(rows(log))[:, :3], ROWS)
 
@@ -63,7 +63,7 @@ def test_a_table_of_any_layout_is_read(name, tmp_path):
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
 def test_a_table_of_another_encoding_is_read(encoding, tmp_path):
     log = read(tmp_path, table("\t", head="Zeit,Arm [°],q2", comma=True), encoding=encoding)
-    assert log.names() == ["Zeit", "Arm [°]", "q2"]
+    assert log.list_columns() == ["Zeit", "Arm [°]", "q2"]
 
 
 def test_a_row_of_units_is_no_row_of_numbers(tmp_path):
@@ -74,27 +74,27 @@ def test_a_row_of_units_is_no_row_of_numbers(tmp_path):
 
 def test_thousands_are_told_from_decimals(tmp_path):
     log = read(tmp_path, "t;q\n999,5;1,5\n1.000,5;2,25\n1.001,5;3\n")
-    assert log.column("t").tolist() == [999.5, 1000.5, 1001.5]
+    assert log.get_column("t").tolist() == [999.5, 1000.5, 1001.5]
     log = read(tmp_path, 't,q\n"1,000.5",1\n"1,001.5",2\n')
-    assert log.column("t").tolist() == [1000.5, 1001.5]
+    assert log.get_column("t").tolist() == [1000.5, 1001.5]
 
 
 def test_blanks_within_lists_do_not_divide_cells(tmp_path):
     rows = "".join(f'CONTROL,{t},"[{a}, {b}, {a}, {b}]"\n' for t, a, b in ROWS)
     log = read(tmp_path, "type,timestamp,positions\n" + rows)
-    assert log.names() == ["timestamp", *(f"positions[{k}]" for k in range(4))]
+    assert log.list_columns() == ["timestamp", *(f"positions[{k}]" for k in range(4))]
     assert log.texts == ("type",)
 
 
 def test_instants_are_seconds(tmp_path):
     log = read(tmp_path, "when,q\n2026-11-26 10:00:00.000,1\n2026-11-26 10:00:00.250,2\n")
-    assert np.diff(log.column("when")).tolist() == [0.25]
+    assert np.diff(log.get_column("when")).tolist() == [0.25]
 
 
 def test_a_file_without_a_header_has_no_row_of_data_for_names(tmp_path):
     log = read(tmp_path, table(head=""))
     assert not log.named
-    assert log.names() == ["column 1", "column 2", "column 3"]
+    assert log.list_columns() == ["column 1", "column 2", "column 3"]
     assert rows(log) == [list(row) for row in ROWS]
 
 
@@ -103,20 +103,20 @@ def test_columns_that_pandas_numbered_have_a_header(head, tmp_path):
     first = "0,0.1,2.5\n" if head == "0,1,2" else "0,0.0,0.1,2.5\n"
     log = read(tmp_path, head + "\n" + first + first.replace("0.1", "0.2"))
     assert log.named
-    assert {"0", "1", "2"} <= set(log.names())
+    assert {"0", "1", "2"} <= set(log.list_columns())
 
 
 def test_numbers_are_called_by_the_names_beside_them_row_by_row(tmp_path):
     head = "%time,field.name0,field.name1,field.position0,field.position1,field.velocity0\n"
     text = head + "1,knee,hip,0.5,0.25,3\n2,hip,knee,0.125,0.75,4\n"
     log = read(tmp_path, text)
-    assert log.column("field.position.knee").tolist() == [0.5, 0.75]
-    assert log.column("field.position.hip").tolist() == [0.25, 0.125]
+    assert log.get_column("field.position.knee").tolist() == [0.5, 0.75]
+    assert log.get_column("field.position.hip").tolist() == [0.25, 0.125]
     # The numbered columns are there for who asks for them.
-    assert "field.position0" not in log.names()
-    assert log.column("field.position0").tolist() == [0.5, 0.125]
+    assert "field.position0" not in log.list_columns()
+    assert log.get_column("field.position0").tolist() == [0.5, 0.125]
     # One velocity of two has no name.
-    assert "field.velocity0" in log.names()
+    assert "field.velocity0" in log.list_columns()
 
 
 @pytest.mark.parametrize("style", ["name_{}", "/js/name[{}]", "name.{}", "joint_names{}"])
@@ -124,19 +124,19 @@ def test_names_stand_in_columns_of_any_style(style, tmp_path):
     position = re.sub(r"(joint_)?names?(?=\W|_|{)", "position", style)
     columns = [form.format(k) for form in (style, position) for k in (1, 2)]
     log = read(tmp_path, ",".join(["t", *columns]) + "\n1,knee,hip,0.5,0.25\n2,knee,hip,0.5,0.75\n")
-    (hip,) = (name for name in log.names() if name.endswith(".hip"))
-    assert log.column(hip).tolist() == [0.25, 0.75]
+    (hip,) = (name for name in log.list_columns() if name.endswith(".hip"))
+    assert log.get_column(hip).tolist() == [0.25, 0.75]
 
 
 def test_names_stand_in_lists_and_in_arrays(tmp_path):
     text = "t,name,position\n0,\"['knee', 'hip']\",\"(0.5, 0.25)\"\n"
     log = read(tmp_path, text + "1,\"['hip', 'knee']\",\"(0.125, 0.75)\"\n")
-    assert log.column("position.knee").tolist() == [0.5, 0.75]
+    assert log.get_column("position.knee").tolist() == [0.5, 0.75]
     q = np.array([[0.5, 0.25], [0.75, 0.125]])
     np.savez(tmp_path / "log.npz", t=[0, 1], q=q, joint_names=np.array(["knee", "hip"]))
     log = read_log(tmp_path / "log.npz")
-    assert log.names() == ["t", "q.knee", "q.hip"]
-    assert log.column("q.hip").tolist() == log.column("q[1]").tolist() == [0.25, 0.125]
+    assert log.list_columns() == ["t", "q.knee", "q.hip"]
+    assert log.get_column("q.hip").tolist() == log.get_column("q[1]").tolist() == [0.25, 0.125]
 
 
 FAULTS = {

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import simgap
-from bench.recordings.inspection import load
-from sims.base import InputError
-from sims.recording.logs import read_log
-from tests.sims.recording.test_bags import ARM
+from bench.logs.inspection import load_recording
+from sims.core.simulator import InputError
+from sims.recording.log_formats.log_files import read_log
+from tests.sims.recording.test_ros_bags import ARM
 
 torch = pytest.importorskip("torch")
 
@@ -46,7 +46,7 @@ def test_containers_and_other_objects(tmp_path):
     )
     log = read_log(saved(tmp_path / "log.pth", content))
     assert set(log.columns) == {"obs/q", "runs/0", "runs/1", "weight"}
-    assert read_log(saved(tmp_path / "one.pt", torch.ones(4))).names() == ["tensor"]
+    assert read_log(saved(tmp_path / "one.pt", torch.ones(4))).list_columns() == ["tensor"]
 
 
 def test_a_log_of_tensors_is_imported_without_torch(tmp_path):
@@ -55,10 +55,10 @@ def test_a_log_of_tensors_is_imported_without_torch(tmp_path):
                "joint_names": ["knee", "hip"]}  # fmt: skip
     saved(tmp_path / "log.pt", content)
     simgap.import_logs([tmp_path / "log.pt"], tmp_path / "arm.xml", tmp_path / "log.toml")
-    recording, _ = load(tmp_path / "log.toml", divide=False)
+    recording, _ = load_recording(tmp_path / "log.toml", divide=False)
     np.testing.assert_allclose(recording.runs[0].channels["q.hip"], Q[:, 0])
     code = f"""import sys
-from sims.recording.logs import read_log
+from sims.recording.log_formats.log_files import read_log
 assert read_log({str(tmp_path / "log.pt")!r}).names() == ["time", "q.knee", "q.hip"]
 assert "torch" not in sys.modules and "h5py" not in sys.modules"""
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -71,7 +71,7 @@ class Bomb:
 
 def test_nothing_is_unpickled(tmp_path):
     log = read_log(saved(tmp_path / "log.pt", {"q": torch.ones(3), "bomb": Bomb()}))
-    assert log.names() == ["q"]
+    assert log.list_columns() == ["q"]
 
 
 def test_what_is_no_archive_is_one_line(tmp_path):

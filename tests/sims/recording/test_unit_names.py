@@ -2,8 +2,8 @@
 
 import pytest
 
-from sims.recording.unit_names import read_unit, split_unit
-from sims.recording.units import scale
+from sims.recording.log_formats.unit_names import read_unit, split_unit
+from sims.recording.unit_conversion import compute_unit_scale
 
 WITH_UNIT = {
     "q1 [deg]": ("q1", "deg"), "q1_deg": ("q1", "deg"), "pos (rad)": ("pos", "rad"),
@@ -36,4 +36,4 @@ def test_every_unit_of_a_joint_converts():
           "torque": "N*m", "force": "N", "time": "s"}  # fmt: skip
     for text in ("deg", "turn", "mrad", "cm", "rpm", "rev/s", "mm/s", "Ncm", "kg*cm", "N", "us"):
         unit, quantity = read_unit(text)
-        assert scale(unit, si[quantity]).gain > 0
+        assert compute_unit_scale(unit, si[quantity]).gain > 0

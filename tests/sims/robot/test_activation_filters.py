@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from sims.base import InputError, Scenario
-from sims.recording.description import check_description
-from sims.robot.activation_filters import activation_filters
-from sims.robot.model import Robot
-from sims.robot.simulator import robot_simulator
+from sims.core.simulator import InputError, Scenario
+from sims.recording.recording_description import check_description
+from sims.robot.dynamics.activation_filters import activation_filters
+from sims.robot.robot_model import RobotModel
+from sims.robot.robot_simulator import make_robot_simulator
 
 ROBOT = """
 <mujoco>
@@ -39,7 +39,7 @@ NONE = np.empty((1, 0))
 def simulator(actuator, integrator="implicitfast"):
     text = ROBOT.format(actuator=actuator, integrator=integrator)
     spec = mujoco.MjSpec.from_string(text)
-    return robot_simulator(Robot(Path("robot.xml"), "mjcf", spec, digest=text))
+    return make_robot_simulator(RobotModel(Path("robot.xml"), "mjcf", spec, digest=text))
 
 
 def plain(kind, activation, command=COMMAND):

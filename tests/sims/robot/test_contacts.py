@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.registry import robot
-from sims.base import Scenario
-from sims.robot.bench_cache import bench_cache
-from sims.robot.contacts import possible
+from bench.core.plugin_registries import make_robot_simulator
+from sims.core.simulator import Scenario
+from sims.robot.dynamics.batch_cache import bench_cache
+from sims.robot.parsing.contact_exclusion import can_collide
 
 MODEL = """<mujoco>{option}<worldbody>{floor}
   <body name="a"><joint type="slide"/><geom name="a" size="0.1"{mask}/>
@@ -43,7 +43,7 @@ def test_a_model_can_have_contacts_where_mujoco_finds_some(case):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)  # all shapes lie within each other
     assert bool(data.ncon) == wanted
-    assert possible(model) == wanted
+    assert can_collide(model) == wanted
 
 
 ARM = """<mujoco><worldbody>{floor}<body name="upper">
@@ -60,7 +60,7 @@ def test_only_contacts_that_cannot_be_are_not_looked_for(tmp_path):
     for name, shape in (("none", ""), ("far", floor.format(-9)), ("near", floor.format(-0.15))):
         path = tmp_path / f"{name}.xml"
         path.write_text(ARM.format(floor=shape))
-        simulator = robot(path)(observe=["q.shoulder"])
+        simulator = make_robot_simulator(path)(observe=["q.shoulder"])
         found[name] = simulator.simulate(np.zeros((1, len(simulator.parameters))), scenario)
         (bench,) = bench_cache(simulator.robot).benches
         off = bool(bench.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -84,7 +84,7 @@ def test_a_lane_whose_contacts_do_not_fit_in_its_arena_has_failed(tmp_path, memo
     for size in ("", f'<size memory="{memory}K"/>'):
         path = tmp_path / f"pile{len(size)}.xml"
         path.write_text(PILE.format(size=size, boxes=boxes))
-        simulator = robot(path)(observe=["q.x"])
+        simulator = make_robot_simulator(path)(observe=["q.x"])
         found[size] = simulator.simulate(
             np.zeros((1, len(simulator.parameters))), Scenario(times, {}, {})
         )

@@ -6,15 +6,22 @@ import mujoco
 import numpy as np
 import pytest
 
-from sims.base import InputError, Scenario
-from sims.extended import Extended, Number, load, read, robot_of, write
-from sims.robot.instants import friction_damping
-from sims.robot.linear import Linear
-from sims.robot.model import Robot
-from sims.robot.numerics import INTEGRATORS
-from sims.robot.reading import read as read_robot
-from sims.robot.simulator import robot_simulator
-from sims.robot.writing import written
+from sims.core.simulator import InputError, Scenario
+from sims.extended_simulator import (
+    ExtendedSimulator,
+    FittedValue,
+    get_robot_reference,
+    load_extended,
+    read_extended,
+    write_extended,
+)
+from sims.robot.dynamics.linearisation_points import friction_damping
+from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.export.write_model_file import write_model_files
+from sims.robot.integrator_settings import INTEGRATOR_IDS
+from sims.robot.parsing.read_model_file import read_robot as read_robot
+from sims.robot.robot_model import RobotModel
+from sims.robot.robot_simulator import make_robot_simulator
 
 ARM = """<mujoco>
 <option timestep="0.002" integrator="{integrator}"/>
@@ -39,7 +46,7 @@ START = (0.4, -0.6)
 def simulator(folder, integrator="implicitfast", elbow="", form="soft", effects=()):
     path = Path(folder) / "arm.xml"
     path.write_text(ARM.format(integrator=integrator, elbow=elbow))
-    kind = robot_simulator(read_robot(path)).with_friction_form(form)
+    kind = make_robot_simulator(read_robot(path)).with_friction_form(form)
     return kind(observe=["q.shoulder", "q.elbow"], effects=list(effects))
 
 
@@ -68,7 +75,7 @@ def off(seen, true):
     return np.sqrt(np.square(seen - true).sum() / np.square(true).sum())
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", INTEGRATOR_IDS)
 @pytest.mark.parametrize("stated", ["", 'solreffriction="0.05 1" solimpfriction="0.8 0.9 0.001"'])
 def test_soft_friction_is_that_of_the_file_with_the_same_frictionloss(tmp_path, integrator, stated):
     """A native effect, and one whose limit is asked for in every step."""
@@ -91,7 +98,7 @@ def test_friction_damping_is_that_of_the_constraint(tmp_path):
                    'solimpfriction="0.7 0.9 0"',
                    'solimpfriction="1 1 0.001"'):  # fmt: skip
         text = ARM.format(integrator="Euler", elbow=f'frictionloss="0.06" {stated}')
-        robot = Robot(Path("arm.xml"), "mjcf", mujoco.MjSpec.from_string(text))
+        robot = RobotModel(Path("arm.xml"), "mjcf", mujoco.MjSpec.from_string(text))
         model = robot.compiled
         data = mujoco.MjData(model)
         data.qvel[:] = (0.0, 0.3)
@@ -109,11 +116,11 @@ def test_the_tangent_of_soft_friction_is_what_a_small_change_makes(tmp_path, int
     effects = ["friction.coulomb@elbow", "friction.coulomb@shoulder"]
     soft = simulator(tmp_path, integrator, effects=effects)
     theta = np.array([already, 0.0])
-    tangent = Linear(soft, theta, scenario(), np.array(START), np.zeros(2))
+    tangent = RunLinearisation(soft, theta, scenario(), np.array(START), np.zeros(2))
     for number, effect in enumerate(soft.effects):
         more = theta + 0.002 * np.eye(2)[number]
         before, after = soft.simulate(np.stack([theta, more]), scenario())
-        (seen,), _ = tangent.responses([(effect, np.array([0.002]))])
+        (seen,), _ = tangent.compute_effect_responses([(effect, np.array([0.002]))])
         assert off(seen, after - before) < (0.08 if already else 0.02)
 
 
@@ -124,8 +131,11 @@ def test_each_form_has_a_tangent_of_its_own(tmp_path):
     for form in ("soft", "stiff"):
         arm = simulator(tmp_path, form=form, effects=["friction.coulomb@elbow"])
         before, after = arm.simulate(np.stack([0 * small, small]), scenario())
-        tangent = Linear(arm, 0 * small, scenario(), np.array(START), np.zeros(2))
-        seen[form], true[form] = tangent.responses([(arm.effects[0], small)])[0][0], after - before
+        tangent = RunLinearisation(arm, 0 * small, scenario(), np.array(START), np.zeros(2))
+        seen[form], true[form] = (
+            tangent.compute_effect_responses([(arm.effects[0], small)])[0][0],
+            after - before,
+        )
     assert off(seen["stiff"], true["soft"]) > 3 * off(seen["soft"], true["soft"])
     assert off(seen["soft"], true["stiff"]) > 2 * off(seen["stiff"], true["stiff"])
 
@@ -134,19 +144,28 @@ def test_each_form_has_a_tangent_of_its_own(tmp_path):
 def extended(tmp_path):
     """An extended simulator with soft friction at the elbow."""
     kind = type(simulator(tmp_path))
-    effects = {"friction.coulomb@elbow": {"coefficient": Number(0.06, "N*m", 0.059, 0.061)}}
+    effects = {"friction.coulomb@elbow": {"coefficient": FittedValue(0.06, "N*m", 0.059, 0.061)}}
     observe = ["q.shoulder", "q.elbow"]
-    return Extended(
-        "arm_extended", "arm", None, "a log", {}, effects, {}, observe, kind, robot_of(kind)
+    return ExtendedSimulator(
+        "arm_extended",
+        "arm",
+        None,
+        "a log",
+        {},
+        effects,
+        {},
+        observe,
+        kind,
+        get_robot_reference(kind),
     )
 
 
 def test_extended_toml_states_the_form(extended, tmp_path):
     path = tmp_path / "extended.toml"
-    write(extended, path)
+    write_extended(extended, path)
     assert 'friction_form = "soft"' in path.read_text()
-    assert read(path).robot.friction_form == "soft"
-    fitted = load(path, lambda _: None)()
+    assert read_extended(path).robot.friction_form == "soft"
+    fitted = load_extended(path, lambda _: None)()
     theta = np.array([[p.nominal for p in fitted.parameters]])
     wanted = plain(ARM.format(integrator="implicitfast", elbow='frictionloss="0.06"'))
     np.testing.assert_allclose(fitted.simulate(theta, scenario())[0], wanted, atol=1e-10)
@@ -154,33 +173,36 @@ def test_extended_toml_states_the_form(extended, tmp_path):
 
 def test_extended_toml_without_the_form_is_stiff(extended, tmp_path):
     path = tmp_path / "extended.toml"
-    write(extended, path)
-    soft = load(path, lambda _: None)
+    write_extended(extended, path)
+    soft = load_extended(path, lambda _: None)
     path.write_text(path.read_text().replace('friction_form = "soft"\n', ""))
-    stiff = load(path, lambda _: None)
+    stiff = load_extended(path, lambda _: None)
     assert stiff.robot.friction_form == "stiff"
     assert stiff.source_digest != soft.source_digest
     kind = extended.kind.with_friction_form("stiff")
     assert kind.source_digest != extended.kind.source_digest
-    write(Extended(**{**vars(extended), "kind": kind, "robot": robot_of(kind)}), path)
+    write_extended(
+        ExtendedSimulator(**{**vars(extended), "kind": kind, "robot": get_robot_reference(kind)}),
+        path,
+    )
     assert "friction_form" not in path.read_text()
 
 
 def test_a_form_that_does_not_exist_is_refused(extended, tmp_path):
     path = tmp_path / "extended.toml"
-    write(extended, path)
+    write_extended(extended, path)
     path.write_text(path.read_text().replace('"soft"', '"spongy"'))
     with pytest.raises(InputError, match="friction_form: expected stiff or soft, found 'spongy'"):
-        read(path)
+        read_extended(path)
 
 
 @pytest.mark.parametrize("form", ["soft", "stiff"])
 def test_the_model_file_states_solver_parameters_of_stiff_friction_alone(extended, form):
     robot = extended.kind.robot.with_friction_form(form)
-    done = written(robot, extended.effects, "log.csv")
+    done = write_model_files(robot, extended.effects, "log.csv")
     assert 'frictionloss="0.06"' in done.xml
     assert ("solreffriction=" in done.xml) == (form == "stiff")
-    (line,) = done.said
+    (line,) = done.notes
     assert ("soft form" in line) == (form == "soft")
     moved = plain(done.xml)
     kind = extended.kind.with_friction_form(form)

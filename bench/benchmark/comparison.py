@@ -1,0 +1,319 @@
+"""Comparison of tuners in its result folder: begin, resume, run, show status, and report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.benchmark.storage.integrity_checks import (
+    check_rows_match_statuses,
+    check_runs,
+    check_segment_statuses,
+)
+from bench.benchmark.storage.journal_segments import (
+    PLAN_FILE,
+    PLAN_REMEDY,
+    SEGMENT_REMEDY,
+    SEGMENTS_FOLDER,
+    read_plan,
+    read_statuses_by_file,
+    write_plan,
+)
+from bench.benchmark.storage.plan_checks import check_plan
+from bench.benchmark.storage.result_folder import read_comparison, read_configuration, write_results
+from bench.benchmark.storage.run_journal import RunJournal
+from bench.benchmark.storage.run_status import STATUS_COLUMNS, RunStatus
+from bench.benchmark.storage.runs_reader import RunsTable
+from bench.benchmark.storage.salt_file import read_salt as kept_salt
+from bench.benchmark.storage.salt_file import reveal_salt
+from bench.benchmark.storage.study_progress import (
+    MISSING_STATUS,
+    RunEnd,
+    StudyOutcome,
+    StudyProgress,
+)
+from sims.core.atomic_files import write_atomically
+from sims.core.simulator import InputError
+
+if TYPE_CHECKING:
+    from bench.benchmark.problem.experiment import Experiment
+    from bench.benchmark.runner.experiment_runner import ExperimentRun, ProgressFactory
+    from bench.benchmark.runner.worker_pools import Pool
+
+PrintLine = Callable[[str], None]
+
+
+class Comparison:
+    """Comparison of tuners x targets x seeds in a result folder; implements `study.Study`.
+
+    Args:
+        folder: result folder of a comparison, for status and report. Use `begin` or `resume_study`
+            for a comparison that can be run.
+
+    Attributes:
+        folder: result folder.
+        configuration: configuration of the comparison.
+        results: problem, plan and stored runs; None if the comparison is read-only.
+
+    Raises:
+        InputError: the folder is not that of a comparison, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.configuration = read_configuration(folder)
+        self.plugins = self.configuration.plugins
+        self.secret: str | None = None
+        self.results: ExperimentRun | None = None
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+        salt: str | None = None,
+    ) -> Comparison:
+        """Plan a comparison in a new folder, without running it; see `Study.begin`.
+
+        Args:
+            experiment: configuration of the comparison.
+            plugins: plugin files.
+            folder: result folder; None for a default name.
+            jobs: number of worker processes.
+            salt: salt of the targets; None for the default.
+        """
+        from bench.benchmark.runner.experiment_runner import (
+            check_classes_importable,
+            prepare_experiment,
+        )
+        from bench.benchmark.runner.run_ids import compute_fingerprint
+        from bench.benchmark.runner.study_setup import prepare_study
+
+        new = prepare_study(experiment, folder, jobs, salt)
+        results = prepare_experiment(new.experiment, new.secret)
+        # This comes before the folder is created, so that a user error leaves no files behind.
+        if jobs:
+            check_classes_importable(new.experiment)
+        hashes = compute_fingerprint(new.experiment, plugins)
+        comparison = cls(new.create_folder(plugins, hashes, results.redraws))
+        comparison.secret = new.secret
+        comparison._attach(results)
+        return comparison
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Comparison:
+        """Open an interrupted comparison with its finished runs; see `Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: additional plugin files.
+        """
+        from bench.benchmark.runner.experiment_runner import prepare_experiment
+        from bench.benchmark.runner.run_ids import check_resumable
+
+        comparison = cls(folder)
+        experiment = comparison.configuration.experiment
+        comparison.plugins = check_resumable(folder, comparison.configuration, plugins)
+        comparison.secret = kept_salt(folder, experiment)
+        comparison._attach(prepare_experiment(experiment, comparison.secret))
+        return comparison
+
+    def _attach(self, results: ExperimentRun) -> None:
+        """Open the journal of the folder, and write or check the plan."""
+        from bench.benchmark.runner.tuner_training import get_weights_folder as trained
+
+        self.results = results
+        # Tuners must not access true parameters, results of other tuners, or earlier trainings.
+        results.hidden_paths = tuple(str(place.resolve()) for place in (self.folder, trained()))
+        ids = [job.request.run for job in results.plan]
+        if not (self.folder / SEGMENTS_FOLDER).exists():
+            results.run_sink.statuses = self._complete(ids)
+            return
+        planned = read_plan(self.folder)
+        journal = RunJournal(self.folder)
+        try:
+            if planned is not None and planned != ids:
+                raise InputError(
+                    f"{self.folder / SEGMENTS_FOLDER / PLAN_FILE}: its plan is not the one that its "
+                    "configuration gives; start a new comparison"
+                )
+            self._check_kept(journal, ids)
+        except InputError:
+            journal.close()
+            raise
+        # The process was killed before it wrote the plan, so there are no runs to compare with it.
+        if planned is None:
+            write_plan(self.folder, ids)
+        results.run_sink = journal
+
+    def _check_kept(self, journal: RunJournal, ids: list[str]) -> None:
+        """Check every stored row, because damaged rows would falsify the results.
+
+        Raises:
+            InputError: a row is damaged, or belongs to another plan.
+        """
+        experiment = self.configuration.experiment
+        for path, held, records in journal.list_segment_contents():
+            file = RunsTable(path, SEGMENT_REMEDY)
+            statuses = check_segment_statuses(path, held, experiment, ids, SEGMENT_REMEDY)
+            runs = file.read_runs(experiment, records)
+            check_runs(runs, file, experiment)
+            check_rows_match_statuses(runs, file, statuses, partial(_at_file, file), "its statuses")
+
+    def _complete(self, ids: list[str]) -> dict[int, RunStatus]:
+        """Return the statuses of a finished comparison by their index in the plan.
+
+        Raises:
+            InputError: the folder has other runs than the plan, or is damaged.
+        """
+        statuses = self._stored()
+        if [status.run for status in statuses] != ids:
+            raise InputError(
+                f"{self.folder / 'status.csv'}: expected the {len(ids)} runs of the plan, found "
+                f"{len(statuses)} or others; start a new comparison"
+            )
+        return dict(enumerate(statuses))
+
+    def _stored(self) -> list[RunStatus]:
+        """Return the statuses of a finished comparison in the order of its plan."""
+        statuses = read_comparison(self.folder, ["run", "tuner", "k"]).statuses
+        made = statuses[statuses["status"] != "skipped"]
+        rows: list[dict[str, Any]] = [
+            {str(name): value for name, value in row.items()}
+            for row in made[STATUS_COLUMNS].to_dict("records")
+        ]
+        return [RunStatus(**row) for row in rows]
+
+    def run(
+        self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
+    ) -> StudyOutcome:
+        """Run what is missing, and write the results; see `bench.studies.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes; 0 for none.
+            progress: called for every step.
+            pool: pool to use instead of local workers.
+        """
+        # Modules that the results need are imported before the work. An interrupt during a first
+        # import would leave a module half imported, and the results could not be written.
+        import pandas as pd  # noqa: F401
+        from pyarrow import compute, parquet  # noqa: F401
+
+        from bench.benchmark.runner.experiment_runner import no_progress, run_experiment
+
+        results = self._begun()
+        journal = results.run_sink
+        if not isinstance(journal, RunJournal):  # the comparison was complete before
+            return StudyOutcome(len(results.plan), len(results.plan))
+        try:
+            run_experiment(results, self.plugins, jobs, progress or no_progress, pool)
+        finally:
+            # If workers cannot be started, the results so far are still written.
+            write_results(
+                self.folder,
+                journal,
+                results.build_training_rows(),
+                results.build_skipped_rows(),
+                self.configuration.experiment.trusted,
+            )
+            self._write_spectra(results)
+            made = StudyOutcome(
+                len(journal.statuses), len(results.plan), results.interrupted, results.stopped
+            )
+            if made.is_complete:
+                reveal_salt(self.folder, self.secret)
+                self.configuration = read_configuration(self.folder)
+                journal.delete_segments()
+            else:
+                journal.close()
+        return made
+
+    def close(self) -> None:
+        """Release the folder without running what is missing."""
+        if self.results is not None and isinstance(self.results.run_sink, RunJournal):
+            self.results.run_sink.close()
+
+    def _begun(self) -> ExperimentRun:
+        if self.results is None:
+            raise InputError(f"{self.folder}: opened to be looked at; resume it to make the rest")
+        return self.results
+
+    def _write_spectra(self, results: ExperimentRun) -> None:
+        """Write identifiability.csv, one row per target and direction, for several parameters."""
+        if results.spectra:
+            from bench.benchmark.statistics.identifiability_table import build_identifiability_table
+
+            problem = results.problem
+            table = build_identifiability_table(
+                problem.experiment, results.spectra, problem.cube.parameters
+            )
+            write_atomically(self.folder / "identifiability.csv", table.to_csv(index=False))
+
+    def status(self) -> StudyProgress:
+        """Return what the folder contains and what is missing; another process may be running it.
+
+        Raises:
+            InputError: the folder is damaged.
+        """
+        held = self.configuration
+        ends = tuple(self._ends())
+        return StudyProgress(
+            held.experiment.name, "runs finished", held.fingerprint, ends, self._under_way
+        )
+
+    def _ends(self) -> list[RunEnd]:
+        if not self._under_way:
+            return [_end(status.run, status) for status in self._stored()]
+        planned, experiment = read_plan(self.folder), self.configuration.experiment
+        if planned is not None:
+            path = self.folder / SEGMENTS_FOLDER / PLAN_FILE
+            check_plan(planned, experiment, path, PLAN_REMEDY)
+        made: dict[str, RunStatus] = {}
+        for path, held in read_statuses_by_file(self.folder):
+            check_segment_statuses(path, held, experiment, planned, SEGMENT_REMEDY)
+            made |= {status.run: status for status in held.values()}
+        return [_end(name, made.get(name)) for name in (made if planned is None else planned)]
+
+    @property
+    def _under_way(self) -> bool:
+        """Whether the comparison is unfinished: its journal is deleted when all is written."""
+        return (self.folder / SEGMENTS_FOLDER).exists()
+
+    def report(self, say: PrintLine) -> int:
+        """Write tables and figures of the stored runs, and print the results.
+
+        Args:
+            say: callback that prints one line.
+
+        Returns:
+            Number of failed runs.
+
+        Raises:
+            InputError: nothing has been written yet, or the results are damaged.
+        """
+        from bench.benchmark.problem.tuning_problem import TuningProblem
+        from bench.benchmark.results_report import write_report
+
+        results = self.results
+        problem = results.problem if results else TuningProblem(self.configuration.experiment)
+        failed = write_report(self.folder, problem, say)
+        for line in results.notes.lines() if results else ():
+            say(line)
+        return failed
+
+
+def _at_file(file: RunsTable, _row: int, says: str) -> InputError:
+    """Make the error for a status of a journal file, which belongs to none of its rows."""
+    return file.make_error(None, says)
+
+
+def _end(name: str, status: RunStatus | None) -> RunEnd:
+    """Return how a planned run ended, or that it is missing; its id begins with the tuner label."""
+    tuner = name.partition("/")[0]
+    if status is None:
+        return RunEnd(name, tuner, MISSING_STATUS)
+    return RunEnd(name, tuner, str(status.status), str(status.reason))

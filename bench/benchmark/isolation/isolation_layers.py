@@ -1,0 +1,210 @@
+"""Isolation layers around a tuner's process: what each one prevents, and how it is applied.
+
+Each layer is applied if the kernel permits it, and the active layers are reported. Landlock and the
+filter of system calls need nothing but Linux; namespaces may be forbidden to users without
+privileges.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import site
+import sys
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from bench.benchmark.isolation import linux_syscalls, seccomp_filter
+from bench.benchmark.isolation.memory_limit import limit_memory
+
+ISOLATION_LAYERS = {
+    "process": "the tuner has a process of its own, with a task and a pipe and nothing else",
+    "files": "it reads Python and its packages, and no results or recordings (Landlock)",
+    "disk": "it writes to an empty folder in memory that is gone with it (tmpfs)",
+    "network": "it reaches no network",
+    "processes": "it sees no other process, and what it starts dies with it (process namespace)",
+    "calls": "it starts no process, looks into none, and mounts nothing (seccomp)",
+    "memory": "nobody reads the harness's memory (user namespace, not dumpable)",
+    "names": "it shares no memory, queue or semaphore by name (IPC namespace)",
+}
+"""Isolation layers with what each one does, in the order of listings."""
+
+MAX_FOLDER_BYTES = 64 << 20
+"""Size of a tuner's own folder in bytes."""
+_FILES = 512
+"""Maximum number of open files of a tuner."""
+_THREADS = 1024
+"""Maximum number of threads of a user's tuners; those of a superuser are not counted."""
+
+PROJECT_ROOT = Path(__file__).resolve().parents[3]
+"""Root folder of this project's packages."""
+_IMPORTABLE_PATHS = ("bench", "methods", "sims", "simgap.py")
+"""Parts of this project that a tuner may import; results and tests in the same folder are not."""
+_SYSTEM_PATHS = (
+    "/usr", "/lib", "/lib64", "/lib32", "/etc/ld.so.cache", "/etc/localtime", "/dev/urandom",
+    "/dev/random", "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
+    "/sys/devices/system/cpu", "/sys/devices/system/node",
+)  # fmt: skip
+"""Paths of the system that Python and numerical libraries read."""
+_DEVICE_PATHS = ("/dev/null", "/dev/zero", "/dev/nvidia0", "/dev/nvidiactl", "/dev/nvidia-uvm")
+"""Devices that they write to: null devices and a graphics card."""
+
+
+class AccessPolicy(NamedTuple):
+    """Access policy of a tuner's process.
+
+    Attributes:
+        folder: its own empty folder.
+        readable_paths: readable files and folders.
+        memory: limit of additional memory in MiB; 0 for no limit.
+    """
+
+    folder: str
+    readable_paths: tuple[str, ...]
+    memory: int = 0
+
+
+def list_readable_paths(hidden: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the files and folders that Python, its packages and this project's code need.
+
+    Args:
+        hidden: folders that must not be accessible, such as the one of the results; a folder of
+            packages that contains one of them is left out.
+    """
+    # A notebook may have added a folder to the path since the last call.
+    return _readable(hidden, tuple(sys.path))
+
+
+@cache
+def _readable(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, ...]:
+    kept = [Path(path).resolve() for path in hidden]
+    interpreter = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
+    places = [*sorted(interpreter), *site.getsitepackages(), site.getusersitepackages(), *packages]
+    found = []
+    for text in places:
+        place = Path(text or ".").resolve()
+        own = place == PROJECT_ROOT and not (PROJECT_ROOT / "numpy").exists()
+        if not own and not any(path.is_relative_to(place) for path in kept):
+            found.append(str(place))
+    libraries = [str(Path(prefix) / "lib") for prefix in sorted(interpreter)]
+    rooms = [str(PROJECT_ROOT / room) for room in _IMPORTABLE_PATHS]
+    return tuple(dict.fromkeys([*found, *libraries, *rooms, *_SYSTEM_PATHS]))
+
+
+def enter_namespaces() -> list[str]:
+    """Enter new user, network and IPC namespaces; children inherit them.
+
+    Returns:
+        Names of the active isolation layers.
+    """
+    user, group = os.geteuid(), os.getegid()
+    held = []
+    if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWUSER)) and _try_layer(
+        lambda: linux_syscalls.map_identity(user, group)
+    ):
+        held.append("memory")
+    # A superuser can enter these namespaces without a user namespace.
+    if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWNET)):
+        held.append("network")
+    if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWIPC)):
+        held.append("names")
+    return held
+
+
+def mount_empty_folder(folder: str) -> list[str]:
+    """Mount an empty folder in memory for this process and its children.
+
+    Returns:
+        Names of the active isolation layers.
+    """
+
+    def put() -> None:
+        _leave(linux_syscalls.CLONE_NEWNS)
+        linux_syscalls.make_mounts_private()
+        # This comes before the mount of its own writable folder. File times and permissions could
+        # pass information to other runs.
+        _try_layer(linux_syscalls.make_mounts_read_only)
+        linux_syscalls.mount_filesystem(
+            "tmpfs", folder, f"size={MAX_FOLDER_BYTES},nr_inodes=4096,mode=700"
+        )
+
+    return ["disk"] if _try_layer(put) else []
+
+
+def enter_process_namespace() -> list[str]:
+    """Enter a new process namespace, in which the next child is the first process.
+
+    Returns:
+        Names of the active isolation layers.
+    """
+    return ["processes"] if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWPID)) else []
+
+
+def lock_down(reach: AccessPolicy, own_user: bool) -> list[str]:
+    """Apply the remaining restrictions to this process permanently.
+
+    Args:
+        reach: access policy.
+        own_user: True if the process has a user namespace.
+
+    Returns:
+        Names of the active isolation layers.
+    """
+    held = []
+    # If its own /proc cannot be mounted, Landlock allows only this process's part of the old one.
+    _try_layer(lambda: linux_syscalls.mount_filesystem("proc", "/proc"))
+    os.chdir(reach.folder)
+    _set_resource_limits(own_user)
+    # This comes before Landlock, which may deny this process access to its own /proc entries.
+    limit_memory(reach.memory)
+    # If memory is exhausted, the kernel kills the tuner first, and no other process.
+    _try_layer(lambda: _write("/proc/self/oom_score_adj", "1000"))
+    if _try_layer(
+        lambda: linux_syscalls.restrict_file_access(
+            reach.readable_paths, [reach.folder, *_DEVICE_PATHS]
+        )
+    ):
+        held.append("files")
+    _try_layer(seccomp_filter.drop_capabilities)
+    if _try_layer(lambda: seccomp_filter.install_syscall_filter(limited=reach.memory > 0)):
+        held += ["calls", "network"]
+    return held
+
+
+def _leave(flags: int) -> None:
+    linux_syscalls.unshare(flags)
+
+
+def _write(path: str, text: str) -> None:
+    Path(path).write_text(text, encoding="ascii")
+
+
+def _try_layer(seal: Callable[[], None]) -> bool:
+    """Return whether an isolation layer could be applied."""
+    try:
+        seal()
+    except (OSError, KeyError, AttributeError):
+        return False
+    return True
+
+
+def _set_resource_limits(own_user: bool) -> None:
+    """Limit core dumps, open files and file sizes, and threads if they are counted separately."""
+    wanted = {
+        resource.RLIMIT_CORE: 0,
+        resource.RLIMIT_NOFILE: _FILES,
+        resource.RLIMIT_FSIZE: MAX_FOLDER_BYTES,
+        **({resource.RLIMIT_NPROC: _THREADS} if own_user else {}),
+    }
+    for limit, most in wanted.items():
+        hard = resource.getrlimit(limit)[1]
+        least = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(limit, (least, least))
+
+
+def sort_layers(held: Iterable[str]) -> list[str]:
+    """Return the active isolation layers in the order of `ISOLATION_LAYERS`."""
+    there = {"process", *held}
+    return [name for name in ISOLATION_LAYERS if name in there]

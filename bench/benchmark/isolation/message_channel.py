@@ -1,0 +1,307 @@
+"""Message protocol of the pipes between the harness and a tuner's process: arrays and JSON.
+
+Objects are never sent. A message has a head (kind, flags, size, length of the body) and a body.
+Each side sends only in response to the other. The tuner's side may write anything: an invalid
+message ends its run, and lengths are checked before memory is allocated.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import struct
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from methods.tuner import Array
+
+_HEAD = struct.Struct("<cBxxIQ")
+"""Head of a message: kind, flags, size, number of bytes in the body."""
+_BUFFER = 1 << 20
+"""Maximum number of bytes per read."""
+_TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
+"""Permitted types of the arrays of a trained tuner."""
+_ARRAYS = 10_000
+"""Maximum number of arrays in a message."""
+_NAMES = 1 << 20
+"""Maximum size of the names and shapes of the arrays in bytes."""
+
+_LONGEST = float((1 << 31) - 1)
+"""Maximum timeout of `poll` in milliseconds."""
+
+MAX_TEXT_BYTES = 1 << 16
+"""Maximum size of a text message in bytes."""
+MAX_PROPOSAL_BYTES = 1 << 28
+"""Maximum size of proposals in bytes."""
+MAX_STATE_BYTES = 1 << 31
+"""Maximum size of trained weights in bytes."""
+
+
+class PeerClosedError(Exception):
+    """The process on the other side has ended."""
+
+
+class ProtocolError(Exception):
+    """The other side sent an invalid or an unexpected message."""
+
+
+class Message(NamedTuple):
+    """Message received through the pipe.
+
+    Attributes:
+        kind: one byte; see `isolation.tuner_server` and `isolation.tuner_client`.
+        flags: number whose meaning depends on the kind.
+        size: number whose meaning depends on the kind.
+        body: content; valid until the next message is read.
+    """
+
+    kind: bytes
+    flags: int
+    size: int
+    body: memoryview
+
+    def to_array(self) -> Array:
+        """Return the body as a new array (n,).
+
+        Raises:
+            FoulError: its size is not that of an array.
+        """
+        if len(self.body) % 8:
+            raise ProtocolError("it sent half a number")
+        return np.frombuffer(self.body, dtype="<f8").astype(np.float64)
+
+    def to_document(self, limit: int = MAX_TEXT_BYTES) -> Any:
+        """Return the body as a JSON document.
+
+        Args:
+            limit: maximum size in bytes, because the parsed document takes much more memory.
+
+        Raises:
+            FoulError: the body is not JSON, or longer.
+        """
+        if len(self.body) > limit:
+            raise ProtocolError(f"it sent {len(self.body)} bytes of JSON, {limit} are allowed")
+        try:
+            return json.loads(bytes(self.body))
+        except (ValueError, RecursionError):
+            raise ProtocolError("it sent what is no JSON") from None
+
+    def to_text(self) -> str:
+        """Return the body as printable text."""
+        return to_printable(bytes(self.body[:MAX_TEXT_BYTES]).decode("utf-8", "replace"))
+
+
+def to_printable(text: str) -> str:
+    """Replace characters that would move a terminal's cursor or end a table's row."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in text)
+
+
+class MessageChannel:
+    """One side of a pair of pipes.
+
+    Args:
+        reading: file descriptor to read from.
+        writing: file descriptor to write to.
+    """
+
+    def __init__(self, reading: int, writing: int) -> None:
+        self._reading, self._writing = reading, writing
+        self._buffer = bytearray(_BUFFER)
+        self._view = memoryview(self._buffer)
+        self._incoming, self._outgoing = select.poll(), select.poll()
+        self._incoming.register(reading, select.POLLIN)
+        self._outgoing.register(writing, select.POLLOUT)
+        # Non-blocking, so that a side that does not read cannot block the other one forever.
+        os.set_blocking(writing, False)
+
+    def close(self) -> None:
+        """Close both pipes; the other side gets an end of file."""
+        for descriptor in (self._reading, self._writing):
+            os.close(descriptor)
+
+    @property
+    def has_data(self) -> bool:
+        """Whether there is data to read."""
+        return any(event & select.POLLIN for _, event in self._incoming.poll(0))
+
+    def send(
+        self,
+        kind: bytes,
+        *parts: bytes | memoryview | Array,
+        flags: int = 0,
+        size: int = 0,
+        deadline: float = float("inf"),
+    ) -> None:
+        """Send a message.
+
+        Args:
+            kind: one byte.
+            parts: parts of the body; arrays are float64.
+            flags: 0 to 255.
+            size: at least 0.
+            deadline: latest time, as of `time.perf_counter`.
+
+        Raises:
+            GoneError: the other side has closed its pipe.
+            TimeoutError: the other side does not read in time.
+        """
+        body = b"".join([part if isinstance(part, bytes) else bytes(part) for part in parts])
+        self._write(_HEAD.pack(kind, flags, size, len(body)) + body, deadline)
+
+    def send_document(self, kind: bytes, document: Any, flags: int = 0) -> None:
+        """Send a message whose body is JSON.
+
+        Args:
+            kind: one byte.
+            document: JSON content.
+            flags: 0 to 255.
+        """
+        self.send(kind, json.dumps(document).encode(), flags=flags)
+
+    def _write(self, whole: bytes, deadline: float) -> None:
+        left = memoryview(whole)
+        while left:
+            try:
+                left = left[os.write(self._writing, left) :]
+            except BlockingIOError:
+                if not self._outgoing.poll(_milliseconds(deadline)):
+                    raise TimeoutError from None
+            except OSError:
+                raise PeerClosedError from None
+
+    def receive(self, limit: int = MAX_TEXT_BYTES, deadline: float = float("inf")) -> Message:
+        """Receive the next message.
+
+        Args:
+            limit: maximum size of the body in bytes.
+            deadline: latest time, as of `time.perf_counter`.
+
+        Raises:
+            GoneError: the other side has ended.
+            FoulError: the data are not a valid message.
+            TimeoutError: there is no message in time.
+        """
+        there = self._read(self._view, deadline)
+        while there < _HEAD.size:
+            there += self._read(self._view[there:], deadline)
+        kind, flags, size, length = _HEAD.unpack_from(self._buffer)
+        if length > limit:
+            raise ProtocolError(f"it sent {length} bytes at once, {limit} are allowed")
+        if there > _HEAD.size + length:
+            raise ProtocolError("it spoke without having been asked")
+        there -= _HEAD.size
+        if _HEAD.size + length > _BUFFER:
+            return Message(kind, flags, size, self._long(there, length, deadline))
+        body = self._view[_HEAD.size : _HEAD.size + length]
+        while there < length:
+            there += self._read(body[there:], deadline)
+        return Message(kind, flags, size, body)
+
+    def _long(self, there: int, length: int, deadline: float) -> memoryview:
+        """Read a body that is longer than the buffer; memory grows only with the data received."""
+        body = bytearray(self._view[_HEAD.size : _HEAD.size + there])
+        while len(body) < length:
+            part = self._view[: min(_BUFFER, length - len(body))]
+            body += part[: self._read(part, deadline)]
+        return memoryview(body)
+
+    def _read(self, into: memoryview, deadline: float) -> int:
+        # `poll` comes before `readv`, because a blocking read could not stop at the deadline.
+        if not self._incoming.poll(_milliseconds(deadline)):
+            raise TimeoutError
+        try:
+            size = os.readv(self._reading, [into])
+        except OSError:
+            raise PeerClosedError from None
+        if not size:
+            raise PeerClosedError
+        return size
+
+
+def _milliseconds(deadline: float) -> float | None:
+    left = (deadline - perf_counter()) * 1e3
+    # A larger timeout exceeds the range of `poll`, and is replaced by no timeout.
+    return None if left > _LONGEST else max(0.0, left)
+
+
+def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
+    """Pack named arrays into the parts of a body: a line of JSON, then the bytes of the arrays.
+
+    Raises:
+        ValueError: an array has a type that is not permitted.
+    """
+    held = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    for name, array in held.items():
+        if array.dtype.str not in _TYPES:
+            raise ValueError(f"array {name!r:.80}: expected numbers, found {array.dtype}")
+    says = [[name, array.dtype.str, array.shape] for name, array in held.items()]
+    return json.dumps(says).encode() + b"\n", *(array.tobytes() for array in held.values())
+
+
+def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
+    """Unpack the arrays of a body that `pack_arrays` made.
+
+    Raises:
+        FoulError: the body is not valid.
+    """
+    line, _, _ = bytes(body[:_NAMES]).partition(b"\n")
+    rest = body[len(line) + 1 :]
+    try:
+        says = json.loads(line)
+        arrays, place = {}, 0
+        for name, kind, shape in says[:_ARRAYS]:
+            array, place = _array(rest, place, kind, shape)
+            arrays[_name(name)] = array
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise ProtocolError("it sent what are no arrays") from None
+    if place != len(rest) or not len(arrays) == len(says) <= _ARRAYS:
+        raise ProtocolError("it sent more or less than the arrays that it names")
+    return arrays
+
+
+def _name(name: object) -> str:
+    """Check the name of an array, which is used as a name in a file.
+
+    Raises:
+        ValueError: the name is not valid.
+    """
+    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) < _NAME_LENGTH:
+        raise ValueError
+    return name
+
+
+_NAME_LENGTH = 500
+"""Upper limit of the length of an array's name in characters."""
+
+
+def _array(
+    data: memoryview, place: int, kind: str, shape: Sequence[int]
+) -> tuple[NDArray[Any], int]:
+    """Read the array at a position.
+
+    Args:
+        data: bytes of all arrays.
+        place: position of the array.
+        kind: type of the array.
+        shape: shape of the array.
+
+    Returns:
+        The array, and the position of its end.
+
+    Raises:
+        ValueError: type or shape are not valid.
+    """
+    if kind not in _TYPES or not all(type(n) is int and 0 <= n < 1 << 40 for n in shape):
+        raise ValueError
+    size = int(np.dtype(kind).itemsize)
+    for n in shape:
+        size *= n
+    if size > len(data) - place:
+        raise ValueError
+    array = np.frombuffer(data[place : place + size], dtype=kind).reshape(shape)
+    return array.copy(), place + size

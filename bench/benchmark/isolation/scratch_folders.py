@@ -1,0 +1,73 @@
+"""Temporary folders of tuner processes; each is deleted when the process that made it has ended.
+
+Folders of killed processes are deleted by the next process that makes one.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+_PREFIX = "simgap-tuner-"
+
+
+class LockedFolder(NamedTuple):
+    """Temporary folder that is locked by this process.
+
+    Attributes:
+        path: path of the folder.
+        lock: file descriptor with the lock; the folder is in use while it is open.
+    """
+
+    path: str
+    lock: int
+
+    def remove(self) -> None:
+        """Delete the folder and release its lock."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self.lock)
+
+
+def create_locked_folder() -> LockedFolder:
+    """Create a new locked folder."""
+    remove_stale_folders()
+    while True:
+        path = tempfile.mkdtemp(prefix=_PREFIX)
+        lock = _locked(path, wait=True)
+        # Between creation and lock another process may have removed the folder as unused.
+        if lock is not None and os.path.isdir(path):
+            return LockedFolder(path, lock)
+
+
+def remove_stale_folders() -> None:
+    """Delete the folders of processes that were killed."""
+    for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        lock = _locked(str(path), wait=False)
+        if lock is not None:
+            LockedFolder(str(path), lock).remove()
+
+
+def _locked(path: str, wait: bool) -> int | None:
+    """Lock a folder, and return the file descriptor.
+
+    Args:
+        path: path of the folder.
+        wait: True to wait for the lock.
+
+    Returns:
+        File descriptor; None if another process has the lock, or the folder does not exist.
+    """
+    try:
+        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:
+        os.close(lock)
+        return None
+    return lock

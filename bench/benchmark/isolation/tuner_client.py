@@ -1,0 +1,196 @@
+"""Client for a tuner in an isolated process: the tuner and its runs, as the harness uses them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.isolation.cpu_affinity import AffinityController
+from bench.benchmark.isolation.message_channel import (
+    MAX_PROPOSAL_BYTES,
+    MAX_TEXT_BYTES,
+    ProtocolError,
+    pack_arrays,
+)
+from bench.benchmark.isolation.tuner_processes import START_TIMEOUT_SECONDS, IsolatedProcess
+from methods.tuner import Array, Evaluation, Proposal, Task
+
+_CLOSE_TIMEOUT_SECONDS = 10.0
+"""Maximum timeout in seconds for the tuner to close its resources at the end of a run."""
+
+
+@dataclass(frozen=True)
+class TunerSpec:
+    """Specification of a tuner to be built in an isolated process.
+
+    Attributes:
+        name: registered name.
+        module: module of an installed tuner.
+        file: plugin file of the tuner; empty if it is installed.
+        options: options of its entry.
+        modules: packages that it needs, to be preloaded.
+    """
+
+    name: str
+    module: str
+    file: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    modules: tuple[str, ...] = ()
+
+
+def relocate(tuned: TunerSpec, places: Mapping[Path, Path]) -> TunerSpec:
+    """Return a specification with another path of its file.
+
+    Args:
+        tuned: specification of a tuner.
+        places: new path of each file by its present path.
+    """
+    return replace(tuned, file=str(places[Path(tuned.file)])) if tuned.file else tuned
+
+
+class IsolatedTuner:
+    """Tuner that has been built in an isolated process.
+
+    Args:
+        child: process of the tuner.
+        tuned: specification of the tuner.
+        state: trained weights of a learned tuner.
+
+    Attributes:
+        import_seconds: seconds to build the tuner, nearly all for imports of its file.
+
+    Raises:
+        EndedError: the tuner cannot be built; the caller has to end the process if it still runs.
+    """
+
+    def __init__(
+        self,
+        child: IsolatedProcess,
+        tuned: TunerSpec,
+        state: Mapping[str, NDArray[Any]] | None = None,
+    ) -> None:
+        self.child = child
+        child.wait_until_ready()
+        started = perf_counter()
+        deadline = started + START_TIMEOUT_SECONDS
+        wanted = {
+            "name": tuned.name,
+            "module": tuned.module,
+            "file": tuned.file,
+            "options": dict(tuned.options),
+        }
+        child.send(b"B", json.dumps(wanted).encode(), deadline=deadline)
+        child.receive(deadline=deadline)
+        self.import_seconds = perf_counter() - started
+        if state is not None:
+            child.send(b"L", *pack_arrays(state), deadline=deadline)
+            child.receive(deadline=deadline)
+
+
+@dataclass(frozen=True)
+class IsolatedRun:
+    """Isolated tuner for one run, with the method `tune` of a tuner.
+
+    Attributes:
+        tuner: isolated tuner.
+        stream: seed of the run's random generator.
+        seconds: time limit of the run.
+    """
+
+    tuner: IsolatedTuner
+    stream: NDArray[np.uint32]
+    seconds: float
+
+    def tune(self, task: Task, _: np.random.Generator) -> IsolatedSteps:
+        """Start the run; its random numbers are drawn in the isolated process.
+
+        Args:
+            task: task of the target.
+            _: not used.
+        """
+        return IsolatedSteps(self.tuner.child, task, self.stream, self.seconds)
+
+
+class IsolatedSteps:
+    """Run of an isolated tuner, with the methods of the generator `tuner.TunerGenerator`."""
+
+    def __init__(
+        self, child: IsolatedProcess, task: Task, stream: NDArray[np.uint32], seconds: float
+    ) -> None:
+        self._child, self._task, self._stream = child, task, stream
+        self._deadline = perf_counter() + seconds
+        self._farewell = min(seconds, _CLOSE_TIMEOUT_SECONDS)
+        self._pace = AffinityController()
+        self._waits = False
+        self._limit = min(MAX_PROPOSAL_BYTES, 8 * task.dim * (task.budget + 2))
+
+    def __next__(self) -> Array | Proposal:
+        task = self._task
+        parts = pack_arrays(
+            {
+                "start": task.start,
+                "observed": task.observed,
+                "scale": task.scale,
+                "training": task.training,
+                "budget": np.array(min(task.budget, 1 << 62)),
+                "lengths": np.array(task.lengths, dtype=np.int64),
+                "initial": task.scene.initial,
+                "inputs": task.scene.inputs,
+                "stream": self._stream.astype(np.int64),
+            }
+        )
+        self._child.send(b"T", *parts, deadline=self._deadline)
+        return self._asked()
+
+    def send(self, evaluation: Evaluation) -> Array | Proposal:
+        """Send an evaluation, and return the next proposal."""
+        flags = self._pace.record_exchange()
+        # False until the next proposal: if this fails, the process has been ended.
+        self._waits = False
+        self._child.send(
+            b"E",
+            evaluation.proposals.tobytes(),
+            evaluation.losses.tobytes(),
+            evaluation.observations.tobytes(),
+            flags=flags,
+            size=len(evaluation.losses),
+            deadline=self._deadline,
+        )
+        return self._asked()
+
+    def _asked(self) -> Array | Proposal:
+        message = self._child.receive(max(self._limit, MAX_TEXT_BYTES), self._deadline)
+        if message.kind == b"S":
+            raise StopIteration(message.to_text())
+        dim, n = self._task.dim, message.size
+        try:
+            numbers = message.to_array()
+        except ProtocolError as error:
+            raise self._child.fail_with_protocol_error(str(error)) from None
+        recommends = message.flags == 1
+        if message.kind != b"A" or not n or numbers.size != (n + recommends) * dim:
+            raise self._child.fail_with_protocol_error("it asked for nothing")
+        self._waits = True
+        if recommends:
+            return Proposal(numbers[dim:].reshape(n, dim), numbers[:dim])
+        return numbers.reshape(n, dim)
+
+    def close(self) -> None:
+        """End the run; the process may serve another one.
+
+        Raises:
+            EndedError: the tuner failed while it was closed.
+        """
+        self._pace.release_affinity()
+        if self._waits:
+            self._waits = False
+            deadline = perf_counter() + self._farewell
+            self._child.send(b"C", deadline=deadline)
+            self._child.receive(deadline=deadline)

@@ -1,0 +1,332 @@
+"""Client of the fork server, and handles of the isolated processes that it starts."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+from bench.benchmark.isolation import fork_server, scratch_folders
+from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT, list_readable_paths
+from bench.benchmark.isolation.message_channel import (
+    MAX_TEXT_BYTES,
+    Message,
+    MessageChannel,
+    PeerClosedError,
+    ProtocolError,
+    to_printable,
+)
+from bench.benchmark.isolation.process_exit import (
+    KilledExternallyError,
+    RunEndedError,
+    describe_exit,
+    with_isolation,
+)
+from methods.tuner import Array
+from sims.engines.compiled import code_cache as compiled
+
+_BOOTSTRAP_CODE = "import sys; sys.path[:] = {path!r}; from bench.benchmark.isolation.fork_server import serve_fork_requests; serve_fork_requests({descriptor})"
+_PRELOADED = ("numpy.random", "bench.benchmark.isolation.tuner_server")
+_NUMERICAL = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
+"""Prefixes of environment variables that determine how numerical libraries compute."""
+START_TIMEOUT_SECONDS = 60.0
+"""Timeout in seconds for the start of a process and for building a tuner."""
+_EXTERNAL_KILL_SIGNALS = (-9, -15)
+"""Exit codes of processes that were killed externally: SIGKILL and SIGTERM.
+
+SIGKILL is also sent by the kernel if memory is exhausted.
+"""
+
+
+_COURTESY = 1.0
+"""Timeout in seconds for a process's report of the files that it has written."""
+_FILES = 1_000_000
+"""Maximum reported number of files; larger reports are cut to it."""
+
+
+class Written(NamedTuple):
+    """Files that a tuner has written to the folder that is deleted with its process.
+
+    Attributes:
+        files: number of files.
+        names: names of the first files.
+    """
+
+    files: int
+    names: tuple[str, ...]
+
+
+NOTHING_WRITTEN = Written(0, ())
+
+
+def _name(said: object) -> str:
+    """Convert a file name to text that fits into one line."""
+    return " ".join(to_printable(str(said)[:100]).split())
+
+
+class ForkServerClient:
+    """Client of the fork server that starts tuner processes; see `isolation.fork_server`."""
+
+    def __init__(self) -> None:
+        self._place: scratch_folders.LockedFolder | None = scratch_folders.create_locked_folder()
+        self._folder = self._place.path
+        self._loaded: set[str] = set()
+        self._link, theirs = socket.socketpair()
+        path = [place for place in sys.path if place not in ("", str(PROJECT_ROOT))] + [
+            str(PROJECT_ROOT)
+        ]
+        code = _BOOTSTRAP_CODE.format(path=path, descriptor=theirs.fileno())
+        nothing = subprocess.DEVNULL
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", code],
+            pass_fds=[theirs.fileno()],
+            env=_environment(self._folder),
+            cwd=self._folder,
+            stdin=nothing,
+            stdout=nothing,
+            start_new_session=True,
+        )
+        theirs.close()
+        atexit.register(self.close)
+        self.preload_modules(_PRELOADED)
+
+    def _ask(self, request: dict[str, Any], descriptors: tuple[int, ...] = ()) -> Any:
+        try:
+            fork_server.send_message(self._link, request, descriptors)
+            return fork_server.receive_message(self._link)[0]
+        except (EOFError, OSError):
+            self.close()
+            raise KilledExternallyError("the process that starts tuners is gone") from None
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the fork server can start another process."""
+        return self._process.poll() is None
+
+    def preload_modules(self, modules: Iterable[str]) -> None:
+        """Preload modules in the fork server; modules of plugins are never preloaded."""
+        missing = [name for name in dict.fromkeys(modules) if name not in self._loaded]
+        if missing:
+            self._ask({"do": "load", "modules": missing})
+            self._loaded.update(missing)
+
+    def start_process(
+        self,
+        service: str,
+        files: Iterable[str] = (),
+        memory: int = 0,
+        hidden: Iterable[str] = (),
+    ) -> IsolatedProcess:
+        """Start an isolated process.
+
+        Args:
+            service: purpose of the process, one of `fork_server.SERVICE_NAMES`.
+            files: files that it may read, in addition to Python and its packages.
+            memory: memory limit in MiB; 0 for no limit.
+            hidden: folders that it must not access, in addition to the working directory.
+
+        Returns:
+            Handle of the process.
+
+        Raises:
+            KilledError: the fork server is gone.
+        """
+        to_child, to_us = os.pipe(), os.pipe()
+        request = {
+            "do": "start",
+            "service": service,
+            "folder": self._folder,
+            "readable": [*list_readable_paths((*hidden, str(Path.cwd()))), *files],
+            "memory": memory,
+        }
+        try:
+            keeper = self._ask(request, (to_child[0], to_us[1]))["keeper"]
+        except KilledExternallyError:
+            os.close(to_us[0])
+            os.close(to_child[1])
+            raise
+        finally:
+            os.close(to_child[0])
+            os.close(to_us[1])
+        return IsolatedProcess(self, keeper, MessageChannel(to_us[0], to_child[1]))
+
+    def end_process(self, keeper: int, kill: bool) -> int | None:
+        """End a process.
+
+        Args:
+            keeper: process id of its supervisor.
+            kill: True to kill it at once; False to let it end by itself first.
+
+        Returns:
+            Its exit code; None if it had to be killed.
+        """
+        code: int | None = self._ask({"do": "end", "keeper": keeper, "kill": kill})["exit"]
+        return code
+
+    def empty_shared_folder(self) -> None:
+        """Delete the content of the folder that processes without their own folder share."""
+        for path in Path(self._folder).iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """End the fork server and every process that it started."""
+        atexit.unregister(self.close)
+        self._link.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=5.0)
+        self._process.kill()
+        self._process.wait()
+        if self._place is not None:
+            self._place.remove()
+            self._place = None
+        # Workers that have ended may have left their folders.
+        scratch_folders.remove_stale_folders()
+
+
+def _environment(folder: str) -> dict[str, str]:
+    """Return the environment variables of tuner processes."""
+    kept = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "SYSTEMROOT")
+    told = {name: os.environ[name] for name in kept if name in os.environ}
+    # Libraries would otherwise compute differently, and results would differ in the last digits.
+    told |= {name: value for name, value in os.environ.items() if name.startswith(_NUMERICAL)}
+    # Compiled steps are loaded from the cache folder before the process is isolated.
+    told["SIMGAP_COMPILED"] = (
+        "off" if compiled.is_compilation_disabled() else str(compiled.get_cache_folder())
+    )
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return {**one, **told, "HOME": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+class IsolatedProcess:
+    """Handle of an isolated process, with the channel to it.
+
+    Attributes:
+        channel: message channel to the process.
+        seals: names of the active isolation layers, once the process is ready.
+    """
+
+    def __init__(self, nursery_: ForkServerClient, keeper: int, channel: MessageChannel) -> None:
+        self._nursery, self._keeper, self.channel = nursery_, keeper, channel
+        self._open = True
+        self.seals: list[str] = []
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process has not been ended."""
+        return self._open
+
+    def wait_until_ready(self) -> None:
+        """Wait until the process is ready.
+
+        Raises:
+            KilledError: the process did not start.
+        """
+        try:
+            self.seals = self.channel.receive(
+                deadline=perf_counter() + START_TIMEOUT_SECONDS
+            ).to_document()
+        except (PeerClosedError, TimeoutError, ProtocolError):
+            raise KilledExternallyError(f"a tuner's process did not start ({self.end()})") from None
+
+    def end(self, kill: bool = True) -> int | None:
+        """End the process.
+
+        Args:
+            kill: True to kill it at once; False to let it end by itself first.
+
+        Returns:
+            Its exit code; None if it had to be killed, or was ended before.
+        """
+        if not self._open:
+            return None
+        self._open = False
+        self.channel.close()
+        code = self._nursery.end_process(self._keeper, kill)
+        if "disk" not in self.seals:
+            self._nursery.empty_shared_folder()
+        return code
+
+    def receive(self, limit: int = MAX_TEXT_BYTES, deadline: float = float("inf")) -> Message:
+        """Receive the next message of the process.
+
+        Args:
+            limit: maximum size of the message in bytes.
+            deadline: latest time, as of `perf_counter`.
+
+        Raises:
+            EndedError: the tuner failed, took too long or is gone; the process may have been ended.
+            KilledError: the process was killed externally.
+        """
+        try:
+            message = self.channel.receive(limit, deadline)
+        except TimeoutError:
+            self.end()
+            raise RunEndedError("timeout", "") from None
+        except ProtocolError as error:
+            raise self.fail_with_protocol_error(str(error)) from None
+        except PeerClosedError:
+            raise self._gone() from None
+        if message.kind == b"D":
+            raise RunEndedError("crashed", with_isolation(message.to_text()))
+        return message
+
+    def written(self) -> Written:
+        """Return the files that the tuner has written to its folder since the last call.
+
+        The result is empty if the process does not answer; its report is optional.
+        """
+        if not self._open:
+            return NOTHING_WRITTEN
+        deadline = perf_counter() + _COURTESY
+        try:
+            self.send(b"N", deadline=deadline)
+            said = self.receive(deadline=deadline).to_document()
+            count = max(0, min(int(said["count"]), _FILES))
+            return Written(count, tuple(map(_name, said["names"][:3])) if count else ())
+        except (RunEndedError, KilledExternallyError, ProtocolError):
+            return NOTHING_WRITTEN
+        except (TypeError, ValueError, LookupError, OverflowError):
+            # The message is JSON, but has another content.
+            return NOTHING_WRITTEN
+
+    def send(self, kind: bytes, *parts: bytes | Array, deadline: float, **head: int) -> None:
+        """Send a message to the process; raises the errors of `receive_message`.
+
+        Args:
+            kind: kind of the message, one byte.
+            parts: content of the message.
+            deadline: latest time, as of `perf_counter`.
+            head: further fields of the message header.
+        """
+        # An answer sent before its question would seem to take no time.
+        if self.channel.has_data:
+            raise self.fail_with_protocol_error("it spoke without having been asked")
+        try:
+            self.channel.send(kind, *parts, deadline=deadline, **head)
+        except TimeoutError:
+            self.end()
+            raise RunEndedError("timeout", "") from None
+        except PeerClosedError:
+            raise self._gone() from None
+
+    def fail_with_protocol_error(self, says: str) -> RunEndedError:
+        """End a process that violated the protocol, and return the error to raise."""
+        self.end()
+        return RunEndedError("crashed", f"the tuner's process broke the pipe: {says}")
+
+    def _gone(self) -> RunEndedError | KilledExternallyError:
+        code = self.end(kill=False)
+        if code in _EXTERNAL_KILL_SIGNALS:
+            return KilledExternallyError(f"the tuner's process was killed by signal {-code}")
+        return RunEndedError("crashed", describe_exit("the tuner's process", code))

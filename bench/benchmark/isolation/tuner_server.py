@@ -1,0 +1,299 @@
+"""Server in an isolated process: builds a tuner, and executes the requests of the harness.
+
+The harness cannot trust this process once a plugin's code runs in it. Everything that counts for
+the results is counted on the harness's side of the pipe.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.isolation.isolation_layers import AccessPolicy
+from bench.benchmark.isolation.message_channel import (
+    MAX_TEXT_BYTES,
+    Message,
+    MessageChannel,
+    PeerClosedError,
+    pack_arrays,
+    unpack_arrays,
+)
+from bench.benchmark.isolation.proposal_arrays import to_points
+from bench.benchmark.isolation.rng_transfer import decode_rng_state, encode_rng_state
+from methods.tuner import (
+    Array,
+    BudgetExceededError,
+    Evaluation,
+    Proposal,
+    ScenarioInfo,
+    Task,
+    TrainingSimulator,
+    Tuner,
+    TunerGenerator,
+)
+
+_LIMIT = 1 << 40
+"""Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
+
+
+def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]) -> None:
+    """Serve requests until the harness closes the channel.
+
+    Args:
+        channel: message channel to the harness.
+        reach: access policy of this process.
+        held: names of the active isolation layers.
+    """
+    channel.send_document(b"R", held)
+    # NumPy was preloaded, so code that uses its global generator would get the same numbers in each
+    # run.
+    np.random.seed()  # noqa: NPY002
+    with suppress(PeerClosedError):
+        tuner = None
+        told: set[str] = set()
+        while True:
+            message = channel.receive(_LIMIT)
+            if message.kind == b"N":
+                _tell_written(channel, reach.folder, told)
+                continue
+            try:
+                tuner = _handle_message(channel, message, tuner)
+            except PeerClosedError:
+                return
+            except BaseException:
+                # This includes SystemExit: it comes from the tuner and ends its run.
+                _report_failure(channel, traceback.format_exc())
+
+
+def _tell_written(channel: MessageChannel, folder: str, told: set[str]) -> None:
+    """Report files that the tuner has written and that are not in `told`; add them to `told`.
+
+    Hidden files and compiled Python files are left out, because libraries write them and they are
+    not needed.
+    """
+    new = [path for path in islice(_written(folder), _MOST_FILES) if path not in told]
+    told.update(new)
+    names = [os.path.relpath(path, folder) for path in sorted(new)[:3]]
+    channel.send_document(b"N", {"count": len(new), "names": names})
+
+
+_MOST_FILES = 10_000
+"""Maximum number of files that are counted."""
+
+
+def _written(folder: str) -> Iterator[str]:
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if name[0] != "." and name != "__pycache__"]
+        yield from (os.path.join(place, name) for name in files if name[0] != ".")
+
+
+def _report_failure(channel: MessageChannel, text: str) -> None:
+    """Report a failure; a long text is cut to its end, which has the error."""
+    channel.send(b"D", text.encode("utf-8", "replace")[-MAX_TEXT_BYTES // 2 :])
+
+
+def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | None) -> Tuner | None:
+    """Execute the request of one message, and return the present tuner."""
+    if message.kind == b"B":
+        wanted = message.to_document()
+        tuner = load_class(wanted)(**wanted["options"])
+        channel.send(b"K")
+    elif tuner is None:
+        raise RuntimeError("asked before there was a tuner")
+    elif message.kind == b"L":
+        tuner.restore(unpack_arrays(message.body))
+        channel.send(b"K")
+    elif message.kind == b"T":
+        _tune(channel, message, tuner)
+    elif message.kind == b"F":
+        _fit(channel, message, tuner)
+    return tuner
+
+
+def load_class(wanted: dict[str, Any], base: type[Any] = Tuner) -> type[Any]:
+    """Load the class of a tuner or of another plugin.
+
+    Args:
+        wanted: ``name`` of the class, and its ``file`` or ``module``.
+        base: required base class.
+
+    Raises:
+        ImportError: the class is not there any more.
+    """
+    module = (
+        _of_file(wanted["file"]) if wanted["file"] else importlib.import_module(wanted["module"])
+    )
+    for value in vars(module).values():
+        if (
+            inspect.isclass(value)
+            and issubclass(value, base)
+            and getattr(value, "name", "") == wanted["name"]
+        ):
+            return value
+    raise ImportError(
+        f"{wanted['file'] or wanted['module']} has no {base.__name__.lower()} {wanted['name']}"
+    )
+
+
+def _of_file(path: str) -> Any:
+    stem = os.path.splitext(os.path.basename(path))[0]
+    spec = importlib.util.spec_from_file_location(f"simgap_plugin_{stem}", path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path}: no Python file")
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses look up their module when they are made.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def make_generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
+    """Return the random generator of the run; see `bench.core.random_streams`."""
+    return np.random.default_rng(arrays["stream"].astype(np.uint32))
+
+
+def _tune(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
+    given = unpack_arrays(message.body)
+    task = Task(
+        dim=given["start"].size,
+        start=given["start"],
+        observed=given["observed"],
+        scale=given["scale"],
+        training=given["training"],
+        budget=int(given["budget"]),
+        lengths=tuple(given["lengths"].tolist()),
+        scene=ScenarioInfo(given["initial"], given["inputs"]),
+    )
+    steps = tuner.tune(task, make_generator(given))
+    try:
+        _exchange(channel, steps, task)
+    except StopIteration as stop:
+        reason = str(stop.value or "the tuner stopped")
+        channel.send(b"S", reason.encode("utf-8", "replace")[: MAX_TEXT_BYTES // 2])
+    except GeneratorExit:
+        steps.close()
+        channel.send(b"K")
+
+
+def _exchange(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoReturn:
+    """Send proposals to the harness, and evaluations to the tuner.
+
+    Raises:
+        StopIteration: the tuner stopped.
+        GeneratorExit: the harness ends the run.
+        Exception: the tuner failed.
+    """
+    dim, used = task.dim, 0
+    length, channels = task.observed.shape
+    asked = next(steps)
+    while True:
+        recommendation: bytes | Array = b""
+        if type(asked) is Proposal:
+            asked, recommend = asked
+            if recommend is not None:
+                recommendation = to_points(recommend, dim, "recommendations")[0]
+        points = to_points(asked, dim, "proposals")
+        # One point beyond the budget is enough for the harness to see that the budget is exceeded.
+        points = points[: max(task.budget - used, 0) + 1]
+        channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
+        answer = channel.receive(_LIMIT)
+        if answer.kind != b"E":
+            raise GeneratorExit
+        if answer.flags:
+            _set_processor(answer.flags - 1)
+        numbers, n = answer.to_array(), answer.size
+        used += n
+        proposals = numbers[: n * dim].reshape(n, dim)
+        losses = numbers[n * dim : n * dim + n]
+        observations = numbers[n * dim + n :].reshape(n, length, channels)
+        proposals.setflags(write=False)
+        losses.setflags(write=False)
+        asked = steps.send(Evaluation(proposals, observations, losses))
+
+
+def _set_processor(processor: int) -> None:
+    """Run on the processor that the harness uses, where alternating is faster."""
+    with suppress(OSError, AttributeError):
+        os.sched_setaffinity(
+            0, {processor} if processor < _ANY_PROCESSOR else range(os.cpu_count() or 1)
+        )
+
+
+_ANY_PROCESSOR = 254
+"""Processor number that represents all processors."""
+
+
+class _RemoteTrainingSimulator:
+    """Training simulator of a learned tuner, which simulates on the harness's side of the pipe."""
+
+    def __init__(self, channel: MessageChannel, which: int) -> None:
+        self._channel, self._which = channel, which
+        channel.send(b"P", flags=which)
+        self._take(channel.receive(_LIMIT))
+
+    def _take(self, answer: Message) -> dict[str, NDArray[Any]]:
+        if answer.kind == b"X":
+            refused = answer.to_document()
+            kinds = {"budget": BudgetExceededError, "value": ValueError}
+            raise kinds.get(refused["kind"], RuntimeError)(refused["says"])
+        given = unpack_arrays(answer.body)
+        self.training, self.scale = given["training"], given["scale"]
+        self.dim = self.training.shape[1]
+        self.lengths = tuple(given["lengths"].tolist())
+        self.scene = ScenarioInfo(given["initial"], given["inputs"])
+        self.used, self.budget = given["counts"].tolist()
+        return given
+
+    def sample(self, rng: np.random.Generator, n: int) -> Array:
+        return rng.uniform(self.training[0], self.training[1], size=(n, self.dim))
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:
+        state = rng.bit_generator.state
+        plain = state["bit_generator"] == "PCG64"
+        # A generator of another type seeds a new PCG64 generator, which can be sent.
+        sent = state if plain else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
+        asked = np.array(points, dtype=np.float64)
+        asked = asked.reshape(-1, self.dim)
+        self._channel.send(b"P", *_stream(sent), asked, flags=2 + self._which, size=len(asked))
+        given = self._take(self._channel.receive(_LIMIT))
+        if plain:
+            rng.bit_generator.state = decode_rng_state(given["stream"])
+        return given["observations"]
+
+
+def _stream(state: Any) -> tuple[bytes]:
+    return (encode_rng_state(state).tobytes(),)
+
+
+class _RemoteTrainingCallback:
+    """Training callback that reports progress to the harness."""
+
+    def __init__(self, channel: MessageChannel) -> None:
+        self._channel = channel
+
+    @property
+    def evaluation_simulator(self) -> TrainingSimulator:
+        return _RemoteTrainingSimulator(self._channel, 1)
+
+    def on_epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+        self._channel.send_document(b"W", [stage, epoch, epochs, float(loss), float(held_out)])
+        self._channel.receive(_LIMIT)
+
+
+def _fit(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
+    given = unpack_arrays(message.body)
+    tuner.watch = _RemoteTrainingCallback(channel) if message.flags else None
+    tuner.fit(_RemoteTrainingSimulator(channel, 0), make_generator(given), int(given["budget"]))
+    tuner.watch = None
+    channel.send(b"L", *pack_arrays(tuner.state()))

@@ -1,0 +1,117 @@
+"""Find what an experiment needs and this machine lacks: a data set, packages, tuners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from bench.benchmark.problem.experiment import Experiment, expand_sweep
+from bench.benchmark.problem.model_file_simulator import find_missing_model_file
+from bench.core.plugin_registries import PartUnavailableError, simulators, tuners
+from bench.datasets import dataset_catalogue as datasets
+from bench.datasets.dataset_catalogue import DataSet
+from sims.engines import ENGINE_MODULES, missing_packages
+
+
+@dataclass(frozen=True)
+class Availability:
+    """Missing requirements of an experiment.
+
+    Attributes:
+        data_set: missing data set that a command of the project downloads; None if none is missing.
+        skipped: why the experiment cannot run here; empty if it can run, or if only the data set is
+            missing.
+        tuners: reason by label of each tuner that cannot run here and is left out.
+    """
+
+    data_set: DataSet | None
+    skipped: str
+    tuners: Mapping[str, str]
+
+
+def availability(experiment: Experiment) -> Availability:
+    """Find what is missing for an experiment, or for all experiments that it names."""
+    if experiment.experiments:
+        return _together(experiment)
+    data_set = _missing_data_set(experiment)
+    skipped = "" if data_set else find_missing_model_file(experiment)
+    return Availability(
+        data_set,
+        skipped or _missing_simulator(experiment) or _missing_engine(experiment),
+        _missing_tuners(experiment),
+    )
+
+
+def _together(experiment: Experiment) -> Availability:
+    """Combine what is missing for the experiments that this one names."""
+    parts = {each.name: availability(each) for each in expand_sweep(experiment)}
+    data_sets = [part.data_set for part in parts.values() if part.data_set]
+    skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]
+    absent = {label: why for part in parts.values() for label, why in part.tuners.items()}
+    return Availability(next(iter(data_sets), None), "; ".join(skipped), absent)
+
+
+def _missing_simulator(experiment: Experiment) -> str:
+    """Return why the experiment's registered simulator cannot be used here.
+
+    The text is empty if it can be used, or if the simulator is not a registered one.
+    """
+    if experiment.model or experiment.simulator not in simulators.names():
+        return ""
+    try:
+        simulators.get(experiment.simulator)
+    except PartUnavailableError as error:
+        return error.reason
+    return ""
+
+
+def _missing_data_set(experiment: Experiment) -> DataSet | None:
+    """Return the data set that an experiment needs and that is missing here."""
+    wanted = [("robot", experiment.model)] if experiment.model else []
+    if experiment.recording:
+        wanted.append(("recording", experiment.recording.path))
+    for kind, path in wanted:
+        found = datasets.providing(kind, path)
+        if found and datasets.find(kind, path) is None:
+            return found
+    return None
+
+
+def _missing_engine(experiment: Experiment) -> str:
+    """Return why an engine of an experiment cannot be used here; empty if all can.
+
+    The engines are those of the tuned simulator and of the simulator that makes the targets.
+    """
+    settings = [experiment.settings, *([experiment.world] if experiment.world else [])]
+    engines = [str(each.get("engine") or _default_engine(experiment)) for each in settings]
+    packages = sorted(
+        {
+            package
+            for name in engines
+            if name in ENGINE_MODULES
+            for package in missing_packages(name)
+        }
+    )
+    if not packages:
+        return ""
+    return f"needs {', '.join(packages)}, not installed (pip install {' '.join(packages)})"
+
+
+def _default_engine(experiment: Experiment) -> str:
+    """Return the default engine of an experiment; empty if its simulator is not known."""
+    if experiment.model:
+        return "mujoco"
+    if experiment.simulator not in simulators.names():
+        return ""
+    return str(getattr(simulators.get(experiment.simulator), "default_engine", ""))
+
+
+def _missing_tuners(experiment: Experiment) -> Mapping[str, str]:
+    """Return the reason by label for each tuner of an experiment that cannot run here."""
+    reasons = {}
+    for entry in experiment.tuners:
+        try:
+            tuners.get(entry.tuner)
+        except PartUnavailableError as error:
+            reasons[entry.label] = error.reason
+    return reasons

@@ -1,0 +1,507 @@
+"""Experiment configuration: parse and check experiment files, and expand them.
+
+An experiment states which tuners are compared, on which simulator and targets, and with what
+budget. The keys of a file are the fields of `Experiment`. `Experiment.document` returns the exact
+configuration, including defaults and command-line changes; it is stored with every run.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypedDict
+
+from bench.benchmark.problem import experiment_sweep
+from bench.benchmark.problem.recorded_runs import resolve_recording_path
+from bench.benchmark.problem.salt import check_commitment
+from bench.benchmark.problem.tuner_entries import TunerEntry, parse_entries
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.toml_validation import (
+    Range,
+    check_entries,
+    check_finite,
+    check_known_names,
+    check_text,
+    get_type_hints_of,
+    make_error,
+    read_toml,
+)
+from sims.core.value_limits import MAX_DESCRIPTION_LENGTH, MAX_NAME_LENGTH, MAX_SAMPLING_RATE_HZ
+
+__all__ = [
+    "Experiment",
+    "HeldOutConfig",
+    "RecordingSource",
+    "SamplingConfig",
+    "TunerEntry",
+    "expand_sweep",
+    "list_experiment_names",
+    "load_experiment",
+    "parse_experiment",
+]
+
+RANGES = ("in", "wide", "real")
+"""Origin of targets: the training range, the bounds, or a recording."""
+
+_LONGEST = 1e9
+"""Maximum finite time limit in seconds; a longer one overflows timers. Infinity means no limit."""
+_MOST_MEMORY = 10**9
+"""Maximum memory limit in MiB; no machine has more memory."""
+ISOLATION_MODES = ("run", "tuner")
+"""Lifetimes of a tuner's process: one run, or all runs of the tuner."""
+
+FixedOrRange = float | Range
+"""A number, or the range from which each scenario draws one uniformly."""
+
+
+class ParameterOverride(TypedDict, total=False):
+    """Parameter properties that an experiment may change; see `sims.core.simulator.Parameter`."""
+
+    nominal: float
+    bounds: Range
+    training: Range
+    log: bool
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Sample times of a simulated target: `samples` of them at `rate` Hz, from zero."""
+
+    rate: float = 100.0
+    samples: int = 400
+
+
+@dataclass(frozen=True)
+class HeldOutConfig:
+    """Unseen scenarios of a simulated target; initial states and inputs are the experiment's where
+    not given.
+    """
+
+    scenarios: int = 3
+    initial: Mapping[str, FixedOrRange] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RecordingSource:
+    """The recording that an experiment on real data tunes to; `path` is relative to the folder of
+    recordings ($SIMGAP_DATA), to that of `simgap download`, to the experiment's file, or to the
+    working directory.
+    """
+
+    path: str = ""
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """A recording of the targets' world, with parameters of its own, from which explain extends the
+    simulator that is tuned.
+
+    Attributes:
+        runs: in it.
+        held_out: of them, on which explain measures what a cause brings.
+        initial: initial states where they are others than the targets'.
+        inputs: input signals where they are others than the targets'.
+    """
+
+    runs: int = 6
+    held_out: int = 2
+    initial: Mapping[str, FixedOrRange] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One comparison.
+
+    Attributes:
+        name: file name without its ending.
+        title: heading of figures.
+        says: a sentence on what it is.
+        tags: words by which a list is searched, e.g. ``quick``; they change nothing.
+        simulator: registered name; of a robot what tables call it, its file's name where empty.
+        model: a robot's model file (MJCF or URDF) in place of a registered simulator: relative to
+            the experiment's file, to the folder in $SIMGAP_ROBOTS, to that of `simgap download` or
+            to the working directory, or in an installed package as ``package://NAME/FILE``.
+        free: numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
+        actuators: that the model file lacks, as in a recording's ``[actuators.NAME]``.
+        observe: channels the tuner sees; all where empty.
+        error_channel: the channel in which `obs_error` and `heldout_error` are reported; the first
+            where empty.
+        ranges: in, wide (simulated targets), or real (a recording).
+        targets: number of targets in each range; for a recording, number of starting points.
+        seeds: runs of each stochastic tuner on each target, and trainings of each learned one.
+        budget: simulations on one target.
+        negligible_error: error below which tuners count as equal when they are ranked and tested,
+            as a share of the training range (the unit of `param_error`); on a recording, where no
+            truth is known, the same share above the smallest error that any tuner reached. The
+            shipped experiments state a tenth of a percent, or the standard error that their noise
+            leaves where that is larger.
+        same_targets_as: another experiment whose targets are met; its own where empty.
+        training_budget: simulations that a learned tuner may train with.
+        timeout: seconds a run may take.
+        memory: MiB that a run may take beside what its worker holds; 0 is no limit.
+        noise: standard deviation of the sensor noise added to simulated targets, by channel.
+        settings: the simulator's own settings, e.g. its time step.
+        world: settings of the simulator that makes the targets, where it is another: another
+            engine, effects with fixed coefficients. Empty: the same simulator. Its parameters are
+            the first of the tuned ones.
+        constants: constants other than the simulator's defaults: a number, or [low, high] for
+            uniform between in each scenario, known to whoever simulates it.
+        parameters: changes to parameters' nominal, bounds, training range.
+        nuisance: effects that the simulator has not and the world may have, by coefficient, each
+            with the range from which it is drawn while a tuner trains whose entry says
+            ``randomised = true`` (`bench.benchmark.problem.domain_randomisation`).
+        initial: initial state: a number, or [low, high] for uniform between.
+        inputs: input signals by name, as `simgap simulate` writes them, e.g. ``sine:2:0.5``
+            (`bench.core.input_signals`).
+        sampling: sample times of simulated targets.
+        held_out: unseen scenarios on which the tuned simulator's prediction is measured; for
+            simulated targets.
+        identifiability: whether to find what the data of each simulated target identify, where
+            there are several parameters (`problem.fisher_information`): two simulations a
+            parameter and target, beside all budgets.
+        recording: the measured data, for range real.
+        calibration: where tuners are compared twice, in the simulator as it is and in the one that
+            explain extends from such a recording (`bench.misspecification`).
+        shot: where the experiment is a bounce shot, its scene (`bounce_shot.shot_config`); targets
+            are then shots a ball.
+        diagnosis: where the experiment compares diagnosers, what is asked of whom
+            (`diagnosis_benchmark.benchmark_config`); `budget`, `timeout` and `memory` are then
+            those of an answer, and there are no tuners.
+        isolation: run: every run of a tuner has a fresh process; tuner: all runs of a tuner with
+            one seed that a worker makes share one.
+        trusted: tuners run in the harness's own processes, where nothing is out of their reach;
+            tables and figures say so.
+        salt: what targets are drawn from; empty for a secret one, fresh for each comparison and
+            revealed at its end; ``public`` for the targets that everybody can draw; any other text
+            is as public as the file that it stands in.
+        salt_sha256: of the secret salt, from the beginning; a folder of results has it.
+        sweep: lists of values by key; the file stands for an experiment ``NAME[budget=10]`` for
+            each combination of them. A key within a table is joined by dots, as ``noise.x``.
+        experiments: others, by name or file, which it stands for: each with the targets, seeds,
+            budgets, limits and tuners of this one.
+        tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
+            the same, a ``label``; or a table for each by its label.
+    """
+
+    name: str
+    title: str = ""
+    says: str = ""
+    tags: tuple[str, ...] = ()
+    simulator: str = ""
+    model: str = ""
+    free: tuple[str, ...] = ()
+    actuators: Mapping[str, Any] = field(default_factory=dict)
+    observe: tuple[str, ...] = ()
+    error_channel: str = ""
+    ranges: tuple[str, ...] = ("in", "wide")
+    targets: int = 20
+    seeds: int = 1
+    budget: int = 100
+    negligible_error: float = 1e-3
+    same_targets_as: str = ""
+    training_budget: int = 1600
+    timeout: float = 3600.0
+    memory: int = 0
+    noise: Mapping[str, float] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    world: Mapping[str, Any] = field(default_factory=dict)
+    constants: Mapping[str, FixedOrRange] = field(default_factory=dict)
+    parameters: Mapping[str, ParameterOverride] = field(default_factory=dict)
+    nuisance: Mapping[str, Range] = field(default_factory=dict)
+    initial: Mapping[str, FixedOrRange] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    held_out: HeldOutConfig | None = None
+    identifiability: bool = True
+    recording: RecordingSource | None = None
+    calibration: CalibrationConfig | None = None
+    shot: Mapping[str, Any] = field(default_factory=dict)
+    diagnosis: Mapping[str, Any] = field(default_factory=dict)
+    isolation: str = "run"
+    trusted: bool = False
+    salt: str = ""
+    salt_sha256: str = ""
+    sweep: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    experiments: tuple[str, ...] = ()
+    tuners: tuple[TunerEntry, ...] = ()
+
+    def __post_init__(self) -> None:
+        who = f"experiment {self.name}"
+        for what in ("targets", "seeds", "budget"):
+            count = getattr(self, what)
+            if count < 1:
+                raise InputError(f"{who}: {what} must be at least 1, found {count}")
+        if self.training_budget < 0:
+            raise make_error(who, "training_budget", "at least 0", self.training_budget)
+        self._check_words(who)
+        self._check_numbers(who)
+        for entry in self.tuners:
+            if entry.randomised and not self.nuisance and not self.experiments:
+                wanted = "a [nuisance] table of effects to train over"
+                raise InputError(f"{who}: tuner {entry.label} is randomised: expected {wanted}")
+        if self.memory < 0 or not self.timeout > 0:  # negated, so that NaN is refused too
+            raise InputError(f"{who}: expected timeout > 0 and memory >= 0")
+        if self.memory > _MOST_MEMORY or _LONGEST < self.timeout < math.inf:
+            wanted = f"timeout of at most {_LONGEST:g} s and memory of at most {_MOST_MEMORY:g} MiB"
+            raise InputError(f"{who}: expected {wanted}")
+        check_known_names("range", self.ranges, RANGES)
+        if not self.ranges or len(set(self.ranges)) < len(self.ranges):
+            raise make_error(who, "ranges", "one or more, each once", list(self.ranges))
+        check_known_names("isolation", [self.isolation], ISOLATION_MODES)
+        check_commitment(who, self.salt, self.salt_sha256)
+        # The range 'real' needs a recording, and the other ranges must not have one.
+        real = "real" in self.ranges
+        if real != (self.recording is not None) or (real and len(self.ranges) != 1):
+            raise InputError(f"{who}: range 'real' and a [recording] go together, and alone")
+        if self.held_out and (self.recording or self.held_out.scenarios < 1):
+            wanted = "simulated targets and scenarios of at least 1"
+            raise InputError(f"{who}: [held_out] needs {wanted}")
+        self._check_calibration(who)
+
+    def _check_calibration(self, who: str) -> None:
+        """Raise an error if the calibration has no runs to fit, or is not applicable."""
+        if self.calibration is None:
+            return
+        runs, held_out = self.calibration.runs, self.calibration.held_out
+        if not 0 <= held_out < runs:
+            raise make_error(who, "calibration.held_out", f"fewer than the {runs} runs", held_out)
+        if self.recording or self.shot:
+            raise InputError(f"{who}: [calibration] needs simulated targets, and no shot")
+
+    def _check_words(self, who: str) -> None:
+        """Raise an error for texts that do not fit into figures, tables or paths."""
+        check_text(who, "title", self.title)
+        check_text(who, "says", self.says, most=MAX_DESCRIPTION_LENGTH)
+        check_text(who, "same_targets_as", self.same_targets_as)
+        check_text(who, "model", self.model, most=MAX_DESCRIPTION_LENGTH)
+        for word in self.free:
+            check_text(who, "free", word, most=MAX_NAME_LENGTH)
+        for word in self.experiments:
+            check_text(who, "experiments", word)
+        check_text(who, "tags", ", ".join(self.tags), most=MAX_DESCRIPTION_LENGTH)
+        for entry in self.tuners:
+            check_text(who, "tuners: label", entry.label, most=MAX_NAME_LENGTH)
+
+    def _check_numbers(self, who: str) -> None:
+        """Raise an error for numbers that are not finite or out of range."""
+        if not 0 <= check_finite(who, "negligible_error", self.negligible_error) < 1:
+            wanted = "a share of the training range, from 0 to below 1"
+            raise make_error(who, "negligible_error", wanted, self.negligible_error)
+        rate = check_finite(who, "sampling.rate", self.sampling.rate)
+        if not 0 < rate <= MAX_SAMPLING_RATE_HZ or self.sampling.samples < 1:
+            wanted = f"a rate above 0 Hz and up to {MAX_SAMPLING_RATE_HZ:g} Hz, and at least 1 of samples"
+            raise make_error(who, "sampling", wanted, asdict(self.sampling))
+        for name, sigma in self.noise.items():
+            if check_finite(who, f"noise.{name}", sigma) < 0:
+                raise make_error(who, f"noise.{name}", "at least 0", sigma)
+        held = self.held_out.initial if self.held_out else {}
+        calibrated = self.calibration.initial if self.calibration else {}
+        for where, given in (
+            ("initial", self.initial),
+            ("constants", self.constants),
+            ("held_out.initial", held),
+            ("calibration.initial", calibrated),
+        ):
+            for name, value in given.items():
+                for end in value if isinstance(value, tuple) else (value,):
+                    check_finite(who, f"{where}.{name}", end)
+
+    def document(self) -> dict[str, Any]:
+        """Return the whole configuration as TOML tables, the inverse of `parse_experiment`."""
+        document = {key: value for key, value in asdict(self).items() if value is not None}
+        del document["name"]
+        # An experiment that is run never has the first two keys, and rarely the last two.
+        for rare in ("sweep", "experiments", "nuisance", "diagnosis"):
+            if not document[rare]:
+                del document[rare]
+        document["tuners"] = {entry.label: entry.to_table() for entry in self.tuners}
+        return document
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Constants that are equal in every scenario."""
+        constants = self.constants.items()
+        return {name: value for name, value in constants if not isinstance(value, tuple)}
+
+    def chosen(self, **changes: Any) -> Experiment:
+        """Return this experiment with the given fields replaced if they are not None."""
+        # None means that an option is not given on the command line.
+        return replace(self, **{k: v for k, v in changes.items() if v is not None})
+
+    def with_seeds(self, seeds: int) -> Experiment:
+        """Return this experiment with a number of seeds.
+
+        Entries of tuners with fewer seeds keep their number.
+        """
+        entries = []
+        for entry in self.tuners:
+            # An entry without a number keeps following the experiment's number.
+            fewer = min(entry.seeds, seeds) if entry.seeds else None
+            entries.append(replace(entry, seeds=fewer))
+        return replace(self, seeds=seeds, tuners=tuple(entries))
+
+    def with_tuners(self, labels: Sequence[str]) -> Experiment:
+        """Return this experiment with only the given tuners, in this order.
+
+        A registered name that has no entry gets a new one.
+        """
+        entries = {entry.label: entry for entry in self.tuners}
+        chosen = tuple(entries.get(label, TunerEntry(label, label)) for label in labels)
+        return replace(self, tuners=chosen)
+
+
+def check_name(text: str) -> str:
+    """Convert a text to a name that is valid in tables, file names and command lines."""
+    return re.sub(r"[^\w.+-]+", "_", text)[:60] or "robot"
+
+
+def resolve_model_path(model: str, experiment: Path) -> str:
+    """Return the path of a model file, made absolute if the file is next to the experiment file.
+
+    Args:
+        model: path of the model file in the experiment.
+        experiment: path of the experiment file.
+    """
+    file = experiment.parent / model
+    return str(file.resolve()) if is_existing_file(file) else model
+
+
+def is_existing_file(file: Path) -> bool:
+    """Return whether a path is a file; False for a path that no file can have."""
+    try:
+        return file.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def list_experiment_names() -> list[str]:
+    """Return the names of the experiments that come with the project."""
+    folder = resources.files("bench.experiments")
+    files = [file.name for file in folder.iterdir() if file.name.endswith(".toml")]
+    return sorted(name.removesuffix(".toml") for name in files)
+
+
+def load_experiment(name_or_path: str) -> Experiment:
+    """Load an experiment of the project by name, or a user's experiment by its TOML file.
+
+    Raises:
+        InputError: there is no such experiment, or its file has an error.
+    """
+    if name_or_path in list_experiment_names():
+        path = Path(str(resources.files("bench.experiments").joinpath(f"{name_or_path}.toml")))
+    elif name_or_path.endswith(".toml"):
+        path = Path(name_or_path)
+    else:
+        error = make_unknown_name_error("experiment", name_or_path, list_experiment_names())
+        raise InputError(f"{error} (or give the path of a .toml file)")
+    return parse_experiment(path.stem, read_toml(path), path)
+
+
+def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
+    """Check the tables of an experiment file and convert them to an experiment.
+
+    Args:
+        name: name of the experiment.
+        document: tables of the file.
+        path: experiment file, for messages and for relative paths.
+
+    Raises:
+        InputError: there is an unknown key or a value of a wrong type; names file and key.
+    """
+    hints = {key: hint for key, hint in get_type_hints_of(Experiment).items() if key != "name"}
+    check_known_names(f"entry of {path}", document, hints)
+    tuners = parse_entries(path, document.get("tuners", {}))
+    given = {key: value for key, value in document.items() if key != "tuners"}
+    fields = check_entries(path, "", given, hints)
+    if model := fields.get("model"):
+        fields["model"] = resolve_model_path(model, path)
+        fields.setdefault("simulator", check_name(Path(model).stem))
+        if (called := fields["simulator"]) != check_name(called):
+            raise make_error(path, "simulator", "letters, digits and _ . + - for a robot", called)
+    elif fields.get("free") or fields.get("actuators"):
+        raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
+    if fields.get("experiments"):
+        fields["experiments"] = tuple(_beside(each, path) for each in fields["experiments"])
+    elif not fields.get("simulator") and not fields.get("diagnosis"):
+        raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')
+    # Paths are made absolute here: workers and result folders do not know this file's location.
+    if "recording" in fields:
+        fields["recording"] = RecordingSource(
+            resolve_recording_path(fields["recording"].path, path)
+        )
+    try:
+        experiment = Experiment(name=name, tuners=tuners, **fields)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    _expanded(experiment, path)  # an error in a swept value is an error of this file
+    return experiment
+
+
+def expand_sweep(experiment: Experiment) -> list[Experiment]:
+    """Expand an experiment into the experiments that its file describes.
+
+    A sweep gives one experiment for each combination of its values, named ``NAME[budget=10]``. All
+    have the same targets, because target seeds depend on the file's name alone. A file that names
+    other experiments gives these, with its own numbers and tuners. Any other experiment gives
+    itself.
+    """
+    if experiment.experiments:
+        return [
+            expanded for name in experiment.experiments for expanded in _as_in(experiment, name)
+        ]
+    return _expanded(experiment, Path(f"{experiment.name}.toml"))
+
+
+SHARED_KEYS = (
+    "targets",
+    "seeds",
+    "budget",
+    "training_budget",
+    "timeout",
+    "memory",
+    "isolation",
+    "trusted",
+    "salt",
+    "tuners",
+)
+"""Keys of a file with several experiments that hold for each of them."""
+
+
+def _as_in(together: Experiment, name: str) -> list[Experiment]:
+    """Return an experiment that another one names, with the numbers and tuners of the latter."""
+    one = load_experiment(name)
+    if one.experiments:
+        raise InputError(f"experiment {together.name}: {name} names experiments itself")
+    # Tuners are replaced as a whole: options of one experiment may be invalid in the other.
+    given = {
+        key: getattr(together, key) for key in SHARED_KEYS if key != "tuners" or together.tuners
+    }
+    return expand_sweep(one.chosen(**given))
+
+
+def _beside(name: str, experiment: Path) -> str:
+    """Return a name, or the path of an experiment file, made absolute if it is next to this one."""
+    file = experiment.parent / name
+    return str(file.resolve()) if name.endswith(".toml") and is_existing_file(file) else name
+
+
+def _expanded(experiment: Experiment, path: Path) -> list[Experiment]:
+    if not experiment.sweep or experiment.experiments:
+        return [experiment]
+    document = experiment.document()
+    del document["sweep"]
+    # All combinations have the same targets, so that only the swept values make a difference.
+    document["same_targets_as"] = experiment.same_targets_as or experiment.name
+    expanded = []
+    for label, changed in experiment_sweep.expand_documents(path, document, experiment.sweep):
+        if experiment.title:
+            values = label.replace("=", " = ").replace(",", ", ")
+            changed["title"] = f"{experiment.title} ({values})"
+        expanded.append(parse_experiment(f"{experiment.name}[{label}]", changed, path))
+    return expanded

@@ -1,0 +1,94 @@
+"""Expand an experiment file that sweeps over lists of values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from itertools import product
+from math import prod
+from pathlib import Path
+from typing import Any
+
+from sims.core.simulator import InputError
+from sims.core.toml_validation import make_error
+
+_UNFIT = re.compile(r"[^\w.+-]+")
+"""Characters that are not valid in folder names and in command lines without quotes."""
+MAX_EXPERIMENTS = 10_000
+"""Maximum number of experiments of one file.
+
+Each one has its own folder, and all are checked before the first run.
+"""
+
+
+def expand_documents(
+    path: Path, document: Mapping[str, Any], swept: Mapping[str, Sequence[Any]]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Iterate over all combinations of the values; those of the last key change fastest.
+
+    Args:
+        path: experiment file, for messages.
+        document: tables of the experiment without a sweep.
+        swept: values by key; a key within a table is joined by dots.
+
+    Yields:
+        The label, as ``budget=10,noise.x=0.1``, and the tables with these values inserted.
+
+    Raises:
+        InputError: a key has no values, two values have the same label, or there are too many
+            combinations.
+    """
+    count = prod(len(values) for values in swept.values())
+    if count > MAX_EXPERIMENTS:
+        raise InputError(
+            f"{path}: sweep: expected at most {MAX_EXPERIMENTS:,} experiments, found {count:.3g} combinations;"
+            " sweep over fewer values, or divide the file"
+        )
+    for key, values in swept.items():
+        _check(path, f"sweep.{key}", values)
+    for values in product(*swept.values()):
+        # A copy is needed, because tables within the document are changed.
+        changed = deepcopy(dict(document))
+        parts = []
+        for key, value in zip(swept, values, strict=True):
+            _put(path, changed, key, value)
+            parts.append(f"{key}={_text(path, key, value)}")
+        yield ",".join(parts), changed
+
+
+def _check(path: Path, where: str, values: Sequence[Any]) -> None:
+    if not values:
+        raise make_error(path, where, "at least one value", values)
+    texts = [_text(path, where, value) for value in values]
+    for text in texts:
+        if texts.count(text) > 1:  # two experiments would share one folder
+            raise InputError(f"{path}: {where}: {text} stands twice")
+
+
+def _text(path: Path, where: str, value: Any) -> str:
+    """Return a value as text for a label."""
+    if isinstance(value, dict):
+        raise make_error(path, where, "texts, numbers, bools or lists of them", value)
+    if isinstance(value, list | tuple):
+        return "_".join(_text(path, where, item) for item in value)
+    if isinstance(value, bool):  # as TOML writes it
+        return str(value).lower()
+    return _UNFIT.sub("-", str(value))
+
+
+def _put(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
+    """Insert a value at the position that a key joined by dots names."""
+    table, rest = document, key
+    while (name := _first(table, rest)) != rest:
+        table, rest = table.setdefault(name, {}), rest[len(name) + 1 :]
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: sweep.{key}: {name} is no table, and has nothing in it")
+    table[rest] = value
+
+
+def _first(table: Mapping[str, Any], key: str) -> str:
+    """Return the part of a key that names an entry of the table; effect names can contain dots."""
+    there = [name for name in table if key == name or key.startswith(f"{name}.")]
+    # A part that is not in the table is a new table, or a key that later checks refuse.
+    return max(there, key=len, default=key.partition(".")[0])

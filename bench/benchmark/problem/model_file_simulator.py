@@ -1,0 +1,125 @@
+"""Get the simulator of an experiment: a registered one, or one made from a model file."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+from typing import Any
+
+from bench.benchmark.problem.experiment import Experiment, is_existing_file
+from bench.benchmark.problem.recorded_runs import find_recording
+from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.datasets import dataset_catalogue as datasets
+from sims.core.registry import PartUnavailableError
+from sims.core.simulator import InputError, Simulator
+from sims.core.value_limits import truncate_text
+from sims.recording.recording import read_recording
+from sims.recording.recording_description import read_model_reference
+from sims.system_simulator import SystemSimulator
+
+PACKAGE_SCHEME = "package://"
+"""Prefix of a model file's path in an installed Python package, as in URDF files."""
+
+
+def get_simulator_class(experiment: Experiment) -> type[Simulator]:
+    """Return the class of the simulator that an experiment tunes.
+
+    Raises:
+        InputError: there is no simulator of that name, or its model file cannot be used.
+        SkippedError: something that it needs is missing on this machine.
+    """
+    if not experiment.model:
+        return simulators.get(experiment.simulator)
+    who = f"experiment {experiment.name}"
+    path = find_model(experiment.model, experiment.name)
+    free, actuators, engine = experiment.free, dict(experiment.actuators), {}
+    if experiment.recording:
+        stated = read_model_reference(find_recording(experiment.recording.path), path)
+        assert stated is not None  # a model was given
+        actuators, engine = {**stated.actuators, **actuators}, dict(stated.engine)
+        free = free or stated.free
+    if not free:
+        wanted = 'free = ["damping@*", ...] or --free, numbers of the model file to tune'
+        raise InputError(f"{who}: expected {wanted}; found none")
+    return make_robot_simulator(path, actuators, engine, free)
+
+
+def complete_robot_experiment(experiment: Experiment) -> Experiment:
+    """Complete a robot experiment that does not specify channels, commands and initial pose.
+
+    They are taken from its recording, or from the robot's default recording.
+    """
+    if not experiment.model:
+        return experiment
+    kind = get_simulator_class(experiment)
+    changes: dict[str, Any] = {}
+    if experiment.recording:
+        path = find_recording(experiment.recording.path)
+        changes["observe"] = tuple(read_recording(path, kind).runs[0].channels)
+    elif issubclass(kind, SystemSimulator):
+        usual = kind.system.usual_recording
+        changes["observe"] = usual.observe
+        changes["initial"] = dict(usual.initial)
+        changes["inputs"] = dict(usual.inputs)
+    left_out = {key: value for key, value in changes.items() if not getattr(experiment, key)}
+    return experiment.chosen(**left_out)
+
+
+def find_missing_model_file(experiment: Experiment) -> str:
+    """Return why an experiment's model file is missing; empty if it exists or is not needed."""
+    if not experiment.model:
+        return ""
+    try:
+        find_model(experiment.model, experiment.name)
+    except PartUnavailableError as error:
+        return error.reason
+    return ""
+
+
+def find_model(path: str, name: str) -> Path:
+    """Find the model file of an experiment.
+
+    It can be in an installed package (``package://NAME/FILE``), below $SIMGAP_ROBOTS, in the user's
+    folder of data sets, or a path.
+
+    Args:
+        path: path of the model file in the experiment.
+        name: name of the experiment, for messages.
+
+    Raises:
+        SkippedError: the file is in none of these places.
+    """
+    if path.startswith(PACKAGE_SCHEME):
+        return _packaged(path, name)
+    if found := datasets.find("robot", path):
+        return found
+    if is_existing_file(Path(path)):
+        return Path(path)
+    if data_set := datasets.providing("robot", path):
+        raise PartUnavailableError("experiment", name, f"it {data_set.advice}")
+    given = os.environ.get("SIMGAP_ROBOTS")
+    places = f"in {given} (SIMGAP_ROBOTS)" if given else "here (SIMGAP_ROBOTS is not set)"
+    raise PartUnavailableError(
+        "experiment", name, f"model {truncate_text(path)}: no such file {places}"
+    )
+
+
+def _packaged(path: str, name: str) -> Path:
+    package, _, inside = path.removeprefix(PACKAGE_SCHEME).partition("/")
+    if not (package.isidentifier() and inside):
+        wanted = f"{PACKAGE_SCHEME}NAME/FILE of an installed package"
+        raise InputError(
+            f"experiment {name}: model: expected {wanted}, found '{truncate_text(path)}'"
+        )
+    # The package is located without importing it, so that its code does not run.
+    known = importlib.util.find_spec(package)
+    if known is None:
+        reason = f"needs {package}, not installed (pip install {package.split('_')[0]})"
+        raise PartUnavailableError("experiment", name, reason)
+    for folder in known.submodule_search_locations or ():
+        if (file := Path(folder, inside)).is_file():
+            return file
+    raise PartUnavailableError(
+        "experiment", name, f"model {truncate_text(path)}: package {package} has no such file"
+    )

@@ -1,0 +1,82 @@
+"""Build an experiment from a robot's model file and a recording, without an experiment file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.benchmark.problem.experiment import (
+    Experiment,
+    HeldOutConfig,
+    RecordingSource,
+    check_name,
+)
+from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
+from bench.benchmark.problem.tuner_entries import TunerEntry
+from sims.core.atomic_files import require_file
+from sims.core.simulator import InputError
+from sims.recording.recording_description import read_model_reference
+
+DEFAULT_TUNERS = (
+    "random",
+    "nelder_mead",
+    "cma_es",
+    "bayes",
+    "entropy_search",
+    "least_squares",
+    "regressor",
+    "tunenet",
+    "hybrid",
+)
+"""Tuners that are compared by default."""
+TARGETS, BUDGET, TRAINING = 5, 50, 480
+"""Defaults: number of starts or targets, simulations on each, and training simulations."""
+DEFAULT_ENCODER_NOISE = 1e-3
+"""Default encoder noise of simulated targets, standard deviation in rad or m."""
+HELD_OUT_RUNS = 2
+"""Default number of held-out runs of each simulated target."""
+
+
+def make_robot_experiment(
+    model: str | Path | None, recording: str | Path | None, free: Sequence[str]
+) -> Experiment:
+    """Build an experiment that tunes numbers of a robot's model file.
+
+    They are tuned to a recording, or to simulated targets if there is no recording.
+
+    Args:
+        model: MJCF or URDF file; None for the one that the recording's description names.
+        recording: table of the recording; None for simulated targets.
+        free: numbers of the model file, such as ``damping@*``.
+
+    Raises:
+        InputError: no model file is given, or it does not contain such a number.
+    """
+    file = Path(model) if model is not None else None
+    if recording is not None:
+        stated = read_model_reference(recording, file)
+        file = stated.path if stated is not None else None
+    if file is None:
+        said = f"{recording}: its description" if recording is not None else "compare"
+        raise InputError(f'{said}: expected model = "robot.xml" or --model FILE, found none')
+    require_file(file)
+    parts = [file.stem] if recording is None else [file.stem, Path(recording).stem]
+    to = f"tuned to {Path(recording).name}" if recording is not None else "tuned to simulations"
+    whole = Experiment(
+        name=check_name("-".join(parts)),
+        title=f"{file.name}: {', '.join(free)}, {to}",
+        simulator=check_name(file.stem),
+        model=str(file.resolve()),
+        free=tuple(free),
+        ranges=("in", "wide") if recording is None else ("real",),
+        recording=None if recording is None else RecordingSource(str(Path(recording).resolve())),
+        targets=TARGETS,
+        budget=BUDGET,
+        training_budget=TRAINING,
+        held_out=HeldOutConfig(HELD_OUT_RUNS) if recording is None else None,
+        tuners=tuple(TunerEntry(name, name) for name in DEFAULT_TUNERS),
+    )
+    whole = complete_robot_experiment(whole)
+    if recording is not None:
+        return whole
+    return whole.chosen(noise=dict.fromkeys(whole.observe, DEFAULT_ENCODER_NOISE))

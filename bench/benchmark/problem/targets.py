@@ -1,0 +1,246 @@
+"""Draw targets: scenarios and observations whose true parameters are hidden from the tuners.
+
+A target's numbers are drawn from its own random streams (`problem.salt`), in a fixed order:
+start and true parameters, initial state, inputs, constants, sensor noise. Another order gives
+another target.
+
+A target whose own simulation diverges cannot be used to compare tuners. The whole target is drawn
+again from random streams that are named after the number of the draw. So the same salt gives the
+same targets, in any process and in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from bench.benchmark.problem.experiment import Experiment, FixedOrRange
+from bench.benchmark.problem.recorded_runs import ObservedRuns, RecordedRuns
+from bench.benchmark.problem.salt import TargetStreams
+from bench.core.input_signals import evaluate_signal
+from sims.core.simulator import Array, Channel, InputError, Scenario, Simulator, UnitCube
+
+_CUBE = np.array([[0.0], [1.0]])
+"""Opposite corners of the unit cube, for any dimension."""
+DIVERGENCE_LIMIT = 1e12
+"""Largest magnitude of a sample, in units of its channel's typical magnitude.
+
+A simulation with larger samples counts as diverged although its numbers are finite.
+"""
+MAX_DRAWS = 200
+"""Maximum number of draws of one target."""
+MAX_FAILED_SHARE = 0.9
+"""Largest share of draws that may diverge.
+
+With a larger share the other draws would not be a representative sample of the ranges.
+"""
+
+
+@dataclass(frozen=True)
+class BlindedTarget:
+    """Target without its true parameters, as worker processes get it.
+
+    Attributes:
+        name: name, for example ``wide-017``.
+        range: in, wide or real.
+        start: (dim,) starting point of the tuners in the unit cube.
+        fitting: runs that the tuner may use.
+        held_out: runs for validation; empty if no runs are held out.
+    """
+
+    name: str
+    range: str
+    start: Array
+    fitting: ObservedRuns
+    held_out: ObservedRuns
+
+
+@dataclass(frozen=True)
+class Target:
+    """Target with its true parameters; exists in the parent process only.
+
+    Attributes:
+        blinded: part of the target that worker processes get.
+        truth: (dim,) true parameters in physical units; None if they are unknown.
+        redraws: number of draws that were discarded because their simulation diverged.
+    """
+
+    blinded: BlindedTarget
+    truth: Array | None
+    redraws: int = 0
+
+
+class Redraws(NamedTuple):
+    """Number of targets that were drawn again.
+
+    Attributes:
+        redrawn: number of targets whose first draw diverged.
+        draws: number of draws of all targets together.
+    """
+
+    redrawn: int
+    draws: int
+
+
+class TargetProblem(Protocol):
+    """Problem from which targets are drawn, as `tuning_problem.TuningProblem` is.
+
+    Attributes:
+        experiment: configuration of the experiment.
+        world: simulator that makes the targets.
+        cube: map between bounds and unit cube.
+        channels: observed channels, in order.
+        noise: (C,) standard deviation of each channel's noise.
+        recording: content of the experiment's recording; None for simulated targets.
+        salt: salt from which targets are drawn.
+    """
+
+    experiment: Experiment
+    salt: str
+    world: Simulator
+    cube: UnitCube
+    channels: tuple[Channel, ...]
+    noise: Array
+    recording: RecordedRuns | None
+
+    def draw_scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
+        """Draw the scenarios of one target."""
+
+
+def draw_target(problem: TargetProblem, kind: str, index: int) -> Target:
+    """Draw one target, again if its simulation diverges.
+
+    It depends on the experiment's name, but not on tuners, seeds or budgets.
+
+    Args:
+        problem: problem of the experiment.
+        kind: range of the target.
+        index: number of the target in its range.
+
+    Raises:
+        InputError: all of `MAX_DRAWS` draws diverge.
+    """
+    for number in range(MAX_DRAWS):
+        target = _draw(problem, kind, index, number)
+        if target is not None:
+            return target
+    raise _diverging(problem.experiment, MAX_DRAWS, MAX_DRAWS)
+
+
+def redraws_of(experiment: Experiment, drawn: Sequence[Target]) -> Redraws:
+    """Count the draws of all targets.
+
+    Args:
+        experiment: configuration of the experiment.
+        drawn: all targets.
+
+    Raises:
+        InputError: more than `MAX_FAILED_SHARE` of the draws diverged.
+    """
+    failed = sum(target.redraws for target in drawn)
+    draws = failed + len(drawn)
+    if failed > MAX_FAILED_SHARE * draws:
+        raise _diverging(experiment, failed, draws)
+    return Redraws(sum(target.redraws > 0 for target in drawn), draws)
+
+
+def _diverging(experiment: Experiment, failed: int, draws: int) -> InputError:
+    return InputError(
+        f"experiment {experiment.name}: the simulation of {failed} of {draws} targets drawn "
+        f"diverges (not finite, or beyond {DIVERGENCE_LIMIT:g} times a channel's typical "
+        f"magnitude); expected at most {MAX_FAILED_SHARE:.0%}: narrow the bounds and training "
+        "ranges in [parameters], or choose a smaller time step in [settings]"
+    )
+
+
+def _draw(problem: TargetProblem, kind: str, index: int, number: int) -> Target | None:
+    """Make one draw; None if the simulation diverges."""
+    # The stream's name contains no tuner, seed or budget, so that all tuners get the same target.
+    met = problem.experiment.same_targets_as or problem.experiment.name
+    again = ("redraw", number) if number else ()
+    streams = TargetStreams(problem.salt, met, kind, index, *again)
+    box = _CUBE if kind == "wide" else problem.cube.training
+    start, truth = (
+        streams.get_stream(what).uniform(box[0], box[1], size=problem.cube.dim)
+        for what in ("start", "truth")
+    )
+    name = f"{kind}-{index:03d}"
+    recording = problem.recording
+    if recording:
+        return Target(BlindedTarget(name, kind, start, recording.fitting, recording.held_out), None)
+    scenarios = problem.draw_scenarios(
+        streams.get_stream("scenario")
+    )  # one scenario, because only recordings have several runs
+    # The parameters of `world` are the first of the tuned ones.
+    theta = problem.cube.to_physical(truth[None])[:, : len(problem.world.parameters)]
+    clean = problem.world.simulate(theta, scenarios[0])[0]
+    observed = clean + problem.noise * streams.get_stream("noise").standard_normal(clean.shape)
+    fitting = ObservedRuns(scenarios, observed)
+    held_out = _held_out(problem, theta, streams)
+    if any(_diverges(each, problem.channels) for each in (clean, held_out.observed)):
+        return None
+    sealed = BlindedTarget(name, kind, start, fitting, held_out)
+    return Target(sealed, problem.cube.to_physical(truth), number)
+
+
+def _diverges(observed: Array, channels: Sequence[Channel]) -> bool:
+    """Return whether a simulation (T, C) failed.
+
+    It failed if a sample is infinite or beyond `DIVERGENCE_LIMIT`, or if a channel has no sample.
+    Single missing samples (NaN), as of a camera, are not a failure.
+    """
+    if not len(observed):
+        return False
+    limits = DIVERGENCE_LIMIT * np.array([channel.scale for channel in channels])
+    return bool((np.abs(observed) > limits).any() or np.isnan(observed).all(axis=0).any())
+
+
+def draw_scenario(
+    experiment: Experiment,
+    rng: np.random.Generator,
+    initial: Mapping[str, FixedOrRange],
+    inputs: Mapping[str, str],
+) -> Scenario:
+    """Draw one run of an experiment.
+
+    Args:
+        experiment: configuration with the sampling and the constants.
+        rng: random generator for values that are given as a range.
+        initial: initial state.
+        inputs: descriptions of the input signals.
+    """
+    sampling = experiment.sampling
+    start = {name: _drawn(rng, value) for name, value in initial.items()}
+    times = np.arange(sampling.samples) / sampling.rate
+    signals = {name: evaluate_signal(text, times, rng) for name, text in inputs.items()}
+    # Constants that are equal in every scenario are set in the simulator.
+    ranges = {name: v for name, v in experiment.constants.items() if isinstance(v, tuple)}
+    constants = {name: _drawn(rng, value) for name, value in ranges.items()}
+    return Scenario(times, start, signals, constants)
+
+
+def _drawn(rng: np.random.Generator, value: FixedOrRange) -> float:
+    return rng.uniform(*value) if isinstance(value, tuple) else value
+
+
+def _held_out(problem: TargetProblem, theta: Array, target: TargetStreams) -> ObservedRuns:
+    """Simulate the held-out scenarios of a target, without sensor noise.
+
+    Args:
+        problem: problem of the experiment.
+        theta: (1, p) parameters of the target.
+        target: random streams of the target; the scenarios depend on nothing else.
+    """
+    experiment, wanted = problem.experiment, problem.experiment.held_out
+    if wanted is None:
+        return ObservedRuns((), np.empty((0, len(problem.channels))))
+    initial = {**experiment.initial, **wanted.initial}
+    inputs = {**experiment.inputs, **wanted.inputs}
+    # Each scenario has its own stream, so that more scenarios do not change the first ones.
+    streams = [target.get_held_out_stream(i) for i in range(wanted.scenarios)]
+    scenarios = tuple(draw_scenario(experiment, rng, initial, inputs) for rng in streams)
+    observed = [problem.world.simulate(theta, each)[0] for each in scenarios]
+    return ObservedRuns(scenarios, np.concatenate(observed))

@@ -1,0 +1,82 @@
+"""Parse the tuners of an experiment file: a list, or a table for each tuner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sims.core.simulator import InputError
+from sims.core.toml_validation import check_entries, get_type_hints_of, make_error
+
+
+@dataclass(frozen=True)
+class TunerEntry:
+    """One tuner of a comparison: its registered name, options, and seeds or budget where they
+    differ; `randomised` where it trains over the experiment's ``[nuisance]``.
+    """
+
+    label: str
+    tuner: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    seeds: int | None = None
+    budget: int | None = None
+    randomised: bool = False
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the entry as the table ``[tuners.LABEL]``."""
+        given = {key: value for key, value in asdict(self).items() if value is not None}
+        del given["label"]
+        if not self.randomised:
+            del given["randomised"]
+        return given
+
+
+def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
+    """Parse the tuner entries of an experiment file, in the order of the file.
+
+    Args:
+        path: experiment file.
+        value: value of the key ``tuners``: a table of tables by label, or a list of registered
+            names and of tables that name their tuner.
+
+    Raises:
+        InputError: the value is not valid.
+    """
+    if isinstance(value, dict):
+        tables = value.items()
+        return tuple(_entry(path, f"tuners.{label}", label, own) for label, own in tables)
+    if not isinstance(value, list):
+        raise make_error(path, "tuners", "a list of names or a table for each tuner", value)
+    listed: list[TunerEntry] = []
+    for place, item in enumerate(value):
+        entry = _listed(path, f"tuners[{place}]", item)
+        # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
+        # can.
+        if entry.label in [other.label for other in listed]:
+            twice = f"{entry.label} stands twice; give one of them a label"
+            raise InputError(f"{path}: tuners: {twice}")
+        listed.append(entry)
+    return tuple(listed)
+
+
+def _listed(path: Path, where: str, item: Any) -> TunerEntry:
+    if isinstance(item, str):
+        return TunerEntry(item, item)
+    if not isinstance(item, dict):
+        raise make_error(path, where, "a name or a table", item)
+    own = dict(item)  # a copy, so that the parsed document is not changed
+    label = own.pop("label", own.get("tuner"))
+    if not isinstance(label, str):
+        raise make_error(path, where, 'a table with tuner = "NAME"', item)
+    return _entry(path, where, label, own)
+
+
+def _entry(path: Path, where: str, label: str, value: Any) -> TunerEntry:
+    hints = {key: hint for key, hint in get_type_hints_of(TunerEntry).items() if key != "label"}
+    own = check_entries(path, where, value, hints)
+    for key in ("seeds", "budget"):
+        if own.get(key, 1) < 1:
+            raise make_error(path, f"{where}.{key}", "at least 1", own[key])
+    return TunerEntry(label, own.pop("tuner", label), **own)

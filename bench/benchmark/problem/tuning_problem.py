@@ -1,0 +1,244 @@
+"""Tuning problem of an experiment: simulator, unit cube, channels and their scale.
+
+`TuningProblem` is rebuilt from the experiment in every process. Targets (`problem.targets`) are
+made in the parent process alone, which stores their true parameters. Learned tuners access the
+simulator through `bench.benchmark.problem.training_simulator`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.problem import targets
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.fisher_information import InformationSpectrum, compute_spectrum
+from bench.benchmark.problem.model_file_simulator import (
+    complete_robot_experiment,
+    get_simulator_class,
+)
+from bench.benchmark.problem.recorded_runs import RecordedRuns, load_recorded_runs
+from bench.benchmark.problem.targets import Target
+from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
+from methods.tuner import ScenarioInfo
+from sims.core.simulator import (
+    Array,
+    InputError,
+    Scenario,
+    Simulator,
+    UnitCube,
+    apply_parameter_changes,
+    make_unknown_name_error,
+)
+
+
+class TuningProblem:
+    """Tuning problem of an experiment; counts its simulations.
+
+    Attributes:
+        experiment: configuration of the experiment.
+        simulator: simulator that is tuned.
+        world: simulator that makes the targets; the tuned one unless the experiment names another.
+        cube: map between the parameters' bounds and the unit cube.
+        channels: observed channels, in order.
+        error_channel: index of the channel in which errors are reported.
+        noise: (C,) standard deviation of each channel's noise, 0 if unknown.
+        scale: (C,) divisor of the residuals: the noise, or the typical magnitude of the channel.
+        recording: content of the experiment's recording; None for simulated targets.
+        salt: salt from which targets are drawn.
+        simulated: number of simulations made so far.
+
+    Args:
+        experiment: configuration of the experiment.
+        salt: secret salt, which only the process that draws the targets has; None for the
+            experiment's own.
+    """
+
+    def __init__(self, experiment: Experiment, salt: str | None = None) -> None:
+        if experiment.sweep:
+            swept = ", ".join(experiment.sweep)
+            remedy = "run those that bench.benchmark.problem.experiment.expand_sweep gives"
+            raise InputError(f"experiment {experiment.name}: sweeps over {swept}; {remedy}")
+        if experiment.experiments:
+            named = ", ".join(experiment.experiments)
+            raise InputError(f"experiment {experiment.name}: names {named}; run these")
+        self.experiment = experiment = complete_robot_experiment(experiment)
+        self.simulated = 0
+        self.salt = experiment.salt if salt is None else salt
+
+        kind = get_simulator_class(experiment)
+        observe = experiment.observe or tuple(c.name for c in kind.channels)
+        self.simulator = self._simulator(kind, observe, experiment.settings)
+        self.world = self.simulator
+        if experiment.world:
+            self.world = self._simulator(kind, observe, experiment.world)
+            self._check_world()
+
+        self._check_constants()
+        self.cube = UnitCube(
+            apply_parameter_changes(self.simulator.parameters, experiment.parameters)
+        )
+        self.channels = self.simulator.channels
+        self.error_channel = self._channel(experiment.error_channel or self.channels[0].name)
+
+        self.recording: RecordedRuns | None = None
+        noise = dict(experiment.noise)
+        for name in noise:
+            self._channel(name)
+        if experiment.recording:
+            self.recording = load_recorded_runs(experiment.recording.path, self.simulator)
+            # Noise in the experiment file has priority over noise in the recording.
+            noise = {**self.recording.noise, **noise}
+        self.noise: Array = np.array([noise.get(c.name, 0.0) for c in self.channels])
+        # Channels with different units are scaled by their noise, or else by their typical
+        # magnitude.
+        typical = [c.scale for c in self.channels]
+        self.scale: Array = np.where(self.noise > 0, self.noise, typical)
+
+    def _simulator(
+        self, kind: type[Simulator], observe: Sequence[str], settings: Mapping[str, Any]
+    ) -> Simulator:
+        experiment = self.experiment
+        try:
+            return kind(constants=experiment.fixed, observe=observe, **settings)
+        except TypeError as error:  # a setting that its constructor does not accept
+            who = f"experiment {experiment.name}: simulator {experiment.simulator}"
+            raise InputError(f"{who}: {error}") from None
+
+    def _check_world(self) -> None:
+        """Raise an error if the parameters of `world` are not the first of the tuned ones."""
+        tuned, made = (
+            [parameter.name for parameter in simulator.parameters]
+            for simulator in (self.simulator, self.world)
+        )
+        if made != tuned[: len(made)]:
+            raise InputError(
+                f"experiment {self.experiment.name}: world: expected none but the first of the "
+                f"tuned parameters {', '.join(tuned)}, found {', '.join(made)}; name effects in "
+                "fixed = { NAME = COEFFICIENT }"
+            )
+
+    def _check_constants(self) -> None:
+        """Raise an error for random constants that the simulator does not have or accept."""
+        constants = self.experiment.constants.items()
+        ranges = {name: ends for name, ends in constants if isinstance(ends, tuple)}
+        for end in range(2):
+            drawn = {name: ends[end] for name, ends in ranges.items()}
+            self.simulator.run_constants(Scenario(np.zeros(1), constants=drawn))
+
+    def close(self) -> None:
+        """Close the simulators."""
+        self.simulator.close()
+        self.world.close()
+
+    def _channel(self, name: str) -> int:
+        names = [c.name for c in self.channels]
+        if name not in names:
+            raise make_unknown_name_error("channel", name, names)
+        return names.index(name)
+
+    def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
+        """Simulate points of the unit cube.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+            scenarios: runs to simulate.
+
+        Returns:
+            Observations (n, T, C) with the samples of the scenarios concatenated.
+        """
+        self.simulated += len(points)
+        theta = self.cube.to_physical(points)
+        if len(scenarios) == 1:  # concatenation would copy the array
+            return self.simulator.simulate(theta, scenarios[0])
+        return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
+
+    def draw_scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
+        """Return the recording's fitted runs, or one run with random initial state and inputs."""
+        if self.recording:
+            return self.recording.fitting.scenarios
+        experiment = self.experiment
+        return (targets.draw_scenario(experiment, rng, experiment.initial, experiment.inputs),)
+
+    def describe_scenarios(self, scenarios: Sequence[Scenario]) -> ScenarioInfo:
+        """Return the scenario information for tuners: initial values, constants and inputs.
+
+        An initial value of an observed channel is left out, because it is the first sample.
+        """
+        shown = {c.name for c in self.channels}
+        initial: list[float] = []
+        inputs = []
+        for scenario in scenarios:
+            hidden = {k: v for k, v in scenario.initial.items() if k not in shown}
+            # Sorted by name, so that each network input always has the same meaning.
+            numbers = sorted({**hidden, **scenario.constants}.items())
+            initial += [value for _, value in numbers]
+            signals = np.array([values for _, values in sorted(scenario.inputs.items())])
+            # A scenario without inputs has T samples of zero signals.
+            inputs.append(signals.reshape(-1, scenario.times.size).T)
+        return ScenarioInfo(np.array(initial, dtype=np.float64), np.concatenate(inputs))
+
+    def draw_target(self, kind: str, index: int) -> Target:
+        """Draw one target.
+
+        It depends on the experiment's name, but not on tuners, seeds or budgets.
+
+        Args:
+            kind: range of the target.
+            index: number of the target in its range.
+        """
+        return targets.draw_target(self, kind, index)
+
+    def draw_targets(self) -> list[Target]:
+        """Draw all targets of the experiment.
+
+        The ranges alternate, so that a part of the targets contains all ranges.
+        """
+        return [
+            self.draw_target(kind, index)
+            for index in range(self.experiment.targets)
+            for kind in self.experiment.ranges
+        ]
+
+    @property
+    def has_several_parameters(self) -> bool:
+        """Whether to compute identifiability: it is requested, and there are several parameters."""
+        return self.cube.dim > 1 and self.experiment.identifiability
+
+    def compute_spectrum(self, target: Target) -> InformationSpectrum | None:
+        """Compute the Fisher-information spectrum of a target's data at its true parameters.
+
+        For a recording it is computed at the nominal parameters, and for the first start only,
+        because all starts have the same data.
+
+        Returns:
+            The spectrum; None if it is not requested or computed for another start.
+        """
+        again = target.truth is None and target.blinded.name != f"{target.blinded.range}-000"
+        if again or not self.has_several_parameters:
+            return None
+        nominal = np.array([parameter.nominal for parameter in self.cube.parameters])
+        at = nominal if target.truth is None else target.truth
+        scenarios = target.blinded.fitting.scenarios
+
+        def simulate(theta: Array) -> Array:
+            # This bypasses `self.simulate`, because these simulations are not part of any budget.
+            return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
+
+        return compute_spectrum(simulate, at, self.cube.parameters, self.scale)
+
+    def compute_distance_from_training(self, truth: Array) -> float:
+        """Return the distance of true parameters (dim,) from the training range.
+
+        It is the largest distance of a parameter in units of the training-range width; 0 inside.
+        """
+        ranges = np.array([p.training_range for p in self.cube.parameters])
+        # One of the two differences is positive outside, both are negative inside.
+        beyond = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
+        return float(max(0.0, (beyond / self.cube.compute_training_widths()).max()))
+
+    def make_training_simulator(self, budget: int) -> CountedTrainingSimulator:
+        """Return the training simulator for a learned tuner."""
+        return CountedTrainingSimulator(self, budget)

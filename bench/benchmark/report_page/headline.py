@@ -1,0 +1,175 @@
+"""Sentences about the best tuners after 1, 3, 10 and all simulations, for terminal and page."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.tuner_ranking import (
+    BEST,
+    EQUAL,
+    FAILED,
+    SIGNIFICANCE,
+    UNDECIDED,
+    WORSE,
+    targets_needed,
+)
+from bench.pages.text_format import format_number
+
+_DIGITS = 2
+"""Number of significant digits of factors."""
+WHERE = {
+    "in": "targets in the training range",
+    "wide": "targets anywhere in the bounds",
+    "real": "the recording",
+}
+"""Wording for the ranges of targets."""
+
+
+class Standing(NamedTuple):
+    """Verdicts on the tuners of one range after some number of simulations.
+
+    Attributes:
+        simulations: Number of simulations.
+        best: Tuners that share the smallest error.
+        error: Median error of the best tuners, as text.
+        worse: Tuners that are significantly worse, each with factor and number of targets.
+        undecided: Tuners with a larger median error whose difference is not significant.
+        failed: Tuners all of whose runs failed.
+    """
+
+    simulations: int
+    best: list[str]
+    error: str
+    worse: list[str]
+    undecided: list[str]
+    failed: list[str]
+
+
+def standings(statistics: ComparisonStatistics, kind: str) -> list[Standing]:
+    """List the verdicts after 1, 3, 10 and all simulations in one range.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
+    ranking = _in_range(statistics, kind)
+    return [
+        _standing(statistics, k, ranking[ranking["simulations"] == k])
+        for k in sorted(set(ranking["simulations"].astype(int)))
+    ]
+
+
+def _in_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
+    return statistics.ranking[statistics.ranking["range"] == kind]
+
+
+def _standing(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> Standing:
+    def named(*verdicts: str) -> pd.DataFrame:
+        return part[part["verdict"].isin(verdicts)]
+
+    # Equal tuners are in the order of legends, so that a page has one order.
+    best = sorted(named(BEST, EQUAL)["tuner"], key=statistics.order.index)
+    first = named(BEST)
+    return Standing(
+        k,
+        [str(name) for name in best],
+        _error(statistics, float(first["median"].iloc[0])) if len(first) else "",
+        [_worse(row) for row in named(WORSE).to_dict("records")],
+        [str(name) for name in named(UNDECIDED)["tuner"]],
+        [str(name) for name in named(FAILED)["tuner"]],
+    )
+
+
+def _error(statistics: ComparisonStatistics, median: float) -> str:
+    if not np.isfinite(median):
+        return "it failed on half of the targets"
+    text = f"{median * statistics.unit:.2g}"
+    return f"at most {text}" if median <= statistics.floor * (1 + 1e-9) else text
+
+
+def _worse(row: dict[Any, Any]) -> str:
+    """Format a worse tuner, e.g. ``cma_es 5.8x (8/10)``."""
+    ratio = float(row["error_ratio"])
+    factor = f" {format_number(ratio, _DIGITS)}x" if ratio > 1.0 else ""
+    # A failed run has an infinite error.
+    factor = factor if np.isfinite(ratio) else " failed"
+    return f"{row['tuner']}{factor} ({row['targets_worse']}/{row['targets']})"
+
+
+def targets_text(statistics: ComparisonStatistics, kind: str) -> str:
+    """Format the number of targets of a range: ``10 targets``, or how many of them decide.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
+    count, ranked = statistics.target_counts[kind], _in_range(statistics, kind)["targets"]
+    deciding = int(ranked.max()) if len(ranked) else 0
+    things = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
+    # Targets whose data identify no direction have no deciding error.
+    return f"{count} {things}" if deciding == count else f"{deciding} of {count} {things} decide"
+
+
+def floor_text(statistics: ComparisonStatistics) -> str:
+    """State which errors count as equal."""
+    return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
+
+
+def how_decided(statistics: ComparisonStatistics, kind: str) -> str:
+    """Explain the test of the ranking and the notation.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
+    others = _others(statistics, kind)
+    if not others:
+        return ""
+    return (
+        f"5.8x (8/10): median error 5.8 times the best one's, larger on 8 of 10 targets. Worse: "
+        f"p < {SIGNIFICANCE:g} in Wilcoxon's signed-rank test against the best, Holm-corrected for "
+        f"{others} comparison{'s' * (others > 1)}."
+    )
+
+
+def _others(statistics: ComparisonStatistics, kind: str) -> int:
+    """Return the number of tuners that the best one is tested against."""
+    part = _in_range(statistics, kind)
+    return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
+
+
+def too_few(statistics: ComparisonStatistics, kind: str) -> str:
+    """Warn if there are too few targets for any significant difference; empty otherwise.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
+    ranked, others = _in_range(statistics, kind)["targets"], _others(statistics, kind)
+    if not others or int(ranked.max()) >= (needed := targets_needed(others)):
+        return ""
+    targets = int(ranked.max())
+    return (
+        f"{targets} target{'s' * (targets != 1)} cannot decide between {others + 1} tuners: "
+        f"it takes at least {needed} (--targets {needed})."
+    )
+
+
+def failed_runs(statistics: ComparisonStatistics, kind: str) -> str:
+    """List the tuners with failed runs in a range and their numbers; empty for none.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
+    part = _in_range(statistics, kind).drop_duplicates("tuner")
+    each = [
+        f"{row['tuner']} {row['failures']} of {row['runs']}"
+        for row in part.to_dict("records")
+        if row["failures"]
+    ]
+    return f"failed runs, which count as infinite errors: {', '.join(each)}" if each else ""

@@ -1,0 +1,380 @@
+"""Write the tables, figures and report page of a comparison, and print a summary."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pandas as pd
+
+from bench.benchmark.figures import comparison_figures
+from bench.benchmark.figures.comparison_figures import (
+    AxisLabels,
+    compute_statistics,
+    make_axis_labels,
+)
+from bench.benchmark.isolation.process_exit import ISOLATED, without_isolation
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.report_page import headline
+from bench.benchmark.report_page.comparison_conclusion import redraws_text
+from bench.benchmark.report_page.comparison_page import render_page
+from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
+from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.error_table import build_error_table, build_summary
+from bench.benchmark.statistics.expected_running_time import build_ert_table
+from bench.benchmark.statistics.paired_tests import compare_all_pairs
+from bench.benchmark.statistics.provenance_columns import add_salt_column, add_trust_column
+from bench.benchmark.statistics.training_amortisation import (
+    BREAK_EVEN_COLUMNS,
+    TARGETS_PER_TRAINING,
+    build_break_even_table,
+    find_cheapest_tuners,
+)
+from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER, read_plan
+from bench.benchmark.storage.result_folder import (
+    CONFIGURATION_FILE,
+    StoredComparison,
+    read_comparison,
+    read_environment,
+)
+from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
+from bench.figures.style import (
+    TRUSTED_TUNERS_NOTE,
+    FigureFiles,
+    render_all_formats,
+    write_figure_files,
+)
+from sims.core.atomic_files import write_atomically
+
+REQUIRED_RUN_COLUMNS = (
+    "run",
+    "experiment",
+    "tuner",
+    "target",
+    "seed",
+    "range",
+    "k",
+    "param_error",
+    "param_abs_error",
+    "stiff_error",
+    "sloppy_error",
+    "obs_error",
+    "heldout_error",
+    "outside",
+    "tuner_seconds",
+    "simulator_seconds",
+)
+"""Columns of the runs that tables and figures use."""
+REPORT_FILE = "report.html"
+"""File name of the report page in the folder of a comparison."""
+WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
+_WIDTH = 120
+"""Width of a line on the terminal in characters."""
+_SHOWN = (3, 10)
+"""Numbers of simulations for printed errors along directions, in addition to the budget."""
+
+
+@numeric_warnings_silenced()
+def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None]) -> int:
+    """Write tables, figures and the report page of a comparison, and print a summary.
+
+    Args:
+        folder: result folder of the comparison.
+        problem: tuning problem of the comparison.
+        say: callback that prints one line.
+
+    Returns:
+        Number of failed runs.
+
+    Raises:
+        InputError: the folder is not that of a comparison, or cannot be written to.
+    """
+    stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
+    if stored.runs.empty:
+        say(f"no run was made; {folder}/status.csv says why")
+        return 0
+    labels, statistics = make_axis_labels(problem), compute_statistics(stored)
+    made = build_tables(stored, statistics)
+    for name, frame in made.items():
+        write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
+    pictures = _drawn(stored, labels, statistics)
+    figures = _kept(folder, pictures)
+    results = ComparisonReportData(
+        stored,
+        labels,
+        statistics,
+        made,
+        pictures,
+        read_environment(folder),
+        str(folder),
+        (folder / CONFIGURATION_FILE).read_text(encoding="utf-8"),
+        _missing(folder, stored),
+    )
+    write_atomically(folder / REPORT_FILE, render_page(results))
+
+    lines = made["table"]
+    for text in _headlines(results):
+        say(text)
+    for text in _results(lines, labels, statistics):
+        say(text)
+    for text in _marks(stored.experiment):
+        say(text)
+    if redrawn := redraws_text(results):
+        say(f"\n{redrawn}")
+    failed = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
+    for text in format_failures(failed):
+        say(text)
+    say("\n" + _seconds(lines, statistics))
+    say(f"\ntable   {folder / 'table.csv'}")
+    say(f"more    {folder}/{', '.join(f'{name}.csv' for name in made if name != 'table')}")
+    for figure in figures:
+        say(f"figure  {figure}")
+    say(f"report  {folder / REPORT_FILE}")
+    # A tuner that cannot be used here does not count as a failure of the comparison.
+    return int((failed["status"] != "skipped").sum())
+
+
+def build_tables(
+    stored: StoredComparison, statistics: ComparisonStatistics | None = None
+) -> dict[str, pd.DataFrame]:
+    """Build the tables of a comparison: table, ert, ranking, pairs, break_even and who_wins.
+
+    Args:
+        stored: stored comparison, from `bench.benchmark.storage.result_folder.read_comparison`.
+        statistics: statistics of the comparison; None to compute them.
+
+    Returns:
+        Tables by name; empty without a run.
+    """
+    if stored.runs.empty:
+        return {}
+    experiment = stored.experiment
+    statistics = statistics or compute_statistics(stored)
+    lines = build_error_table(stored.runs, stored.statuses, experiment.budget, stored.costs)
+    frames = {
+        "table": statistics.sorted(add_salt_column(lines, experiment)),
+        "ert": statistics.sorted(
+            build_ert_table(statistics.curves, statistics.levels, experiment.budget)
+        ),
+        "ranking": statistics.ranking,
+        "pairs": compare_all_pairs(statistics.curves, statistics.floor),
+        "break_even": _break_even(experiment.name, statistics),
+        "who_wins": _who_wins(experiment.name, statistics),
+    }
+    return {name: add_trust_column(frame, experiment) for name, frame in frames.items()}
+
+
+def _break_even(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
+    parts = [
+        build_break_even_table(experiment, kind, level, by_tuner)
+        for level, ranges in statistics.tuning_costs.items()
+        for kind, by_tuner in ranges.items()
+    ]
+    # Concatenation with an empty part would change numeric columns to object columns.
+    parts = [part for part in parts if len(part)]
+    return pd.concat(parts) if parts else pd.DataFrame(columns=BREAK_EVEN_COLUMNS)
+
+
+def _who_wins(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
+    lines = [
+        (experiment, kind, level, *line)
+        for level, ranges in statistics.tuning_costs.items()
+        for kind, by_tuner in ranges.items()
+        for line in find_cheapest_tuners(by_tuner, TARGETS_PER_TRAINING)
+    ]
+    return pd.DataFrame(lines, columns=WINNER_COLUMNS)
+
+
+def _drawn(
+    stored: StoredComparison, labels: AxisLabels, statistics: ComparisonStatistics
+) -> dict[str, FigureFiles]:
+    """Render all figures that exist for the comparison, by name."""
+    return {
+        name: render_all_formats(comparison_figures.draw_figure(stored, labels, name, statistics))
+        for name in comparison_figures.list_figure_names(stored)
+    }
+
+
+def _kept(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Path]:
+    """Write the figures, and return the paths of the PNG files."""
+    return [
+        write_figure_files(
+            folder / "figures" / comparison_figures.FIGURE_FILES[name], picture.png, picture.pdf
+        )[0]
+        for name, picture in pictures.items()
+    ]
+
+
+def _missing(folder: Path, stored: StoredComparison) -> int:
+    """Return the number of planned runs that are missing."""
+    plan = read_plan(folder) if (folder / SEGMENTS_FOLDER).exists() else None
+    return max(len(plan) - int(stored.runs["run"].nunique()), 0) if plan else 0
+
+
+def _marks(experiment: Experiment) -> list[str]:
+    """Return notes on how the runs were made that limit the value of the results."""
+    texts = []
+    if experiment.trusted:
+        texts.append(f"\n{TRUSTED_TUNERS_NOTE}")
+    if not experiment.salt_sha256:
+        texts.append("\nthe targets have a public salt: everybody can draw them")
+    return texts
+
+
+def _headlines(results: ComparisonReportData) -> list[str]:
+    """Describe the best tuners after 1, 3, 10 and all simulations, one paragraph per range."""
+    statistics, texts = results.statistics, []
+    label = results.format_metric_label(results.shown_metric)
+    for kind in results.ranges:
+        where = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
+        lines = [f"\nbest tuners, {where} ({label}; {headline.floor_text(statistics)})"]
+        for one in headline.standings(statistics, kind):
+            lines += _standing(one)
+        lines += [headline.failed_runs(statistics, kind)]
+        lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
+        texts.append("\n".join(line for line in lines if line))
+    return texts
+
+
+def _standing(one: headline.Standing) -> list[str]:
+    """Format the lines of one number of simulations; verdicts without tuners are left out."""
+    best = f"{', '.join(one.best)} ({one.error})" if one.best else "none: every run failed"
+    parts = {
+        "best": best,
+        "worse": ", ".join(one.worse),
+        "not decided": ", ".join(one.undecided),
+        "all runs failed": ", ".join(one.failed),
+    }
+    lines = [
+        textwrap.fill(
+            f"{what}: {names}", _WIDTH, initial_indent=" " * 12, subsequent_indent=" " * 14
+        )
+        for what, names in parts.items()
+        if names
+    ]
+    lines[0] = f"  after {one.simulations}".ljust(12) + lines[0].lstrip()
+    return lines
+
+
+def _results(
+    lines: pd.DataFrame, labels: AxisLabels, statistics: ComparisonStatistics
+) -> list[str]:
+    """Format one or two short tables for each range."""
+    texts = []
+    for kind in lines["range"][lines["range"] != ""].unique():
+        texts.append("\n" + _text(lines, kind, labels, statistics))
+        if more := _directions(lines, kind, labels.channel, statistics):
+            texts.append("\n" + more)
+    return texts
+
+
+def _text(
+    lines: pd.DataFrame, kind: str, labels: AxisLabels, statistics: ComparisonStatistics
+) -> str:
+    """Format the median errors of one range as a table for the terminal."""
+    present = set(lines["metric"])
+    if kind == "real":
+        held_out = "heldout_error" in present
+        metric, what = ("heldout_error", "held-out") if held_out else ("obs_error", "fitted")
+        title = f"median {what} RMSE of {labels.channel} after N simulations"
+    else:
+        metric = "param_abs_error" if "param_abs_error" in present else "param_error"
+        what = labels.parameter or "the parameters [training widths]"
+        where = "in the training range" if kind == "in" else "anywhere in the bounds"
+        title = f"median absolute error of {what} after N simulations, targets {where}"
+    medians = build_summary(lines, metric, kind, statistics.order_in(kind))
+    fits = lines.drop_duplicates("tuner").set_index("tuner")["fit_simulations"]
+    medians["trained on"] = [f"{fits[t]:.0f}" if fits[t] else "-" for t in medians.index]
+    return f"{title}\n{_laid_out(medians.rename(index=statistics.labelled))}"
+
+
+def _laid_out(frame: pd.DataFrame) -> str:
+    """Format numbers with two digits, without names of rows and columns."""
+    bare = frame.rename_axis(index=None, columns=None)
+    return bare.to_string(float_format=lambda value: f"{value:.2g}")
+
+
+def _directions(
+    lines: pd.DataFrame, kind: str, channel: str, statistics: ComparisonStatistics
+) -> str:
+    """Format errors along stiff and sloppy directions, and held-out errors, of one range.
+
+    The text is empty if there are none.
+    """
+    titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
+    part = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
+    if kind == "real" or part.empty:
+        return ""
+    budget = part["simulations"].max()
+    shown = [k for k in (*_SHOWN, budget) if k <= budget]
+    part = part[part["simulations"].isin(shown)]
+    part = part.assign(column=part["metric"].map(titles) + " " + part["simulations"].astype(str))
+    order = [f"{t} {k}" for t in titles.values() for k in sorted(part["simulations"].unique())]
+    medians = part.pivot(index="tuner", columns="column", values="median")
+    medians = medians[[c for c in order if c in medians]].dropna(axis=1, how="all")
+    medians = medians.reindex([t for t in statistics.order_in(kind) if t in medians.index])
+    title = "median error along stiff and sloppy directions [training widths]"
+    if "heldout_error" in set(part["metric"]):
+        title += f" and RMSE of {channel} in unseen scenarios"
+    return f"{title}, after N simulations\n{_laid_out(medians.rename(index=statistics.labelled))}"
+
+
+def _seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:
+    """Format the mean seconds per run of each tuner, of its simulations, and of its training."""
+    last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
+    columns = {
+        "tuner": "tuner_seconds",
+        "simulator": "simulator_seconds",
+        "one training": "fit_seconds",
+    }
+    seconds = pd.DataFrame({name: last[column] for name, column in columns.items()})
+    seconds = seconds.reindex([t for t in statistics.order if t in seconds.index])
+    return f"mean seconds of a run\n{_laid_out(seconds)}"
+
+
+def format_failures(failed: pd.DataFrame) -> list[str]:
+    """Format failures as lines, one for each tuner and status.
+
+    Each line has the error of the first reason, and where it was raised.
+    """
+    lines = [
+        (
+            str(tuner),
+            str(len(group)),
+            str(status),
+            format_failure_reason(str(group["reason"].iloc[0])),
+        )
+        for (tuner, status), group in failed.groupby(["tuner", "status"], sort=False)
+    ]
+    if not lines:
+        return []
+    lines.insert(0, ("tuner", "runs", "status", "first reason"))
+    a, b, c = (max(len(line[i]) for line in lines) for i in range(3))
+    laid_out = [
+        f"{tuner:{a}}  {runs:>{b}}  {status:{c}}  {reason}".rstrip()
+        for tuner, runs, status, reason in lines
+    ]
+    refused = [reason.endswith(ISOLATED) for reason in failed["reason"].astype(str)]
+    isolated = list(dict.fromkeys(failed["tuner"][refused].astype(str)))
+    note = [f"{', '.join(isolated)}: {ISOLATED}"] if isolated else []
+    return ["", "failures", *laid_out, *note]
+
+
+_FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<function>\S+)')
+
+
+def format_failure_reason(reason: str) -> str:
+    """Return error and location from a reason, which may be a traceback."""
+    lines = without_isolation(reason.strip()).splitlines() or [""]
+    frames = [i for i, line in enumerate(lines) if _FRAME.search(line)]
+    if not frames:
+        return lines[-1].strip()
+    # The error message is the first line without indentation after the last frame; it may be
+    # followed by pages of text.
+    words = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
+    file, number, function = _FRAME.findall(lines[frames[-1]])[0]
+    return f"{words} ({Path(file).name}, line {number}, in {function})"

@@ -1,0 +1,300 @@
+"""Hash everything that determines a run: code, classes, recordings and package versions.
+
+The id of a run and the name of a file of trained weights contain these hashes. If something that
+determines a run were missing here, one run or one set of weights could be mistaken for another.
+Therefore whole source folders are hashed, and a class whose source cannot be found is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import linecache
+import platform
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from importlib.metadata import PackageNotFoundError, entry_points, version
+from pathlib import Path
+from typing import Any
+
+from bench import __version__
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.recorded_runs import find_recording
+from sims import effects
+from sims.core.simulator import InputError
+from sims.engines.compiled import code_cache
+
+PROJECT_ROOT = Path(__file__).resolve().parents[3]
+"""Root folder of this project's packages."""
+COMPARISON_SOURCE_FOLDERS = (
+    "methods",
+    "sims",
+    "bench/benchmark/problem",
+    "bench/benchmark/runner",
+    "bench/benchmark/isolation",
+)
+"""Source folders that determine runs: tuners, simulators, and the code that drives and scores."""
+BOUNCE_SHOT_SOURCE_FOLDERS = (
+    *COMPARISON_SOURCE_FOLDERS,
+    "bench/bounce_shot",
+    "bench/diagnosis",
+    "bench/logs",
+)
+"""Source folders that determine bounce shots: also drops, films and explanations."""
+EXPLAIN_SOURCE_FOLDERS = (
+    *COMPARISON_SOURCE_FOLDERS,
+    "bench/misspecification",
+    "bench/diagnosis",
+    "bench/logs",
+)
+"""Source folders that determine extended simulators and the runs in them."""
+NUMERICAL_PACKAGES = (
+    "av",
+    "botorch",
+    "cma",
+    "llvmlite",
+    "mujoco",
+    "nlopt",
+    "numba",
+    "numpy",
+    "opencv-python-headless",
+    "pybullet",
+    "sbi",
+    "scikit-learn",
+    "scikit-optimize",
+    "scipy",
+    "torch",
+)
+"""Numerical packages; another version of one may give other results."""
+_PLUGIN = "simgap_plugin_"
+"""Prefix of the module names of plugin files (`bench.core.plugin_registries`)."""
+_GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects", "simgap.diagnosers")
+"""Entry-point groups by which installed plugins register."""
+
+
+def compute_digest(*parts: Any, length: int = 10) -> str:
+    """Return a short hexadecimal hash of plain values; arrays are given as bytes.
+
+    Args:
+        parts: values to hash.
+        length: number of hexadecimal digits.
+    """
+    text = json.dumps(parts, sort_keys=True, default=_plainly)
+    return hashlib.sha256(text.encode()).hexdigest()[:length]
+
+
+def _plainly(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return hashlib.sha256(value).hexdigest()
+    return dict(value) if isinstance(value, Mapping) else str(value)
+
+
+@cache
+def hash_source_folders(which: tuple[str, ...] = ()) -> str:
+    """Hash every file of some source folders; those that determine runs if none are given."""
+    return compute_digest(
+        __version__,
+        [
+            _contents(PROJECT_ROOT / room, PROJECT_ROOT)
+            for room in which or COMPARISON_SOURCE_FOLDERS
+        ],
+    )
+
+
+def _contents(folder: Path, root: Path) -> list[tuple[str, bytes]]:
+    """Return relative path and content of each file in a folder, without compiled Python files.
+
+    Args:
+        folder: folder to read.
+        root: folder to which the paths are relative.
+    """
+    files = [
+        file
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and "__pycache__" not in file.parts
+    ]
+    return [(file.relative_to(root).as_posix(), file.read_bytes()) for file in files]
+
+
+@cache
+def hash_package_versions() -> str:
+    """Hash the versions of Python and of the numerical packages."""
+    packages = [get_package_version(name) for name in NUMERICAL_PACKAGES]
+    return compute_digest(platform.python_version(), packages, code_cache.is_compilation_disabled())
+
+
+def get_package_version(name: str) -> str:
+    """Return name and version of an installed package, or a note that it is absent."""
+    try:
+        return f"{name} {version(name)}"
+    except PackageNotFoundError:
+        return f"{name} absent"
+
+
+def hash_plugin_files(plugins: Sequence[str]) -> str:
+    """Hash the names and contents of plugin files."""
+    return compute_digest([[Path(p).name, Path(p).read_bytes()] for p in plugins])
+
+
+def hash_recording(experiment: Experiment) -> str:
+    """Hash the two files of the recording; empty if the experiment has none."""
+    if experiment.recording is None:
+        return ""
+    table = find_recording(experiment.recording.path)
+    return hashlib.sha256(table.read_bytes() + table.with_suffix(".toml").read_bytes()).hexdigest()
+
+
+def select_relevant_keys(experiment: Experiment, but: Iterable[str]) -> dict[str, Any]:
+    """Return the configuration without the fields that do not affect a result.
+
+    A new field of `Experiment` is included until it is listed with a reason.
+
+    Args:
+        experiment: configuration of the experiment.
+        but: names of the fields that are left out.
+    """
+    document = experiment.document() | {"name": experiment.name}
+    return {name: value for name, value in document.items() if name not in but}
+
+
+def hash_class_source(kind: type) -> str:
+    """Hash the source of a class and of its base classes.
+
+    A class of this project's source folders is represented by its name, because
+    `hash_source_folders` hashes
+    their content. A class of a plugin file is represented by the file, one of an installed plugin
+    by its whole package, and one of a notebook cell or a script by its own text. A class that is
+    made at run time has the attribute ``source_digest``, a text that changes with everything that
+    determines the class. Its attribute ``made_of`` may list further classes that it uses.
+
+    Raises:
+        InputError: the source of a class cannot be found.
+    """
+    return compute_digest([(_name(part), _place(part)) for part in _parts(kind)])
+
+
+def _name(kind: type) -> str:
+    """Return the full name of a class; the changing module name of a plugin file is replaced."""
+    plugin = kind.__module__.startswith(_PLUGIN)
+    return f"{'plugin' if plugin else kind.__module__}.{kind.__qualname__}"
+
+
+def _parts(kind: type) -> list[type]:
+    """Return a class, its bases, and the classes that it lists in ``made_of``."""
+    parts: list[type] = []
+    waiting = [kind]
+    while waiting:
+        for part in waiting.pop().__mro__:
+            # Classes of the standard library are determined by the version of Python. A base that
+            # only describes an interface is found there. A class that a metaclass made only names
+            # such a module.
+            if part in parts or (_of_python(part) and _under_its_name(part)):
+                continue
+            parts.append(part)
+            waiting += vars(part).get("made_of", ())
+    return parts
+
+
+def _of_python(kind: type) -> bool:
+    top = _top(kind)
+    return top in sys.stdlib_module_names and top != "__main__"
+
+
+def _top(kind: type) -> str:
+    return kind.__module__.partition(".")[0]
+
+
+def _under_its_name(kind: type) -> bool:
+    """Return whether the module that a class names contains this class under its name.
+
+    Only then is the module's source the source of the class. A function may make many classes from
+    one source, each with other values. A class made by ``type(...)`` from an abstract class names
+    `abc` as its module.
+    """
+    held: Any = sys.modules.get(kind.__module__)
+    for name in kind.__qualname__.split("."):
+        held = getattr(held, name, None)
+    return held is kind
+
+
+def _place(kind: type) -> Any:
+    """Return the representation of a class in a hash: empty if `hash_source_folders` covers it, else its source.
+
+    Raises:
+        InputError: there is no source.
+    """
+    # The digest is not inherited, because a subclass behaves differently.
+    if (own := vars(kind).get("source_digest")) is not None:
+        return own
+    if not _under_its_name(kind):
+        raise _untold(kind)
+    if kind.__module__ == "__main__":
+        return _text(kind)
+    file = getattr(sys.modules[kind.__module__], "__file__", None)
+    if file is None:
+        raise _untold(kind)
+    path = Path(file).resolve()
+    if any(path.is_relative_to(PROJECT_ROOT / room) for room in COMPARISON_SOURCE_FOLDERS):
+        return ""
+    return _package(kind, path)
+
+
+def _text(kind: type) -> str:
+    """Return the source of a class of a notebook cell or of the main script."""
+    try:
+        return inspect.getsource(kind)
+    except (OSError, TypeError):
+        pass
+    # A notebook has no file to search for classes, but functions refer to the text of their cell.
+    for function in filter(inspect.isfunction, vars(kind).values()):
+        if cell := linecache.getlines(function.__code__.co_filename):
+            return "".join(cell)
+    raise _untold(kind)
+
+
+def _package(kind: type, path: Path) -> Any:
+    """Return the contents of an installed plugin's package, or of the file with the class."""
+    top = sys.modules.get(_top(kind))
+    if _top(kind) in _installed() and (folders := getattr(top, "__path__", None)):
+        return [_contents(Path(folder), Path(folder)) for folder in folders]
+    return path.name, path.read_bytes()
+
+
+def _untold(kind: type) -> InputError:
+    return InputError(
+        f"class {kind.__qualname__} of {kind.__module__}: expected a class of a module, a plugin "
+        "file or a notebook's cell, found one whose source cannot be told; define it there under "
+        "its own name, or give it a text source_digest that changes with all that went into it"
+    )
+
+
+@cache
+def _installed() -> frozenset[str]:
+    """Return the top-level packages of installed plugins, including this project's own."""
+    entries = [entry for group in _GROUPS for entry in entry_points(group=group)]
+    return frozenset(entry.module.partition(".")[0] for entry in entries)
+
+
+def hash_effect_sources(*settings: Mapping[str, Any]) -> list[str]:
+    """Hash the sources of effects named in simulator settings; the simulator class lacks them."""
+    return [hash_class_source(effects.get_effect(name)) for name in list_effect_names(*settings)]
+
+
+def list_effect_names(*settings: Mapping[str, Any]) -> list[str]:
+    """Return the sorted names of registered effects in ``effects`` and ``fixed`` of settings."""
+    return sorted(find_named_effects(*settings) & set(effects.list_names()))
+
+
+def find_named_effects(*settings: Mapping[str, Any]) -> set[str]:
+    """Return all effect names in settings, also those that a plugin may define later."""
+    names: set[str] = set()
+    for table in settings:
+        for key in ("effects", "fixed"):
+            value = table.get(key, ())
+            # Values of a wrong type are reported by the simulator.
+            if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
+                # An effect at a place of a robot is the effect without the place.
+                names.update(name.partition("@")[0] for name in value if isinstance(name, str))
+    return names

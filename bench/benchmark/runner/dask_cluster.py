@@ -1,0 +1,338 @@
+"""Run calls on a Dask cluster, each one in an isolated process on the worker's machine.
+
+`runner.worker_pools` does the same on this machine. A worker of the cluster never runs a tuner
+itself.
+It has one isolated process and passes the call on, so that a tuner that hangs, dies or fills memory
+fails its own run and does not stop the worker. If a worker is lost, its calls are sent to another
+worker. Plugin files and trained weights are sent with the calls. Recordings and environment
+variables (SIMGAP_DATA) must exist on the workers' machines.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import multiprocessing
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from bench.benchmark.runner.code_digest import hash_package_versions, hash_source_folders
+from bench.benchmark.runner.plugin_discovery import Plugin
+from bench.benchmark.runner.tuner_training import TrainingResult, get_weights_folder, train_or_load
+from bench.benchmark.runner.worker_pools import Call, LocalPool, PoolLostError
+from sims.core.atomic_files import get_first_line, write_atomically
+from sims.core.simulator import InputError
+
+_SCHEDULER_TIMEOUT_SECONDS = 20.0
+"""Seconds without an answer after which the scheduler counts as lost."""
+_QUEUED_CALLS_PER_THREAD = 3
+"""Number of calls in progress per thread of the cluster.
+
+It also limits the number of results that wait in this process.
+"""
+_WORKER_CHECK_ATTEMPTS = 3
+"""Maximum number of attempts to compare the workers' code if workers are lost meanwhile."""
+_MAX_LOST_WORKERS_PER_CALL = 20
+"""Maximum number of workers that one call may lose before the pool is given up."""
+
+FileContents = tuple[tuple[str, bytes], ...]
+"""Names and contents of files."""
+PluginContents = tuple[tuple[Plugin, bytes], ...]
+"""Plugins and the contents of their files; the content is empty for an installed plugin."""
+
+
+@runtime_checkable
+class Transferable(Protocol):
+    """Argument of a call that refers to files, which must exist where the call is executed."""
+
+    def list_files(self) -> Sequence[Path]:
+        """Return the paths of the files, which must have different names."""
+        ...
+
+    def relocate(self, places: Mapping[Path, Path]) -> Transferable:
+        """Return a copy that refers to other paths.
+
+        Args:
+            places: new path of each file by its present path.
+        """
+        ...
+
+
+class ClusterPool:
+    """Pool of the workers of a Dask cluster.
+
+    Args:
+        address: address of the scheduler, for example ``tcp://10.0.0.5:8786``.
+
+    Raises:
+        InputError: the package is not installed, no scheduler answers, or the workers have other
+            code than this process.
+    """
+
+    def __init__(self, address: str) -> None:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise InputError(
+                'a cluster needs the package distributed (pip install -e ".[cluster]")'
+            ) from None
+        # Dask's own log messages are suppressed; this class reports losses in one line.
+        for name in [*logging.root.manager.loggerDict, "asyncio"]:
+            if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
+                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        self.address = address
+        try:
+            self._client = Client(address, timeout=10.0, set_as_default=False)
+        # Dask asserts that the event loop of an earlier, failed client is still running.
+        except (OSError, ValueError, TypeError, ImportError, AssertionError) as error:
+            raise InputError(
+                f"{address}: no Dask scheduler answers there ({get_first_line(error)})"
+            ) from None
+        self._plugins: PluginContents = ()
+        self._sent_files: dict[Path, Any] = {}
+        self._check()
+
+    def _check(self) -> None:
+        threads = self._client.nthreads()
+        if not threads:
+            raise InputError(
+                f"{self.address}: has no workers; start some: dask worker {self.address}"
+            )
+        here = (hash_source_folders(), hash_package_versions())
+        try:
+            there = self._identities()
+        except Exception as error:  # any error of a worker that lacks our modules
+            raise InputError(
+                f"{self.address}: its workers lack simgap ({get_first_line(error)})"
+            ) from None
+        others = [worker for worker, answer in there.items() if answer != here]
+        if others:
+            raise InputError(
+                f"{self.address}: worker {others[0]} has other code or package versions than this "
+                "process; install the same on both"
+            )
+
+    def _identities(self) -> dict[str, Any]:
+        """Return hashes of code and package versions by worker.
+
+        Raises:
+            Exception: a worker failed to compute them.
+        """
+        for _ in range(_WORKER_CHECK_ATTEMPTS):
+            there: dict[str, Any] = self._client.run(_identity, on_error="return")
+            # A worker that is lost during the call gives no information about its code.
+            if not any(isinstance(answer, OSError) for answer in there.values()):
+                break
+        answers = {w: answer for w, answer in there.items() if not isinstance(answer, OSError)}
+        for answer in answers.values():
+            if isinstance(answer, BaseException):
+                raise answer
+        return answers
+
+    def load_plugins(self, plugins: Sequence[Plugin]) -> None:
+        """Register plugins for the workers; must be called before the first call."""
+        self._plugins = tuple((p, Path(p.path).read_bytes() if p.path else b"") for p in plugins)
+
+    def __enter__(self) -> ClusterPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        closing = threading.Thread(target=self._client.close, kwargs={"timeout": 5}, daemon=True)
+        closing.start()  # in a thread, because closing waits long for a lost scheduler
+        closing.join(timeout=10)
+
+    def iterate_results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
+        """Iterate over the results of calls in the order in which they end.
+
+        See `bench.benchmark.runner.worker_pools.LocalPool`.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: soft time limit of one call.
+
+        Yields:
+            Index of the call, and its result or exception.
+
+        Raises:
+            LostError: the scheduler is lost; calls that have not ended are not executed.
+        """
+        from distributed import CancelledError, KilledWorker
+
+        waiting: dict[Any, int] = {}
+        # The number of workers that each call has lost, and the calls to be executed again.
+        losses: dict[int, int] = {}
+        following = iter(range(len(calls)))
+        again: list[int] = []
+        try:
+            while True:
+                ahead = _QUEUED_CALLS_PER_THREAD * max(sum(self._client.nthreads().values()), 1)
+                while (
+                    len(waiting) < ahead
+                    and (place := again.pop() if again else next(following, None)) is not None
+                ):
+                    waiting[self._submit(calls[place], seconds)] = place
+                if not waiting:
+                    return
+                for future in self._done(list(waiting)):
+                    place = waiting.pop(future)
+                    ended = future.status
+                    error = future.exception() if ended in ("error", "cancelled") else None
+                    killed = isinstance(error, KilledWorker | CancelledError)
+                    # The loss of a worker gives no information about the call.
+                    if killed or ended in ("lost", "cancelled"):
+                        losses[place] = losses.get(place, 0) + 1
+                        if losses[place] > _MAX_LOST_WORKERS_PER_CALL:
+                            raise PoolLostError(
+                                f"cluster {self.address}: lost {_MAX_LOST_WORKERS_PER_CALL} workers on one run"
+                            )
+                        again.append(place)
+                        continue
+                    result = error if error is not None else self._received(future.result())
+                    # The cluster stores a result until its future is released.
+                    future.release()
+                    yield place, result
+        except (OSError, TimeoutError, CancelledError) as error:
+            raise PoolLostError(
+                f"cluster {self.address}: the scheduler is gone ({type(error).__name__})"
+            ) from None
+
+    def _done(self, futures: list[Any]) -> list[Any]:
+        """Wait until at least one future is done, and return all that are.
+
+        It checks regularly whether the scheduler still answers.
+        """
+        from distributed import CancelledError, wait
+
+        while True:
+            try:
+                with self._client.as_current():
+                    wait(futures, timeout=2.0, return_when="FIRST_COMPLETED")
+            # A cancelled future is done; its call is repeated if the scheduler is still running.
+            except (TimeoutError, CancelledError):
+                self._there()
+            if done := [future for future in futures if future.done()]:
+                self._there()
+                return done
+
+    def _there(self) -> None:
+        """Raise an error unless the scheduler answers within `_SCHEDULER_TIMEOUT_SECONDS`."""
+        if self._client.status != "running":
+            raise OSError(f"connection {self._client.status}")
+        self._client.sync(
+            self._client.scheduler.identity, callback_timeout=_SCHEDULER_TIMEOUT_SECONDS
+        )
+
+    def _submit(self, call: Call, seconds: float) -> Any:
+        function, arguments = call
+        travelling = [argument for argument in arguments if isinstance(argument, Transferable)]
+        paths = [path for argument in travelling for path in argument.list_files()]
+        contents = [self._sent(path) for path in paths]
+        return self._client.submit(
+            run_on_worker, function, arguments, seconds, self._plugins, paths, contents, pure=False
+        )
+
+    def _sent(self, path: Path) -> Any:
+        """Send name and content of a file to the cluster, once for all calls.
+
+        It is stored as the result of a task: scattered data would be lost with the worker that
+        stores them, whereas a task is executed again.
+        """
+        if path not in self._sent_files:
+            content = (path.name, path.read_bytes())
+            self._sent_files[path] = self._client.submit(_itself, content, pure=False)
+        return self._sent_files[path]
+
+    def _received(self, result: Any) -> Any:
+        """Return the value of a worker's result; trained weights are written to the local cache."""
+        kind, value, content = result
+        if kind == "weights":
+            path = get_weights_folder() / value.path.name
+            _write_if_absent(path, content)
+            return replace(value, path=path)
+        return value
+
+
+def _write_if_absent(path: Path, content: bytes) -> None:
+    """Write a file atomically if it does not exist."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, content)
+
+
+def _itself(content: tuple[str, bytes]) -> tuple[str, bytes]:
+    return content
+
+
+def _identity() -> tuple[str, str]:
+    """Return hashes of a worker's code and package versions."""
+    return hash_source_folders(), hash_package_versions()
+
+
+_pools: dict[tuple[int, str], LocalPool] = {}
+
+
+def run_on_worker(
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    seconds: float,
+    plugins: PluginContents,
+    paths: Sequence[Path],
+    contents: Sequence[tuple[str, bytes]],
+) -> tuple[str, Any, bytes]:
+    """Execute a call in an isolated process of this machine; runs on a worker of the cluster.
+
+    Args:
+        function: function to call.
+        arguments: arguments of the call; paths in them refer to the client's machine.
+        seconds: soft time limit of the call.
+        plugins: plugins that the process loads or registers, and the contents of their files.
+        paths: paths of the files on the client's machine.
+        contents: names and contents of these files, in the same order.
+
+    Returns:
+        Kind, value and content: the result of the call or the error that ended it ("value"), or a
+        training with the content of its weights file ("weights").
+    """
+    if paths:
+        # All files are in one folder, because a recording's description must be next to its table.
+        folder_here = _unpacked(tuple(contents))
+        places = {path: folder_here / name for path, (name, _) in zip(paths, contents, strict=True)}
+        arguments = tuple(
+            argument.relocate(places) if isinstance(argument, Transferable) else argument
+            for argument in arguments
+        )
+    key = (threading.get_ident(), repr(plugins))
+    if key not in _pools:
+        # Dask's workers are daemonic processes, which may not have children because these could
+        # outlive them. The processes of this pool end with their parent.
+        multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+        _pools[key] = LocalPool(1)
+        # Each plugin has its own folder, so that its path does not depend on other plugins.
+        _pools[key].load_plugins([_here(plugin, content) for plugin, content in plugins])
+    ((_, result),) = _pools[key].iterate_results([(function, arguments)], seconds)
+    if function is train_or_load and isinstance(result, TrainingResult):
+        return "weights", result, result.path.read_bytes()
+    return "value", result, b""
+
+
+def _here(plugin: Plugin, content: bytes) -> Plugin:
+    """Return the plugin with its file on this machine."""
+    if not plugin.path:
+        return plugin
+    name = Path(plugin.path).name
+    return replace(plugin, path=str(_unpacked(((name, content),)) / name))
+
+
+def _unpacked(files: FileContents) -> Path:
+    """Write files into a folder of this machine that is named by their hash; return the folder."""
+    hashed = hashlib.sha256()
+    for name, content in files:
+        hashed.update(name.encode() + hashlib.sha256(content).digest())
+    place = Path(tempfile.gettempdir()) / f"simgap-{hashed.hexdigest()[:16]}"
+    for name, content in files:
+        _write_if_absent(place / name, content)
+    return place

@@ -1,0 +1,447 @@
+"""Run an experiment: tuners x targets x seeds, in worker processes or in this process.
+
+Every run is stored as soon as it has ended.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from bench.benchmark.isolation.linux_syscalls import not_dumpable
+from bench.benchmark.isolation.memory_limit import import_resource_module
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.fisher_information import InformationSpectrum
+from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
+from bench.benchmark.problem.targets import Redraws, Target, redraws_of
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.code_digest import list_effect_names
+from bench.benchmark.runner.plugin_discovery import describe_plugins, must_build_isolated
+from bench.benchmark.runner.result_rows import build_rows, make_status, make_unfinished_outcome
+from bench.benchmark.runner.run_ids import RunIds
+from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
+from bench.benchmark.runner.tuner_notes import Notes
+from bench.benchmark.runner.tuner_training import (
+    TrainingRequest,
+    TrainingResult,
+    WeightsError,
+    build_tuner,
+    train_or_load,
+)
+from bench.benchmark.runner.worker_pools import (
+    Call,
+    Pool,
+    PoolLostError,
+    WorkerDiedError,
+    make_pool,
+)
+from bench.benchmark.runner.worker_tasks import RunOutcome, RunRequest, execute_run
+from bench.benchmark.storage.run_status import RunStatus
+from bench.core.plugin_registries import PartUnavailableError, Registry, effects, simulators, tuners
+from sims.core.simulator import InputError
+
+ProgressFactory = Callable[[str, int], Callable[[], None]]
+"""Function that gets a title and a number of steps.
+
+It returns a function that is called after each step.
+"""
+
+
+def no_progress(_title: str, _steps: int) -> Callable[[], None]:
+    """Ignore progress."""
+    return lambda: None
+
+
+class RunSink(Protocol):
+    """Storage of finished runs by their index in the plan.
+
+    Attributes:
+        statuses: status of each stored run.
+    """
+
+    statuses: dict[int, RunStatus]
+
+    def append(self, place: int, columns: Mapping[str, Any], status: RunStatus) -> None:
+        """Store the rows and the status of a finished run.
+
+        Args:
+            place: index of the run in the plan.
+            columns: rows of runs.parquet.
+            status: status of the run.
+        """
+        ...
+
+
+class MemoryRunSink:
+    """Storage of finished runs in memory."""
+
+    def __init__(self) -> None:
+        self.columns: dict[int, Mapping[str, Any]] = {}
+        self.statuses: dict[int, RunStatus] = {}
+
+    def append(self, place: int, columns: Mapping[str, Any], status: RunStatus) -> None:
+        """Store the rows and the status of a finished run.
+
+        Args:
+            place: index of the run in the plan.
+            columns: rows of runs.parquet.
+            status: status of the run.
+        """
+        self.columns[place], self.statuses[place] = columns, status
+
+
+@dataclass
+class ExperimentRun:
+    """A comparison while it is running: its problem, plan, stored runs and trainings.
+
+    Attributes:
+        problem: tuning problem.
+        run_sink: storage of finished runs.
+        plan: all runs.
+        trainings: result of each training, by tuner label and seed.
+        spectra: Fisher-information spectrum by target name, if it can be computed.
+        skipped: reason by label of each tuner that cannot be used.
+        tuned: specification by label of each tuner that runs in an isolated process.
+        hidden_paths: paths that isolated processes must not access.
+        redraws: number of targets that were drawn again.
+        interrupted: whether the user interrupted the comparison.
+        stopped: why the comparison stopped early; empty if it did not.
+        notes: notes for the authors of tuners, from the runs of this process.
+    """
+
+    problem: TuningProblem
+    run_sink: RunSink = field(default_factory=MemoryRunSink)
+    plan: list[PlannedRun] = field(default_factory=list)
+    trainings: dict[tuple[str, int], TrainingResult] = field(default_factory=dict)
+    spectra: dict[str, InformationSpectrum] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    tuned: dict[str, TunerSpec] = field(default_factory=dict)
+    hidden_paths: tuple[str, ...] = ()
+    redraws: Redraws | None = None
+    interrupted: bool = False
+    stopped: str = ""
+    notes: Notes = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.notes = Notes(self.problem.experiment.isolation)
+
+    def build_training_rows(self) -> list[tuple[str, int, int, float]]:
+        """Return rows of training.csv: tuner, seed, simulations, seconds."""
+        return [
+            (label, seed, t.simulations, t.seconds) for (label, seed), t in self.trainings.items()
+        ]
+
+    def build_skipped_rows(self) -> list[dict[str, Any]]:
+        """Return rows of status.csv for tuners that could not be used."""
+        experiment = self.problem.experiment
+        simulator = experiment.simulator
+        fixed = {"target": "", "seed": 0, "status": "skipped", "simulations": 0, "seconds": 0.0}
+        fixed["trusted"] = experiment.trusted
+        return [
+            {"run": label, "tuner": label, "simulator": simulator, **fixed, "reason": reason}
+            for label, reason in self.skipped.items()
+        ]
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """Run request with its target including the true parameters; stays in the parent process."""
+
+    request: RunRequest
+    target: Target
+
+
+def count_seeds(experiment: Experiment, entry: TunerEntry) -> int:
+    """Return the number of seeds of an entry.
+
+    It is the entry's or the experiment's number, or one if the tuner is deterministic.
+
+    Args:
+        experiment: configuration of the experiment.
+        entry: entry of the tuner.
+    """
+    kind = tuners.get(entry.tuner)
+    if not (kind.stochastic or kind.learned):
+        return 1
+    return entry.seeds or experiment.seeds
+
+
+def check_tuners(experiment: Experiment) -> dict[str, str]:
+    """Build every tuner once, so that errors are reported before the work begins.
+
+    Returns:
+        Reason by label of each tuner that is skipped.
+    """
+    skipped = {}
+    for entry in experiment.tuners:
+        try:
+            if experiment.trusted or not must_build_isolated(entry):
+                build_tuner(entry)
+        except PartUnavailableError as error:
+            skipped[entry.label] = error.reason
+    return skipped
+
+
+def check_classes_importable(experiment: Experiment, workers: bool = True) -> None:
+    """Raise an error for classes that exist in this process only, if other processes need them.
+
+    A worker is a new interpreter, so that no tuner finds the true parameters in its memory. It
+    loads plugin files and installed packages, but does not import the script or notebook that calls
+    simgap. The same holds for the process of a tuner.
+
+    Args:
+        experiment: configuration of the experiment.
+        workers: True if worker processes simulate; otherwise only tuners have processes.
+
+    Raises:
+        InputError: the simulator, a tuner or an effect is such a class.
+    """
+    tuned: list[tuple[Registry[Any], str]] = [(tuners, e.tuner) for e in experiment.tuners]
+    used = tuned
+    if workers:
+        named = list_effect_names(experiment.settings, experiment.world)
+        simulated = [] if experiment.model else [(simulators, experiment.simulator)]
+        used = [*simulated, *tuned, *((effects, name) for name in named)]
+    for registry, name in used:
+        added = registry.snapshot().get(name)
+        if added is not None and added.path is None:
+            raise unreachable(registry.kind, name, added.part)
+
+
+def unreachable(kind: str, name: str, part: type) -> InputError:
+    """Make the error for a class that worker processes cannot load.
+
+    Args:
+        kind: kind of the class, such as ``tuner``.
+        name: name under which it is registered.
+        part: the class.
+    """
+    file = getattr(sys.modules.get(part.__module__), "__file__", None)
+    main = part.__module__ == "__main__"
+    where = "this session"
+    if file:
+        where = f"the script {Path(file).resolve()}" if main else str(Path(file).resolve())
+    plugin = f"{name}.py" if main or not file else str(Path(file).resolve())
+    move = f"put it into a file of its own, say {plugin}, and " if main or not file else ""
+    named = f"tuners=[{name!r}], " if kind in ("tuner", "diagnoser") else ""
+    return InputError(
+        f"{kind} {name}: class {part.__qualname__} is defined in {where}, which "
+        f"worker processes do not import; {move}pass {named}plugins=[{plugin!r}], or pass "
+        "jobs=0, which runs everything in this process"
+    )
+
+
+@numeric_warnings_silenced()
+def prepare_experiment(experiment: Experiment, salt: str | None = None) -> ExperimentRun:
+    """Check an experiment completely before any work, and plan its runs.
+
+    Args:
+        experiment: configuration of the experiment; its plugins are already registered.
+        salt: secret salt from which its targets are drawn; None for the experiment's own.
+
+    Raises:
+        InputError: the experiment, its simulator, recording or tuners have an error.
+    """
+    if not experiment.tuners:
+        remedy = "add a [tuners.NAME] table or choose some"
+        raise InputError(f"experiment {experiment.name}: names no tuner; {remedy}")
+    # A memory limit that this system does not support would crash every run.
+    if experiment.memory:
+        import_resource_module()
+    results = ExperimentRun(TuningProblem(experiment, salt), skipped=check_tuners(experiment))
+    entries = [entry for entry in experiment.tuners if entry.label not in results.skipped]
+    if not experiment.trusted:
+        results.tuned = {entry.label: make_tuner_spec(entry) for entry in entries}
+    drawn = results.problem.draw_targets()
+    results.redraws = redraws_of(experiment, drawn)
+    results.plan = list(_plan(experiment, entries, drawn))
+    # Workers open their own simulators, and this process does not need one for now.
+    results.problem.close()
+    return results
+
+
+def _plan(
+    experiment: Experiment, entries: list[TunerEntry], targets: list[Target]
+) -> Iterator[PlannedRun]:
+    """Iterate over all runs, target by target, so that the remaining time can be estimated."""
+    name = RunIds(experiment).make_run_id
+    for target in targets:
+        for entry in entries:
+            budget = entry.budget or experiment.budget
+            for seed in range(count_seeds(experiment, entry)):
+                run = name(entry, target.blinded, seed, budget)
+                yield PlannedRun(RunRequest(run, entry, seed, target.blinded, budget), target)
+
+
+@numeric_warnings_silenced()
+def run_experiment(
+    results: ExperimentRun,
+    plugins: Sequence[str] = (),
+    jobs: int = 2,
+    progress: ProgressFactory = no_progress,
+    pool: Pool | None = None,
+) -> None:
+    """Execute every run of a prepared experiment that is not yet stored.
+
+    Each result is added to `results.kept` as soon as its run ends.
+
+    Args:
+        results: prepared experiment from `prepare_experiment`.
+        plugins: plugin files that workers need; already registered in this process.
+        jobs: number of worker processes; 0 to run everything in this process. The results do not
+            depend on their number.
+        progress: called for every step.
+        pool: pool to use instead, for example of a cluster.
+
+    Raises:
+        InputError: workers cannot be started, or a class is needed that they cannot load.
+    """
+    experiment = results.problem.experiment
+    if pool is not None or jobs or not experiment.trusted:
+        check_classes_importable(experiment, workers=pool is not None or jobs > 0)
+    # This process has the true parameters, and a tuner's process may run as the same user.
+    hidden = nullcontext() if experiment.trusted else not_dumpable()
+    with hidden, pool or make_pool(jobs) as workers:
+        workers.load_plugins(describe_plugins(plugins, results.problem.experiment))
+        try:
+            _run(results, workers, progress)
+        except KeyboardInterrupt:
+            results.interrupted = True
+        except PoolLostError as error:
+            results.stopped = str(error)
+
+
+def _run(results: ExperimentRun, pool: Pool, progress: ProgressFactory) -> None:
+    missing = [
+        place for place in range(len(results.plan)) if place not in results.run_sink.statuses
+    ]
+    _identify(results, progress)
+    failures = _train(pool, results, progress)
+    step = progress("running", len(missing))
+    ready: list[int] = []
+    # Runs of a tuner whose training failed remain in the table, as failures.
+    for place in missing:
+        order = results.plan[place].request
+        if (failure := failures.get((order.entry.label, order.seed))) is not None:
+            _store_result(results, place, failure)
+            step()
+        else:
+            ready.append(place)
+    # Each outcome is stored before the next one, so that a kill loses running calls only.
+    calls = _LazyCalls(results, ready)
+    for i, outcome in pool.iterate_results(calls, results.problem.experiment.timeout):
+        _store_result(results, ready[i], outcome)
+        step()
+
+
+def _identify(results: ExperimentRun, progress: ProgressFactory) -> None:
+    """Compute the Fisher-information spectrum of each target.
+
+    Only the parent process can do this, because it needs the true parameters if there are any.
+    """
+    problem, targets = (
+        results.problem,
+        {job.target.blinded.name: job.target for job in results.plan},
+    )
+    if not problem.has_several_parameters:
+        return
+    step = progress("identifiability", len(targets))
+    for name, target in targets.items():
+        if (spectrum := problem.compute_spectrum(target)) is not None:
+            results.spectra[name] = spectrum
+        step()
+    problem.close()
+
+
+class _LazyCalls(Sequence[Call]):
+    """Lazy sequence of calls for places of the plan.
+
+    Each call is created when it is accessed, because a million calls would fill the memory.
+    """
+
+    def __init__(self, results: ExperimentRun, places: list[int]) -> None:
+        self._results, self._places = results, places
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, i: Any) -> Any:
+        results = self._results
+        order = results.plan[self._places[i]].order
+        order = replace(
+            order, tuned=results.tuned.get(order.entry.label), hidden=results.hidden_paths
+        )
+        # The plan was made before the training; run ids do not depend on the location of weights.
+        training = results.trainings.get((order.entry.label, order.seed))
+        if training is not None:
+            order = replace(order, weights=training.path)
+        return execute_run, (results.problem.experiment, order)
+
+
+def _train(
+    pool: Pool, results: ExperimentRun, progress: ProgressFactory
+) -> dict[tuple[str, int], Exception]:
+    """Train every learned entry with each of its seeds.
+
+    Returns:
+        Exception by label and seed of each training that failed.
+
+    Raises:
+        WeightsError: stored weights are damaged. The user must repair this, and no run has started.
+    """
+    experiment = results.problem.experiment
+    wanted = [
+        (entry, seed)
+        for entry in experiment.tuners
+        if entry.label not in results.skipped and tuners.get(entry.tuner).learned
+        for seed in range(count_seeds(experiment, entry))
+    ]
+    failures: dict[tuple[str, int], Exception] = {}
+    # A progress bar without steps would never end.
+    if not wanted:
+        return failures
+    step = progress("training", len(wanted))
+    lessons = [
+        TrainingRequest(entry, seed, results.tuned.get(entry.label), results.hidden_paths)
+        for entry, seed in wanted
+    ]
+    calls = [(train_or_load, (experiment, lesson)) for lesson in lessons]
+    for place, training in pool.iterate_results(calls, math.inf):
+        entry, seed = wanted[place]
+        if isinstance(training, TrainingResult):
+            results.trainings[entry.label, seed] = training
+        elif isinstance(training, WeightsError):
+            raise training
+        else:
+            failures[entry.label, seed] = training
+        step()
+    return failures
+
+
+def _store_result(results: ExperimentRun, place: int, outcome: RunOutcome | Exception) -> None:
+    """Store the result of a worker: an outcome, or the error that ended the run."""
+    problem, job = results.problem, results.plan[place]
+    # Every run gets rows and a status, because a failure is a result too.
+    if isinstance(outcome, TimeoutError):
+        reason = f"killed past its limit of {problem.experiment.timeout:g} s"
+        outcome = make_unfinished_outcome(problem, job.target, "timeout", reason)
+    elif isinstance(outcome, WorkerDiedError):
+        outcome = make_unfinished_outcome(problem, job.target, "crashed", str(outcome))
+    elif isinstance(outcome, RunEndedError):
+        outcome = make_unfinished_outcome(problem, job.target, outcome.status, outcome.reason)
+    elif isinstance(outcome, Exception):
+        reason = "".join(traceback.format_exception(outcome))
+        outcome = make_unfinished_outcome(problem, job.target, "crashed", reason)
+    results.notes.add(job.request.entry.label, outcome)
+    columns = build_rows(
+        problem, job.request, job.target, outcome, results.spectra.get(job.target.blinded.name)
+    )
+    results.run_sink.append(place, columns, make_status(problem, job.request, outcome))

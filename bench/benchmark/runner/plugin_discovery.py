@@ -1,0 +1,439 @@
+"""Inspect plugin files and installed plugins in an isolated process.
+
+The code of a plugin with tuners or diagnosers never runs in a process that has true parameters.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, ClassVar
+
+from bench.benchmark.isolation.isolation_layers import AccessPolicy
+from bench.benchmark.isolation.message_channel import MessageChannel, to_printable
+from bench.benchmark.isolation.process_exit import RunEndedError, with_isolation
+from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.runner.code_digest import compute_digest, find_named_effects, hash_class_source
+from bench.benchmark.runner.sandboxed_tuner import (
+    get_fork_server,
+    make_tuner_spec,
+    retry_if_killed,
+    start_isolated_tuner,
+)
+from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase
+from bench.core.plugin_registries import REGISTRIES, diagnosers, load_plugins, tuners
+from methods.tuner import Tuner
+from sims.core.registry import PartUnavailableError, Registry
+from sims.core.simulator import InputError
+from sims.extended_simulator import read_extended
+
+_INSPECTION_TIMEOUT_SECONDS = 120.0
+"""Timeout for loading a plugin, in seconds."""
+_MAX_ANSWER_BYTES = 1 << 20
+"""Maximum size of the description of a plugin, in bytes."""
+_PROJECT_PACKAGES = ("methods.", "bench.")
+"""Packages of the project's own tuners and diagnosers, which are trusted."""
+_ISOLATED_REGISTRIES = ("tuner", "diagnoser")
+"""Kinds of parts that are compared; their code never runs in a process with true parameters."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A plugin file and its description.
+
+    Attributes:
+        path: path of the file; empty for an installed plugin.
+        is_loaded: whether its code runs in the harness's processes.
+        tuners: descriptions of its tuners if it is not loaded, as fields of `TunerStub`.
+        diagnosers: descriptions of its diagnosers if it is not loaded.
+    """
+
+    path: str
+    is_loaded: bool = True
+    tuners: tuple[dict[str, Any], ...] = ()
+    diagnosers: tuple[dict[str, Any], ...] = ()
+
+
+class TunerStub(Tuner):
+    """Stub of a tuner whose code is not in this process, with its description."""
+
+    module: ClassVar[str] = ""
+    source_digest: ClassVar[str] = ""
+
+
+def make_tuner_stub(known: dict[str, Any]) -> type[TunerStub]:
+    """Make the stub class of a tuner from its description."""
+    fields: dict[str, Any] = {
+        "name": str(known["name"]),
+        "stochastic": known["stochastic"] is not False,
+        "learned": known["learned"] is True,
+        "trains_as": str(known["trains_as"]),
+        "module": str(known["module"]),
+        "source_digest": str(known["source"]),
+        "__doc__": str(known["says"]),
+        "__module__": __name__,
+    }
+    made: type[TunerStub] = type(fields["name"], (TunerStub,), fields)
+    return made
+
+
+class DiagnoserStub(Diagnoser):
+    """Stub of a diagnoser whose code is not in this process, with its description."""
+
+    module: ClassVar[str] = ""
+    source_digest: ClassVar[str] = ""
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Raise an error, because a stub cannot diagnose."""
+        raise NotImplementedError
+
+
+def make_diagnoser_stub(known: dict[str, Any]) -> type[DiagnoserStub]:
+    """Make the stub class of a diagnoser from its description."""
+    fields: dict[str, Any] = {
+        "name": str(known["name"]),
+        "learned": known["learned"] is True,
+        "module": str(known["module"]),
+        "source_digest": str(known["source"]),
+        "__doc__": str(known["says"]),
+        "__module__": __name__,
+    }
+    made: type[DiagnoserStub] = type(fields["name"], (DiagnoserStub,), fields)
+    return made
+
+
+def register_plugins(plugins: Iterable[Plugin]) -> None:
+    """Register plugins in this process: load their code, or make stubs of their descriptions.
+
+    Raises:
+        InputError: a plugin has an error.
+    """
+    plugins = list(plugins)
+    load_plugins(plugin.path for plugin in plugins if plugin.is_loaded)
+    for plugin in plugins:
+        for known in plugin.tuners:
+            tuners.announce(make_tuner_stub(known), Path(plugin.path) if plugin.path else None)
+        for known in plugin.diagnosers:
+            diagnosers.announce(
+                make_diagnoser_stub(known), Path(plugin.path) if plugin.path else None
+            )
+
+
+_known_plugins: dict[str, Plugin] = {}
+"""Plugin files that this process has loaded or inspected, by path."""
+
+
+def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) -> None:
+    """Load or describe plugin files before an experiment runs.
+
+    Files whose code may run in this process are loaded; the others are inspected in an isolated
+    process.
+
+    Args:
+        paths: plugin files.
+        experiment: configuration, which states the simulator, the effects and whether tuners are
+            trusted.
+
+    Raises:
+        InputError: a file cannot be used.
+    """
+    known = [Plugin(path) for path in paths]
+    if not experiment.trusted:
+        needed = {experiment.simulator} | find_named_effects(experiment.settings, experiment.world)
+        known = inspect_plugins(paths, needed | _extended(paths))
+        _refuse_both(known, experiment)
+    register_plugins(known)
+    _known_plugins.update({plugin.path: plugin for plugin in known})
+    if not experiment.trusted:
+        _announce_installed(entry.tuner for entry in experiment.tuners)
+
+
+def _extended(paths: Iterable[str]) -> set[str]:
+    """Return the names of the systems and effects of extended simulators.
+
+    Args:
+        paths: plugin files; those of extended simulators end in .toml.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    names = set()
+    for path in paths:
+        if path.endswith(".toml"):
+            extended = read_extended(Path(path))
+            names |= {extended.system, *(name.partition("@")[0] for name in extended.effects)}
+    return names
+
+
+def _refuse_both(plugins: Iterable[Plugin], experiment: Experiment) -> None:
+    """Raise an error if a file with a simulator or effect in use also has a tuner in use.
+
+    Raises:
+        InputError: there is such a file.
+    """
+    labels = {entry.tuner: entry.label for entry in experiment.tuners}
+    for plugin in plugins:
+        for known in plugin.tuners:
+            if plugin.is_loaded and known["name"] in labels:
+                raise _among_truths(labels[known["name"]], plugin.path)
+
+
+def _among_truths(label: str, place: object) -> InputError:
+    return InputError(
+        f"tuner {label}: the code of {place} runs in this process, where the truths are: a "
+        "simulator or effect in it is used here, or it was loaded by hand; put the tuner into a "
+        "file of its own, or trust the tuners"
+    )
+
+
+def describe_plugins(paths: Sequence[str], experiment: Experiment) -> list[Plugin]:
+    """Return what other processes need to know of plugin files and of installed tuners.
+
+    Args:
+        paths: plugin files.
+        experiment: configuration of the experiment.
+
+    Raises:
+        InputError: a file cannot be used.
+    """
+    if experiment.trusted:
+        return [Plugin(path) for path in paths]
+    missing = [path for path in paths if path not in _known_plugins]
+    if missing:
+        load_plugins_for_experiment(missing, experiment)
+    names = {entry.tuner for entry in experiment.tuners}
+    packages = [plugin for name, plugin in _packages.items() if name in names]
+    return [_known_plugins[path] for path in paths] + packages
+
+
+_packages: dict[str, Plugin] = {}
+"""Descriptions of tuners of installed packages in this process, by name."""
+
+
+def _announce_installed(names: Iterable[str]) -> None:
+    """Inspect tuners of other packages before they are imported in this process."""
+    for name in names:
+        if is_external_part(name):
+            with suppress(PartUnavailableError):
+                _packages[name] = inspect_installed_part(name)
+                register_plugins([_packages[name]])
+
+
+def must_build_isolated(entry: TunerEntry) -> bool:
+    """Return whether an entry's tuner must be built in an isolated process only.
+
+    If so, it has been built there once as a test.
+
+    Raises:
+        InputError: the tuner cannot be built, or its code is already in this process.
+        SkippedError: the tuner cannot be used here.
+    """
+    _announce_installed([entry.tuner])
+    kind, place = tuners.get(entry.tuner), tuners.place(entry.tuner)
+    if not issubclass(kind, TunerStub):
+        if place is not None:
+            raise _among_truths(entry.label, place)
+        return False
+    try:
+        retry_if_killed(lambda: _build(entry))
+        return True
+    except RunEndedError as ended:
+        said = "".join(str(ended).strip().splitlines()[-1:])
+        kind_of_error, _, why = said.partition(": ")
+        said = why if kind_of_error in ("TypeError", "ValueError") else said
+        raise InputError(f"tuner {entry.label}: {said}") from None
+
+
+def _build(entry: TunerEntry) -> None:
+    with start_isolated_tuner(make_tuner_spec(entry), 0, "run"):
+        return
+
+
+def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
+    """Inspect plugin files, and decide which of them to load.
+
+    A file is loaded if it defines a simulator or effect that is needed.
+
+    Args:
+        paths: plugin files.
+        needed: names of the simulators and effects in use.
+
+    Raises:
+        InputError: a file cannot be used.
+    """
+    wanted = set(needed)
+    found = []
+    claimed: dict[tuple[str, str], str] = {}
+    for path in paths:
+        # An extended simulator is data and contains no code.
+        if path.endswith(".toml"):
+            found.append(Plugin(path))
+            continue
+        parts = _asked({"file": path, "kind": "", "name": ""}, path)
+        worlds = {part["name"] for part in parts if part["kind"] not in _ISOLATED_REGISTRIES}
+        for part in parts:
+            if part["name"] in wanted and part["kind"] not in _ISOLATED_REGISTRIES:
+                _refuse_taken(part["kind"], part["name"], path, claimed)
+        methods = [tuple(p for p in parts if p["kind"] == kind) for kind in _ISOLATED_REGISTRIES]
+        found.append(Plugin(path, bool(worlds & wanted), *methods))
+    return found
+
+
+def _refuse_taken(kind: str, name: str, path: str, claimed: dict[tuple[str, str], str]) -> None:
+    """Raise an error if a name in a file's description is already in use.
+
+    This is checked before the file's code is loaded, because the description may be wrong.
+
+    Raises:
+        InputError: the name is in use.
+    """
+    for registry in REGISTRIES:
+        taken = registry.kind == kind and name in registry.names()
+        if taken and registry.place(name) != Path(path).resolve():
+            raise InputError(f"plugin {path}: {kind} '{name}' exists already; give it another name")
+    other = claimed.setdefault((kind, name), path)
+    if other != path:
+        raise InputError(f"plugin {path}: {kind} '{name}' is in {other} too; give one another name")
+
+
+def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
+    """Inspect a tuner or diagnoser that another package has installed.
+
+    Args:
+        name: registered name.
+        kind: ``tuner`` or ``diagnoser``.
+
+    Raises:
+        SkippedError: it cannot be used here.
+        InputError: it cannot be inspected.
+    """
+    known = _asked({"file": "", "kind": kind, "name": name}, name)
+    if known and "skipped" in known[0]:
+        raise PartUnavailableError(kind, name, known[0]["skipped"])
+    return Plugin("", False, *(tuple(known) if kind == k else () for k in _ISOLATED_REGISTRIES))
+
+
+def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
+    """Return whether a registered part belongs to another package and is not loaded here.
+
+    Args:
+        name: registered name.
+        registry: registry of the part.
+    """
+    place = registry.entry(name)
+    known = registry.place(name) is not None or place is None
+    return not known and not str(place).startswith(_PROJECT_PACKAGES)
+
+
+def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
+    """Return the answer of an isolated process that has loaded the given plugin."""
+    file = question["file"]
+    if file and not Path(file).is_file():
+        raise InputError(f"plugin {file}: no such file")
+    try:
+        answer = retry_if_killed(lambda: _answer(question, [file] if file else []))
+    except RunEndedError as ended:
+        said = "takes too long to load" if ended.status == "timeout" else ended.reason
+        raise InputError(f"plugin {what}: {said.strip().splitlines()[-1]}") from None
+    if isinstance(answer, dict):
+        raise InputError(with_isolation(str(answer.get("fault"))))
+    return [_plain(part, file) for part in answer]
+
+
+def _answer(question: dict[str, str], files: list[str]) -> Any:
+    house = get_fork_server()
+    house.preload_modules(["bench.benchmark.runner.plugin_discovery"])
+    child = house.start_process("bench.benchmark.runner.plugin_discovery:serve_inspection", files)
+    deadline = perf_counter() + _INSPECTION_TIMEOUT_SECONDS
+    try:
+        child.wait_until_ready()
+        child.send(b"Q", json.dumps(question).encode(), deadline=deadline)
+        return child.receive(_MAX_ANSWER_BYTES, deadline).to_document(_MAX_ANSWER_BYTES)
+    finally:
+        child.end()
+
+
+def _plain(part: Any, file: str) -> dict[str, Any]:
+    """Validate a part of an answer, and convert it to plain values."""
+    kinds = [registry.kind for registry in REGISTRIES]
+    if not isinstance(part, dict) or part.get("kind") not in kinds or "name" not in part:
+        raise InputError(f"plugin {file}: its process did not say what it holds")
+    keys = ("kind", "name", "trains_as", "says")
+    text = {key: to_printable(str(part.get(key, ""))[:500]) for key in keys}
+    # The hash contains the file's content, in addition to the plugin's own description.
+    told = [str(part.get("source", "")), Path(file).read_bytes() if file else b""]
+    # A part of a file is found by the file; a module name could pass information to its runs.
+    module = "" if file else str(part.get("module", ""))
+    rest = {"file": file, "module": module, "source": compute_digest(*told)}
+    flags = {key: part.get(key) for key in ("stochastic", "learned")}
+    skipped = {"skipped": str(part["skipped"])[:500]} if "skipped" in part else {}
+    return {**text, **rest, **flags, **skipped}
+
+
+def serve_inspection(channel: MessageChannel, _reach: AccessPolicy, held: list[str]) -> None:
+    """Answer one question about a plugin; runs in the isolated process.
+
+    Args:
+        channel: channel to the harness.
+        _reach: access policy; not used.
+        held: names of the active isolation layers.
+    """
+    channel.send_document(b"R", held)
+    question = channel.receive().to_document()
+    try:
+        answer: Any = _parts(question["file"]) if question["file"] else [_one(question)]
+    except InputError as error:
+        answer = {"fault": str(error)}
+    channel.send_document(b"K", answer)
+    channel.receive()
+
+
+def _parts(file: str) -> list[dict[str, Any]]:
+    """Describe what a plugin file defines.
+
+    Raises:
+        InputError: the file cannot be loaded.
+    """
+    load_plugins([file])
+    path = Path(file).resolve()
+    return [
+        _told(registry.kind, added.part)
+        for registry in REGISTRIES
+        for added in registry.snapshot().values()
+        if added.path == path
+    ]
+
+
+def _one(question: dict[str, str]) -> dict[str, Any]:
+    """Describe an installed tuner or diagnoser."""
+    kind, name = question["kind"], question["name"]
+    try:
+        return _told(kind, _REGISTRY_OF[kind].get(name))
+    except PartUnavailableError as error:
+        return {"kind": kind, "name": name, "skipped": error.reason}
+
+
+_REGISTRY_OF: dict[str, Registry[Any]] = {"tuner": tuners, "diagnoser": diagnosers}
+
+
+def _told(kind: str, part: Any) -> dict[str, Any]:
+    known = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
+    if kind not in _ISOLATED_REGISTRIES:
+        return known
+    try:
+        return {
+            **known,
+            "module": part.__module__,
+            "stochastic": getattr(part, "stochastic", True),
+            "learned": part.learned,
+            "trains_as": getattr(part, "trains_as", ""),
+            "source": hash_class_source(part),
+            # A package may be missing for the part although its file can be imported.
+            "name": _REGISTRY_OF[kind].get(part.name).name,
+        }
+    except PartUnavailableError as error:
+        return {**known, "skipped": error.reason}

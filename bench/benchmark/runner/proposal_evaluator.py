@@ -1,0 +1,112 @@
+"""Simulate proposals, and score them against one target's observation."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sims.core.simulator import Array
+
+if TYPE_CHECKING:
+    from bench.benchmark.problem.recorded_runs import ObservedRuns
+    from bench.benchmark.problem.tuning_problem import TuningProblem
+
+
+class ProposalEvaluator:
+    """Evaluator of unit-cube points: simulates them, and computes and stores their errors.
+
+    The loss of simulated y against observed o, over C channels of scale s and the N_c present
+    samples of each, is the root mean square
+
+        L^2 = 1/C sum_c 1/(N_c s_c^2) S_c,   S_c = sum_t (y_tc - o_tc)^2        (1)
+        RMSE_c^2 = S_c / N_c                                                    (2)
+
+    Args:
+        problem: tuning problem.
+        side: runs of the target with their observations.
+    """
+
+    def __init__(self, problem: TuningProblem, side: ObservedRuns) -> None:
+        self._problem = problem
+        self._scenarios = side.scenarios
+        missing = np.isnan(side.observed)
+        self._missing = missing if missing.any() else None
+        self._observed = np.where(missing, 0.0, side.observed)
+        # For a channel without samples the divisor must not be zero.
+        present = np.maximum((~missing).sum(axis=0), 1)
+        self._per_sample = 1.0 / present  # (2)
+        self._per_loss = 1.0 / (present * problem.scale**2 * len(problem.scale))  # (1)
+        self._only_per_loss = float(self._per_loss[0])
+        self._seen: list[Array] = []
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Simulate points and compute their losses.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C) and losses (n,); NaN and infinite if the simulation failed.
+        """
+        observations = self._problem.simulate(points, self._scenarios)
+        single = observations.shape[0] == observations.shape[2] == 1
+        if single and self._missing is None:
+            return observations, self._one_loss(observations)
+        squares = self._squares(observations)
+        self._seen.append(squares)
+        losses: Array = np.sqrt(squares @ self._per_loss)  # (1)
+        # The loss of a failed simulation is infinite, because comparisons with NaN are always
+        # false.
+        if not all(map(math.isfinite, losses.tolist())):
+            losses[~np.isfinite(losses)] = np.inf
+        return observations, losses
+
+    def _one_loss(self, observations: Array) -> Array:
+        """Compute the loss (1,) of one observation of one channel without missing samples.
+
+        Most evaluations are of this kind, and this takes a third of the time of the general case.
+        """
+        difference = (observations - self._observed).ravel()
+        square = float(difference.dot(difference))  # S of (1)
+        self._seen.append(np.array([[square]]))
+        loss = square * self._only_per_loss
+        return np.array([math.sqrt(loss) if math.isfinite(loss) else math.inf])
+
+    def _squares(self, observations: Array) -> Array:
+        """Compute sums (n, C) of squared errors over present samples, in squared channel units."""
+        difference = observations - self._observed
+        if self._missing is not None:
+            difference[:, self._missing] = 0.0
+        # Squared in place, because the observations of a large batch would not fit in memory twice.
+        difference *= difference
+        sums: Array = np.add.reduce(difference, axis=1)
+        return sums
+
+    def compute_rmse(self, proposals: Array, recommendations: Array) -> Array:
+        """Compute the RMS errors of recommended points, in channel units.
+
+        Points among `proposals` are looked up. The others are simulated outside the tuner's budget,
+        because these simulations only measure the error.
+
+        Args:
+            proposals: (m, dim) points simulated so far, in their order.
+            recommendations: (k, dim) recommended points.
+
+        Returns:
+            (k, C) root-mean-square errors.
+        """
+        known = {point.tobytes(): row for point, row in zip(proposals, self._rows(), strict=True)}
+        result = np.empty((len(recommendations), len(self._per_sample)))
+        for i, point in enumerate(recommendations):
+            # Points are compared by their bytes, so that only an identical point is looked up.
+            key = point.tobytes()
+            if key not in known:
+                known[key] = self._squares(self._problem.simulate(point[None], self._scenarios))[0]
+            result[i] = known[key]
+        errors: Array = np.sqrt(result * self._per_sample)  # (2)
+        return errors
+
+    def _rows(self) -> Array:
+        return np.concatenate(self._seen) if self._seen else np.empty((0, len(self._per_sample)))

@@ -1,0 +1,142 @@
+"""Train a tuner that lives in an isolated process; its simulations run here and are counted."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.isolation.message_channel import (
+    MAX_PROPOSAL_BYTES,
+    MAX_STATE_BYTES,
+    Message,
+    ProtocolError,
+    pack_arrays,
+    to_printable,
+    unpack_arrays,
+)
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.rng_transfer import decode_rng_state, encode_rng_state
+from bench.benchmark.isolation.tuner_processes import IsolatedProcess
+from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
+from methods.tuner import BudgetExceededError, TrainingCallback
+from methods.tuner import TrainingSimulator as Ground
+from sims.core.simulator import Array
+
+_RNG_STATE_BYTES = 48
+"""Size in bytes of the random generator's state before the requested points."""
+_NO_DEADLINE = float("inf")
+"""Deadline of a training, in seconds: none."""
+
+
+def train_remotely(
+    child: IsolatedProcess,
+    practice: CountedTrainingSimulator,
+    stream: NDArray[np.uint32],
+    watch: TrainingCallback | None,
+) -> dict[str, Array]:
+    """Train a tuner in its isolated process.
+
+    Args:
+        child: process of the tuner.
+        practice: training simulator, which counts the simulations.
+        stream: seed of the tuner's random generator.
+        watch: training callback; None for none.
+
+    Returns:
+        Trained arrays by name.
+
+    Raises:
+        EndedError: the tuner failed.
+        KilledError: its process was killed externally.
+    """
+    given = {"stream": stream.astype(np.int64), "budget": np.array(practice.budget)}
+    child.send(b"F", *pack_arrays(given), flags=watch is not None, deadline=_NO_DEADLINE)
+    grounds: list[Ground] = [practice]
+    while True:
+        message = child.receive(MAX_STATE_BYTES, _NO_DEADLINE)
+        try:
+            if message.kind == b"L":
+                return unpack_arrays(message.body)
+            _serve(child, message, grounds, watch)
+        except ProtocolError as error:
+            raise RunEndedError("crashed", f"the tuner's process broke the pipe: {error}") from None
+
+
+def _serve(
+    child: IsolatedProcess, message: Message, grounds: list[Ground], watch: TrainingCallback | None
+) -> None:
+    """Handle one message of a tuner during its training.
+
+    Raises:
+        FoulError: the message is not valid here.
+    """
+    if message.kind == b"W" and watch is not None:
+        watch.on_epoch(*_parse_progress(message.to_document()))
+        child.send(b"K", deadline=_NO_DEADLINE)
+    elif (
+        message.kind == b"P" and message.flags < 4 and (watch is not None or not message.flags & 1)
+    ):
+        # The second simulator is for evaluation only, and exists only if there is a callback.
+        if message.flags & 1 and watch is not None and len(grounds) == 1:
+            grounds.append(watch.evaluation_simulator)
+        _serve_simulation(child, message, grounds[message.flags & 1])
+    else:
+        raise ProtocolError("it sent what nobody asked for")
+
+
+def _parse_progress(said: Any) -> tuple[str, int, int, float, float]:
+    """Parse a progress message: stage, epoch, number of epochs, and two losses.
+
+    Raises:
+        FoulError: the message has another content.
+    """
+    try:
+        stage, epoch, epochs, loss, held_out = said
+        return to_printable(str(stage)[:80]), int(epoch), int(epochs), float(loss), float(held_out)
+    except (TypeError, ValueError, OverflowError):
+        raise ProtocolError("it told of no epoch") from None
+
+
+def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) -> None:
+    """Send the properties of a simulator, and simulate if the message requests it."""
+    result: dict[str, NDArray[Any]] = {}
+    if message.flags & 2:
+        try:
+            result = _simulated(message, ground)
+        except (ValueError, BudgetExceededError) as error:
+            kind = "budget" if isinstance(error, BudgetExceededError) else "value"
+            refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
+            child.send(b"X", refusal, deadline=_NO_DEADLINE)
+            return
+    told = {
+        "training": ground.training,
+        "scale": ground.scale,
+        "lengths": np.array(ground.lengths, dtype=np.int64),
+        "initial": ground.scene.initial,
+        "inputs": ground.scene.inputs,
+        "counts": np.array([ground.used, ground.budget], dtype=np.int64),
+    }
+    child.send(b"O", *pack_arrays({**told, **result}), deadline=_NO_DEADLINE)
+
+
+def _simulated(message: Message, ground: Ground) -> dict[str, NDArray[Any]]:
+    """Simulate the requested points.
+
+    Returns:
+        The observations, and the state of the random generator after drawing the scenario.
+    """
+    body = bytes(message.body)
+    if (
+        len(body) > MAX_PROPOSAL_BYTES
+        or len(body) != _RNG_STATE_BYTES + 8 * message.size * ground.dim
+    ):
+        raise ProtocolError("it asked for no points")
+    bits = np.random.PCG64()
+    state: Any = decode_rng_state(np.frombuffer(body[:_RNG_STATE_BYTES], dtype="<i8"))
+    bits.state = state
+    points = np.frombuffer(body[_RNG_STATE_BYTES:], dtype="<f8").reshape(message.size, ground.dim)
+    observations = ground.simulate(np.random.Generator(bits), points.astype(np.float64))
+    return {"observations": observations, "stream": encode_rng_state(bits.state)}

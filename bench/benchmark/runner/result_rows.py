@@ -1,0 +1,144 @@
+"""Score a run against the true parameters, in the parent process, and build its result rows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.problem.fisher_information import InformationSpectrum
+from bench.benchmark.problem.targets import Target
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.tuner_loop import RunTrace
+from bench.benchmark.runner.worker_tasks import RunOutcome, RunRequest
+from bench.benchmark.storage.run_status import RunStatus
+
+
+def make_unfinished_outcome(
+    problem: TuningProblem, target: Target, status: str, reason: str
+) -> RunOutcome:
+    """Make the outcome of a run that ended without a trace.
+
+    It has no simulations, and its only recommendation is the start.
+
+    Args:
+        problem: tuning problem.
+        target: target of the run.
+        status: status of the run.
+        reason: reason of the status.
+    """
+    nothing, start = np.empty(0), target.blinded.start[None]
+    trace = RunTrace(status, reason, start[:0], nothing, start, nothing, nothing)
+    return RunOutcome(trace, np.full((1, len(problem.channels)), np.nan), None, 0.0)
+
+
+def make_status(problem: TuningProblem, order: RunRequest, outcome: RunOutcome) -> RunStatus:
+    """Make the status row of a run.
+
+    Args:
+        problem: tuning problem.
+        order: request of the run.
+        outcome: outcome of the run.
+    """
+    trace = outcome.trace
+    return RunStatus(
+        run=order.run,
+        tuner=order.entry.label,
+        simulator=problem.experiment.simulator,
+        target=order.target.name,
+        seed=order.seed,
+        status=trace.status,
+        reason=trace.reason,
+        simulations=len(trace.losses),
+        seconds=outcome.seconds,
+        trusted=problem.experiment.trusted,
+    )
+
+
+def build_rows(
+    problem: TuningProblem,
+    order: RunRequest,
+    target: Target,
+    outcome: RunOutcome,
+    spectrum: InformationSpectrum | None = None,
+) -> dict[str, Any]:
+    """Build the columns of runs.parquet for one run, with a row for each k = 0..simulations.
+
+    Args:
+        problem: tuning problem.
+        order: request of the run.
+        target: target with its true parameters.
+        outcome: outcome of the run.
+        spectrum: Fisher-information spectrum of the target; if given, parameter errors along stiff
+            and along sloppy directions are added.
+
+    Returns:
+        Values by column name.
+    """
+    trace = outcome.trace
+    k = len(trace.losses)
+    columns: dict[str, Any] = {
+        "run": [order.run] * (k + 1),
+        "experiment": [problem.experiment.name] * (k + 1),
+        "tuner": [order.entry.label] * (k + 1),
+        "simulator": [problem.experiment.simulator] * (k + 1),
+        "target": [target.blinded.name] * (k + 1),
+        "seed": [order.seed] * (k + 1),
+        "range": [target.blinded.range] * (k + 1),
+        "trusted": [problem.experiment.trusted] * (k + 1),
+        "k": np.arange(k + 1),
+        "loss": _after_start(trace.losses),
+    }
+    columns |= _parameter_columns(problem, target, outcome)
+    if spectrum is not None and target.truth is not None:
+        # Directions combine parameters, which therefore need a common unit: training widths.
+        away = problem.cube.to_physical(trace.recommendations) - target.truth
+        widths = away / problem.cube.compute_training_widths()
+        columns["stiff_error"], columns["sloppy_error"] = spectrum.compute_directional_errors(
+            widths
+        )
+    columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
+    # All runs of a comparison have the same columns, so that their rows form one table.
+    nothing = np.full((k + 1, len(problem.channels)), np.nan)
+    heldout = nothing if outcome.heldout_rmse is None else outcome.heldout_rmse
+    columns["heldout_error"] = heldout[:, problem.error_channel]
+    for i, channel in enumerate(problem.channels):
+        columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, i]
+        # Without noise the error cannot be measured in units of the noise.
+        noise = problem.noise[i] if problem.noise[i] > 0 else np.nan
+        columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / noise
+        columns[f"heldout_error_{channel.name}"] = heldout[:, i]
+    columns["tuner_seconds"] = _after_start(trace.tuner_seconds)
+    columns["simulator_seconds"] = _after_start(trace.simulator_seconds)
+    return columns
+
+
+def _parameter_columns(
+    problem: TuningProblem, target: Target, outcome: RunOutcome
+) -> dict[str, Any]:
+    """Build columns of parameter errors, proposals, recommendations and true parameters."""
+    cube = problem.cube
+    recommended = cube.to_physical(outcome.trace.recommendations)
+    proposed = cube.to_physical(outcome.trace.proposals)
+    # A recording has no known true parameters, so its parameter errors are NaN.
+    truth = np.full(cube.dim, np.nan) if target.truth is None else target.truth
+    errors = np.abs(recommended - truth)
+    columns: dict[str, Any] = {
+        "param_error": (errors / cube.compute_training_widths()).mean(axis=1)
+    }
+    if cube.dim == 1:
+        columns["param_abs_error"] = errors[:, 0]
+    columns["outside"] = np.full(
+        len(errors),
+        np.nan if target.truth is None else problem.compute_distance_from_training(target.truth),
+    )
+    for i, parameter in enumerate(cube.parameters):
+        columns[f"proposal_{parameter.name}"] = _after_start(proposed[:, i])
+        columns[f"recommendation_{parameter.name}"] = recommended[:, i]
+        columns[f"true_{parameter.name}"] = np.full(len(errors), truth[i])
+    return columns
+
+
+def _after_start(values: Any) -> Any:
+    """Prepend NaN, for k = 0 before any simulation, to the values of simulations 1..k."""
+    return np.concatenate([[np.nan], values])

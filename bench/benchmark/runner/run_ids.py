@@ -1,0 +1,206 @@
+"""Run identifiers that change with everything that determines a run, and with nothing else.
+
+``cma_es/wide-017/0/3f9ac2d15b`` consists of tuner, target, seed and a hash. The hash covers the
+tuner's options, the simulator with its settings, the target's scenario and observation, budget,
+limits, code and package versions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.model_file_simulator import get_simulator_class
+from bench.benchmark.problem.targets import BlindedTarget
+from bench.benchmark.runner.code_digest import (
+    BOUNCE_SHOT_SOURCE_FOLDERS,
+    EXPLAIN_SOURCE_FOLDERS,
+    compute_digest,
+    hash_class_source,
+    hash_effect_sources,
+    hash_package_versions,
+    hash_plugin_files,
+    hash_recording,
+    hash_source_folders,
+    select_relevant_keys,
+)
+from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.storage.result_folder import FolderConfiguration
+from bench.core.plugin_registries import PartUnavailableError, tuners
+from sims.core.simulator import InputError
+
+RUN_IRRELEVANT_KEYS = {
+    "title": "words",
+    "says": "words",
+    "tags": "words",
+    "ranges": "which targets there are; each run's id has its own",
+    "targets": "how many there are",
+    "same_targets_as": "which targets there are; their scenarios and observations are hashed",
+    "held_out": "scenarios and observations of the held-out side are hashed with the target",
+    "seeds": "how many there are; each run's id has its own",
+    "budget": "each run's id has its own, which the tuner's entry may change",
+    "training_budget": "matters to learned tuners alone, and is hashed with their entries",
+    "negligible_error": "ranks tuners when all runs are made",
+    "identifiability": "is found beside the runs, which know nothing of it",
+    "recording": "where it lies; what it holds is hashed",
+    "model": "where it lies; what it holds is hashed",
+    "calibration": "what it comes to is in the settings of what is tuned",
+    "shot": "what is done with a tuned model afterwards",
+    "diagnosis": "who diagnoses what, where nothing is tuned",
+    "salt": "which targets there are; their scenarios and observations are hashed",
+    "salt_sha256": "which targets there are; their scenarios and observations are hashed",
+    "sweep": "what is run sweeps over nothing; it has values of its own",
+    "experiments": "what is run names no others",
+    "nuisance": "matters to entries that are randomised alone, and is hashed with them",
+    "tuners": "who else runs; each run's id has its own tuner with its options",
+}
+"""Keys of an experiment that do not change any run by themselves, each with the reason."""
+
+
+def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
+    """Hash everything that must not change while an experiment is running.
+
+    Args:
+        experiment: configuration of the experiment.
+        plugins: plugin files.
+
+    Returns:
+        Hashes by readable name.
+    """
+    return {
+        # The salt is secret until the end, but its commitment exists from the beginning.
+        "configuration": compute_digest(experiment.name, experiment.chosen(salt="").document())
+        if experiment.salt_sha256
+        else compute_digest(experiment.name, experiment.document()),
+        "recording": compute_digest(hash_recording(experiment)),
+        **(
+            {"model file": compute_digest(hash_class_source(get_simulator_class(experiment)))}
+            if experiment.model
+            else {}
+        ),
+        "plugins": hash_plugin_files(plugins),
+        "code": hash_source_folders(_get_source_folders(experiment)),
+        "package versions": hash_package_versions(),
+        "simulator and tuners": compute_digest(_classes(experiment)),
+    }
+
+
+def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
+    """Return the source folders that determine the results, if more than those of a comparison."""
+    if experiment.shot:
+        return BOUNCE_SHOT_SOURCE_FOLDERS
+    return EXPLAIN_SOURCE_FOLDERS if experiment.calibration else ()
+
+
+def _classes(experiment: Experiment) -> list[str]:
+    """Hash the sources of simulator and tuners; classes of a notebook are in no plugin file."""
+    sources = [hash_class_source(get_simulator_class(experiment))]
+    for entry in experiment.tuners:
+        try:
+            sources.append(hash_class_source(tuners.get(entry.tuner)))
+        # A skipped tuner has no runs yet; its hash changes when it becomes available.
+        except PartUnavailableError:
+            sources.append("skipped")
+    return sources
+
+
+def check_unchanged(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
+    """Raise an error if the configuration of a study has changed.
+
+    Args:
+        folder: folder of the study.
+        before: fingerprint when the study was started.
+        now: present fingerprint.
+
+    Raises:
+        InputError: something has changed since the study was started.
+    """
+    if not before:
+        raise InputError(
+            f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
+        )
+    # The first difference is reported: direct changes are listed before their consequences.
+    for what, hashed in now.items():
+        if before.get(what) != hashed:
+            raise InputError(
+                f"{folder}: its {what} changed since it was begun ({before.get(what)} then, "
+                f"{hashed} now); runs of two kinds are not mixed: put it back as it was, or start "
+                "a new comparison"
+            )
+
+
+def check_resumable(folder: Path, held: FolderConfiguration, plugins: Sequence[str]) -> list[str]:
+    """Check that a study can be resumed, and load its plugins.
+
+    Args:
+        folder: folder of the study.
+        held: configuration with which the study was started.
+        plugins: additional plugin files.
+
+    Returns:
+        All plugin files that the study needs.
+
+    Raises:
+        InputError: something relevant has changed since the study was started.
+    """
+    # The study's own plugins come first and in their order, as when it was started.
+    given = {str(Path(p).resolve()) for p in plugins}
+    everything = held.plugins + sorted(given - set(held.plugins))
+    load_plugins_for_experiment(everything, held.experiment)
+    check_unchanged(folder, held.fingerprint, compute_fingerprint(held.experiment, everything))
+    return everything
+
+
+class RunIds:
+    """Identifiers of an experiment's runs."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment = experiment
+        self._world = compute_digest(
+            select_relevant_keys(experiment, RUN_IRRELEVANT_KEYS),
+            hash_recording(experiment),
+            hash_class_source(get_simulator_class(experiment)),
+            hash_effect_sources(experiment.settings, experiment.world),
+            hash_source_folders(),
+            hash_package_versions(),
+        )
+        self._entries: dict[str, str] = {}
+        self._targets: dict[str, str] = {}
+
+    def make_run_id(self, entry: TunerEntry, target: BlindedTarget, seed: int, budget: int) -> str:
+        """Return the identifier of one run.
+
+        Args:
+            entry: entry of the tuner.
+            target: target of the run.
+            seed: seed of the tuner.
+            budget: number of simulations.
+        """
+        # Hashes are cached, because a plan may have a million runs.
+        if entry.label not in self._entries:
+            kind = tuners.get(entry.tuner)
+            training = self._experiment.training_budget if kind.learned else 0
+            over = [dict(self._experiment.nuisance)] if entry.randomised else []
+            self._entries[entry.label] = compute_digest(
+                entry.tuner, dict(entry.options), training, hash_class_source(kind), *over
+            )
+        if target.name not in self._targets:
+            self._targets[target.name] = _target(target)
+        what = compute_digest(
+            self._world, self._entries[entry.label], self._targets[target.name], seed, budget
+        )
+        return f"{entry.label}/{target.name}/{seed}/{what}"
+
+
+def _target(target: BlindedTarget) -> str:
+    """Hash a target's scenarios, observations and start."""
+    sides = [target.fitting, target.held_out]
+    scenarios = [
+        [s.times.tobytes(), s.initial, {k: v.tobytes() for k, v in s.inputs.items()}, s.constants]
+        for side in sides
+        for s in side.scenarios
+    ]
+    return compute_digest(
+        scenarios, [side.observed.tobytes() for side in sides], target.start.tobytes()
+    )

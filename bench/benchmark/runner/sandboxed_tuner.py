@@ -1,0 +1,225 @@
+"""Start and reuse the isolated tuner processes of this process, with one fork server."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
+
+from bench.benchmark.isolation.process_exit import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.tuner_client import IsolatedTuner, TunerSpec
+from bench.benchmark.isolation.tuner_processes import ForkServerClient
+from bench.benchmark.problem.experiment import TunerEntry
+from bench.core.plugin_registries import tuners
+from sims.core.simulator import InputError
+
+Result = TypeVar("Result")
+
+_PRELOADABLE_PACKAGES = (
+    "bench", "botorch", "cma", "gpytorch", "linear_operator", "methods", "nlopt", "numpy", "pandas",
+    "pysindy", "sbi", "scipy", "sims", "skopt", "sklearn", "statsmodels", "torch",
+)  # fmt: skip
+"""Packages that may be imported before a run: simgap's own and those that it requires.
+
+Other packages that a plugin imports are imported anew in each run, because they could store
+information from an earlier run.
+"""
+_MAX_WAITING_TUNERS = 8
+"""Maximum number of idle tuners that wait for another run."""
+
+MAX_RETRIES = 3
+"""Maximum number of attempts at work whose processes are killed externally.
+
+An external kill gives no information about the work itself.
+"""
+
+_fork_servers: dict[int, ForkServerClient] = {}
+_idle_tuners: OrderedDict[Any, IsolatedTuner] = OrderedDict()
+
+
+def get_fork_server() -> ForkServerClient:
+    """Return the fork server of this process; it is started at the first call."""
+    held = _fork_servers.get(0)
+    if held is None or not held.is_alive:
+        # A fork server that was killed externally is closed too, because its folder still exists.
+        close_isolated_processes()
+        held = _fork_servers[0] = ForkServerClient()
+    return held
+
+
+@cache
+def list_active_isolation_layers() -> tuple[str, ...]:
+    """Return the active isolation layers of tuner processes here; see `isolation.isolation_layers`.
+
+    Raises:
+        InputError: no isolated process can be started.
+    """
+    try:
+        return retry_if_killed(_seals)
+    except RunEndedError as ended:
+        raise InputError(
+            f"no tuner can have a process of its own here: {ended}; mend that, or give --trust for "
+            "tuners that you know"
+        ) from None
+
+
+def _seals() -> tuple[str, ...]:
+    child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")
+    try:
+        child.wait_until_ready()
+        return tuple(child.seals)
+    finally:
+        child.end()
+
+
+def close_isolated_processes() -> None:
+    """End all tuner processes of this process, and its fork server."""
+    _idle_tuners.clear()
+    for house in _fork_servers.values():
+        house.close()
+    _fork_servers.clear()
+
+
+def retry_if_killed(work: Callable[[], Result]) -> Result:
+    """Call a function, again if one of its processes was killed externally.
+
+    Args:
+        work: function without arguments.
+
+    Returns:
+        The result of the function.
+
+    Raises:
+        EndedError: processes were killed in each of `MAX_RETRIES` attempts.
+    """
+    for _ in range(MAX_RETRIES):
+        try:
+            return work()
+        except KilledExternallyError as killed:
+            said = str(killed)
+    # After several kills the work itself is the more likely cause.
+    raise RunEndedError("crashed", f"{said}, {MAX_RETRIES} times")
+
+
+def make_tuner_spec(entry: TunerEntry) -> TunerSpec:
+    """Return the specification of the tuner of an entry, for an isolated process."""
+    kind = tuners.get(entry.tuner)
+    place = tuners.place(entry.tuner)
+    module = getattr(kind, "module", "") or kind.__module__
+    ahead = (
+        find_preloadable_packages(str(place) if place else _file_of(module))
+        if place or module
+        else ()
+    )
+    return TunerSpec(kind.name, module, str(place or ""), dict(entry.options), ahead)
+
+
+def _file_of(module: str) -> str:
+    top = module.partition(".")[0]
+    if top not in _PRELOADABLE_PACKAGES:
+        return ""
+    spec = importlib.util.find_spec(module)
+    return (spec.origin or "") if spec else ""
+
+
+@cache
+def find_preloadable_packages(file: str) -> tuple[str, ...]:
+    """Return the known packages that a source file imports, directly or through simgap's tuners.
+
+    The files are parsed; their code does not run.
+    """
+    wanted: dict[str, None] = {}
+    files = [file]
+    while files:
+        for name in _imported(files.pop()):
+            if name.partition(".")[0] in _PRELOADABLE_PACKAGES and name not in wanted:
+                wanted[name] = None
+                if name.startswith("methods."):
+                    files.append(_file_of(name))
+    return tuple(wanted)
+
+
+def _imported(file: str) -> list[str]:
+    try:
+        tree = ast.parse(Path(file).read_bytes())
+    # A deeply nested file can exceed the limits of the parser.
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+        return []
+    names: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.append(node.module)
+    return names
+
+
+@contextmanager
+def start_isolated_tuner(
+    tuned: TunerSpec,
+    seed: int,
+    isolation: str,
+    hidden: tuple[str, ...] = (),
+    memory: int = 0,
+    state: Mapping[str, NDArray[Any]] | None = None,
+) -> Iterator[IsolatedTuner]:
+    """Start an isolated tuner for one run or one training, or reuse an idle one.
+
+    Args:
+        tuned: specification of the tuner.
+        seed: seed of the run.
+        isolation: ``run``: the process is ended afterwards; ``tuner``: it serves the next run of
+            this tuner with this seed.
+        hidden: folders that the process must not access.
+        memory: memory limit in MiB; 0 for no limit.
+        state: trained weights.
+
+    Yields:
+        The isolated tuner.
+
+    Raises:
+        EndedError: the tuner cannot be built.
+        KilledError: the process was killed externally.
+    """
+    kept = isolation == "tuner"
+    # Weights are hashed only if an idle tuner could have different ones.
+    key = (repr(tuned), seed, hidden, memory, _digest(state or {})) if kept else None
+    tuner = _idle_tuners.pop(key, None)
+    if tuner is not None:
+        tuner.import_seconds = 0.0
+    if tuner is None or not tuner.child.is_alive:
+        house = get_fork_server()
+        house.preload_modules(
+            [*tuned.modules, *([tuned.module] if tuned.module.startswith("methods.") else [])]
+        )
+        files = [tuned.file] if tuned.file else []
+        child = house.start_process(
+            "bench.benchmark.isolation.tuner_server:serve_requests", files, memory, hidden
+        )
+        try:
+            tuner = IsolatedTuner(child, tuned, state)
+        except BaseException:
+            child.end()
+            raise
+    try:
+        yield tuner
+    except BaseException:
+        tuner.child.end()
+        raise
+    if not kept:
+        tuner.child.end()
+    elif tuner.child.is_alive:
+        _idle_tuners[key] = tuner
+        while len(_idle_tuners) > _MAX_WAITING_TUNERS:
+            _idle_tuners.popitem(last=False)[1].child.end()
+
+
+def _digest(state: Mapping[str, NDArray[Any]]) -> int:
+    return hash(tuple((name, array.tobytes()) for name, array in state.items()))

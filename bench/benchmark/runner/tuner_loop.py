@@ -1,0 +1,305 @@
+"""Run one tuner on one target: exact budget, statuses and recommendations.
+
+This module has no access to the true parameters. It gets a sealed task and a function that
+simulates. Scoring against the true parameters happens later, in another process
+(`bench.benchmark.runner.experiment_runner`).
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Protocol
+
+import numpy as np
+
+from bench.benchmark.isolation.process_exit import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.proposal_arrays import to_points
+from methods.tuner import Array, Evaluation, Proposal, Task
+
+Evaluate = Callable[[Array], "tuple[Array, Array]"]
+"""Function that simulates points (n, dim) of the unit cube.
+
+It returns observations (n, T, C) and losses (n,).
+"""
+
+
+class TunerRun(Protocol):
+    """Run of a tuner, in this process or in another one; see `methods.tuner.TunerGenerator`."""
+
+    def __next__(self) -> Array | Proposal: ...
+
+    def send(self, evaluation: Evaluation, /) -> Array | Proposal:
+        """Send an evaluation to the tuner and return its next proposal."""
+        ...
+
+    def close(self) -> None:
+        """End the run."""
+        ...
+
+
+class RunnableTuner(Protocol):
+    """Tuner that can be run: a `methods.tuner.Tuner`, or one in another process."""
+
+    def tune(self, task: Task, rng: np.random.Generator, /) -> TunerRun:
+        """Start a run on a target.
+
+        Args:
+            task: task of the target.
+            rng: random generator of the run.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class RunTrace:
+    """Trace of one run.
+
+    Attributes:
+        status: done, converged, timeout, crashed or diverged.
+        reason: reason of the status; the traceback for a crash; empty for done.
+        proposals: (k, dim) simulated points of the unit cube.
+        losses: (k,) losses of the simulated points.
+        recommendations: (k + 1, dim) points that the tuner recommends after 0, 1, ... k
+            simulations.
+        tuner_seconds: (k,) time in the tuner before each simulation, distributed evenly over a
+            batch; the last one includes the time after the last simulation.
+        simulator_seconds: (k,) time in the simulator.
+    """
+
+    status: str
+    reason: str
+    proposals: Array
+    losses: Array
+    recommendations: Array
+    tuner_seconds: Array
+    simulator_seconds: Array
+
+
+class _DivergenceError(Exception):
+    """A tuner proposed or recommended a point that is not finite."""
+
+
+def _points(asked: object, dim: int, what: str) -> Array:
+    """Return proposals as a new (n, dim) array, clipped to the unit cube."""
+    points = to_points(asked, dim, what)
+    # Nearly all points are inside, so the expensive check is done only if some are not.
+    if not _is_in_unit_cube(points):
+        if not np.isfinite(points).all():
+            first = points[~np.isfinite(points).all(axis=1)][0]
+            raise _DivergenceError(f"the tuner gave {what} that are not finite: {first}")
+        points.clip(0.0, 1.0, out=points)
+    return points
+
+
+def _is_in_unit_cube(points: Array) -> bool:
+    """Return whether all points are inside the unit cube.
+
+    For the few numbers of one point a plain loop is three times faster than NumPy.
+    """
+    if points.size <= 32:
+        return all(0.0 <= x <= 1.0 for x in points.ravel().tolist())
+    return bool((points >= 0.0).all() and (points <= 1.0).all())
+
+
+class _RunRecord:
+    """Record of a run while it is running."""
+
+    def __init__(self, task: Task) -> None:
+        self.used = 0
+        self._dim = task.dim
+        self._proposals: list[Array] = []
+        self._losses: list[Array] = []
+        self._recommended: list[Array] = [task.start]
+        self._tuner_seconds: list[tuple[int, float]] = []
+        self._simulator_seconds: list[tuple[int, float]] = []
+        self._best_loss, self._best = np.inf, task.start
+
+    @property
+    def diverged(self) -> bool:
+        """Whether points were simulated and none of them has a finite loss."""
+        return self.used > 0 and self._best_loss == np.inf
+
+    def recommend(self, recommendation: Array) -> None:
+        """Record what the tuner recommends after all evaluations so far."""
+        self._recommended[-1] = _points(recommendation, self._dim, "recommendations")[0]
+
+    def add(self, points: Array, losses: Array, stays: bool) -> None:
+        """Add simulated points and their losses.
+
+        Args:
+            points: (n, dim) points as the tuner gets them.
+            losses: (n,) losses as the tuner gets them.
+            stays: True if the tuner's last recommendation stays valid until the next one; otherwise
+                the best point so far is recommended.
+        """
+        # The tuner gets the same arrays; writing to them would change the record.
+        points.setflags(write=False)
+        losses.setflags(write=False)
+        self.used += len(points)
+        self._proposals.append(points)
+        self._losses.append(losses)
+        for i, loss in enumerate(losses.tolist()):
+            if loss < self._best_loss:
+                self._best_loss, self._best = loss, points[i]
+            self._recommended.append(self._recommended[-1] if stays else self._best)
+
+    def time(self, points: int, tuner: float, simulator: float) -> None:
+        """Add the seconds spent on a batch of points.
+
+        Args:
+            points: number of points.
+            tuner: seconds in the tuner.
+            simulator: seconds in the simulator.
+        """
+        self._tuner_seconds.append((points, tuner))
+        self._simulator_seconds.append((points, simulator))
+
+    def late(self, tuner: float) -> None:
+        """Add the seconds in the tuner after the last simulation to those of the last batch."""
+        if self._tuner_seconds:
+            points, seconds = self._tuner_seconds[-1]
+            self._tuner_seconds[-1] = points, seconds + tuner
+
+    def trace(self, status: str, reason: str) -> RunTrace:
+        """Return the trace of the ended run.
+
+        Args:
+            status: status of the run.
+            reason: reason of the status.
+        """
+        return RunTrace(
+            status,
+            reason,
+            np.concatenate(self._proposals) if self._proposals else np.empty((0, self._dim)),
+            np.concatenate(self._losses) if self._losses else np.empty(0),
+            np.stack(self._recommended),
+            _distribute_batch_seconds(self._tuner_seconds),
+            _distribute_batch_seconds(self._simulator_seconds),
+        )
+
+
+def drive_tuner(
+    tuner: RunnableTuner,
+    task: Task,
+    evaluate: Evaluate,
+    rng: np.random.Generator,
+    seconds: float = float("inf"),
+) -> RunTrace:
+    """Run a tuner on a task until its budget is used, it stops, or it fails.
+
+    Proposals outside the unit cube are moved to its boundary. A batch that would exceed the budget
+    is shortened. The `recommendations` follow `methods.tuner.Proposal`; for k = 0 the start is
+    recommended, unless the tuner recommends another point before its first simulation.
+
+    Args:
+        tuner: tuner, trained if it needs training.
+        task: task of the target, without its true parameters.
+        evaluate: function that simulates points and computes their losses.
+        rng: random generator of the run.
+        seconds: time limit, checked between evaluations.
+
+    Returns:
+        The trace; a failure is a status of it.
+
+    Raises:
+        KilledError: the tuner's process was killed externally, which is not a failure of the tuner.
+    """
+    record = _RunRecord(task)
+    started = perf_counter()
+    steps = None
+    try:
+        steps = tuner.tune(task, rng)
+        status, reason = _run_ask_tell_loop(steps, task, evaluate, record, started + seconds)
+    except StopIteration as stop:
+        status, reason = "converged", str(stop.value or "the tuner stopped")
+    except _DivergenceError as error:
+        status, reason = "diverged", str(error)
+    except RunEndedError as ended:
+        status, reason = ended.status, ended.reason
+    except KilledExternallyError:
+        # The run is not the cause, so it is repeated.
+        raise
+    except Exception:
+        status, reason = "crashed", traceback.format_exc()
+    finally:
+        # After an interrupt, too, the tuner must close its resources.
+        fault = _close_generator(steps)
+    if status == "timeout":
+        reason = f"stopped after {perf_counter() - started:.1f} s, limit {seconds:g} s"
+    elif fault:
+        status, reason = "crashed", fault
+    elif status in ("done", "converged") and record.diverged:
+        says = f"none of {record.used} simulations has a finite loss"
+        status, reason = "diverged", f"{says} ({reason or 'budget used'})"
+    return record.trace(status, reason)
+
+
+def _run_ask_tell_loop(
+    steps: TunerRun, task: Task, evaluate: Evaluate, record: _RunRecord, deadline: float
+) -> tuple[str, str]:
+    """Simulate the tuner's proposals until the budget or the time limit is reached.
+
+    Returns:
+        Status and reason.
+
+    Raises:
+        StopIteration: the tuner stopped; the exception's value is its reason.
+        _DivergenceError: the tuner proposed or recommended a point that is not finite.
+        Exception: the tuner or the simulator failed.
+    """
+    before = perf_counter()
+    asked = next(steps)
+    while True:
+        recommendation = None
+        if type(asked) is Proposal:
+            asked, recommendation = asked
+            if recommendation is not None:
+                record.recommend(recommendation)
+        points = _points(asked, task.dim, "proposals")
+        # The check comes here, so that the recommendation after the last simulation is recorded.
+        left = task.budget - record.used
+        if left <= 0:
+            # The time that the tuner needed for this recommendation is recorded, too.
+            record.late(perf_counter() - before)
+            return "done", ""
+        cut = len(points) > left
+        if cut:
+            points = points[:left]
+        now = perf_counter()
+        observations, losses = evaluate(points)
+        after = perf_counter()
+        record.time(len(points), now - before, after - now)
+        record.add(points, losses, stays=recommendation is not None)
+        if after > deadline:
+            return "timeout", ""
+        # The tuner gets the evaluations of complete batches only.
+        if cut:
+            return "done", ""
+        before = perf_counter()
+        asked = steps.send(Evaluation(points, observations, losses))
+
+
+def _close_generator(steps: TunerRun | None) -> str:
+    """Close a tuner's generator, and return the traceback of an error in it, or an empty text."""
+    # An object without `close` is not a generator, and has already failed with its own message.
+    if steps is None or not hasattr(steps, "close"):
+        return ""
+    try:
+        steps.close()
+    except RunEndedError as ended:
+        return ended.reason or "the tuner did not close what it holds"
+    except KilledExternallyError:
+        raise
+    except Exception:
+        return traceback.format_exc()
+    return ""
+
+
+def _distribute_batch_seconds(batches: list[tuple[int, float]]) -> Array:
+    """Distribute (size, seconds) of batches evenly to their simulations."""
+    sizes = np.array([n for n, _ in batches], dtype=np.int64)
+    seconds = np.array([s for _, s in batches], dtype=np.float64)
+    return np.repeat(seconds / np.maximum(sizes, 1), sizes)

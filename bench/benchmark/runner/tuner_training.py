@@ -1,0 +1,422 @@
+"""Train learned tuners once for each simulator and seed, and cache their weights as arrays.
+
+The name of a weights file contains a hash of everything that determines the weights: the code that
+makes runs, source and options of the tuner and simulator, the training range and scenarios, budget,
+seed, and the versions of the numerical packages (`runner.code_digest`). The file contains the same
+hash, so that an exchanged file is detected. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.tuner_client import TunerSpec, relocate
+from bench.benchmark.problem.domain_randomisation import RandomisedSimulator
+from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.model_file_simulator import get_simulator_class
+from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.code_digest import (
+    compute_digest,
+    hash_class_source,
+    hash_effect_sources,
+    hash_package_versions,
+    hash_recording,
+    hash_source_folders,
+    select_relevant_keys,
+)
+from bench.benchmark.runner.remote_training import train_remotely
+from bench.benchmark.runner.sandboxed_tuner import retry_if_killed, start_isolated_tuner
+from bench.core.plugin_registries import tuners
+from bench.core.random_streams import make_seed_words
+from methods.tuner import TrainingCallback, Tuner
+from sims.core.atomic_files import atomic_replacement
+from sims.core.simulator import Array, InputError
+
+_COST_ARRAY = "__simulations_and_seconds__"
+"""Name of the array with the cost of the training: simulations and seconds."""
+_KEY = "__key__"
+"""Name of the array with the training key."""
+_REMEDY = "delete it to have it trained again"
+"""Advice for a file that cannot be used; it is never repaired silently."""
+
+
+NOT_REPRODUCIBLE_REASON = "it was killed, and asked for other simulations when it was made again"
+"""Reason of a run or training that was not reproducible after a kill."""
+
+
+class WeightsError(InputError):
+    """A file of trained weights cannot be used."""
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """Result of a training.
+
+    Attributes:
+        path: file of the weights.
+        simulations: number of simulations of the training.
+        seconds: duration of the training in seconds.
+        was_cached: True if the weights were in the cache.
+    """
+
+    path: Path
+    simulations: int
+    seconds: float
+    was_cached: bool = False
+
+
+def build_tuner(entry: TunerEntry) -> Tuner:
+    """Build the tuner of an entry with its options.
+
+    Raises:
+        InputError: the tuner does not have an option, or refuses its value.
+    """
+    kind = tuners.get(entry.tuner)
+    try:
+        return kind(**entry.options)
+    # Python raises a TypeError for an unknown option, and tuners a ValueError for a bad value.
+    except (TypeError, ValueError) as error:
+        raise InputError(f"tuner {entry.label}: {error}") from None
+
+
+def get_weights_folder() -> Path:
+    """Return the folder of trained weights: $SIMGAP_CACHE, else simgap/ in the user's cache."""
+    if os.environ.get("SIMGAP_CACHE"):
+        return Path(os.environ["SIMGAP_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
+
+
+TRAINING_IRRELEVANT_KEYS = {
+    "title": "words",
+    "says": "words",
+    "tags": "words",
+    "error_channel": "what is reported of runs",
+    "ranges": "targets are met after the training",
+    "targets": "targets are met after the training",
+    "same_targets_as": "targets are met after the training",
+    "held_out": "targets are met after the training",
+    "world": "makes the targets; tuners train in the simulator that they tune",
+    "seeds": "how many trainings there are; each key has its own seed",
+    "budget": "of a run",
+    "timeout": "of a run",
+    "memory": "of a run",
+    "negligible_error": "ranks tuners when all runs are made",
+    "identifiability": "is found beside the runs",
+    "isolation": "of a run; a training has a process of its own",
+    "salt": "targets are met after the training",
+    "salt_sha256": "targets are met after the training",
+    "recording": "where it lies; what it holds is hashed",
+    "model": "where it lies; what it holds is hashed",
+    "calibration": "what it comes to is in the settings of what is tuned",
+    "shot": "what is done with a tuned model afterwards",
+    "diagnosis": "who diagnoses what, where nothing is tuned",
+    "sweep": "what is run sweeps over nothing; it has values of its own",
+    "experiments": "what is run names no others",
+    "nuisance": "matters to entries that are randomised alone, and is hashed with them",
+    "tuners": "who else trains; the key has its own tuner with its options",
+}
+"""Keys of an experiment that do not change trained weights, each with the reason."""
+
+
+def compute_training_key(experiment: Experiment, entry: TunerEntry, seed: int) -> str:
+    """Return the key of a training: a name with a hash of everything that determines the weights.
+
+    Args:
+        experiment: configuration of the training.
+        entry: entry of the tuner.
+        seed: seed of the training.
+
+    Raises:
+        InputError: the source of the tuner or the simulator cannot be found.
+    """
+    simulator = get_simulator_class(experiment)
+    hashed = compute_digest(
+        select_relevant_keys(experiment, TRAINING_IRRELEVANT_KEYS),
+        hash_recording(experiment),
+        entry.tuner,
+        dict(entry.options),
+        seed,
+        [hash_class_source(tuners.get(entry.tuner)), hash_class_source(simulator)],
+        hash_effect_sources(experiment.settings),
+        hash_source_folders(),
+        hash_package_versions(),
+        *([dict(experiment.nuisance)] if entry.randomised else []),
+        length=16,
+    )
+    return f"{entry.tuner}-{experiment.simulator}-{seed}-{hashed}"
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """Request of one training.
+
+    Attributes:
+        entry: tuner with its options.
+        seed: seed of the training.
+        tuned: specification of the tuner for an isolated process; None if it is trusted.
+        hidden: folders that this process must not access.
+    """
+
+    entry: TunerEntry
+    seed: int
+    tuned: TunerSpec | None = None
+    hidden: tuple[str, ...] = ()
+
+    def list_files(self) -> tuple[Path, ...]:
+        """Return the files that another machine needs for the training."""
+        return (Path(self.tuned.file),) if self.tuned and self.tuned.file else ()
+
+    def relocate(self, places: Mapping[Path, Path]) -> TrainingRequest:
+        """Return the request with other paths of its files.
+
+        Args:
+            places: new path of each file by its present path.
+        """
+        return self if self.tuned is None else replace(self, tuned=relocate(self.tuned, places))
+
+
+def train_or_load(
+    experiment: Experiment,
+    lesson: TrainingRequest,
+    watch: TrainingCallback | None = None,
+    anew: bool = False,
+) -> TrainingResult:
+    """Train a tuner, or find its weights in the cache.
+
+    Args:
+        experiment: configuration with the simulator and the training budget.
+        lesson: request of the training.
+        watch: training callback; None for none.
+        anew: True to train even if there are weights, and to replace them.
+
+    Returns:
+        File of the weights and cost of the training.
+
+    Raises:
+        WeightsError: there is a file, but it is damaged or belongs to another training.
+        EndedError: the tuner failed in its process.
+    """
+    before: list[str] = []
+    return retry_if_killed(lambda: _train(experiment, lesson, watch, anew, before))
+
+
+def _train(
+    experiment: Experiment,
+    lesson: TrainingRequest,
+    watch: TrainingCallback | None,
+    anew: bool,
+    before: list[str],
+) -> TrainingResult:
+    entry, seed = lesson.entry, lesson.seed
+    name = compute_training_key(experiment, entry, seed)
+    path = get_weights_folder() / f"{name}.npz"
+    if path.exists() and not anew:
+        simulations, seconds = _checked(path, name)[_COST_ARRAY]
+        # Weights that do not fit must be reported now, and not in every run.
+        _check_weights(lesson, path)
+        return TrainingResult(path, int(simulations), float(seconds), was_cached=True)
+    problem = TuningProblem(experiment)
+    # Tuners with the same `trains_as` share a random stream, so that they have the same network.
+    stream = make_seed_words(
+        experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
+    )
+    learn = _train_in_process if lesson.tuned is None else _train_isolated
+    rough = RandomisedSimulator(problem) if entry.randomised else None
+    practice = _ReplayCheckedSimulator(problem, experiment.training_budget, before, rough)
+    started = perf_counter()
+    state = learn(lesson, practice, stream, watch)
+    seconds = perf_counter() - started
+    problem.close()
+    if rough is not None:
+        rough.close()
+    # Cost and key are stored with the weights, so that an exchanged file is detected.
+    about = {
+        _COST_ARRAY: np.array([practice.used, seconds]),
+        _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
+    }
+    _write(path, {**state, **about})
+    return TrainingResult(path, practice.used, seconds)
+
+
+class _ReplayCheckedSimulator(CountedTrainingSimulator):
+    """Training simulator that checks that a repeated training makes the same requests.
+
+    A training is repeated if its process was killed externally. Otherwise a tuner that causes its
+    own kill could use the budget several times.
+    """
+
+    def __init__(
+        self,
+        problem: TuningProblem,
+        budget: int,
+        before: list[str],
+        nuisance: RandomisedSimulator | None = None,
+    ) -> None:
+        super().__init__(problem, budget, nuisance)
+        self._before, self._place = before, 0
+
+    def simulate(self, rng: np.random.Generator, points: Array) -> Array:
+        """Simulate points, see `CountedTrainingSimulator.simulate`; check them against the requests before a kill.
+
+        Args:
+            rng: random generator.
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C).
+
+        Raises:
+            EndedError: the request differs from the one before the kill.
+        """
+        asked = compute_digest(repr(rng.bit_generator.state), np.asarray(points).tobytes())
+        if self._place == len(self._before):
+            self._before.append(asked)
+        elif self._before[self._place] != asked:
+            raise RunEndedError("crashed", NOT_REPRODUCIBLE_REASON)
+        self._place += 1
+        return super().simulate(rng, points)
+
+
+def _train_in_process(
+    lesson: TrainingRequest,
+    practice: CountedTrainingSimulator,
+    stream: NDArray[np.uint32],
+    watch: TrainingCallback | None,
+) -> Mapping[str, Array]:
+    """Train a trusted tuner in this process, and return its weights."""
+    tuner = build_tuner(lesson.entry)
+    tuner.watch = watch
+    tuner.fit(practice, np.random.default_rng(stream), practice.budget)
+    return tuner.state()
+
+
+def _train_isolated(
+    lesson: TrainingRequest,
+    practice: CountedTrainingSimulator,
+    stream: NDArray[np.uint32],
+    watch: TrainingCallback | None,
+) -> Mapping[str, Array]:
+    """Train a tuner in its isolated process, and return its weights; this process simulates."""
+    assert lesson.tuned is not None
+    with start_isolated_tuner(lesson.tuned, lesson.seed, "run", lesson.hidden) as tuner:
+        state = train_remotely(tuner.child, practice, stream, watch)
+    # These names are arguments of `np.savez` or reserved in the file.
+    taken = {"file", "allow_pickle", _COST_ARRAY, _KEY} & set(state)
+    if taken:
+        raise RunEndedError(
+            "crashed", f"the tuner learned what cannot be kept by the names {taken}"
+        )
+    return state
+
+
+def _check_weights(lesson: TrainingRequest, path: Path) -> None:
+    """Raise an error if the tuner does not accept the weights.
+
+    Raises:
+        WeightsError: the tuner does not accept the weights.
+    """
+    if lesson.tuned is None:
+        load_trained_tuner(lesson.entry, path)
+        return
+    try:
+        with start_isolated_tuner(
+            lesson.tuned, lesson.seed, "run", lesson.hidden, state=read_weights(path)
+        ):
+            return
+    except RunEndedError as ended:
+        said = ended.reason.strip().splitlines()[-1:]
+        raise _not_of(path, lesson.entry, "".join(said)) from None
+
+
+def _not_of(path: Path, entry: TunerEntry, why: object) -> WeightsError:
+    return WeightsError(f"{path}: not the weights of {entry.label}: {why}; {_REMEDY}")
+
+
+def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
+    """Write a file atomically, because several processes may train the same tuner."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_replacement(path) as partial, partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def load_trained_tuner(entry: TunerEntry, path: Path) -> Tuner:
+    """Build the tuner of an entry, and load its weights.
+
+    Args:
+        entry: entry of the tuner.
+        path: file of the weights.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or of another training.
+    """
+    tuner = build_tuner(entry)
+    try:
+        tuner.restore(read_weights(path))
+    except ValueError as error:
+        raise _not_of(path, entry, error) from None
+    return tuner
+
+
+def read_weights(path: Path) -> dict[str, Array]:
+    """Read the weights of a file.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or of another training.
+    """
+    state = _checked(path, path.stem)
+    del state[_COST_ARRAY], state[_KEY]
+    return state
+
+
+def _checked(path: Path, name: str) -> dict[str, Array]:
+    """Read and check the arrays of a weights file.
+
+    Args:
+        path: file of the weights.
+        name: key of the training.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or of another training than `name`.
+    """
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = {member: file[member] for member in file.files}
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
+        KeyError,
+        AttributeError,
+    ):
+        raise WeightsError(
+            f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}"
+        ) from None
+    counts, held = arrays.get(_COST_ARRAY, np.empty(0)), arrays.get(_KEY, np.empty(0))
+    if (
+        counts.shape != (2,)
+        or counts.dtype != np.float64
+        or held.dtype != np.uint8
+        or held.ndim != 1
+    ):
+        raise WeightsError(
+            f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}"
+        )
+    found = held.tobytes().decode("utf-8", "replace")
+    if found != name:
+        raise WeightsError(
+            f"{path}: expected the weights of {name}, found those of {found:.80}; {_REMEDY}"
+        )
+    return arrays

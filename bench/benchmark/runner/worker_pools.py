@@ -1,0 +1,393 @@
+"""Execute calls in worker processes with hard time limits, or in this process.
+
+A worker executes one call at a time. If it dies, only this call is lost. In this process no worker
+is used, so that prints and breakpoints work.
+
+Every worker is a separate pebble pool with a single process. The workers of one pebble pool share a
+channel that is protected by two locks. A worker that is killed while it holds them would block all
+workers of its pool; here it blocks only itself.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Protocol
+
+from bench.benchmark.isolation.process_exit import describe_exit
+from bench.benchmark.runner.spawn_context import WorkerContext
+from bench.benchmark.runner.thread_limit import THREAD_COUNT_VARIABLES, limit_to_one_thread
+from bench.benchmark.runner.worker_setup import initialise_worker
+from sims.core.simulator import InputError
+from sims.engines import describe_stepping
+
+if TYPE_CHECKING:
+    from bench.benchmark.runner.plugin_discovery import Plugin
+
+HARD_LIMIT_GRACE_SECONDS = 30.0
+"""Difference between hard and soft time limit in seconds.
+
+A cooperative run ends at the soft limit; the worker is killed at the hard limit.
+"""
+MAX_RETRIES = 3
+"""Maximum number of repetitions of a call whose worker was killed externally.
+
+An external kill gives no information about the call itself.
+"""
+_EXTERNAL_KILL_EXIT_CODES = (-9, -15, 15)
+"""Exit codes of a worker that was killed externally: SIGKILL and SIGTERM.
+
+SIGKILL is also sent by the kernel if memory is exhausted.
+"""
+_MAX_IMMEDIATE_DEATHS = 10
+"""Maximum number of successive workers that die before they do any work."""
+_SHORT_CALL_SECONDS = 1.0
+"""Calls shorter than this many seconds are queued in advance at the workers."""
+
+Call = tuple[Callable[..., Any], tuple[Any, ...]]
+
+
+class WorkerDiedError(RuntimeError):
+    """The worker process of a call died; the message says how."""
+
+
+class PoolLostError(RuntimeError):
+    """The executor of the calls is lost, and unfinished calls with it; the message names it."""
+
+
+class Pool(Protocol):
+    """Executor of calls: local worker processes, a cluster, or this process."""
+
+    def load_plugins(self, plugins: Sequence[Plugin]) -> None:
+        """Register plugins for the workers; must be called before the first call."""
+        ...
+
+    def iterate_results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
+        """Iterate over the results of calls in the order in which they end.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: soft time limit of one call.
+
+        Yields:
+            Index of the call, and its result or exception.
+        """
+        ...
+
+    def __enter__(self) -> Pool: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def make_pool(jobs: int) -> Pool:
+    """Return a pool of worker processes on this machine, or of this process for 0 workers.
+
+    Raises:
+        InputError: `jobs` is negative.
+    """
+    if jobs < 0:
+        raise InputError(f"jobs: expected a number of worker processes from 0 on, found {jobs}")
+    return LocalPool(jobs) if jobs else InProcessPool()
+
+
+class InProcessPool:
+    """Executor of calls in this process, one after another, so that prints and breakpoints work.
+
+    There is no isolation. A call that hangs or ends its process stops everything, a class need not
+    be in a file, and a tuner could read the true parameters.
+    """
+
+    def load_plugins(self, plugins: Sequence[Plugin]) -> None:
+        """Do nothing, because the caller has loaded the plugins in this process."""
+
+    def __enter__(self) -> InProcessPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        from bench.benchmark.runner.worker_tasks import close_problem
+
+        # A notebook may redefine a simulator under the same name before the next comparison.
+        close_problem()
+
+    def iterate_results(
+        self,
+        calls: Sequence[Call],
+        seconds: float,  # noqa: ARG002 - there is nobody who could end a call past its limit
+    ) -> Iterator[tuple[int, Any]]:
+        """Iterate over the results of calls, in their order.
+
+        Exceptions are also printed on stderr, for the author of the code.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: time limit; not used, because a call in this process cannot be ended.
+
+        Yields:
+            Index of the call, and its result or exception.
+        """
+        with limit_to_one_thread():
+            for place in range(len(calls)):
+                function, arguments = calls[place]
+                try:
+                    result = function(*arguments)
+                except InputError as error:
+                    result = error
+                except Exception as error:
+                    traceback.print_exc()
+                    result = error
+                except SystemExit as error:
+                    traceback.print_exc()
+                    result = WorkerDiedError(f"it asked to exit with {error.code!r}")
+                yield place, result
+
+
+@dataclass
+class _AssignedCall:
+    """Call that is assigned to a worker."""
+
+    place: int
+    deaths: int = 0
+    given: float = field(default_factory=monotonic)
+
+
+@dataclass
+class _PrefetchPolicy:
+    """Number of calls that a worker has at a time.
+
+    If calls are short, a second one is queued, so that a worker does not wait for its next call.
+    """
+
+    depth: int = 1
+    ended: int = 0
+    busy: float = 0.0
+
+    def note(self, seconds: float) -> None:
+        """Count a call that took a number of seconds."""
+        self.ended += 1
+        self.busy += seconds
+
+    def adapt(self) -> None:
+        """Choose the number of calls per worker from the mean duration so far."""
+        # With two calls queued, the time of a call includes the wait for the one before it.
+        short = self.ended and self.busy / self.ended < self.depth * _SHORT_CALL_SECONDS
+        self.depth = 2 if short else 1
+
+
+class LocalPool:
+    """Worker processes on this machine, each a new interpreter with one numerical thread.
+
+    Args:
+        jobs: number of worker processes.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        # Workers inherit the variables; numerical libraries read them when they are loaded.
+        for name in THREAD_COUNT_VARIABLES:
+            os.environ.setdefault(name, "1")
+        self._jobs = jobs
+        self._plugins: list[Plugin] = []
+        self._slots: list[_WorkerSlot] = []
+
+    def load_plugins(self, plugins: Sequence[Plugin]) -> None:
+        """Register plugins for the workers; must be called before the first call."""
+        self._plugins = list(plugins)
+
+    def __enter__(self) -> LocalPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for slot in self._slots:
+            slot.stop()
+
+    def iterate_results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
+        """Iterate over the results of calls in the order in which they end.
+
+        A call that exceeds its limit gives a `TimeoutError`. A call whose worker dies gives a
+        `WorkerDiedError`; if the worker was killed externally (by the kernel or a user), only after
+        `MAX_RETRIES` repetitions.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: soft time limit of one call.
+
+        Yields:
+            Index of the call, and its result or exception.
+
+        Raises:
+            InputError: workers die before they do any work.
+        """
+        limit = None if math.isinf(seconds) else seconds + HARD_LIMIT_GRACE_SECONDS
+        if not self._slots:
+            describe_stepping()  # executed here, because a worker cannot report what it waits for
+        self._slots = self._slots or [_WorkerSlot(self._plugins) for _ in range(self._jobs)]
+        following = deque(_AssignedCall(place) for place in range(len(calls)))
+        pace = _PrefetchPolicy()
+        while True:
+            self._hand_out(following, pace.depth, calls, limit)
+            futures = [future for slot in self._slots for future in slot.given]
+            if not futures:
+                return
+            # The timeout is needed because a worker that exits with code 0 completes no future.
+            wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
+            for slot in self._slots:
+                for one, result in slot.collect(following):
+                    pace.note(monotonic() - one.given)
+                    yield one.place, result
+            pace.adapt()
+
+    def _hand_out(
+        self,
+        following: deque[_AssignedCall],
+        depth: int,
+        calls: Sequence[Call],
+        limit: float | None,
+    ) -> None:
+        """Assign up to `depth` calls to every worker; all get a first before any gets a second."""
+        for _ in range(depth):
+            for slot in self._slots:
+                if following and len(slot.given) < depth:
+                    slot.give(following.popleft(), calls, limit)
+
+
+class _WorkerSlot:
+    """One worker process, replaced whenever it is lost.
+
+    A new process has a new pipe, so that the rest of a dead process's message is never read.
+    """
+
+    def __init__(self, plugins: list[Plugin]) -> None:
+        self._plugins = plugins
+        self._futile = 0
+        self.given: dict[Future[Any], _AssignedCall] = {}
+        self._start()
+
+    def _start(self) -> None:
+        from pebble import ProcessPool
+
+        # A forked process would inherit the parent's memory with the true parameters.
+        context = WorkerContext()
+        # Each process that the pool starts reports here. A second report means that the first
+        # process is dead, which pebble does not notice if the exit code is 0.
+        self._births, telling = context.Pipe(duplex=False)
+        self._born = 0
+        arguments = (self._plugins, telling)
+        self._pool = ProcessPool(
+            1, initializer=initialise_worker, initargs=arguments, context=context
+        )
+
+    def stop(self) -> None:
+        """End the process, including a running call."""
+
+        def end(pool: Any = self._pool) -> None:
+            pool.stop()
+            pool.join()
+
+        # This runs in a thread, because pebble would wait forever for the rest of a message whose
+        # sender was killed.
+        ending = threading.Thread(target=end, daemon=True, name="ending-a-worker")
+        ending.start()
+        ending.join(timeout=5.0)
+
+    def give(self, one: _AssignedCall, calls: Sequence[Call], limit: float | None) -> None:
+        """Assign a call to the process; replace a pool that broke in the meantime.
+
+        Args:
+            one: call to assign.
+            calls: all calls.
+            limit: hard time limit in seconds; None for no limit.
+        """
+        function, arguments = calls[one.place]
+        one.given = monotonic()
+        try:
+            future = self._pool.schedule(function, args=arguments, timeout=limit)
+        except RuntimeError:  # the pool broke between two calls
+            self._renew()
+            future = self._pool.schedule(function, args=arguments, timeout=limit)
+        self.given[future] = one
+
+    def collect(self, again: deque[_AssignedCall]) -> list[tuple[_AssignedCall, Any]]:
+        """Return the ended calls; put those that a lost worker did not begin back into `again`."""
+        ended: list[tuple[_AssignedCall, Any]] = []
+        lost = False
+        for future in [future for future in self.given if future.done()]:
+            one, error = self.given.pop(future), future.exception()
+            lost = lost or _loses_the_worker(error)
+            if error is None:
+                self._futile = 0
+            if _should_retry(one, error):
+                again.appendleft(one)
+            else:
+                ended.append((one, future.result() if error is None else _end_of(error)))
+        if not lost and self._died_quietly():
+            lost = True
+            at = next(future for future in self.given if future.running())
+            ended.append((self.given.pop(at), WorkerDiedError(_says(0))))
+        if lost:
+            self._futile = 0 if ended else self._futile
+            again.extendleft(reversed(self.given.values()))
+            self._renew()
+        return ended
+
+    def _died_quietly(self) -> bool:
+        """Return whether the process was replaced although its running call has no result."""
+        while self._births.poll():
+            self._births.recv()
+            self._born += 1
+        return self._born > 1 and any(future.running() for future in self.given)
+
+    def _renew(self) -> None:
+        self._futile += 1
+        if self._futile > _MAX_IMMEDIATE_DEATHS:
+            said = "what they say stands above, if anything"
+            raise InputError(f"worker processes die as soon as they start; {said}")
+        self.given.clear()
+        self.stop()
+        self._births.close()
+        self._start()
+
+
+def _exit_code(error: BaseException | None) -> int | None:
+    """Return the exit code of the worker process if pebble reports that this ended the call."""
+    return getattr(error, "exitcode", None)
+
+
+def _loses_the_worker(error: BaseException | None) -> bool:
+    """Return whether the worker of an ended call is gone: it died, or was killed at its limit."""
+    return _exit_code(error) is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
+
+
+def _should_retry(one: _AssignedCall, error: BaseException | None) -> bool:
+    """Return whether to repeat a call, because its end gives no information about it.
+
+    It also counts the deaths of workers during the call.
+    """
+    code = _exit_code(error)
+    # A broken pool has not begun the call, or has not reported its result.
+    again = isinstance(error, BrokenExecutor) or (
+        code in _EXTERNAL_KILL_EXIT_CODES and one.deaths < MAX_RETRIES
+    )
+    if again:
+        one.deaths += code is not None
+    return again
+
+
+def _end_of(error: BaseException) -> BaseException:
+    """Return the exception that replaces the result of a failed call."""
+    if isinstance(error, FutureTimeoutError):
+        return TimeoutError(str(error))  # two different classes before Python 3.11
+    code = _exit_code(error)
+    return error if code is None else WorkerDiedError(_says(code))
+
+
+def _says(code: int) -> str:
+    """Describe how a worker process ended."""
+    said = describe_exit("the worker process", code)
+    return f"{said} (out of memory?)" if code == -9 else said

@@ -1,0 +1,263 @@
+"""Execute one run on one target in a worker process.
+
+Trainings are executed by `tuner_training.train_or_load`. True parameters never enter a worker: it
+gets
+`BlindedTarget`s and returns traces, which the parent process scores. Code of tuners does not enter
+it either, unless the tuners are trusted. The worker simulates, counts and measures time, and the
+tuner lives in its own process (`bench.benchmark.isolation`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from bench.benchmark.isolation.memory_limit import limited_memory
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.tuner_client import IsolatedRun, TunerSpec, relocate
+from bench.benchmark.isolation.tuner_processes import NOTHING_WRITTEN, Written
+from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.targets import BlindedTarget
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
+from bench.benchmark.runner.sandboxed_tuner import retry_if_killed, start_isolated_tuner
+from bench.benchmark.runner.tuner_loop import Evaluate, RunTrace, TunerRun, drive_tuner
+from bench.benchmark.runner.tuner_training import (
+    NOT_REPRODUCIBLE_REASON,
+    build_tuner,
+    load_trained_tuner,
+    read_weights,
+)
+from bench.benchmark.storage.run_status import FAILED_STATUSES
+from bench.core.random_streams import make_rng, make_seed_words
+from methods.tuner import Task
+from sims.core.simulator import Array
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """Request of one run.
+
+    Attributes:
+        run: id of the run.
+        entry: entry of the tuner.
+        seed: seed of the tuner.
+        target: target without its true parameters.
+        budget: number of simulations.
+        weights: file of the weights of a learned tuner; None for none.
+        tuned: specification of the tuner for an isolated process; None if it is trusted.
+        hidden: folders that this process must not access.
+    """
+
+    run: str
+    entry: TunerEntry
+    seed: int
+    target: BlindedTarget
+    budget: int
+    weights: Path | None = None
+    tuned: TunerSpec | None = None
+    hidden: tuple[str, ...] = ()
+
+    def list_files(self) -> tuple[Path, ...]:
+        """Return the files that another machine needs for the run."""
+        plugin = Path(self.tuned.file) if self.tuned and self.tuned.file else None
+        return tuple(path for path in (self.weights, plugin) if path is not None)
+
+    def relocate(self, places: Mapping[Path, Path]) -> RunRequest:
+        """Return the request with other paths of its files.
+
+        Args:
+            places: new path of each file by its present path.
+        """
+        weights = None if self.weights is None else places[self.weights]
+        tuned = None if self.tuned is None else relocate(self.tuned, places)
+        return replace(self, weights=weights, tuned=tuned)
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """Outcome of one run, with the errors of its recommendations after 0..k simulations.
+
+    Attributes:
+        trace: trace of the run.
+        obs_rmse: (k + 1, C) RMS error on the target's fitted runs, in channel units.
+        heldout_rmse: (k + 1, C) RMS error on its held-out runs; None if there are none.
+        seconds: wall-clock time of the run in seconds, without the scoring.
+        written: files that the tuner wrote and that were deleted with its process.
+        import_seconds: time in seconds for imports of the tuner's file before the run.
+    """
+
+    trace: RunTrace
+    obs_rmse: Array
+    heldout_rmse: Array | None
+    seconds: float
+    written: Written = NOTHING_WRITTEN
+    import_seconds: float = 0.0
+
+
+class HiddenSimulationError(RuntimeError):
+    """A tuner simulated points without the harness counting them."""
+
+
+_problems: dict[int, tuple[Experiment, TuningProblem]] = {}
+"""Last problem of this process; several problems would hold several simulators open."""
+
+
+def get_problem(experiment: Experiment) -> TuningProblem:
+    """Return the problem of an experiment; it is cached until another one is needed."""
+    held = _problems.get(0)
+    if held is None or held[0] != experiment:
+        close_problem()
+        held = _problems[0] = (experiment, TuningProblem(experiment))
+    return held[1]
+
+
+def close_problem() -> None:
+    """Close the cached problem of this process."""
+    for _, problem in _problems.values():
+        problem.close()
+    _problems.clear()
+
+
+def execute_run(experiment: Experiment, order: RunRequest) -> RunOutcome:
+    """Execute one run; failures of the tuner or the simulator are a status of its trace.
+
+    Args:
+        experiment: configuration of the experiment.
+        order: request of the run.
+
+    Raises:
+        CheatError: more points were simulated than the tuner requested from the harness.
+        EndedError: the tuner's process was killed externally several times.
+    """
+    before: list[Array] = []
+    return retry_if_killed(lambda: _perform(experiment, order, before))
+
+
+class _ReplayCheckedEvaluator:
+    """Evaluator that checks that a repeated run makes the same requests.
+
+    A run is repeated if its process was killed externally. Otherwise a tuner that causes its own
+    kill could repeat its run until the result is good.
+    """
+
+    def __init__(self, evaluate: Evaluate, before: list[Array]) -> None:
+        self._evaluate, self._before, self._place = evaluate, before, 0
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        if self._place == len(self._before):
+            self._before.append(points)
+        elif not np.array_equal(self._before[self._place], points):
+            raise RunEndedError("crashed", NOT_REPRODUCIBLE_REASON)
+        self._place += 1
+        return self._evaluate(points)
+
+
+def _perform(experiment: Experiment, order: RunRequest, before: list[Array]) -> RunOutcome:
+    problem = get_problem(experiment)
+    target = order.target
+    evaluator = ProposalEvaluator(problem, target.fitting)
+    task = Task(
+        dim=problem.cube.dim,
+        start=target.start,
+        observed=target.fitting.observed,
+        scale=problem.scale,
+        training=problem.cube.training,
+        budget=order.budget,
+        lengths=tuple(s.times.size for s in target.fitting.scenarios),
+        scene=problem.describe_scenarios(target.fitting.scenarios),
+    )
+    # Simulations of the scoring and of earlier runs are not counted.
+    simulated = problem.simulated
+    started = perf_counter()
+    written, import_seconds = NOTHING_WRITTEN, 0.0
+    if order.tuned is None:
+        trace = _run_in_process(experiment, order, task, evaluator)
+    else:
+        repeated = _ReplayCheckedEvaluator(evaluator, before)
+        trace, written, import_seconds = _run_isolated(experiment, order, task, repeated)
+    seconds = perf_counter() - started
+    beside = problem.simulated - simulated - len(trace.losses)
+    # A simulator that raises an error has counted simulations without a result.
+    if beside > 0 and trace.status != "crashed":
+        raise HiddenSimulationError(f"{beside} simulations beside the budget")
+    if trace.status == "crashed":
+        # The stderr of a worker is discarded; without workers the author of the tuner sees it.
+        sys.stderr.write(trace.reason)
+    # Held-out runs are simulated after the run, so that the tuner cannot see them.
+    heldout = None
+    if target.held_out.scenarios:
+        heldout = ProposalEvaluator(problem, target.held_out).compute_rmse(
+            trace.proposals[:0], trace.recommendations
+        )
+    rmse = evaluator.compute_rmse(trace.proposals, trace.recommendations)
+    return RunOutcome(trace, rmse, heldout, seconds, written, import_seconds)
+
+
+def _names(experiment: Experiment, order: RunRequest) -> tuple[str | int, ...]:
+    """Return the names that determine the random stream of the run."""
+    return experiment.name, order.entry.tuner, order.target.name, order.seed
+
+
+def _run_in_process(
+    experiment: Experiment, order: RunRequest, task: Task, evaluate: Evaluate
+) -> RunTrace:
+    """Execute a run whose tuner works in this process."""
+    entry, weights = order.entry, order.weights
+    tuner = build_tuner(entry) if weights is None else load_trained_tuner(entry, weights)
+    rng = make_rng(*_names(experiment, order))
+    with limited_memory(experiment.memory):
+        return drive_tuner(tuner, task, evaluate, rng, experiment.timeout)
+
+
+def _run_isolated(
+    experiment: Experiment, order: RunRequest, task: Task, evaluate: Evaluate
+) -> tuple[RunTrace, Written, float]:
+    """Execute a run whose tuner has an isolated process.
+
+    Returns:
+        The trace, the files that the tuner wrote, and the seconds of its imports.
+    """
+    assert order.tuned is not None
+    state = None if order.weights is None else read_weights(order.weights)
+    names = _names(experiment, order)
+    house = start_isolated_tuner(
+        order.tuned, order.seed, experiment.isolation, order.hidden, experiment.memory, state
+    )
+    try:
+        with house as tuner:
+            run = IsolatedRun(tuner, make_seed_words(*names), experiment.timeout)
+            trace = drive_tuner(run, task, evaluate, make_rng(*names), experiment.timeout)
+            written = tuner.child.written()
+            # A failed run may have left the process in any state.
+            if trace.status in FAILED_STATUSES:
+                tuner.child.end()
+            return trace, written, tuner.import_seconds
+    except RunEndedError as ended:
+        # The tuner could not be built, so the run has no simulations.
+        trace = drive_tuner(FailedTuner(ended), task, evaluate, make_rng(*names))
+        return trace, NOTHING_WRITTEN, 0.0
+
+
+@dataclass(frozen=True)
+class FailedTuner:
+    """Tuner that could not be built; its run fails at the start.
+
+    Attributes:
+        error: reason of the failure.
+    """
+
+    error: RunEndedError
+
+    def tune(self, _task: Task, _rng: object) -> TunerRun:
+        """Fail to start a run.
+
+        Raises:
+            EndedError: always.
+        """
+        raise self.error

@@ -1,0 +1,109 @@
+"""Percentile-bootstrap intervals over targets (Efron & Tibshirani 1993, ch. 13).
+
+A resample is represented by the number of times that it contains each target. A mean is then a
+weighted mean, and a median is found by counting along the sorted values, once for all resamples.
+scipy's bootstrap builds every resample as an array, which takes twenty times as long for 825
+targets and 48 columns. It gives the same numbers from the same draws; the tests compare both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.core.random_streams import make_rng
+from sims.core.simulator import Array
+
+ResampleCounts = NDArray[np.unsignedinteger[Any]]
+"""Number of times that each target is in each resample, shape (n, resamples).
+
+The smallest unsigned integer type that holds n is used.
+"""
+INTERVAL_QUANTILES = (0.025, 0.975)
+"""Quantiles of the bootstrap distribution that bound a 95 % interval."""
+
+
+def compute_bootstrap_interval(
+    values: Array,
+    statistic: Callable[[Array, ResampleCounts], Array],
+    *names: str,
+    resamples: int = 2000,
+) -> tuple[Array, Array]:
+    """Compute the 95 % percentile-bootstrap interval of a statistic over the rows of an array.
+
+    Args:
+        values: (n, m) measured values, one row per target; rows that are not finite are left out.
+        statistic: `compute_resampled_means` or `compute_resampled_medians`.
+        names: names that determine the random stream of the bootstrap.
+        resamples: number of resamples.
+
+    Returns:
+        Lower and upper bounds (m,); NaN if there are fewer than two rows.
+    """
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < 2:
+        return np.full(values.shape[1], np.nan), np.full(values.shape[1], np.nan)
+    counts = draw_resample_counts(len(values), resamples, make_rng("bootstrap", *names))
+    low, high = np.quantile(statistic(values, counts), INTERVAL_QUANTILES, axis=1)
+    return low, high
+
+
+def draw_resample_counts(n: int, resamples: int, rng: np.random.Generator) -> ResampleCounts:
+    """Draw n targets with replacement, and count how often each one is drawn.
+
+    Args:
+        n: number of targets.
+        resamples: number of resamples.
+        rng: random generator.
+
+    Returns:
+        (n, resamples) counts.
+    """
+    picked = rng.integers(n, size=(resamples, n))
+    picked += n * np.arange(resamples)[:, None]
+    counts = np.bincount(picked.ravel(), minlength=resamples * n)
+    return np.ascontiguousarray(counts.reshape(resamples, n).T.astype(np.min_scalar_type(n)))
+
+
+def compute_resampled_means(values: Array, counts: ResampleCounts) -> Array:
+    """Compute means of resampled rows.
+
+    Args:
+        values: (n, m) one row per target.
+        counts: (n, resamples) number of times that each row is in each resample.
+
+    Returns:
+        (m, resamples) means.
+    """
+    total = np.zeros((values.shape[1], counts.shape[1]))
+    # Rows are added one by one: the summation order of a matrix product depends on the machine.
+    for row, often in zip(values, counts, strict=True):
+        total += row[:, None] * often
+    return total / len(values)
+
+
+def compute_resampled_medians(values: Array, counts: ResampleCounts) -> Array:
+    """Compute medians of resampled rows.
+
+    Args:
+        values: (n, m) one row per target.
+        counts: (n, resamples) number of times that each row is in each resample.
+
+    Returns:
+        (m, resamples) medians.
+    """
+    n = len(values)
+    result = np.empty((values.shape[1], counts.shape[1]))
+    for column, place in zip(values.T, result, strict=True):
+        order = np.argsort(column)
+        upto = np.cumsum(counts[order], axis=0, dtype=counts.dtype)
+        # With k counted from 0, the k-th smallest value of a resample is the first sorted value
+        # whose cumulative count is larger than k.
+        lower, upper = (
+            np.add.reduce(upto <= k, axis=0, dtype=counts.dtype) for k in ((n - 1) // 2, n // 2)
+        )
+        place[:] = 0.5 * (column[order[lower]] + column[order[upper]])
+    return result

@@ -1,0 +1,41 @@
+"""Tail of the chi-squared distribution with a whole number of degrees of freedom."""
+
+from __future__ import annotations
+
+from math import erfc, exp, fsum, inf, lgamma, log, sqrt
+
+
+def chi_squared_tail(freedom: int, statistic: float) -> float:
+    """Return the probability that a chi-squared variable exceeds a statistic, its p-value.
+
+    Q(x | k) = Σ_{i=0}^{k/2-1} e^{-h} h^i / i! for even k, and                              (1)
+    Q(x | k) = erfc(√h) + Σ_{i=1}^{(k-1)/2} e^{-h} h^{i-1/2} / Γ(i + 1/2) for odd k,        (2)
+
+    with h = x / 2 (M. Abramowitz, I. A. Stegun, Handbook of Mathematical Functions, 1964,
+    equations 26.4.4 and 26.4.5). All terms are positive, so nothing cancels: the relative error is
+    below 1e-12 for up to some thousand degrees of freedom. `scipy.special.chdtrc` gives the same,
+    but importing it takes as long as a quarter of a small diagnosis.
+
+    Args:
+        freedom: degrees of freedom k, at least 1.
+        statistic: x.
+
+    Raises:
+        ValueError: `count_identified_states` is below 1.
+    """
+    if freedom < 1:
+        raise ValueError(f"expected at least 1 degree of freedom, found {freedom}")
+    if statistic != statistic:
+        return statistic
+    if statistic <= 0.0:
+        return 1.0
+    if statistic == inf:
+        return 0.0
+    h = statistic / 2.0
+    half = (freedom % 2) / 2.0
+    # Logarithms, since e^{-h} alone is 0 where h is above 745.
+    terms = [
+        exp((i - half) * log(h) - lgamma(i - half + 1.0) - h)
+        for i in range(1 if half else 0, (freedom + 1) // 2)
+    ]
+    return min(1.0, fsum([erfc(sqrt(h)) if half else 0.0, *terms]))

@@ -1,0 +1,257 @@
+"""Compute the statistics behind the tables and figures of one comparison, each one once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.statistics.error_curves import RunCurves, RunRowTable, select_primary_metric
+from bench.benchmark.statistics.expected_running_time import build_runtime_table, select_thresholds
+from bench.benchmark.statistics.median_curves import (
+    coinciding,
+    compute_median_curves,
+    compute_medians_by_distance,
+)
+from bench.benchmark.statistics.training_amortisation import TuningCost, compute_tuning_costs
+from bench.benchmark.statistics.tuner_ranking import failure_notes, final_order, rank_tuners
+
+PRICED_LEVEL_COUNT = 3
+"""Number of thresholds for which costs are computed, the loosest first.
+
+Few tuners reach the tighter ones.
+"""
+
+
+class ComparisonStatistics:
+    """Statistics of one comparison: the deciding metric, rankings, medians and costs.
+
+    Args:
+        experiment: configuration of the comparison.
+        runs: rows of runs.parquet.
+        statuses: rows of status.csv.
+        costs: (simulations, seconds) of one training, by tuner.
+
+    Attributes:
+        metric: name of the deciding metric, see `select_primary_metric`.
+        runs: runs that have the deciding metric.
+        curves: deciding metric of every run.
+        spread: thresholds of the runtime distribution.
+        levels: thresholds of the tables.
+        all_runs: all runs, including those without the deciding metric.
+        floor: errors of the deciding metric below this value count as equal to it.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        runs: pd.DataFrame,
+        statuses: pd.DataFrame,
+        costs: Mapping[str, tuple[float, float]],
+    ) -> None:
+        self.metric, self.runs, in_widths = select_primary_metric(runs)
+        self._statuses, self._budget, self._costs = statuses, experiment.budget, costs
+        self._rows = self._laid_out(self.runs)
+        self.curves = self._rows.build_curves(self.metric)
+        self.spread, self.levels = select_thresholds(self.curves, in_widths)
+        self.floor = experiment.negligible_error
+        if not in_widths:
+            # For a recording no error is known to be zero; the smallest median error is used
+            # instead.
+            self.floor = (1.0 + self.floor) * _least_median(self.curves)
+        self.all_runs = runs
+        self._curves: dict[str, RunCurves] = {}
+        self._medians: dict[tuple[str, str], pd.DataFrame] = {}
+
+    def select_range(self, kind: str) -> pd.DataFrame:
+        """Return all rows of a range."""
+        return self.all_runs[self.all_runs["range"] == kind]
+
+    @cached_property
+    def target_counts(self) -> dict[str, int]:
+        """Number of targets of each range that has runs."""
+        counts = self.all_runs.groupby("range", sort=False)["target"].nunique()
+        return {str(kind): int(count) for kind, count in counts.items()}
+
+    @cached_property
+    def ranking(self) -> pd.DataFrame:
+        """Ranks of the tuners in each range; see `tuner_ranking.rank_tuners`."""
+        return rank_tuners(self.curves, self._budget, self.floor)
+
+    @cached_property
+    def order(self) -> list[str]:
+        """Tuners ranked over all ranges, the best first; the order of legends.
+
+        Tuners without a run that has the deciding metric come last.
+        """
+        order = final_order(self.curves, self._budget, self.floor)
+        return [*order, *(t for t in self._all.keys["tuner"].unique() if t not in order)]
+
+    def order_in(self, kind: str) -> list[str]:
+        """Return the tuners of one range after all simulations, the best first."""
+        last = self.ranking[self.ranking["simulations"] == self._budget]
+        ranked = list(last.loc[last["range"] == kind, "tuner"])
+        return [*ranked, *(t for t in self.order if t not in ranked)]
+
+    def sorted(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Sort rows that have the columns range and tuner: range by range, the best tuner first."""
+        kinds = [str(kind) for kind in dict.fromkeys(self._all.keys["range"])]
+        order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
+        places = {key: place for place, key in enumerate(order)}
+        # A tuner that could not be used has no range.
+        keys = [
+            places.get(key, len(places)) for key in zip(frame["range"], frame["tuner"], strict=True)
+        ]
+        return frame.iloc[np.argsort(keys, kind="stable")].reset_index(drop=True)
+
+    @cached_property
+    def notes(self) -> dict[str, str]:
+        """Notes of legends and tables about tuners with failed runs, by tuner."""
+        failed = pd.Series(self._all.failed).groupby(self._all.keys["tuner"], sort=False)
+        return failure_notes({str(t): (int(bad.sum()), len(bad)) for t, bad in failed})
+
+    def coinciding(self, shown: Sequence[tuple[str, str]]) -> dict[str, str]:
+        """Find tuners whose curves are hidden below another curve.
+
+        Args:
+            shown: metric and range of each panel of curves.
+
+        Returns:
+            Note by tuner, such as ``same as hybrid up to 2``.
+        """
+        drawn: dict[str, list[pd.Series[float]]] = {}
+        for metric, kind in shown:
+            for tuner, line in self.compute_median_curves(metric, kind).groupby(
+                "tuner", sort=False
+            ):
+                drawn.setdefault(str(tuner), []).append(line.set_index("simulations")["median"])
+        return coinciding(drawn)
+
+    def floor_of(self, metric: str) -> float | None:
+        """Return the error below which tuners count as equal, in the unit of a metric.
+
+        Returns:
+            Error; None for a metric that does not decide the comparison.
+        """
+        if metric == self.metric:
+            return self.floor
+        decides = self.metric == "param_error" and metric == "param_abs_error"
+        return self.floor * self.unit if decides else None
+
+    def labelled(self, tuner: str) -> str:
+        """Return the tuner's name, with its number of failed runs if there are any."""
+        return f"{tuner} [{self.notes[tuner]}]" if tuner in self.notes else tuner
+
+    @cached_property
+    def unit(self) -> float:
+        """Factor that converts the floor and the medians to the unit of the single parameter.
+
+        It is 1 if there are several parameters, or none whose true value is known.
+        """
+        if self.metric != "param_error" or "param_abs_error" not in self.runs:
+            return 1.0
+        # The absolute error is the relative error times the width of the training range.
+        largest = float(self.runs["param_error"].max())
+        return float(self.runs["param_abs_error"].max()) / largest if largest > 0 else 1.0
+
+    def compute_median_curves(self, metric: str, kind: str) -> pd.DataFrame:
+        """Return medians of a metric against simulations in a range, of the runs that have it.
+
+        See `bench.benchmark.statistics.median_curves.compute_median_curves`.
+
+        Args:
+            metric: name of the metric.
+            kind: range of the targets.
+        """
+        key = metric, kind
+        if key not in self._medians:
+            curves = self._of_all(metric).select(range=kind)
+            self._medians[key] = compute_median_curves(curves, metric, self._budget)
+        return self._medians[key]
+
+    def _of_all(self, metric: str) -> RunCurves:
+        """Return the curves of a metric for all runs that have it."""
+        if metric not in self._curves:
+            there = self.all_runs[metric].notna()
+            rows = self._all if there.all() else self._laid_out(self.all_runs[there])
+            self._curves[metric] = rows.build_curves(metric)
+        return self._curves[metric]
+
+    @cached_property
+    def _all(self) -> RunRowTable:
+        """Table of all runs; equal to the table of the deciding runs if these are all runs."""
+        whole = len(self.runs) == len(self.all_runs)
+        return self._rows if whole else self._laid_out(self.all_runs)
+
+    def _laid_out(self, runs: pd.DataFrame) -> RunRowTable:
+        return RunRowTable(runs, self._statuses, self._budget)
+
+    @property
+    def parameter_error_metric(self) -> str:
+        """Name of the parameter error: absolute for one parameter, else in training widths."""
+        return "param_abs_error" if "param_abs_error" in self.all_runs else "param_error"
+
+    @cached_property
+    def medians_by_distance(self) -> pd.DataFrame:
+        """Errors by distance from the training range.
+
+        See `median_curves.compute_medians_by_distance`.
+        """
+        first = self.select_range("wide").drop_duplicates("target").set_index("target")["outside"]
+        curves = self._of_all(self.parameter_error_metric).select(range="wide")
+        return compute_medians_by_distance(curves, first.sort_index(), self._budget)
+
+    @cached_property
+    def runtime_distribution(self) -> pd.DataFrame:
+        """Runtime distribution of every range; see `expected_running_time.build_runtime_table`."""
+        return build_runtime_table(self.curves, self.spread)
+
+    @cached_property
+    def tuning_costs(self) -> dict[float, dict[str, dict[str, TuningCost]]]:
+        """Cost of every tuner by threshold (the first `PRICED_LEVEL_COUNT`), by range, by tuner."""
+        return {level: self._prices(level) for level in self.levels[:PRICED_LEVEL_COUNT]}
+
+    def _prices(self, level: float) -> dict[str, dict[str, TuningCost]]:
+        in_tuner = self._rows.build_cumulative_seconds("tuner_seconds")
+        in_simulator = self._rows.build_cumulative_seconds("simulator_seconds")
+        ranges = self.curves.keys["range"]
+        result = {}
+        for kind in dict.fromkeys(ranges):
+            mask = (ranges == kind).to_numpy(dtype=bool)
+            result[str(kind)] = compute_tuning_costs(
+                self.curves.select_mask(mask),
+                level,
+                self._budget,
+                in_tuner[mask],
+                in_simulator[mask],
+                self._costs,
+            )
+        return result
+
+    @cached_property
+    def reference_level(self) -> float:
+        """Tightest threshold that at least half of the tuners reach in every range.
+
+        It is the loosest threshold if there is no such threshold.
+        """
+        for level in sorted(self.tuning_costs):
+            if all(_half(by_tuner) for by_tuner in self.tuning_costs[level].values()):
+                return level
+        return max(self.tuning_costs)
+
+
+def _least_median(curves: RunCurves) -> float:
+    """Return the smallest median final error of any tuner; 0 if every run failed."""
+    medians = [
+        float(np.median(curves.select(tuner=t).compute_final_values()))
+        for t in curves.list_tuners()
+    ]
+    return min((m for m in medians if np.isfinite(m)), default=0.0)
+
+
+def _half(by_tuner: Mapping[str, TuningCost]) -> bool:
+    reaching = sum(np.isfinite(price.effort.compute_ert()) for price in by_tuner.values())
+    return bool(2 * reaching >= len(by_tuner))

@@ -1,0 +1,253 @@
+"""Expected running time (ERT) and runtime distributions over error thresholds, as in COCO.
+
+Sources: N. Hansen, A. Auger, D. Brockhoff, T. Tusar, Anytime performance assessment in blackbox
+optimization benchmarking, IEEE TEVC 26(6), 2022, sections III and IV; N. Hansen, A. Auger, R. Ros,
+S. Finck, P. Posik, Comparing results of 31 algorithms from BBOB-2009, GECCO 2010, for ERT.
+
+Two definitions differ on purpose. A run has reached a threshold after the simulation from which on
+its recommendation *stays* within the threshold, because a user without the true parameters cannot
+know when an error is below it for the first time. A failed run has reached no threshold, and counts
+with its whole budget.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.statistics.error_table import select_checkpoints
+from bench.core.random_streams import make_rng
+from sims.core.simulator import Array
+
+RUNTIME_THRESHOLDS: Array = np.logspace(0, -8, 51)
+"""Thresholds of the runtime distribution in widths of the training range; 51 as in COCO."""
+ERT_TARGET_LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
+"""Thresholds of the ERT table in widths of the training range."""
+
+
+def select_thresholds(curves: RunCurves, simulated: bool) -> tuple[Array, tuple[float, ...]]:
+    """Choose thresholds of the runtime distribution and of the ERT table.
+
+    For a recording, they are between the median initial error and the smallest final error.
+
+    Args:
+        curves: values of the deciding metric.
+        simulated: True if errors are in widths of the training range.
+
+    Returns:
+        Thresholds of the distribution, and thresholds of the table.
+    """
+    if simulated:
+        return RUNTIME_THRESHOLDS, ERT_TARGET_LEVELS
+    start = float(np.nanmedian(curves.values[:, 0]))
+    # At most half of the initial error, so that thresholds differ even if no tuner improved.
+    best = min(float(np.nanmin(curves.compute_final_values())), 0.5 * start)
+    # Slightly above the smallest error, so that the best run reaches it despite rounding.
+    spread = np.geomspace(start, 1.001 * best, 21)
+    return spread, tuple(float(x) for x in spread[[5, 10, 15, 18, 20]])
+
+
+def compute_hitting_times(curves: RunCurves, threshold: float) -> Array:
+    """Compute the number of simulations after which the error stays at or below a threshold.
+
+    Args:
+        curves: values of the metric.
+        threshold: error threshold.
+
+    Returns:
+        (R,) numbers of simulations; infinite for runs that do not reach the threshold.
+    """
+    # The comparison is negated, so that NaN counts as above the threshold.
+    beyond = ~(curves.values <= threshold)
+    steps = beyond.shape[1]
+    # The first index after the last value above the threshold.
+    last = steps - np.argmax(beyond[:, ::-1], axis=1)
+    last = np.where(beyond.any(axis=1), last, 0)
+    return np.where((last >= steps) | curves.failed, np.inf, last.astype(np.float64))
+
+
+@dataclass(frozen=True)
+class ThresholdEffort:
+    """Effort to reach a threshold, by target.
+
+    Attributes:
+        simulations: (targets,) simulations of all runs of a target, until the threshold or the end.
+        seconds: (targets,) seconds in the tuner, until the threshold or the end.
+        successes: (targets,) number of runs that reached the threshold.
+        runs: number of all runs.
+    """
+
+    simulations: Array
+    seconds: Array
+    successes: NDArray[np.int64]
+    runs: int
+
+    def compute_ert(self, picked: NDArray[np.int64] | None = None) -> Array:
+        """Compute the expected running time: simulations per success.
+
+        Args:
+            picked: (..., n) indices of the targets that are used; None for all targets.
+
+        Returns:
+            (...) expected running time; infinite without a success.
+        """
+        return _per_success(self.simulations, self.successes, picked)
+
+    def compute_tuner_seconds(self) -> float:
+        """Return the seconds in the tuner per success."""
+        return float(_per_success(self.seconds, self.successes, None))
+
+
+def _per_success(
+    spent: Array, successes: NDArray[np.int64], picked: NDArray[np.int64] | None
+) -> Array:
+    if picked is not None:
+        spent, successes = spent[picked], successes[picked]
+    total, count = spent.sum(axis=-1), successes.sum(axis=-1)
+    result: Array = np.where(count > 0, total / np.maximum(count, 1), np.inf)
+    return result
+
+
+def compute_effort(
+    curves: RunCurves, threshold: float, budget: int, tuner_seconds: Array | None = None
+) -> ThresholdEffort:
+    """Compute the effort of one tuner's runs to reach a threshold.
+
+    Args:
+        curves: curves of one tuner and range.
+        threshold: threshold of the metric.
+        budget: number of simulations that a failed run counts with.
+        tuner_seconds: (R, K + 1) cumulative seconds in the tuner; None if they are not needed.
+    """
+    times = compute_hitting_times(curves, threshold)
+    success = np.isfinite(times)
+    unsuccessful = np.where(curves.failed, budget, curves.used)
+    spent = np.where(success, times, unsuccessful)
+    seconds = np.zeros(len(spent))
+    if tuner_seconds is not None:
+        # A run that exceeded the budget counts with its seconds at the budget.
+        column = np.minimum(spent, tuner_seconds.shape[1] - 1).astype(np.int64)
+        seconds = tuner_seconds[np.arange(len(spent)), column]
+    _, groups = curves.group_by_target()
+    return ThresholdEffort(
+        np.array([spent[rows].sum() for rows in groups]),
+        np.array([seconds[rows].sum() for rows in groups]),
+        np.array([success[rows].sum() for rows in groups]),
+        len(spent),
+    )
+
+
+def draw_target_resamples(targets: int, *names: str, resamples: int = 1000) -> NDArray[np.int64]:
+    """Draw target indices with replacement, from a random stream that depends on names only.
+
+    Tuners that share the targets get the same draws.
+
+    Args:
+        targets: number of targets.
+        names: names that determine the random stream.
+        resamples: number of resamples.
+
+    Returns:
+        (resamples, targets) indices.
+    """
+    return make_rng("resample", *names).integers(targets, size=(resamples, targets))
+
+
+def compute_percentile_interval(values: Array) -> tuple[float, float]:
+    """Return the 95 % percentile interval of resampled values, which may be infinite."""
+    # Order statistics are used without interpolation, because values may be infinite.
+    ordered = np.sort(values)
+    n = len(ordered)
+    return float(ordered[int(0.025 * (n - 1))]), float(ordered[int(np.ceil(0.975 * (n - 1)))])
+
+
+ERT_COLUMNS = [
+    "experiment",
+    "range",
+    "tuner",
+    "threshold",
+    "ert",
+    "low",
+    "high",
+    "successes",
+    "runs",
+    "failures",
+]
+
+
+def build_ert_table(curves: RunCurves, levels: tuple[float, ...], budget: int) -> pd.DataFrame:
+    """Compute the expected running time of each tuner with 95 % bootstrap intervals.
+
+    Args:
+        curves: values of the deciding metric.
+        levels: error thresholds.
+        budget: largest number of simulations.
+
+    Returns:
+        Table with the columns `ERT_COLUMNS`; the intervals are over targets.
+    """
+    lines = []
+    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
+        part = curves.select(experiment=str(experiment), range=str(kind))
+        for tuner in part.list_tuners():
+            mine = part.select(tuner=tuner)
+            for level in levels:
+                spent = compute_effort(mine, level, budget)
+                # All tuners use the same draws, so that differences between targets cancel in
+                # comparisons.
+                picked = draw_target_resamples(len(spent.successes), str(experiment), str(kind))
+                low, high = compute_percentile_interval(spent.compute_ert(picked))
+                counts = int(spent.successes.sum()), spent.runs, int(mine.failed.sum())
+                lines.append(
+                    (experiment, kind, tuner, level, float(spent.compute_ert()), low, high, *counts)
+                )
+    return pd.DataFrame(lines, columns=ERT_COLUMNS)
+
+
+RUNTIME_SHARE_COLUMNS = ["range", "tuner", "simulations", "share"]
+_RUNTIME_POINT_COUNT = 60
+"""Number of points of a runtime distribution, on a logarithmic scale of simulations."""
+
+
+def compute_solved_fraction(curves: RunCurves, spread: Array, points: NDArray[np.int64]) -> Array:
+    """Compute the share of (run, threshold) pairs that are reached.
+
+    Args:
+        curves: values of the deciding metric.
+        spread: thresholds.
+        points: (P,) numbers of simulations.
+
+    Returns:
+        (P,) shares.
+    """
+    times = np.concatenate([compute_hitting_times(curves, float(t)) for t in spread])
+    return np.array([(times <= k).mean() for k in points])
+
+
+def build_runtime_table(curves: RunCurves, spread: Array) -> pd.DataFrame:
+    """Compute runtime distributions: the share of (run, threshold) pairs that are reached.
+
+    The numbers of simulations are those on a logarithmic scale and those of the tables.
+
+    Args:
+        curves: values of the deciding metric in all ranges.
+        spread: thresholds of that metric.
+
+    Returns:
+        Table with the columns `RUNTIME_SHARE_COLUMNS`.
+    """
+    budget = curves.values.shape[1] - 1
+    between = np.geomspace(1, budget, _RUNTIME_POINT_COUNT).astype(int)
+    points = np.unique(np.concatenate([[0], between, select_checkpoints(budget)]))
+    parts = []
+    for kind in dict.fromkeys(curves.keys["range"]):
+        part = curves.select(range=str(kind))
+        for tuner in part.list_tuners():
+            share = compute_solved_fraction(part.select(tuner=tuner), spread, points)
+            columns = (str(kind), tuner, points, share)
+            parts.append(pd.DataFrame(dict(zip(RUNTIME_SHARE_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True)

@@ -1,0 +1,212 @@
+"""Paired tests of tuners over targets with effect sizes, and mean ranks over problems.
+
+Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 65,
+1979; D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial
+correlation; J. Demsar, JMLR 7, 2006, for ranks over problems, Friedman's and Nemenyi's tests
+(scikit-posthocs).
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.statistics.error_curves import RunCurves, average_over_seeds
+from sims.core.simulator import Array
+
+PAIR_COLUMNS = [
+    "experiment",
+    "range",
+    "a",
+    "b",
+    "targets",
+    "a_better",
+    "effect",
+    "error_ratio",
+    "p_value",
+    "p_holm",
+]
+MIN_ERROR = 1e-12
+"""Errors below this value count as equal, because they consist of rounding."""
+_FAILED_RUN_LOG_ERROR = 1e3
+"""Logarithm that represents a failed run: larger than any error, and equal for all failures."""
+MIN_PROBLEMS_FOR_RANKS = 5
+"""Minimum number of problems for mean ranks."""
+
+
+def build_log_error_table(curves: RunCurves, k: int = -1, floor: float = MIN_ERROR) -> pd.DataFrame:
+    """Compute the logarithms of errors after k simulations.
+
+    The mean over seeds is taken first. A failure in one seed makes it infinite, so the tuner counts
+    as failed on this target.
+
+    Args:
+        curves: error of every run.
+        k: number of simulations; -1 for all.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Table with one row per target and one column per tuner.
+    """
+    columns = {}
+    for tuner in curves.list_tuners():
+        mine = curves.select(tuner=tuner)
+        names, groups = mine.group_by_target()
+        errors = average_over_seeds(mine.after(k), groups)
+        columns[tuner] = pd.Series(compute_log_errors(errors, floor), index=names)
+    return pd.DataFrame(columns)
+
+
+def compare_all_pairs(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
+    """Compare every pair of tuners on the targets of each experiment and range.
+
+    Args:
+        curves: error of every run.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Table with the columns `PAIR_COLUMNS`. `a_better` is the share of targets on which a ends
+        with the smaller error (ties count half). `effect` is the rank-biserial correlation, 1 if a
+        is better on all targets, -1 if b is. `error_ratio` is the median of a's error over b's.
+        Holm's correction is over all pairs of an experiment and range.
+    """
+    parts = []
+    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
+        logs = build_log_error_table(
+            curves.select(experiment=str(experiment), range=str(kind)), floor=floor
+        )
+        lines = [
+            (experiment, kind, a, b, *compare_pair(logs[a].to_numpy(), logs[b].to_numpy()))
+            for a, b in itertools.combinations(logs.columns, 2)
+        ]
+        # A single tuner makes no pair.
+        if lines:
+            part = pd.DataFrame(lines, columns=PAIR_COLUMNS[:-1])
+            part["p_holm"] = correct_holm(part["p_value"].to_numpy())
+            parts.append(part)
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=PAIR_COLUMNS)
+
+
+def correct_holm(p: Array) -> Array:
+    """Apply the Holm correction to the p-values (n,) of one family of tests.
+
+    It bounds the probability of any false rejection in the family. The k-th smallest p-value is
+    multiplied by n + 1 - k; a corrected value is at least as large as the one before it.
+    """
+    order = np.argsort(p, kind="stable")
+    steps = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    corrected = np.empty(len(p))
+    corrected[order] = np.minimum(steps, 1.0)
+    return corrected
+
+
+def compute_log_errors(errors: Array, floor: float = MIN_ERROR) -> Array:
+    """Return logarithms of errors (n,); errors below `floor` count as equal to it.
+
+    An infinite error, as of a failed run, becomes a number that is larger than any error.
+
+    Args:
+        errors: (n,) errors.
+        floor: smallest error that is distinguished.
+    """
+    logs: Array = np.where(
+        np.isinf(errors), _FAILED_RUN_LOG_ERROR, np.log(np.maximum(errors, floor))
+    )
+    return logs
+
+
+class PairedTest(NamedTuple):
+    """Comparison of tuner a with tuner b on the same targets.
+
+    Attributes:
+        targets: number of targets that both tuners have.
+        a_better: share of targets on which a has the smaller error; ties count half.
+        effect: matched-pairs rank-biserial correlation, 1 if a is better on all targets.
+        ratio: median over targets of a's error over b's.
+        p_value: two-sided p-value of Wilcoxon's signed-rank test.
+    """
+
+    targets: int
+    a_better: float
+    effect: float
+    ratio: float
+    p_value: float
+
+
+def compare_pair(a: Array, b: Array) -> PairedTest:
+    """Compare two tuners by Wilcoxon's signed-rank test.
+
+    Args:
+        a: (n,) logarithms of the errors of tuner a; NaN where it has none.
+        b: (n,) logarithms of the errors of tuner b on the same targets.
+    """
+    from scipy.stats import rankdata, wilcoxon
+
+    there = ~(np.isnan(a) | np.isnan(b))
+    difference = a[there] - b[there]
+    wins = (difference < 0) + 0.5 * (difference == 0)
+    better = float(wins.mean()) if len(difference) else np.nan
+    # Wilcoxon's test drops ties.
+    unequal = difference[difference != 0]
+    if not len(unequal):
+        return PairedTest(len(difference), better, 0.0, 1.0, 1.0)
+    ranks = rankdata(np.abs(unequal))
+    # Kerby's simple difference: the share of ranks in favour minus the share against.
+    effect = float((ranks[unequal < 0].sum() - ranks[unequal > 0].sum()) / ranks.sum())
+    with warnings.catch_warnings():
+        # scipy warns that it approximates if there are few pairs or ties.
+        warnings.simplefilter("ignore")
+        p = float(wilcoxon(unequal).pvalue)
+    # The ratio of a failed run and a successful one would overflow.
+    ratio = float(np.exp(np.clip(np.median(difference), -700, 700)))
+    return PairedTest(len(difference), better, effect, ratio, p)
+
+
+def compute_problem_ranks(curves: RunCurves, floor: float = MIN_ERROR) -> pd.DataFrame:
+    """Rank tuners on each problem by their median error over targets.
+
+    A problem is an experiment and a range. The best tuner has rank 1 and failures are last. Tuners
+    that miss a problem are left out.
+
+    Args:
+        curves: error of every run.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Ranks with one row per problem and one column per tuner.
+    """
+    rows = {}
+    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
+        logs = build_log_error_table(
+            curves.select(experiment=str(experiment), range=str(kind)), floor=floor
+        )
+        rows[f"{experiment} {kind}"] = logs.median(axis=0)
+    medians = pd.DataFrame(rows).T.dropna(axis="columns")
+    # Rounding gives errors that differ by the last bit the same rank.
+    return medians.round(9).rank(axis=1)
+
+
+def compute_nemenyi_p_values(ranked: pd.DataFrame) -> tuple[float, pd.DataFrame]:
+    """Test ranks (problems, tuners) with Friedman's test and Nemenyi's post-hoc test.
+
+    Returns:
+        Friedman's p-value, and Nemenyi's p-value for each pair of tuners.
+
+    Raises:
+        ValueError: there are fewer than `MIN_PROBLEMS_FOR_RANKS` problems or fewer than three
+            tuners.
+    """
+    if len(ranked) < MIN_PROBLEMS_FOR_RANKS or ranked.shape[1] < 3:
+        raise ValueError(
+            f"mean ranks need {MIN_PROBLEMS_FOR_RANKS} problems and 3 tuners, found {ranked.shape}"
+        )
+    from scikit_posthocs import posthoc_nemenyi_friedman
+    from scipy.stats import friedmanchisquare
+
+    table = posthoc_nemenyi_friedman(ranked.to_numpy())
+    table.index = table.columns = ranked.columns
+    return float(friedmanchisquare(*ranked.to_numpy().T).pvalue), table

@@ -1,0 +1,243 @@
+"""Compare the training cost of learned tuners with the cost of search tuners.
+
+A learned tuner has a training cost, which is paid once, and a small cost for each target.
+`compute_break_even_targets` computes the number of targets from which its total number of
+simulations is below the
+one of a search tuner. `find_cheapest_tuners` finds the tuner that needs the least time when a
+simulation takes c seconds.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.statistics.expected_running_time import (
+    ThresholdEffort,
+    compute_effort,
+    compute_percentile_interval,
+    draw_target_resamples,
+)
+from sims.core.simulator import Array
+
+BREAK_EVEN_COLUMNS = [
+    "experiment",
+    "range",
+    "threshold",
+    "learned",
+    "search",
+    "fit_simulations",
+    "fit_seconds",
+    "ert_learned",
+    "ert_search",
+    "targets",
+    "low",
+    "high",
+]
+SIMULATION_COST_GRID: Array = np.logspace(-6, 3, 181)
+"""Durations of one simulation for which tuners are compared, in seconds."""
+AT_ONCE, NEVER = 10**-0.5, 10**4.5
+"""Positions on a logarithmic axis for two results without a finite number of targets.
+
+`AT_ONCE`: training pays from the first target, because the search tuner never reaches the error.
+`NEVER`: training does not pay within 10^4 targets.
+"""
+TIME_PER_TARGET_COLUMNS = ["range", "tuner", "simulation_seconds", "seconds"]
+TARGETS_PER_TRAINING = 100
+"""Number of targets that share one training when tuners are compared by time."""
+
+
+@dataclass(frozen=True)
+class TuningCost:
+    """Cost of one tuner to reach one threshold.
+
+    Attributes:
+        effort: simulations and seconds spent on each target.
+        fit_simulations: number of simulations of one training.
+        fit_seconds: duration of one training including its simulations, in seconds.
+        simulation_seconds: duration of one simulation as measured in these runs, in seconds.
+    """
+
+    effort: ThresholdEffort
+    fit_simulations: float = 0.0
+    fit_seconds: float = 0.0
+    simulation_seconds: float = 0.0
+
+    def compute_seconds_per_target(self, cost: Array, targets: float) -> Array:
+        """Compute the seconds per target for a given duration of one simulation.
+
+        Args:
+            cost: duration of one simulation in seconds, any shape.
+            targets: number of targets that share the cost of one training.
+
+        Returns:
+            Seconds per target, in the shape of `cost`.
+        """
+        # The measured time of the training simulations is replaced by their time at the given cost.
+        learning = max(self.fit_seconds - self.fit_simulations * self.simulation_seconds, 0.0)
+        marginal = self.effort.compute_ert() * cost + self.effort.compute_tuner_seconds()
+        result: Array = marginal + (self.fit_simulations * cost + learning) / targets
+        return result
+
+
+def compute_tuning_costs(
+    curves: RunCurves,
+    threshold: float,
+    budget: int,
+    tuner_seconds: Array,
+    simulator_seconds: Array,
+    fits: Mapping[str, tuple[float, float]],
+) -> dict[str, TuningCost]:
+    """Compute the cost of every tuner in one experiment and range.
+
+    Args:
+        curves: error curves of all tuners.
+        threshold: error threshold of the metric.
+        budget: number of simulations on one target.
+        tuner_seconds: (R, K + 1) cumulative seconds spent in the tuner after k simulations.
+        simulator_seconds: (R, K + 1) cumulative seconds spent in the simulator after k simulations.
+        fits: (simulations, seconds) of one training, by tuner.
+
+    Returns:
+        Cost by tuner.
+    """
+    result = {}
+    for tuner in curves.list_tuners():
+        mask = (curves.keys["tuner"] == tuner).to_numpy(dtype=bool)
+        spent = compute_effort(curves.select_mask(mask), threshold, budget, tuner_seconds[mask])
+        each = float(simulator_seconds[mask][:, -1].sum() / max(curves.used[mask].sum(), 1))
+        result[tuner] = TuningCost(spent, *fits.get(tuner, (0.0, 0.0)), each)
+    return result
+
+
+def compute_break_even_targets(
+    learned: TuningCost, search: TuningCost, picked: NDArray[np.int64] | None = None
+) -> Array:
+    """Compute the number of targets from which training pays.
+
+    This is the n that solves fit + n ert_learned = n ert_search, with the expected running times
+    (ERT) of both tuners.
+
+    Args:
+        learned: cost of the learned tuner.
+        search: cost of the search tuner.
+        picked: (..., n) indices of the targets that are used; None for all targets.
+
+    Returns:
+        Number of targets; 0 where the search tuner never reaches the threshold, infinite where
+        training never pays.
+    """
+    # Solved for n: fit / (ert_search - ert_learned).
+    hopeless = np.isinf(learned.effort.compute_ert(picked))
+    # The difference is NaN or not positive if both tuners fail or need the same number.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        saved = search.effort.compute_ert(picked) - learned.effort.compute_ert(picked)
+        result: Array = np.where(hopeless | ~(saved > 0), np.inf, learned.fit_simulations / saved)
+    return result
+
+
+def build_break_even_table(
+    experiment: str, kind: str, threshold: float, held: Mapping[str, TuningCost]
+) -> pd.DataFrame:
+    """Compare every learned tuner with every search tuner by break-even targets.
+
+    Args:
+        experiment: name of the experiment.
+        kind: range of the targets.
+        threshold: error threshold of the metric.
+        held: cost by tuner.
+
+    Returns:
+        One row per pair with 95 % bootstrap intervals over targets, columns `BREAK_EVEN_COLUMNS`.
+    """
+    lines = []
+    for name, learned in held.items():
+        for other, search in held.items():
+            # Only a trained tuner has a training cost, and it is compared with untrained tuners
+            # alone.
+            if not learned.fit_simulations or search.fit_simulations:
+                continue
+            picked = draw_target_resamples(len(learned.effort.successes), experiment, kind)
+            low, high = compute_percentile_interval(
+                compute_break_even_targets(learned, search, picked)
+            )
+            costs = learned.fit_simulations, learned.fit_seconds
+            erts = float(learned.effort.compute_ert()), float(search.effort.compute_ert())
+            even = float(compute_break_even_targets(learned, search))
+            lines.append((experiment, kind, threshold, name, other, *costs, *erts, even, low, high))
+    return pd.DataFrame(lines, columns=BREAK_EVEN_COLUMNS)
+
+
+def find_cheapest_tuners(
+    held: Mapping[str, TuningCost], targets: float
+) -> list[tuple[float, float, str]]:
+    """Find the fastest tuner for each duration of one simulation.
+
+    Args:
+        held: cost by tuner.
+        targets: number of targets that share the cost of one training.
+
+    Returns:
+        List of (from, to, tuner): bounds of the duration of one simulation in seconds, and the
+        tuner that needs the least time between them. Empty if no tuner reaches the threshold.
+    """
+    names = [name for name, price in held.items() if np.isfinite(price.effort.compute_ert())]
+    if not names:
+        return []
+    best = np.argmin(
+        [held[name].compute_seconds_per_target(SIMULATION_COST_GRID, targets) for name in names],
+        axis=0,
+    )
+    changes = np.flatnonzero(np.diff(best)) + 1
+    edges = [0, *changes.tolist(), len(SIMULATION_COST_GRID)]
+    return [
+        (
+            float(SIMULATION_COST_GRID[begin]),
+            float(SIMULATION_COST_GRID[end - 1]),
+            names[best[begin]],
+        )
+        for begin, end in itertools.pairwise(edges)
+    ]
+
+
+def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) -> pd.DataFrame:
+    """Build a table of seconds per target against the duration of one simulation.
+
+    Tuners that never reach the error have no rows.
+
+    Args:
+        prices: cost to reach one error, by range, by tuner.
+
+    Returns:
+        Table with the columns `TIME_PER_TARGET_COLUMNS`.
+    """
+    parts = []
+    for kind, by_tuner in prices.items():
+        for tuner, price in by_tuner.items():
+            seconds = price.compute_seconds_per_target(SIMULATION_COST_GRID, TARGETS_PER_TRAINING)
+            # A logarithmic axis cannot show a tuner that needs 0 seconds.
+            if np.isfinite(price.effort.compute_ert()) and seconds[0] > 0:
+                columns = (kind, tuner, SIMULATION_COST_GRID, seconds)
+                parts.append(pd.DataFrame(dict(zip(TIME_PER_TARGET_COLUMNS, columns, strict=True))))
+    return (
+        pd.concat(parts, ignore_index=True)
+        if parts
+        else pd.DataFrame(columns=TIME_PER_TARGET_COLUMNS)
+    )
+
+
+def placed_even(table: pd.DataFrame) -> pd.DataFrame:
+    """Map target counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`."""
+    placed = table.copy()
+    for column in ("targets", "low", "high"):
+        values = table[column].to_numpy(dtype=np.float64)
+        # Counts below one become one; counts beyond the axis are put at its end.
+        within = np.where(values < 1e4, np.maximum(values, 1.0), NEVER)
+        placed[column] = np.where(values == 0, AT_ONCE, within)
+    return placed

@@ -1,0 +1,206 @@
+"""Rank tuners after k simulations, and test the best one against each other tuner.
+
+This is the only ranking rule of a comparison: headline, tables, legends and terminal use it.
+
+* A tuner's error on a target is the mean over its seeds. An error below the experiment's
+  `negligible_error` counts as equal to it. A run that failed has an infinite error.
+* Tuners are ranked by the median of that error over targets; equal medians share a rank. Among
+  equals the smaller geometric mean over targets comes first, then the better rank after fewer
+  simulations.
+* The first tuner is tested against each other one: Wilcoxon's signed-rank test on the paired
+  logarithms of errors, two-sided, with Holm's correction over the k - 1 comparisons.
+
+The best tuner is chosen by the same data that it is tested with. J. C. Hsu (Constrained
+simultaneous confidence intervals for multiple comparisons with the best, Annals of Statistics
+12(3), 1136-1144, 1984, doi:10.1214/aos/1176346732) shows why k - 1 comparisons suffice: the truly
+best tuner is called worse only if one of the k - 1 others beats it in a test. With a level of
+alpha / (k - 1) for each test this happens with a probability of at most alpha, whichever of the
+others was selected. Two-sided p-values make each test twice as strict as the one-sided tests of
+Hsu, which leaves room for Holm's larger levels after the first rejections; a test simulates equal
+tuners and checks the error rate. What is controlled is the exclusion of the best tuner, not every
+statement about pairs: these are in pairs.csv, corrected over all pairs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.statistics.paired_tests import (
+    build_log_error_table,
+    compare_pair,
+    correct_holm,
+)
+
+RANKING_COLUMNS = [
+    "experiment",
+    "range",
+    "simulations",
+    "rank",
+    "tuner",
+    "verdict",
+    "median",
+    "error_ratio",
+    "targets_worse",
+    "targets",
+    "p_value",
+    "p_holm",
+    "runs",
+    "failures",
+]
+SIGNIFICANCE = 0.05
+"""Holm-corrected p-value below which a tuner is called worse than the best one."""
+_RANKED_AFTER = (1, 3, 10)
+"""Numbers of simulations after which tuners are ranked, in addition to the whole budget."""
+_NO_ERROR = 100.0
+"""Threshold of log error; larger values are the number that represents a failed run."""
+BEST, EQUAL, UNDECIDED, WORSE, FAILED = "best", "equal", "not decided", "worse", "failed"
+"""Verdicts on a tuner.
+
+`BEST`: first of the ranking. `EQUAL`: same rank as the first and not worse. `UNDECIDED`: lower
+rank, but the test does not decide. `WORSE`: the test decides. `FAILED`: all runs failed.
+"""
+
+
+def ranked_after(budget: int) -> list[int]:
+    """Return the numbers of simulations after which tuners are ranked: 1, 3, 10 and the budget."""
+    return [k for k in _RANKED_AFTER if k < budget] + [budget]
+
+
+def targets_needed(others: int) -> int:
+    """Return the number of targets that can decide between the best tuner and `others` tuners.
+
+    The smallest two-sided p-value of Wilcoxon's signed-rank test on n pairs is 2 / 2^n; Holm's
+    first step multiplies it by the number of comparisons.
+    """
+    return next(n for n in itertools.count(1) if 2.0 ** (1 - n) * others < SIGNIFICANCE)
+
+
+def rank_tuners(curves: RunCurves, budget: int, floor: float) -> pd.DataFrame:
+    """Rank the tuners of each experiment and range after 1, 3, 10 and all simulations.
+
+    Args:
+        curves: deciding error of every run.
+        budget: largest number of simulations.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        One row per tuner, in the order of the ranking, columns `RANKING_COLUMNS`. `error_ratio` is
+        the tuner's median over the best one's, `targets_worse` the number of targets on which its
+        error is larger.
+    """
+    parts = []
+    for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
+        part = curves.select(experiment=str(experiment), range=str(kind))
+        for k, ranking in _rankings(part, budget, floor).items():
+            parts.append(_verdicts(ranking, part, (str(experiment), str(kind), k)))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=RANKING_COLUMNS)
+
+
+def final_order(curves: RunCurves, budget: int, floor: float) -> list[str]:
+    """Rank tuners after the whole budget, over all targets of all ranges; best first.
+
+    Tuners come last if all their runs failed.
+
+    Args:
+        curves: deciding error of every run.
+        budget: largest number of simulations.
+        floor: errors below this value count as equal to it.
+    """
+    return list(_rankings(curves, budget, floor)[budget].order)
+
+
+class _Ranking(NamedTuple):
+    """Ranking of the tuners after a number of simulations.
+
+    Attributes:
+        logs: logarithms of errors, one row per target, one column per tuner.
+        ranks: rank of each tuner, 1 is best.
+        order: tuners, the best first.
+    """
+
+    logs: pd.DataFrame
+    ranks: pd.Series[float]
+    order: Sequence[str]
+
+
+def _rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Ranking]:
+    """Compute the ranking after each number of simulations of `ranked_after`."""
+    failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
+    rankings: dict[int, _Ranking] = {}
+    earlier: list[pd.Series[float]] = []
+    for k in ranked_after(budget):
+        logs = build_log_error_table(curves, k, floor)
+        # Rounding gives errors that differ by the last bits the same rank.
+        medians, means = logs.median().round(9), logs.mean().round(9)
+        ranks = medians.rank(method="min")
+        keys = [pd.Series(failed), medians, means, *reversed(earlier)]
+        order = sorted(logs.columns, key=lambda t: [float(key[t]) for key in keys])
+        rankings[k] = _Ranking(logs, ranks, order)
+        earlier.append(ranks)
+    return rankings
+
+
+def _verdicts(ranking: _Ranking, curves: RunCurves, key: tuple[str, str, int]) -> pd.DataFrame:
+    """Build the rows of one ranking, with each tuner tested against the first."""
+    logs, ranks, order = ranking
+    runs = {t: curves.select(tuner=t).failed for t in order}
+    delivered = [t for t in order if not runs[t].all()]
+    best = delivered[0] if delivered else order[0]
+    tests = {t: compare_pair(logs[t].to_numpy(), logs[best].to_numpy()) for t in order}
+    others = [t for t in delivered if t != best]
+    corrected = dict(
+        zip(others, correct_holm(np.array([tests[t].p_value for t in others])), strict=True)
+    )
+    lines = []
+    for tuner in order:
+        test, p_holm = tests[tuner], corrected.get(tuner, np.nan)
+        if tuner not in delivered:
+            verdict = FAILED
+        elif tuner == best:
+            verdict = BEST
+        elif p_holm < SIGNIFICANCE and test.effect < 0:
+            verdict = WORSE
+        else:
+            verdict = EQUAL if ranks[tuner] == ranks[best] else UNDECIDED
+        worse = int((logs[tuner] > logs[best]).sum())
+        median, least = _median_error(logs[tuner]), _median_error(logs[best])
+        p_value = test.p_value if tuner in others else np.nan
+        against = (
+            median,
+            median / least if np.isfinite(least) else np.nan,
+            worse,
+            test.targets,
+            p_value,
+            p_holm,
+        )
+        counts = len(runs[tuner]), int(runs[tuner].sum())
+        lines.append((*key, int(ranks[tuner]), tuner, verdict, *against, *counts))
+    return pd.DataFrame(lines, columns=RANKING_COLUMNS)
+
+
+def _median_error(logs: pd.Series[float]) -> float:
+    """Return the median error; infinite if half of the targets failed."""
+    middle = float(logs.median())
+    return float(np.exp(middle)) if middle < _NO_ERROR else np.inf
+
+
+def failure_notes(failed: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+    """Build the notes that follow the names of tuners with failed runs.
+
+    Args:
+        failed: (failed runs, runs) by tuner.
+
+    Returns:
+        Note by tuner with failed runs.
+    """
+    return {
+        tuner: "all runs failed" if bad == runs else f"{bad} of {runs} runs failed"
+        for tuner, (bad, runs) in failed.items()
+        if bad
+    }

@@ -1,0 +1,236 @@
+"""Validate table cells against their declared columns, whole columns at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
+from sims.core.atomic_files import get_first_line
+from sims.core.toml_validation import format_value
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Mask = NDArray[np.bool_]
+
+_TEXTS: Mapping[type, str] = {
+    bool: "True|False",
+    int: r"-?\d{1,18}",
+    float: r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?|-?inf|nan|",
+}
+"""Patterns of values in a CSV file, by type."""
+
+
+class CellError(Exception):
+    """A cell or a whole column that violates its declaration.
+
+    Attributes:
+        row: First such row, counted from 0; None if the error is in the column.
+        says: Column, expected and found value.
+    """
+
+    def __init__(self, row: int | None, column: str, wanted: str, found: str) -> None:
+        self.row = row
+        self.says = f"{column}: expected {wanted}, found {found}"
+        super().__init__(self.says)
+
+
+def select_declared_columns(
+    names: Sequence[str], columns: Columns, row: int | None = None
+) -> list[ColumnSpec]:
+    """Select the declared columns that a table or a row of a JSON file has.
+
+    Args:
+        names: Names of its columns.
+        columns: Declared columns.
+        row: Row for the error message; None for a table.
+
+    Raises:
+        CellError: A required column is missing, or a column occurs twice.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            times = f"it {names.count(name)} times"
+            raise CellError(None, f"column {format_value(name)}", "it once", times)
+    for column in columns:
+        if column.required and column.name not in names:
+            there = format_value(", ".join(names))
+            raise CellError(row, "columns", f"one named {column.name}", there)
+    return [column for column in columns if column.name in names]
+
+
+def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
+    """Convert a column of a Parquet file to text, int64, float64 or bool.
+
+    Args:
+        column: Its declaration.
+        values: Its values.
+
+    Raises:
+        CellError: It has another type, or a cell is empty that must not be.
+    """
+    import pyarrow as pa
+    from pyarrow import compute
+
+    try:
+        # After damage, the bytes of a text may be invalid UTF-8.
+        values.validate(full=True)
+    except pa.ArrowInvalid as error:
+        raise CellError(None, column.name, column.expected_text, get_first_line(error)) from None
+    kind = values.type
+    if pa.types.is_dictionary(kind):
+        values = values.cast(kind.value_type)
+        kind = values.type
+    text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+    fits: Mapping[type, bool] = {
+        str: text,
+        int: pa.types.is_integer(kind),
+        float: pa.types.is_floating(kind) or pa.types.is_integer(kind),
+        bool: pa.types.is_boolean(kind),
+    }
+    if not fits[column.kind]:
+        raise CellError(None, column.name, column.expected_text, f"a column of type {kind}")
+    if values.null_count:
+        if column.kind is not float:
+            row = compute.index(compute.is_null(values), True).as_py()
+            raise CellError(row, column.name, column.expected_text, "nothing")
+        values = compute.fill_null(values, np.nan)
+    try:
+        return values.cast(_arrow(column))
+    except pa.ArrowInvalid:  # A number that is too large for the type.
+        raise CellError(
+            None, column.name, column.expected_text, f"numbers beyond it ({kind})"
+        ) from None
+
+
+def parse_csv_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
+    """Convert a column of a CSV file to text, int64, float64 or bool.
+
+    Args:
+        column: Its declaration.
+        values: Its cells as text.
+
+    Raises:
+        CellError: A cell cannot be converted.
+    """
+    from pyarrow import compute
+
+    if column.kind is str:
+        return values
+    sound = compute.match_substring_regex(values, f"^({_TEXTS[column.kind]})$")
+    _refuse(
+        column, to_numpy_mask(compute.invert(sound)), lambda row: format_value(values[row].as_py())
+    )
+    if column.kind is float:
+        # An empty cell means NaN.
+        values = compute.if_else(compute.equal(values, ""), "nan", values)
+    return values.cast(_arrow(column))
+
+
+def parse_json_column(column: ColumnSpec, values: Sequence[Any]) -> pa.Array:
+    """Convert values of a JSON file to text, int64, float64 or bool.
+
+    Args:
+        column: Declaration of the values.
+        values: Values from the JSON file.
+
+    Raises:
+        CellError: A value has another type or is too large.
+    """
+    import pyarrow as pa
+
+    kinds = (int, float) if column.kind is float else (column.kind,)
+    for row, value in enumerate(values):
+        none = value is None and column.kind is float  # JSON has no NaN.
+        mistaken = isinstance(value, bool) and column.kind is not bool
+        if not none and (mistaken or not isinstance(value, kinds) or _beyond(value)):
+            raise CellError(row, column.name, column.expected_text, format_value(value))
+    given = [np.nan if v is None else v for v in values]
+    return pa.array(given, type=_arrow(column))
+
+
+def _beyond(value: Any) -> bool:
+    """Return whether an integer is too large for int64; integers in JSON are unlimited."""
+    return isinstance(value, int) and abs(value) >= 2**63
+
+
+def _arrow(column: ColumnSpec) -> pa.DataType:
+    import pyarrow as pa
+
+    types = {str: pa.large_string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+    return types[column.kind]
+
+
+def check_cells(
+    column: ColumnSpec,
+    values: pa.Array,
+    at_start: Mask | None = None,
+    no_truth: Mask | None = None,
+) -> None:
+    """Check that every cell fits the declaration of its column.
+
+    Args:
+        column: Its declaration.
+        values: Result of `parse_parquet_column`, `parse_csv_column` or `parse_json_column`.
+        at_start: Mask of rows with k = 0.
+        no_truth: Mask of rows of a recording.
+
+    Raises:
+        CellError: The first cell that does not.
+    """
+    if column.kind is bool:
+        return
+    if column.kind is str:
+        _check_texts(column, values)
+        return
+    numbers = values.to_numpy(zero_copy_only=False)
+    empty = np.isnan(numbers) if column.kind is float else np.zeros(len(numbers), dtype=bool)
+
+    def said(row: int) -> str:
+        return "nothing" if empty[row] else f"{numbers[row]}"
+
+    outside = ~empty & ~((numbers >= column.low) & (numbers <= column.high))
+    if not column.infinite:
+        outside |= np.isinf(numbers)
+    _refuse(column, outside, said)
+    wanted = {
+        EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
+        EmptyCellRule.MAY: empty,
+        EmptyCellRule.AT_START: at_start,
+        EmptyCellRule.NO_TRUTH: no_truth,
+    }[column.empty]
+    if wanted is None:
+        return
+    _refuse(column, empty & ~wanted, said)
+    _refuse(column, wanted & ~empty, said, f"nothing {column.empty.value}")
+
+
+def _check_texts(column: ColumnSpec, values: pa.Array) -> None:
+    import pyarrow as pa
+    from pyarrow import compute
+
+    if column.words:
+        known = compute.is_in(values, value_set=pa.array(column.words, type=values.type))
+        bad = compute.invert(known)
+    elif column.empty is EmptyCellRule.NEVER:
+        bad = compute.equal(values, "")
+    else:
+        return
+    _refuse(column, to_numpy_mask(bad), lambda row: format_value(values[row].as_py()))
+
+
+def to_numpy_mask(values: pa.Array) -> Mask:
+    """Convert an Arrow array of bool to NumPy."""
+    mask: Mask = values.to_numpy(zero_copy_only=False).astype(bool)
+    return mask
+
+
+def _refuse(column: ColumnSpec, bad: Mask, said: Callable[[int], str], wanted: str = "") -> None:
+    """Raise an error for the first bad row."""
+    if bad.any():
+        row = int(bad.argmax())
+        raise CellError(row, column.name, wanted or column.expected_text, said(row))

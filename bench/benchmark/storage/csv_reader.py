@@ -1,0 +1,145 @@
+"""Read CSV files of a result folder by their declared columns; errors name the line."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.benchmark.storage.cell_validation import (
+    CellError,
+    check_cells,
+    parse_csv_column,
+    select_declared_columns,
+)
+from bench.benchmark.storage.table_schemas import Columns
+from sims.core.atomic_files import get_first_line
+from sims.core.simulator import InputError
+from sims.core.toml_validation import format_value
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ColumnResolver = Callable[[list[str]], Columns]
+"""Returns the declared columns of a file for its header."""
+
+
+class CsvTable:
+    """A CSV file whose cells fit their declarations.
+
+    Args:
+        path: The file.
+        columns: Declared columns, or a function that returns them for a file's header.
+        remedy: Advice for a damaged file.
+
+    Attributes:
+        table: Declared columns that the file has.
+
+    Raises:
+        InputError: The file is damaged; the message is one line.
+    """
+
+    def __init__(self, path: Path, columns: Columns | ColumnResolver, remedy: str) -> None:
+        self._path, self._remedy = path, remedy
+        self._text = self._read()
+        self._header = self._fields(next(self._records(), (1, ""))[1])
+        declared = columns(self._header) if callable(columns) else columns
+        try:
+            there = select_declared_columns(self._header, declared)
+            self.table = self._checked(there)
+        except CellError as error:
+            raise self.make_error(error.row, error.says) from None
+
+    def make_error(self, row: int | None, says: str) -> InputError:
+        """Make the error for a row, counted from 0, or for the whole file.
+
+        Args:
+            row: Row, or None for the file.
+            says: What is wrong.
+        """
+        place = "" if row is None else f", line {self._line(row)}"
+        return InputError(f"{self._path}{place}: {says}; {self._remedy}")
+
+    def _read(self) -> str:
+        wrong = f"{self._path}: not a complete comparison"
+        try:
+            data = self._path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{wrong}: {error.strerror}; {self._remedy}") from None
+        if not data.strip():
+            raise InputError(f"{wrong}: expected a CSV file, found an empty one; {self._remedy}")
+        try:
+            return data.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            line = data[: error.start].count(b"\n") + 1
+            says = f"expected UTF-8 text, found byte {data[error.start]:#04x}"
+            raise InputError(f"{self._path}, line {line}: {says}; {self._remedy}") from None
+
+    def _checked(self, there: Columns) -> pa.Table:
+        import pyarrow as pa
+
+        texts = self._texts()
+        typed = {}
+        for column in there:
+            values = parse_csv_column(column, texts[column.name].combine_chunks())
+            check_cells(column, values)
+            typed[column.name] = values
+        return pa.table(typed)
+
+    def _texts(self) -> pa.Table:
+        """Read every cell as text."""
+        import pyarrow as pa
+        from pyarrow import csv as arrow
+
+        data = self._text.encode()
+        texts = {name: pa.large_string() for name in self._header}
+        try:
+            return arrow.read_csv(
+                pa.BufferReader(data),
+                # One block, since a text cell may be longer than any block.
+                arrow.ReadOptions(block_size=min(len(data) + 1, 2**31 - 1), use_threads=False),
+                arrow.ParseOptions(newlines_in_values=True),
+                arrow.ConvertOptions(column_types=texts, null_values=[], strings_can_be_null=False),
+            )
+        except pa.ArrowException as error:
+            self._refuse_ragged()
+            raise self.make_error(
+                None, f"expected a CSV file, found {get_first_line(error)}"
+            ) from None
+
+    def _refuse_ragged(self) -> None:
+        """Raise an error for the first line whose number of cells differs from the header's."""
+        for number, record in self._records():
+            cells = len(self._fields(record))
+            if cells != len(self._header):
+                says = f"expected {len(self._header)} cells, found {cells}"
+                raise InputError(f"{self._path}, line {number}: {says}; {self._remedy}")
+
+    def _fields(self, record: str) -> list[str]:
+        try:
+            return next(csv.reader([record], strict=True), [])
+        except csv.Error as error:
+            raise self.make_error(
+                None, f"expected cells, found {format_value(record)} ({error})"
+            ) from None
+
+    def _records(self) -> Iterator[tuple[int, str]]:
+        """Yield every record with its first line number; quoted text may span several lines."""
+        first, inside = 1, False
+        parts: list[str] = []
+        for number, line in enumerate(self._text.split("\n"), start=1):
+            if not inside:
+                first, parts = number, []
+            parts.append(line)
+            # A quote within quotes is written twice.
+            inside ^= line.count('"') % 2 == 1
+            if not inside and "".join(parts).strip():
+                yield first, "\n".join(parts).removesuffix("\r")
+        if inside:
+            yield first, "\n".join(parts)
+
+    def _line(self, row: int) -> int:
+        """Return the line number of a row; the first record is the header."""
+        lines = (number for place, (number, _) in enumerate(self._records()) if place == row + 1)
+        return next(lines, row + 2)

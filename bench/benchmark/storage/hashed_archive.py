@@ -1,0 +1,248 @@
+"""Store a folder as a zip archive with a manifest of file hashes.
+
+The same folder gives the same bytes (with the same zlib): names are sorted, times are fixed. Before
+an archive of unknown origin is unpacked, it is checked for attacks: paths outside the folder,
+links, more bytes than stated or than any result has.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import stat
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import IO, Any, NamedTuple
+
+from bench.benchmark.storage.provenance import compute_sha256
+from bench.schemas import find_violations
+from sims.core.atomic_files import atomic_replacement
+from sims.core.simulator import InputError
+
+MANIFEST_FILE = "manifest.json"
+MAX_UNPACKED_BYTES = 8 << 30
+"""Maximum size of an unpacked archive in bytes."""
+MAX_COMPRESSION_RATIO = 200
+"""Maximum ratio of unpacked to packed size, if the unpacked size exceeds `_HARMLESS`."""
+_HARMLESS = 100 << 20
+_MOST = 100_000
+"""Maximum number of files in an archive."""
+_MANIFEST_BYTES = 64 << 20
+_BLOCK = 1 << 20
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+"""The earliest time that a zip file can store, which is given to every file."""
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 0x1
+_LONGEST = 1000
+"""Maximum length of a path in characters."""
+
+
+class ArchiveFault(NamedTuple):
+    """A difference between an archive and its manifest.
+
+    Attributes:
+        file: Path in the archive's folder.
+        says: What was expected, and what was found.
+    """
+
+    file: str
+    says: str
+
+
+def write_archive(
+    archive: Path, name: str, files: Mapping[str, Path], about: Mapping[str, Any]
+) -> None:
+    """Write an archive completely or not at all.
+
+    Args:
+        archive: Path of a new file.
+        name: Name of the folder in the archive.
+        files: Path of each file on disk, by its path in that folder.
+        about: Entries of the manifest in addition to the files.
+
+    Raises:
+        InputError: The archive exists already, or a file cannot be read or written.
+    """
+    if archive.exists():
+        raise InputError(f"{archive}: exists already; name another file with --out")
+    listed = [
+        {"path": path, "bytes": place.stat().st_size, "sha256": compute_sha256(place)}
+        for path, place in sorted(files.items())
+    ]
+    manifest = json.dumps({**about, "files": listed}, indent=1, ensure_ascii=False) + "\n"
+    try:
+        archive.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_replacement(archive) as partial, zipfile.ZipFile(partial, "w") as packed:
+            packed.writestr(_entry(f"{name}/{MANIFEST_FILE}"), manifest, zipfile.ZIP_DEFLATED, 9)
+            for path, place in sorted(files.items()):
+                with place.open("rb") as source, packed.open(_entry(f"{name}/{path}"), "w") as to:
+                    while block := source.read(_BLOCK):
+                        to.write(block)
+    except OSError as error:
+        raise InputError(f"{archive}: cannot be written ({error.strerror})") from None
+
+
+def _entry(path: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(path, _EPOCH)
+    entry.create_system = 3  # Always Unix, so that the bytes do not depend on this machine.
+    entry.external_attr = (stat.S_IFREG | 0o644) << 16
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    return entry
+
+
+class UnpackedArchive(NamedTuple):
+    """An archive that has been unpacked.
+
+    Attributes:
+        folder: Temporary folder with its content.
+        manifest: Its manifest.
+        faults: Differences from the manifest.
+    """
+
+    folder: Path
+    manifest: dict[str, Any]
+    faults: list[ArchiveFault]
+
+
+@contextmanager
+def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
+    """Context that unpacks an archive into a temporary folder.
+
+    Raises:
+        InputError: It is not an archive of simgap, or unpacking it could be harmful.
+    """
+    try:
+        with zipfile.ZipFile(archive) as packed, TemporaryDirectory(prefix="simgap-") as place:
+            entries = _sound(archive, packed)
+            top = _top(archive, entries)
+            manifest = _manifest(archive, packed, top)
+            found = {}
+            for entry in entries:
+                path = Path(place, *PurePosixPath(entry.filename).parts)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                found[entry.filename.removeprefix(f"{top}/")] = _written(
+                    archive, packed, entry, path
+                )
+            del found[MANIFEST_FILE]
+            yield UnpackedArchive(Path(place, top), manifest, list(_unlike(manifest, found)))
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError) as error:
+        raise InputError(f"{archive}: expected an archive of simgap bundle; {error}") from None
+    except OSError as error:
+        raise InputError(f"{archive}: cannot be read ({error.strerror or error})") from None
+
+
+def _sound(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    """Return the entries of an archive if all of them can be unpacked safely.
+
+    Raises:
+        InputError: One cannot.
+    """
+    entries = packed.infolist()
+    if len(entries) > _MOST:
+        raise _refused(archive, f"{len(entries)} files, at most {_MOST} expected")
+    for entry in entries:
+        if wrong := _wrong(entry):
+            raise _refused(archive, f"{entry.filename[:80]!r} {wrong}")
+    # Two names that a file system treats as equal would overwrite each other's file.
+    twice = [name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1]
+    if twice:
+        raise _refused(archive, f"{twice[0]!r} is in it twice")
+    total, size = sum(entry.file_size for entry in entries), archive.stat().st_size
+    if total > MAX_UNPACKED_BYTES or (total > _HARMLESS and total > MAX_COMPRESSION_RATIO * size):
+        raise _refused(archive, f"it would unpack from {size} bytes to {total}")
+    if packed.comment or min((e.header_offset for e in entries), default=0) > 0:
+        raise _refused(archive, "there is something in it beside its files")
+    return entries
+
+
+def _wrong(entry: zipfile.ZipInfo) -> str:
+    """Return why an entry must not be unpacked; empty if it may be."""
+    name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
+    parts = name.split("/")
+    # If the two stored names of an entry differ, programs would unpack it to different paths.
+    if name != entry.orig_filename or "\\" in name or ":" in name or not name.isprintable():
+        return "is no plain path"
+    if len(name) > _LONGEST or any(part in ("", ".", "..") for part in parts):
+        return "leads out of its folder, or is none"
+    if kind not in (0, stat.S_IFREG) or entry.is_dir():
+        return "is a link, a folder or a device; expected a file"
+    if entry.flag_bits & _ENCRYPTED:
+        return "is encrypted"
+    if entry.compress_type not in _METHODS:
+        return "is compressed in a way that simgap does not use"
+    return ""
+
+
+def _refused(archive: Path, why: str) -> InputError:
+    return InputError(f"{archive}: refused: {why}; nothing was unpacked")
+
+
+def _top(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
+    """Return the single top-level folder of an archive."""
+    tops = {entry.filename.partition("/")[0] for entry in entries}
+    if len(tops) != 1 or f"{(top := tops.pop())}/{MANIFEST_FILE}" not in {
+        e.filename for e in entries
+    }:
+        raise InputError(
+            f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} in it"
+        )
+    return top
+
+
+def _manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
+    entry = packed.getinfo(f"{top}/{MANIFEST_FILE}")
+    if entry.file_size > _MANIFEST_BYTES:
+        raise _refused(archive, f"{MANIFEST_FILE} has {entry.file_size} bytes")
+    try:
+        manifest = json.loads(packed.read(entry))
+    except (ValueError, RecursionError):
+        manifest = None
+    if wrong := find_violations(manifest, "manifest"):
+        raise InputError(f"{archive}: {MANIFEST_FILE}: {wrong[0]}")
+    found: dict[str, Any] = manifest
+    return found
+
+
+def _written(
+    archive: Path, packed: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path
+) -> tuple[int, str]:
+    """Unpack one file; return its size and hash."""
+    digest, size = hashlib.sha256(), 0
+    with packed.open(entry) as source, path.open("wb") as to:
+        for block in _blocks(source):
+            size += len(block)
+            if size > entry.file_size:
+                raise _refused(archive, f"{entry.filename!r} holds more than it says")
+            digest.update(block)
+            to.write(block)
+    return size, digest.hexdigest()
+
+
+def _blocks(source: IO[bytes]) -> Iterator[bytes]:
+    while block := source.read(_BLOCK):
+        yield block
+
+
+def _unlike(
+    manifest: dict[str, Any], found: Mapping[str, tuple[int, str]]
+) -> Iterator[ArchiveFault]:
+    """Yield files that are missing, added, or different from the manifest."""
+    listed = {each["path"]: (each["bytes"], each["sha256"]) for each in manifest["files"]}
+    if len(listed) < len(manifest["files"]):
+        yield ArchiveFault(MANIFEST_FILE, "expected each file once, found one listed twice")
+    for path in sorted({*listed, *found}):
+        if path not in found:
+            yield ArchiveFault(path, "expected it, as the manifest lists it; found none")
+        elif path not in listed:
+            yield ArchiveFault(
+                path, "expected no file that the manifest does not list; found this one"
+            )
+        elif listed[path] != found[path]:
+            (size, digest), (other, its) = listed[path], found[path]
+            what = f"{size} bytes with SHA-256 {digest[:12]}"
+            yield ArchiveFault(path, f"expected {what}, found {other} bytes with {its[:12]}")

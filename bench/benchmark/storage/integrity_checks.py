@@ -1,0 +1,325 @@
+"""Check the consistency between the files of a comparison, and with its plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.storage.csv_reader import CsvTable
+from bench.benchmark.storage.plan_checks import check_complete, list_target_names, list_tuner_labels
+from bench.benchmark.storage.row_errors import (
+    RowErrorFactory,
+    check_equal,
+    check_known,
+    raise_for_first_bad_row,
+)
+from bench.benchmark.storage.run_status import STATUS_COLUMNS, RunStatus
+from bench.benchmark.storage.runs_reader import RunsTable
+from bench.benchmark.storage.table_schemas import (
+    ERROR_TABLE_COLUMNS,
+    IDENTIFIABILITY_COLUMNS,
+    TRAINING_COLUMNS,
+    ColumnSpec,
+    expand_columns,
+)
+from bench.benchmark.storage.table_schemas import (
+    STATUS_COLUMNS as STATUS,
+)
+from sims.core.simulator import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class CheckedFiles(NamedTuple):
+    """The files of a comparison with stored runs, checked cell by cell.
+
+    Attributes:
+        runs: One line per run; see `bench.benchmark.storage.runs_reader.RunsTable.runs`.
+        statuses: Rows of status.csv.
+        training: Rows of training.csv.
+        spectra: Rows of identifiability.csv; None if there is no such file.
+    """
+
+    runs: pd.DataFrame
+    statuses: pd.DataFrame
+    training: pd.DataFrame
+    spectra: pd.DataFrame | None
+
+
+def check_files(
+    folder: Path, experiment: Experiment, *, under_way: bool, plan: list[str] | None = None
+) -> CheckedFiles:
+    """Check runs.parquet, status.csv, training.csv, identifiability.csv and their consistency.
+
+    Args:
+        folder: Folder of the comparison.
+        experiment: The experiment.
+        under_way: Whether runs may be missing.
+        plan: The id of every run; None if unknown.
+
+    Raises:
+        InputError: A check fails; the message is one line.
+    """
+    remedy = get_remedy(folder, under_way=under_way)
+    file = RunsTable(folder / "runs.parquet", remedy)
+    runs = file.read_runs(experiment)
+    status = CsvTable(folder / "status.csv", STATUS, remedy)
+    statuses = status.table.to_pandas()
+    check_statuses(statuses, experiment, status.make_error)
+    made = statuses[statuses["status"] != "skipped"]
+    if not under_way:
+        check_complete(made, experiment, status.make_error)
+        there = set(statuses["tuner"])
+        gone = [label for label in list_tuner_labels(experiment) if label not in there]
+        if gone:
+            raise status.make_error(None, f"tuner: expected runs of {gone[0]}, found none")
+    if plan is not None:
+        known = made["run"].isin(plan)
+        raise_for_first_bad_row(
+            ~known,
+            lambda i, says: status.make_error(int(made.index[i]), says),
+            lambda i: f"run: expected one of segments/plan.txt, found {made['run'].iloc[i]}",
+        )
+    check_runs(runs, file, experiment)
+    check_rows_match_statuses(runs, file, statuses, status.make_error, "status.csv")
+    training = CsvTable(folder / "training.csv", TRAINING_COLUMNS, remedy)
+    trainings = training.table.to_pandas()
+    check_known(trainings["tuner"], list_tuner_labels(experiment), "tuner", training.make_error)
+    raise_for_first_bad_row(
+        trainings.duplicated(["tuner", "seed"]),
+        training.make_error,
+        lambda _: "tuner and seed: expected every training once, found one again",
+    )
+    return CheckedFiles(runs, statuses, trainings, _spectra(folder, experiment, remedy))
+
+
+def get_remedy(folder: Path, *, under_way: bool) -> str:
+    """Return advice for a damaged file of results.
+
+    Args:
+        folder: Folder of the comparison.
+        under_way: Whether its segments still exist.
+    """
+    if under_way:  # The segments contain everything.
+        return f"simgap compare --resume {folder} writes it again"
+    return "restore the file, or start a new comparison"
+
+
+def check_table(folder: Path) -> None:
+    """Check table.csv if it exists.
+
+    Raises:
+        InputError: It is damaged.
+    """
+    path = folder / "table.csv"
+    if path.exists():
+        CsvTable(path, ERROR_TABLE_COLUMNS, f"simgap plot {folder} writes it again")
+
+
+def _spectra(folder: Path, experiment: Experiment, remedy: str) -> pd.DataFrame | None:
+    path = folder / "identifiability.csv"
+    if not path.exists():
+        return None
+    file = CsvTable(path, _directions, remedy)
+    spectra: pd.DataFrame = file.table.to_pandas()
+    check_known(spectra["target"], list_target_names(experiment), "target", file.make_error)
+    wanted = spectra.groupby("target").cumcount() + 1
+    raise_for_first_bad_row(
+        spectra["direction"] != wanted,
+        file.make_error,
+        lambda row: f"direction: expected {wanted[row]}, found {spectra['direction'][row]}",
+    )
+    return spectra
+
+
+def _directions(names: list[str]) -> list[ColumnSpec]:
+    """Return the columns of identifiability.csv: all without a declared name are parameters."""
+    fixed = [column.name for column in IDENTIFIABILITY_COLUMNS]
+    return expand_columns(
+        IDENTIFIABILITY_COLUMNS, [name for name in names if name not in fixed], ()
+    )
+
+
+def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: RowErrorFactory) -> None:
+    """Check that statuses are unique, belong to the experiment, and are within its budget.
+
+    Args:
+        statuses: Rows with the columns of `table_schemas.STATUS_COLUMNS`, cells checked.
+        experiment: The experiment.
+        fault: Makes the error for a row.
+
+    Raises:
+        InputError: A check fails.
+    """
+    raise_for_first_bad_row(
+        statuses["run"].duplicated(),
+        fault,
+        lambda row: f"run: expected every run once, found {statuses['run'].iloc[row]} again",
+    )
+    check_known(statuses["tuner"], list_tuner_labels(experiment), "tuner", fault)
+    check_known(statuses["simulator"], [experiment.simulator], "simulator", fault)
+    skipped = statuses["status"] == "skipped"
+    begins = statuses["tuner"] + "/" + statuses["target"] + "/" + statuses["seed"].astype(str) + "/"
+    named = [
+        run == tuner if never else run.startswith(begin)
+        for run, tuner, begin, never in zip(
+            statuses["run"], statuses["tuner"], begins, skipped, strict=True
+        )
+    ]
+    raise_for_first_bad_row(
+        ~np.array(named, dtype=bool),
+        fault,
+        lambda row: (
+            f"run: expected one that begins with {begins.iloc[row]}, "
+            f"found {statuses['run'].iloc[row]}"
+        ),
+    )
+    check_known(
+        statuses["target"][~skipped],
+        list_target_names(experiment),
+        "target",
+        lambda row, says: fault(int(np.flatnonzero(~skipped)[row]), says),
+    )
+    budgets = {entry.label: entry.budget or experiment.budget for entry in experiment.tuners}
+    budget = statuses["tuner"].map(budgets).astype(np.int64)  # Also for an empty column.
+    used = statuses["simulations"]
+    raise_for_first_bad_row(
+        used > budget,
+        fault,
+        lambda row: (
+            f"simulations: expected at most {budget.iloc[row]}, "
+            f"the budget of {statuses['tuner'].iloc[row]}, found {used.iloc[row]}"
+        ),
+    )
+    # "done" means that the budget was used; a run that ends earlier has converged or failed.
+    raise_for_first_bad_row(
+        (statuses["status"] == "done") & (used != budget),
+        fault,
+        lambda row: (
+            f"simulations: expected {budget.iloc[row]} of a run that is done, "
+            f"found {used.iloc[row]}"
+        ),
+    )
+
+
+def check_rows_match_statuses(
+    runs: pd.DataFrame, file: RunsTable, statuses: pd.DataFrame, fault: RowErrorFactory, source: str
+) -> None:
+    """Check that rows and statuses describe the same runs consistently.
+
+    Args:
+        runs: One line per run, as read from `file`.
+        file: File of the rows.
+        statuses: How they ended; cells checked.
+        fault: Makes the error for a row of the statuses.
+        source: Name of the file of statuses, for messages.
+
+    Raises:
+        InputError: A check fails.
+    """
+    import pandas as pd
+
+    places = pd.Index(statuses["run"]).get_indexer(runs["run"])
+    row_of = runs["row"].to_numpy()
+    names = runs["run"]
+
+    def at(i: int, says: str) -> InputError:
+        return file.make_error(int(row_of[i]), says)
+
+    raise_for_first_bad_row(
+        places < 0, at, lambda i: f"run: expected one of {source}, found {names[i]}"
+    )
+    made = (statuses["status"] != "skipped").to_numpy()
+    raise_for_first_bad_row(
+        ~made[places], at, lambda i: f"run: {names[i]} is skipped by {source}, and has rows"
+    )
+    held = np.zeros(len(statuses), dtype=bool)
+    held[places] = True
+    ids = statuses["run"]
+    raise_for_first_bad_row(
+        made & ~held, fault, lambda row: f"run: {ids[row]} has no rows in {file.path.name}"
+    )
+    told, used = statuses.iloc[places].reset_index(drop=True), runs["used"]
+    raise_for_first_bad_row(
+        told["simulations"] != used,
+        lambda i, says: fault(int(places[i]), says),
+        lambda i: (
+            f"simulations: expected {used[i]}, the last k of {names[i]} in {file.path.name}, "
+            f"found {told['simulations'][i]}"
+        ),
+    )
+    for name in ("tuner", "simulator", "target", "seed"):
+        check_equal(runs[name], told[name], name, f"as in {source}", at)
+
+
+def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> None:
+    """Check that the runs belong to one experiment, and agree on the parameters of each target.
+
+    Args:
+        runs: One line per run, as read from `file`.
+        file: File of the rows.
+        experiment: The experiment.
+
+    Raises:
+        InputError: A check fails.
+    """
+
+    def at(i: int, says: str) -> InputError:
+        return file.make_error(int(runs["row"][i]), says)
+
+    check_known(runs["experiment"], [experiment.name], "experiment", at)
+    check_equal(
+        runs["range"],
+        runs["target"].str.replace(r"-\d+$", "", regex=True),
+        "range",
+        "of its target",
+        at,
+    )
+    for name in runs.columns:
+        if name.startswith("true_"):
+            first = runs.drop_duplicates("target").set_index("target")[name]
+            wanted = runs["target"].map(first)
+            check_equal(runs[name], wanted, name, "as in other runs on this target", at)
+
+
+def check_segment_statuses(
+    path: Path,
+    held: Mapping[int, RunStatus],
+    experiment: Experiment,
+    plan: Sequence[str] | None,
+    remedy: str,
+) -> pd.DataFrame:
+    """Check the statuses that a part or a journal contains.
+
+    Args:
+        path: Path of the part or journal.
+        held: Statuses by index in the plan.
+        experiment: The experiment.
+        plan: The id of every run; None if unknown.
+        remedy: Advice for a damaged file.
+
+    Returns:
+        The statuses as rows of status.csv.
+
+    Raises:
+        InputError: A check fails.
+    """
+    import pandas as pd
+
+    places = list(held)
+
+    def at(row: int | None, says: str) -> InputError:
+        place = "" if row is None else f", run {places[row]}"
+        return InputError(f"{path}{place}: {says}; {remedy}")
+
+    statuses = pd.DataFrame([vars(status) for status in held.values()], columns=STATUS_COLUMNS)
+    check_statuses(statuses, experiment, at)
+    if plan is not None:
+        wanted = [plan[place] if place < len(plan) else "none" for place in places]
+        check_equal(statuses["run"], pd.Series(wanted, dtype=object), "run", "by plan.txt", at)
+    return statuses

@@ -1,0 +1,202 @@
+"""Segment files of an unfinished comparison: its plan, records of finished runs, and parts.
+
+`bench.benchmark.storage.run_journal` writes them.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Container, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.benchmark.storage import cell_validation
+from bench.benchmark.storage.cell_validation import CellError
+from bench.benchmark.storage.run_status import STATUS_COLUMNS, RunStatus
+from bench.benchmark.storage.table_schemas import STATUS_COLUMNS as STATUS
+from bench.benchmark.storage.table_schemas import ColumnSpec
+from sims.core.atomic_files import get_first_line, write_atomically
+from sims.core.simulator import InputError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SEGMENTS_FOLDER = "segments"
+"""Name of the folder of segments in the folder of an unfinished comparison."""
+PLAN_FILE = "plan.txt"
+"""Name of the file of the plan, which lists the id of every run."""
+PLAN_REMEDY = "restore it, or delete it and resume the comparison, which writes it again"
+"""Advice for a damaged plan."""
+_HEAD = struct.Struct(">4sII")
+"""Head of a record: mark, length of the content, checksum of the content."""
+_MARK = b"run\n"
+"""Mark at the beginning of a record."""
+SEGMENT_REMEDY = "restore it, or delete it and resume the comparison: its runs are made again"
+"""Advice for a damaged segment."""
+_PLACE = ColumnSpec("place in the plan", int, low=0, high=2.0**31)
+
+
+def encode_record(place: int, status: RunStatus, rows: pa.Table) -> bytes:
+    """Encode a finished run as a record of a journal, with a checksum.
+
+    Args:
+        place: Index of the run in the plan.
+        status: How the run ended.
+        rows: Rows of the run.
+    """
+    import pyarrow as pa
+
+    sink = pa.BufferOutputStream()
+    head = json.dumps([place, asdict(status)])
+    rows = rows.replace_schema_metadata({"status": head})
+    with pa.ipc.new_stream(sink, rows.schema) as stream:
+        stream.write_table(rows)
+    packed: bytes = sink.getvalue().to_pybytes()
+    return _HEAD.pack(_MARK, len(packed), zlib.crc32(packed)) + packed
+
+
+def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
+    """Yield index, status, rows and end offset of every complete record of a journal."""
+    import pyarrow as pa
+
+    data, end = path.read_bytes(), 0
+    while end + _HEAD.size <= len(data):
+        mark, length, checksum = _HEAD.unpack_from(data, end)
+        payload = data[end + _HEAD.size : end + _HEAD.size + length]
+        if mark != _MARK or len(payload) < length or zlib.crc32(payload) != checksum:
+            return
+        end += _HEAD.size + length
+        try:
+            rows = pa.ipc.open_stream(payload).read_all()
+            held = _statuses_of([json.loads(rows.schema.metadata[b"status"])])
+        except _DAMAGE as error:
+            raise _damaged(path, f"a record of a run: {get_first_line(error)}") from None
+        ((place, status),) = held.items()
+        yield place, status, rows.replace_schema_metadata(), end
+
+
+def read_part_statuses(path: Path) -> dict[int, RunStatus]:
+    """Read the statuses of a part, by index in the plan, from its footer.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    from pyarrow import parquet
+
+    try:
+        return _statuses_of(json.loads(parquet.read_schema(path).metadata[b"statuses"]))
+    except _DAMAGE as error:
+        raise _damaged(
+            path, f"a part of a comparison, found damage: {get_first_line(error)}"
+        ) from None
+
+
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, CellError, RecursionError, NotImplementedError)
+"""Errors that reading a damaged segment may raise; they include Arrow's own errors."""
+
+
+def _statuses_of(held: Any) -> dict[int, RunStatus]:
+    """Convert ``[[place, {column: value}], ...]`` to statuses by index, checking every cell.
+
+    Raises:
+        CellError: A value violates its declaration.
+    """
+    places = cell_validation.parse_json_column(_PLACE, [place for place, _ in held])
+    cell_validation.check_cells(_PLACE, places)
+    columns = [c for c in STATUS if c.name in STATUS_COLUMNS]
+    for column in columns:
+        values = [status[column.name] for _, status in held]
+        cell_validation.check_cells(column, cell_validation.parse_json_column(column, values))
+    return {
+        place: RunStatus(**{name: status[name] for name in STATUS_COLUMNS})
+        for place, status in held
+    }
+
+
+def _damaged(path: Path, expected: str) -> InputError:
+    return InputError(f"{path}: expected {expected}; {SEGMENT_REMEDY}")
+
+
+def check_no_duplicate_runs(path: Path, places: Iterable[int], known: Container[int]) -> None:
+    """Reject runs that another file contains already.
+
+    Args:
+        path: Path of the file.
+        places: Indices of its runs.
+        known: Indices of the runs in other files.
+
+    Raises:
+        InputError: A run is in both.
+    """
+    if double := [place for place in places if place in known]:
+        raise _damaged(
+            path, f"every run once, found that of line {double[0] + 1} of the plan again"
+        )
+
+
+def list_segments(folder: Path, ending: str) -> list[Path]:
+    """List the segment files with an extension, in order.
+
+    Args:
+        folder: Folder of segments.
+        ending: File extension without dot.
+
+    Raises:
+        InputError: The name of a file is not a number.
+    """
+    paths = sorted(folder.glob(f"*.{ending}"))
+    for path in paths:
+        if not (path.stem.isascii() and path.stem.isdigit()):
+            raise InputError(f"{path}: expected a name such as 000001.{ending}; move it elsewhere")
+    return paths
+
+
+def read_finished_statuses(folder: Path) -> dict[int, RunStatus]:
+    """Read the statuses of the finished runs of a study, by index in the plan.
+
+    Another process may be writing there at the same time.
+
+    Raises:
+        InputError: A file is damaged.
+    """
+    return {
+        place: status for _, held in read_statuses_by_file(folder) for place, status in held.items()
+    }
+
+
+def read_statuses_by_file(folder: Path) -> Iterator[tuple[Path, dict[int, RunStatus]]]:
+    """Yield the statuses of the finished runs of a study by file; see `read_finished_statuses`."""
+    # Journals first: a journal that becomes a part in the meantime is then found among the parts.
+    for path in list_segments(folder / SEGMENTS_FOLDER, "journal"):
+        with suppress(FileNotFoundError):
+            yield path, {place: status for place, status, _, _ in read_records(path)}
+    known: set[int] = set()
+    for path in list_segments(folder / SEGMENTS_FOLDER, "parquet"):
+        statuses = read_part_statuses(path)
+        check_no_duplicate_runs(path, statuses, known)
+        known.update(statuses)
+        yield path, statuses
+
+
+def write_plan(folder: Path, ids: Sequence[str]) -> None:
+    """Write the id of every run, in the order of the plan."""
+    write_atomically(folder / SEGMENTS_FOLDER / PLAN_FILE, "".join(f"{name}\n" for name in ids))
+
+
+def read_plan(folder: Path) -> list[str] | None:
+    """Read the ids of the plan; None if there is no plan yet.
+
+    Raises:
+        InputError: It is damaged.
+    """
+    path = folder / SEGMENTS_FOLDER / PLAN_FILE
+    try:
+        return path.read_text(encoding="utf-8").splitlines() if path.is_file() else None
+    except ValueError:
+        raise InputError(
+            f"{path}: expected the ids of the runs as UTF-8 text, found other bytes; {PLAN_REMEDY}"
+        ) from None

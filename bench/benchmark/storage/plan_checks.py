@@ -1,0 +1,118 @@
+"""List the targets, seeds and runs of an experiment, and check plans for completeness."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.tuner_entries import TunerEntry
+from bench.benchmark.storage.row_errors import (
+    TableErrorFactory,
+    check_known,
+    raise_for_first_bad_row,
+)
+from bench.core.plugin_registries import tuners
+from sims.core.simulator import InputError
+from sims.core.toml_validation import format_value
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_SEED = re.compile("[0-9]{1,9}")
+
+
+def list_target_names(experiment: Experiment) -> list[str]:
+    """List the names of all targets of an experiment."""
+    return [f"{kind}-{i:03d}" for i in range(experiment.targets) for kind in experiment.ranges]
+
+
+def list_tuner_labels(experiment: Experiment) -> list[str]:
+    """List the labels of an experiment's tuners."""
+    return [entry.label for entry in experiment.tuners]
+
+
+def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: str) -> None:
+    """Check that a plan belongs to an experiment and is complete.
+
+    Args:
+        plan: The id of every run.
+        experiment: The experiment.
+        path: Path of the plan.
+        remedy: Advice for a damaged plan.
+
+    Raises:
+        InputError: A check fails.
+    """
+    import pandas as pd
+
+    def at(row: int | None, says: str) -> InputError:
+        place = "" if row is None else f", line {row + 1}"
+        return InputError(f"{path}{place}: {says}; {remedy}")
+
+    rows = []
+    for row, name in enumerate(plan):
+        parts = name.rsplit("/", 3)
+        if len(parts) != 4 or not _SEED.fullmatch(parts[2]):
+            raise at(row, f"expected TUNER/TARGET/SEED/HASH, found {format_value(name)}")
+        rows.append((name, parts[0], parts[1], int(parts[2])))
+    planned = pd.DataFrame(rows, columns=["run", "tuner", "target", "seed"])
+    names = planned["run"]
+    raise_for_first_bad_row(
+        names.duplicated(), at, lambda row: f"expected every run once, found {names[row]} again"
+    )
+    check_known(planned["tuner"], list_tuner_labels(experiment), "tuner", at)
+    check_known(planned["target"], list_target_names(experiment), "target", at)
+    check_complete(planned, experiment, at)
+
+
+def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableErrorFactory) -> None:
+    """Check that each tuner with runs has all of its runs, and no more.
+
+    Args:
+        made: Tuner, target and seed of each run; the index is the row in the file.
+        experiment: The experiment.
+        fault: Makes the error for a row, or for the file.
+
+    Raises:
+        InputError: A run is missing, or there is one too many.
+    """
+    targets = list_target_names(experiment)
+    for entry in experiment.tuners:
+        mine = made[made["tuner"] == entry.label]
+        if mine.empty:
+            continue
+        seeds = range(_seeds(entry, experiment, mine["seed"].max()))
+        found = set(zip(mine["target"], mine["seed"].tolist(), strict=True))
+        missing = next(((t, s) for t in targets for s in seeds if (t, s) not in found), None)
+        if missing:
+            target, seed = missing
+            says = f"expected a run of {entry.label} on {target} with seed {seed}, found none"
+            raise fault(None, says)
+        if len(mine) > len(targets) * len(seeds):
+            twice = mine.duplicated(["target", "seed"]) | (mine["seed"] >= len(seeds))
+            row = int(mine.index[int(twice.to_numpy().argmax())])
+            raise fault(
+                row,
+                f"run: expected {len(targets)} targets with {len(seeds)} seeds, "
+                f"found one more: {mine['run'][row]}",
+            )
+
+
+def _seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
+    """Return the number of seeds of an entry.
+
+    It equals `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
+    """
+    wanted = entry.seeds or experiment.seeds
+    if wanted == 1 or largest > 0:
+        return wanted
+    # A single seed is correct for a deterministic tuner. The tuner is loaded only now, since it may
+    # import large packages.
+    try:
+        kind = tuners.get(entry.tuner)
+    except InputError:  # A tuner of a plugin that is not loaded or cannot be used here.
+        return 1
+    return wanted if kind.stochastic or kind.learned else 1

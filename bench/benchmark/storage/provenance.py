@@ -1,0 +1,126 @@
+"""Provenance of results: versions, machine, and the settings of an explanation."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+from typing import Any
+
+from bench import __version__
+from sims.core.atomic_files import write_atomically
+
+ENVIRONMENT_FILE = "environment.json"
+
+
+def describe_machine() -> dict[str, Any]:
+    """Describe Python and the machine."""
+    return {
+        "python": sys.version,
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+    }
+
+
+def list_package_versions() -> dict[str, str]:
+    """List the version of every installed package, by name."""
+    return dict(sorted(_name_and_version(each) for each in distributions()))
+
+
+def _name_and_version(distribution: Distribution) -> tuple[str, str]:
+    """Read name and version from the head of the metadata.
+
+    Parsing all of it takes 20 times as long.
+    """
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    lines = text.partition("\n\n")[0].splitlines()
+    head = dict(line.split(": ", 1) for line in lines if _FIELD.match(line))
+    if {"Name", "Version"} <= head.keys():
+        return head["Name"], head["Version"]
+    return distribution.metadata["Name"], distribution.version
+
+
+_FIELD = re.compile("(Name|Version): ")
+
+
+def get_utc_time() -> str:
+    """Return the present time in UTC."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def format_explain_command(recordings: Iterable[object], settings: Mapping[str, Any]) -> list[str]:
+    """Return the words of the command that explains recordings.
+
+    Args:
+        recordings: Paths of their tables.
+        settings: Options of `simgap explain` by name; unset options are left out.
+    """
+    words = ["simgap", "explain", *map(str, recordings)]
+    for name, value in settings.items():
+        if value is True:
+            words.append(f"--{name}")
+        elif isinstance(value, (list, tuple)):
+            # An option that can be given several times.
+            words += [word for one in value for word in (f"--{name}", str(one))]
+        elif value not in (None, False, ""):
+            words += [f"--{name}", str(value)]
+    return words
+
+
+def write_explanation_environment(
+    folder: Path, started: str, settings: Mapping[str, Any], recordings: Iterable[Path]
+) -> Path:
+    """Write the provenance of an explanation to its folder.
+
+    Args:
+        folder: Folder of the explanation.
+        started: Time of the start, UTC.
+        settings: Options of `simgap explain` by name.
+        recordings: Paths of the tables; their descriptions are included if they exist.
+
+    Returns:
+        Path of environment.json.
+    """
+    told = {
+        "simgap": __version__,
+        "command": "explain",
+        "settings": {key: value for key, value in settings.items() if value not in (None, [], "")},
+        "recordings": [
+            {"file": path.name, "sha256": compute_sha256(path)}
+            for table in recordings
+            for path in dict.fromkeys([table, table.with_suffix(".toml")])
+            if path.is_file()
+        ],
+        "started": started,
+        **describe_machine(),
+        "packages": list_package_versions(),
+    }
+    path = folder / ENVIRONMENT_FILE
+    write_atomically(path, json.dumps(told, indent=1, default=str) + "\n")
+    return path
+
+
+def read_environment(folder: Path) -> dict[str, Any]:
+    """Read environment.json; return an empty dict if there is none, as for old explanations."""
+    try:
+        told = json.loads((folder / ENVIRONMENT_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def compute_sha256(path: Path) -> str:
+    """Compute the SHA-256 hash of a file."""
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

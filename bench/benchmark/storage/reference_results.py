@@ -1,0 +1,227 @@
+"""Reference results: checked comparisons that figures draw in grey behind the user's own.
+
+In a checkout they are below results/reference, in an installed wheel below bench/reference; the
+wheel contains the table, configuration and environment of each. Any other folder with these three
+files can be used, too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.benchmark.storage.csv_reader import CsvTable
+from bench.benchmark.storage.result_folder import CONFIGURATION_FILE
+from bench.benchmark.storage.table_schemas import ERROR_TABLE_COLUMNS
+from sims.core.atomic_files import get_first_line
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.toml_validation import read_toml
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from bench.benchmark.problem.experiment import Experiment
+
+_PACKAGE = Path(__file__).resolve().parents[2]
+_PLACES = (_PACKAGE.parent / "results" / "reference", _PACKAGE / "reference")
+"""Folders of references: in the root of a checkout, or in the package of a wheel."""
+_TABLE = "table.csv"
+_DRAWN = ("tuner", "range", "simulations", "metric", "median")
+_COLUMNS = [column for column in ERROR_TABLE_COLUMNS if column.name in _DRAWN]
+"""Columns of a table that are read; an older table may lack others."""
+_SAME_PROBLEM = ("simulator", "model", "recording", "observe", "error_channel")
+"""Keys that must be equal for the errors of two comparisons to be comparable."""
+_ALIKE = (
+    "ranges",
+    "targets",
+    "seeds",
+    "budget",
+    "training_budget",
+    "noise",
+    "settings",
+    "world",
+    "constants",
+    "parameters",
+    "initial",
+    "inputs",
+    "sampling",
+    "held_out",
+    "free",
+)
+"""Keys whose differences are reported."""
+
+
+@dataclass(frozen=True)
+class ReferenceResult:
+    """A reference result.
+
+    Attributes:
+        name: Name by which it was requested.
+        folder: Its folder.
+        table: Rows of its table.csv: tuner, range, simulations, metric, median.
+        document: Content of its experiment.toml.
+        simgap: Version that made it.
+        revision: Hash of the code that made its runs; empty if unknown.
+        started: Time of its start, UTC.
+    """
+
+    name: str
+    folder: Path
+    table: pd.DataFrame
+    document: Mapping[str, Any]
+    simgap: str
+    revision: str
+    started: str
+
+    @property
+    def tuners(self) -> list[str]:
+        """Labels in the order of its table."""
+        return [str(tuner) for tuner in dict.fromkeys(self.table["tuner"])]
+
+    @property
+    def provenance_text(self) -> str:
+        """Provenance as text: ``ball-drop (simgap 0.1.0, code 9276d6d2c3, 2026-11-21)``."""
+        code = f", code {self.revision}" if self.revision else ""
+        return f"{self.name} (simgap {self.simgap}{code}, {self.started[:10]})"
+
+    def find_mismatches(self, experiment: Experiment) -> list[str]:
+        """List the differences from an experiment that is drawn over it, one line each.
+
+        Raises:
+            InputError: It is of another problem, so the errors are not comparable.
+        """
+        mine = _plain(experiment.document())
+        # Keys that were added in a later version cannot be compared with an older file.
+        differing = [
+            key
+            for key in (*_SAME_PROBLEM, *_ALIKE)
+            if key in self.document and _plain(self.document[key]) != mine.get(key)
+        ]
+        for key in differing:
+            if key in _SAME_PROBLEM:
+                raise InputError(
+                    f"{self.name}: of another problem than experiment {experiment.name}: {key} is "
+                    f"{_said(self.document[key])}, expected {_said(mine.get(key))}"
+                )
+        return [
+            f"{key}: {_said(self.document[key])}, here {_said(mine.get(key))}" for key in differing
+        ]
+
+    def get_curve(self, tuner: str, kind: str, metric: str, budget: int) -> pd.DataFrame:
+        """Return the median of a metric by number of simulations, up to a budget.
+
+        Args:
+            tuner: Label of the tuner.
+            kind: Range of the targets.
+            metric: Name of the metric.
+            budget: Maximum number of simulations.
+
+        Returns:
+            Columns simulations and median; empty if there is no such curve.
+        """
+        lines = self.table
+        part = lines[
+            (lines["tuner"] == tuner)
+            & (lines["range"] == kind)
+            & (lines["metric"] == metric)
+            & (lines["simulations"] <= budget)
+        ]
+        return part[["simulations", "median"]].dropna().sort_values("simulations")
+
+    def to_document(self, experiment: Experiment, drawn: list[Path]) -> dict[str, Any]:
+        """Build the JSON document of the reference.
+
+        Args:
+            experiment: Experiment that is drawn over it.
+            drawn: Paths of the figures.
+        """
+        return {
+            "name": self.name,
+            "simgap": self.simgap,
+            "revision": self.revision or None,
+            "started": self.started,
+            "mismatches": self.find_mismatches(experiment),
+            "drawn": drawn,
+        }
+
+
+def list_reference_names() -> list[str]:
+    """List the names of the references of simgap, which are the names of their folders."""
+    found = [
+        table.parent.relative_to(place).as_posix()
+        for place in _PLACES
+        for table in sorted(place.rglob(_TABLE))
+        if _is_one(table.parent)
+    ]
+    return sorted(set(found))
+
+
+def _is_one(folder: Path) -> bool:
+    """Return whether a folder is a comparison's; a bounce shot has no error curves."""
+    if not (folder / CONFIGURATION_FILE).is_file():
+        return False
+    with (folder / _TABLE).open(encoding="utf-8") as file:
+        return "metric" in file.readline().split(",")
+
+
+def find_reference(name: str) -> ReferenceResult:
+    """Find a reference by its name, or by the folder of any comparison.
+
+    ``comparison/ball-wind`` is also found as ``ball-wind`` if no other reference has this name.
+
+    Raises:
+        InputError: There is no such reference, or it is damaged.
+    """
+    known = list_reference_names()
+    endings = [each for each in known if each.endswith(f"/{name}")]
+    if name in known:
+        return _read(name, _place(name))
+    if len(endings) == 1:
+        return _read(endings[0], _place(endings[0]))
+    folder = Path(name)
+    if (folder / CONFIGURATION_FILE).is_file():
+        return _read(folder.resolve().name, folder)
+    if len(endings) > 1:
+        raise InputError(f"reference {name}: expected one of {', '.join(endings)}")
+    error = make_unknown_name_error("reference", name, known)
+    raise InputError(f"{error} (or give the folder of a comparison)")
+
+
+def _place(name: str) -> Path:
+    return next(place / name for place in _PLACES if (place / name / _TABLE).is_file())
+
+
+def _read(name: str, folder: Path) -> ReferenceResult:
+    path = folder / "environment.json"
+    try:
+        environment = json.loads(path.read_text(encoding="utf-8"))
+        made = {key: str(environment[key]) for key in ("simgap", "started")}
+        revision = str(environment.get("fingerprint", {}).get("code", ""))
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        wanted = "expected what a comparison writes"
+        raise InputError(f"{path}: {wanted}, found {get_first_line(error)}") from None
+    table = CsvTable(folder / _TABLE, _COLUMNS, f"simgap plot {folder} writes it again").table
+    document = read_toml(folder / CONFIGURATION_FILE)
+    return ReferenceResult(name, folder, table.to_pandas(), document, **made, revision=revision)
+
+
+def _plain(value: Any) -> Any:
+    """Convert numbers to float and tuples to lists, so that TOML and experiments compare equal."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _said(value: Any) -> str:
+    """Format a value in one line."""
+    if isinstance(value, Mapping):
+        inside = ", ".join(f"{key} = {_said(inner)}" for key, inner in value.items())
+        return f"{{{inside}}}"[:80]
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_said(inner) for inner in value)}]"[:80]
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,334 @@
+"""Folder of a comparison: configuration, versions, machine, simulations and run statuses."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from bench import __version__
+from bench.benchmark.problem.experiment import Experiment, parse_experiment
+from bench.benchmark.problem.targets import Redraws
+from bench.benchmark.storage.integrity_checks import check_files, check_table
+from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER, read_plan
+from bench.benchmark.storage.provenance import describe_machine, get_utc_time, list_package_versions
+from bench.benchmark.storage.run_journal import RunJournal
+from bench.benchmark.storage.run_status import STATUS_COLUMNS
+from bench.benchmark.storage.table_schemas import (
+    ENVIRONMENT_KEYS,
+    OPTIONAL_ENVIRONMENT_KEYS,
+    RUN_COLUMNS,
+    Columns,
+)
+from bench.benchmark.storage.table_schemas import (
+    STATUS_COLUMNS as STATUS,
+)
+from sims.core.atomic_files import (
+    atomic_new_folder,
+    atomic_replacement,
+    check_folder_empty,
+    get_first_line,
+    make_timestamped_path,
+    write_atomically,
+)
+from sims.core.simulator import InputError
+from sims.core.toml_validation import check_entries, format_value, read_toml
+from sims.engines import describe_stepping
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CONFIGURATION_FILE = "experiment.toml"
+"""Name of the file that identifies the folder of a study."""
+SALT_FILE = "salt"
+"""Name of the file of a secret salt, in the folder of segments."""
+DEFAULT_RESULTS_FOLDER = Path("results")
+"""Default parent folder of new results."""
+
+
+def choose_free_folder(
+    experiment: Experiment, out: Path | None, results: Path = DEFAULT_RESULTS_FOLDER
+) -> Path:
+    """Choose the folder of a new study.
+
+    Args:
+        experiment: The experiment.
+        out: Wanted folder; None for a folder in `results` named after the experiment and the time.
+        results: Parent of such a folder.
+
+    Raises:
+        InputError: `out` exists and is not empty.
+    """
+    folder = out or make_timestamped_path(results, experiment.name)
+    try:
+        check_folder_empty(folder)
+    except InputError as error:
+        raise InputError(f"{error}, or resume what is in it") from None
+    return folder
+
+
+class FolderConfiguration(NamedTuple):
+    """Configuration of a study's folder.
+
+    Attributes:
+        experiment: The exact configuration of the experiment.
+        plugins: Plugin files that it needs.
+        fingerprint: Hashes of what must not change until the study is complete.
+        isolation_layers: Isolation layers that were available for its tuners when it was started.
+    """
+
+    experiment: Experiment
+    plugins: list[str]
+    fingerprint: dict[str, str]
+    isolation_layers: tuple[str, ...] = ()
+
+
+def create_folder(
+    folder: Path,
+    configuration: FolderConfiguration,
+    jobs: int,
+    secret: str | None = None,
+    seals: Sequence[str] = (),
+    redraws: Redraws | None = None,
+) -> None:
+    """Make the folder with experiment.toml and environment.json, all at once or not at all.
+
+    Args:
+        folder: Path of a new or empty folder.
+        configuration: Its configuration.
+        jobs: Planned number of worker processes.
+        secret: Salt from which its targets are drawn; see `bench.benchmark.storage.salt_file`.
+        seals: Isolation layers that are available for its tuners on this machine.
+        redraws: Number of targets that were drawn again; None for studies without such targets.
+
+    Raises:
+        InputError: The folder cannot be made.
+    """
+    experiment = configuration.experiment
+    environment = {
+        "simgap": __version__,
+        "experiment": experiment.name,
+        "plugins": [str(Path(p).resolve()) for p in configuration.plugins],
+        "jobs": jobs,
+        "seals": list(seals),
+        "started": get_utc_time(),
+        **describe_machine(),
+        "fingerprint": configuration.fingerprint,
+        "stepping": describe_stepping(),
+        "packages": list_package_versions(),
+    }
+    if redraws is not None:
+        environment |= {"redrawn_targets": redraws.redrawn, "target_draws": redraws.draws}
+    try:
+        # An interrupted start must not leave a folder without its configuration.
+        with atomic_new_folder(folder) as partial:
+            write_configuration(partial, experiment)
+            write_atomically(partial / "environment.json", json.dumps(environment, indent=1) + "\n")
+            (partial / SEGMENTS_FOLDER).mkdir()
+            if secret is not None:
+                _hide(partial / SEGMENTS_FOLDER / SALT_FILE, secret)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
+
+
+def _hide(path: Path, secret: str) -> None:
+    """Write a file that only its owner can read."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        file.write(secret)
+
+
+def write_configuration(folder: Path, experiment: Experiment) -> None:
+    """Write experiment.toml completely or not at all."""
+    import tomli_w
+
+    write_atomically(folder / CONFIGURATION_FILE, tomli_w.dumps(_plain(experiment.document())))
+
+
+def _plain(value: Any) -> Any:
+    """Convert tuples to lists and mappings to dicts, the types that TOML supports."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value
+
+
+def read_configuration(folder: Path) -> FolderConfiguration:
+    """Read the configuration of a comparison's folder.
+
+    Raises:
+        InputError: It is not such a folder, or a file in it is damaged.
+    """
+    path = folder / CONFIGURATION_FILE
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: expected the folder of a comparison with {CONFIGURATION_FILE} in it, found none"
+        )
+    held = read_environment(folder)
+    experiment = parse_experiment(str(held["experiment"]), read_toml(path), path)
+    return FolderConfiguration(
+        experiment,
+        list(held["plugins"]),
+        dict(held.get("fingerprint", {})),
+        tuple(held.get("seals", ())),
+    )
+
+
+def read_environment(folder: Path) -> dict[str, Any]:
+    """Read and check environment.json; undeclared keys are left out.
+
+    Raises:
+        InputError: It is damaged.
+    """
+    path = folder / "environment.json"
+    wrong, remedy = f"{path}: not a complete comparison", "restore it, or start a new comparison"
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{wrong}: {get_first_line(error)}; {remedy}") from None
+    if not isinstance(said, dict):
+        raise InputError(f"{wrong}: expected a table, found {format_value(said)}; {remedy}")
+    for key in ENVIRONMENT_KEYS:
+        if key not in said and key not in OPTIONAL_ENVIRONMENT_KEYS:
+            raise InputError(f"{wrong}: expected a key {key}, found none; {remedy}")
+    given = {key: value for key, value in said.items() if key in ENVIRONMENT_KEYS}
+    # On some systems the number of processors is unknown.
+    if given["processors"] is None:
+        del given["processors"]
+    try:
+        return check_entries(path, "", given, ENVIRONMENT_KEYS)
+    except InputError as error:
+        raise InputError(f"{error}; {remedy}") from None
+
+
+def write_results(
+    folder: Path,
+    journal: RunJournal,
+    trainings: Iterable[tuple[str, int, int, float]],
+    skipped: Iterable[Mapping[str, Any]],
+    trusted: bool = False,
+) -> None:
+    """Write runs.parquet, training.csv and status.csv in the order of the plan.
+
+    Each file is written completely or not at all.
+
+    Args:
+        folder: Folder of the comparison.
+        journal: Its finished runs.
+        trainings: Tuner, seed, simulations and seconds of each training.
+        skipped: Rows of status.csv for tuners that could not be used.
+        trusted: Whether the tuners ran inside the harness.
+    """
+    import pandas as pd
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with atomic_replacement(folder / "runs.parquet") as partial:
+        writer = None
+        for rows in journal.iterate_tables():
+            # The first table defines the columns.
+            writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
+            writer.write_table(rows)
+        if writer is None:
+            parquet.write_table(pa.table({}), partial)
+        else:
+            writer.close()
+    training = pd.DataFrame(sorted(trainings), columns=["tuner", "seed", "simulations", "seconds"])
+    training["trusted"] = trusted
+    write_atomically(folder / "training.csv", training.to_csv(index=False))
+    rows_of_statuses = [
+        asdict(journal.statuses[place]) for place in sorted(journal.statuses)
+    ] + list(skipped)
+    statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMNS)
+    write_atomically(folder / "status.csv", statuses.to_csv(index=False))
+
+
+class StoredComparison(NamedTuple):
+    """A comparison read from its folder.
+
+    Attributes:
+        experiment: The experiment.
+        runs: Rows of runs.parquet.
+        statuses: Rows of status.csv.
+        costs: (simulations, seconds) of one training, by tuner.
+        spectra: Rows of identifiability.csv; None if there is no such file.
+    """
+
+    experiment: Experiment
+    runs: pd.DataFrame
+    statuses: pd.DataFrame
+    costs: dict[str, tuple[float, float]]
+    spectra: pd.DataFrame | None = None
+
+
+def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> StoredComparison:
+    """Read and check the folder of a finished or interrupted comparison.
+
+    Args:
+        folder: Folder of the comparison.
+        columns: Columns of the runs to read, if present; None for all.
+
+    Raises:
+        InputError: A file is missing or violates `storage.table_schemas`, or runs are missing.
+    """
+    from pyarrow import parquet
+
+    experiment = read_configuration(folder).experiment
+    path = folder / "runs.parquet"
+    under_way = (folder / SEGMENTS_FOLDER).exists()
+    # The study was killed before its first results were written, so nothing is damaged.
+    if not path.exists() and under_way:
+        raise InputError(
+            f"{folder}: not finished, and nothing written yet; resume it to make the rest"
+        )
+    plan = read_plan(folder) if under_way else None
+    files = check_files(folder, experiment, under_way=under_way, plan=plan)
+    there = parquet.read_schema(path).names
+    wanted = [name for name in there if columns is None or name in columns]
+    runs = parquet.read_table(path, columns=wanted).to_pandas()
+    return StoredComparison(
+        experiment,
+        _with_defaults(runs, RUN_COLUMNS, columns) if there else runs,
+        _with_defaults(files.statuses, STATUS),
+        _costs(files.training),
+        files.spectra,
+    )
+
+
+def read_checked_comparison(folder: Path) -> StoredComparison:
+    """Read and check a comparison as `read_comparison` does, and also check table.csv.
+
+    Raises:
+        InputError: A file in the folder is damaged.
+    """
+    stored = read_comparison(folder)
+    check_table(folder)
+    return stored
+
+
+def _with_defaults(
+    frame: pd.DataFrame, declared: Columns, wanted: Sequence[str] | None = None
+) -> pd.DataFrame:
+    """Add columns with a default that an older folder lacks."""
+    missing = {
+        column.name: column.default
+        for column in declared
+        if column.default is not None
+        and column.name not in frame
+        and (wanted is None or column.name in wanted)
+    }
+    return frame.assign(**missing)
+
+
+def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
+    """Compute simulations and seconds of one training, mean over seeds, by tuner."""
+    means = training.groupby("tuner")[["simulations", "seconds"]].mean()
+    values = means.to_numpy(dtype=float)
+    return {
+        str(name): (float(row[0]), float(row[1]))
+        for name, row in zip(means.index, values, strict=True)
+    }

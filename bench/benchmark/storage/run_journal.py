@@ -1,0 +1,226 @@
+"""Crash-safe journal of finished runs: each is appended as one record the moment it ends.
+
+The folder ``list_segments`` of an unfinished comparison contains ``plan.txt`` (the id of every run,
+in
+order), ``NNNNNN.journal`` (records that are being appended) and ``NNNNNN.parquet`` (parts of many
+records). A part is written next to its journal, renamed, and only then is the journal deleted; if
+both are found, the part contains everything. A record that was cut off by a kill fails its checksum
+and is dropped: its run was not finished. Appended records survive the end of any process; a crash
+of the machine may lose the runs since the last part.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from bench.benchmark.storage.journal_segments import (
+    SEGMENTS_FOLDER,
+    check_no_duplicate_runs,
+    encode_record,
+    list_segments,
+    read_part_statuses,
+    read_records,
+)
+from bench.benchmark.storage.run_status import RunStatus
+from sims.core.atomic_files import atomic_replacement
+from sims.core.simulator import InputError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+RUNS_PER_PART = 1000
+"""Number of records that are combined into a part."""
+
+
+class RunJournal:
+    """Journal of the finished runs of a comparison; opening it recovers earlier records.
+
+    Attributes:
+        statuses: Statuses of all finished runs, by index in the plan.
+
+    Raises:
+        InputError: Another process is working in the folder, or a part is damaged.
+    """
+
+    def __init__(self, folder: Path, part_runs: int = RUNS_PER_PART) -> None:
+        self.folder = folder / SEGMENTS_FOLDER
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except FileExistsError:
+            raise InputError(
+                f"{self.folder}: expected a folder, found a file; move it elsewhere"
+            ) from None
+        self._lock = _locked(self.folder / "lock")
+        # An incomplete part of a process that was killed while it wrote; its journal still exists.
+        for half in self.folder.glob("*.partial"):
+            half.unlink()
+        self._part_runs = part_runs
+        self.statuses: dict[int, RunStatus] = {}
+        self._index: dict[Path, list[int]] = {}
+        self._records: list[tuple[int, RunStatus, pa.Table]] = []
+        try:
+            self._read_parts()
+            self._number = 1 + max((int(p.stem) for p in self._index), default=0)
+            for path in list_segments(self.folder, "journal"):
+                # A part contains its whole journal. After a kill between writing the one and
+                # deleting the other, reading both would duplicate runs.
+                if int(path.stem) < self._number:
+                    path.unlink()
+                else:  # Numbers may be skipped if the user deleted a damaged part.
+                    self._number = int(path.stem)
+            self._file = self._reopened(self._path("journal"))
+        except InputError:
+            self._lock.close()
+            raise
+
+    def _read_parts(self) -> None:
+        for path in list_segments(self.folder, "parquet"):
+            statuses = read_part_statuses(path)
+            check_no_duplicate_runs(path, statuses, self.statuses)
+            self.statuses |= statuses
+            self._index[path] = sorted(statuses)
+
+    def _path(self, ending: str) -> Path:
+        return self.folder / f"{self._number:06d}.{ending}"
+
+    def _reopened(self, path: Path) -> IO[bytes]:
+        """Open a journal for appending: read its complete records and drop one that is cut off."""
+        end = 0
+        if path.exists():
+            # Appending continues at the last end.
+            for place, status, rows, end in read_records(path):  # noqa: B007
+                check_no_duplicate_runs(path, [place], self.statuses)
+                self._records.append((place, status, rows))
+                self.statuses[place] = status
+        # Unbuffered: what is written must survive a kill of this process.
+        file = path.open("r+b" if path.exists() else "w+b", buffering=0)
+        # Remove a record that was cut off by a kill, or the next one would follow an incomplete
+        # record.
+        file.truncate(end)
+        file.seek(end)
+        return file
+
+    def append(self, place: int, columns: Mapping[str, Any], status: RunStatus) -> None:
+        """Append a finished run; when this returns, the run survives a kill.
+
+        Args:
+            place: Index of the run in the plan.
+            columns: Rows of the run, by column.
+            status: How the run ended.
+        """
+        import pyarrow as pa
+
+        rows = pa.table(dict(columns))
+        # A single write: after a kill a record is complete or cut off, but never mixed with
+        # another.
+        self._file.write(encode_record(place, status, rows))
+        self._records.append((place, status, rows))
+        self.statuses[place] = status
+        if len(self._records) >= self._part_runs:
+            self._make_part()
+
+    def _make_part(self) -> None:
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        self._records.sort(key=lambda record: record[0])
+        # The footer allows reading the statuses without reading the rows.
+        statuses = json.dumps([[place, asdict(status)] for place, status, _ in self._records])
+        tables = [_placed(place, rows) for place, _, rows in self._records]
+        whole = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
+        path = self._path("parquet")
+        with atomic_replacement(path) as partial:
+            parquet.write_table(whole, partial, compression="zstd")
+        # Not earlier: until the part exists, the journal is the only copy of these runs.
+        self._file.close()
+        self._path("journal").unlink()
+        self._index[path] = [place for place, _, _ in self._records]
+        self._records = []
+        self._number += 1
+        self._file = self._reopened(self._path("journal"))
+
+    def iterate_tables(self, runs: int = 2000) -> Iterator[pa.Table]:
+        """Yield the rows of all finished runs in the order of the plan, chunk by chunk.
+
+        Args:
+            runs: Approximate number of runs in a chunk.
+        """
+        import pyarrow as pa
+        from pyarrow import compute, parquet
+
+        pending = {place: rows for place, _, rows in self._records}
+        places = sorted(self.statuses)
+        # In chunks, since all rows of a million runs would not fit in memory.
+        for first in range(0, len(places), runs):
+            chunk = places[first : first + runs]
+            low, high = chunk[0], chunk[-1]
+            parts = [_placed(place, pending[place]) for place in chunk if place in pending]
+            for path, held in self._index.items():
+                if held[0] <= high and held[-1] >= low:
+                    between = (compute.field("place") >= low) & (compute.field("place") <= high)
+                    parts.append(parquet.read_table(path, filters=between))
+            whole = pa.concat_tables([part.replace_schema_metadata() for part in parts])
+            order = compute.sort_indices(
+                whole, sort_keys=[("place", "ascending"), ("k", "ascending")]
+            )
+            yield whole.take(order).drop_columns(["place"])
+
+    def list_segment_contents(
+        self,
+    ) -> Iterator[tuple[Path, dict[int, RunStatus], list[pa.Table] | None]]:
+        """Yield the content of each file.
+
+        The content is the statuses by index in the plan, and the rows of the current journal; the
+        rows of a part are None, since they are in its file.
+        """
+        for path, places in self._index.items():
+            yield path, {place: self.statuses[place] for place in places}, None
+        if self._records:
+            held = {place: status for place, status, _ in self._records}
+            yield self._path("journal"), held, [rows for _, _, rows in self._records]
+
+    def close(self) -> None:
+        """Close the journal and release the lock of the folder."""
+        self._file.close()
+        self._lock.close()
+
+    def delete_segments(self) -> None:
+        """Delete the segments, whose content has been stored elsewhere.
+
+        The folder is renamed first, so that an incomplete one is never found.
+        """
+        self.close()
+        # An incomplete folder of segments would count as an unfinished comparison.
+        gone = self.folder.with_name(f".{SEGMENTS_FOLDER}.gone")
+        shutil.rmtree(gone, ignore_errors=True)
+        self.folder.rename(gone)
+        shutil.rmtree(gone)
+
+
+def _placed(place: int, rows: pa.Table) -> pa.Table:
+    import numpy as np
+    import pyarrow as pa
+
+    return rows.append_column("place", pa.array(np.full(len(rows), place)))
+
+
+def _locked(path: Path) -> IO[str]:
+    """Lock the folder until this process ends in any way."""
+    file = path.open("a", encoding="ascii")
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # This system has no such locks.
+        pass
+    except OSError:
+        file.close()
+        raise InputError(
+            f"{path.parent.parent}: another simgap is at work there; wait for it, or end it"
+        ) from None
+    return file

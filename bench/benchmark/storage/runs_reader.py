@@ -1,0 +1,273 @@
+"""Read rows of runs batch by batch, and check every cell and the completeness of every run.
+
+The rows are those of runs.parquet and of the parts of a journal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.storage.cell_validation import (
+    CellError,
+    Mask,
+    check_cells,
+    parse_parquet_column,
+    select_declared_columns,
+    to_numpy_mask,
+)
+from bench.benchmark.storage.table_schemas import (
+    RUN_COLUMNS,
+    RUN_CONSTANT_COLUMNS,
+    ColumnSpec,
+    expand_columns,
+    list_channels,
+    list_parameters,
+)
+from sims.core.atomic_files import get_first_line
+from sims.core.simulator import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+_BATCH_ROWS = 131_072
+"""Number of rows checked at a time; all columns of many rows would not fit in memory."""
+
+
+class RunsTable(NamedTuple):
+    """A file of runs.
+
+    Attributes:
+        path: Path of the file.
+        remedy: Advice for a damaged file.
+    """
+
+    path: Path
+    remedy: str
+
+    def make_error(self, row: int | None, says: str) -> InputError:
+        """Make the error for a row, counted from 0, or for the whole file.
+
+        Args:
+            row: Row, or None for the file.
+            says: What is wrong.
+        """
+        place = "" if row is None else f", row {row}"
+        return InputError(f"{self.path}{place}: {says}; {self.remedy}")
+
+    def list_columns(self) -> list[str]:
+        """List the columns of the file.
+
+        Raises:
+            InputError: It is not a Parquet file.
+        """
+        from pyarrow import ArrowException, parquet
+
+        try:
+            return list(parquet.read_schema(self.path).names)
+        # In a damaged file even the names of columns may be invalid text.
+        except (OSError, ArrowException, UnicodeDecodeError) as error:
+            raise self._unreadable(error) from None
+
+    def read_runs(
+        self, experiment: Experiment, records: Sequence[pa.Table] | None = None
+    ) -> pd.DataFrame:
+        """Read one line per run, in the order of the file.
+
+        Each line has the columns that are constant within the run, ``row``, at which it begins, and
+        ``used``, its last k.
+
+        Args:
+            experiment: Experiment of the runs.
+            records: Tables that were read before, for a file that is not Parquet.
+
+        Raises:
+            InputError: The file is damaged; the message is one line.
+        """
+        import pyarrow as pa
+
+        try:
+            if records is None:
+                return read_checked_runs(self._batches(), self.list_columns(), experiment)
+            whole = pa.concat_tables(records)
+            return read_checked_runs([whole], whole.column_names, experiment)
+        except CellError as error:
+            raise self.make_error(error.row, error.says) from None
+        except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+            raise self._unreadable(error) from None
+
+    def _batches(self) -> Iterator[pa.Table]:
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        with parquet.ParquetFile(self.path) as file:
+            for batch in file.iter_batches(_BATCH_ROWS):
+                yield pa.Table.from_batches([batch])
+
+    def _unreadable(self, error: Exception) -> InputError:
+        missing = isinstance(error, FileNotFoundError)
+        what = (
+            "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
+        )
+        return InputError(f"{self.path}: not a complete comparison: {what}; {self.remedy}")
+
+
+def declare_run_columns(names: list[str], experiment: Experiment) -> list[ColumnSpec]:
+    """Return the declared columns of an experiment's runs.
+
+    The parameters and channels are those in the file's columns and those of the experiment.
+
+    Args:
+        names: Names of the file's columns.
+        experiment: The experiment.
+    """
+    parameters = dict.fromkeys([*list_parameters(names), *experiment.parameters])
+    channels = experiment.observe or list_channels(names)
+    columns = expand_columns(RUN_COLUMNS, parameters or ["PARAMETER"], channels or ["CHANNEL"])
+    # A single parameter also has its error in its own unit.
+    return [c for c in columns if c.name != "param_abs_error" or len(parameters) == 1]
+
+
+def read_checked_runs(
+    batches: Iterable[pa.Table], names: list[str], experiment: Experiment
+) -> pd.DataFrame:
+    """Check rows of runs and return one line per run; see `RunsTable.read_runs`.
+
+    Args:
+        batches: The rows, as consecutive tables.
+        names: Names of the columns.
+        experiment: Experiment of the runs.
+
+    Raises:
+        CellError: A cell or a run violates its declaration.
+    """
+    import pandas as pd
+
+    # Without runs there are no columns.
+    there = select_declared_columns(names, declare_run_columns(names, experiment)) if names else []
+    told: list[pd.DataFrame] = []
+    before: pa.Table | None = None
+    offset = 0
+    for batch in batches:
+        if not len(batch):
+            continue
+        rows = _checked(batch, there, before, offset)
+        told.append(_summarise_new_runs(rows, before is not None, offset))
+        offset += len(batch)
+        before = rows.slice(len(rows) - 1)
+    runs = (
+        pd.concat(told, ignore_index=True)
+        if told
+        else pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row"])
+    )
+    # k counts without gaps, so the number of rows gives the last k.
+    runs["used"] = np.diff(np.append(runs["row"].to_numpy(dtype=np.int64), offset)) - 1
+    twice = runs["run"].duplicated().to_numpy(dtype=bool)
+    if twice.any():
+        place = int(twice.argmax())
+        name = runs["run"].iloc[place]
+        raise CellError(int(runs["row"].iloc[place]), "run", "every run once", f"{name} again")
+    return runs
+
+
+def _checked(
+    batch: pa.Table, there: list[ColumnSpec], before: pa.Table | None, offset: int
+) -> pa.Table:
+    """Convert a batch to its declared types and prepend the last row of the previous batch.
+
+    Raises:
+        CellError: A cell violates its declaration, or a run is incomplete.
+    """
+    import pyarrow as pa
+    from pyarrow import compute
+
+    try:
+        typed = {c.name: parse_parquet_column(c, batch[c.name].combine_chunks()) for c in there}
+        at_start = typed["k"].to_numpy() == 0
+        no_truth = to_numpy_mask(compute.equal(typed["range"], "real"))
+        for column in there:
+            check_cells(column, typed[column.name], at_start, no_truth)
+    except CellError as error:
+        row = None if error.row is None else error.row + offset
+        raise _moved(error, row) from None
+    rows = pa.table(typed)
+    rows = rows if before is None else pa.concat_tables([before, rows]).combine_chunks()
+    try:
+        _check_counts(rows, before is not None)
+        _check_same(rows)
+    except CellError as error:
+        raise _moved(error, (error.row or 0) + offset - (before is not None)) from None
+    return rows
+
+
+def _moved(error: CellError, row: int | None) -> CellError:
+    error.row = row
+    return error
+
+
+def _new(rows: pa.Table) -> Mask:
+    """Return an (n,) mask of rows where a run begins, including the first row."""
+    return np.append(True, _changes(rows["run"]))
+
+
+def _changes(values: pa.ChunkedArray) -> Mask:
+    """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
+    import pyarrow as pa
+    from pyarrow import compute
+
+    column = values.combine_chunks()
+    if pa.types.is_floating(column.type):
+        numbers = column.to_numpy()
+        nothing = np.isnan(numbers[1:]) & np.isnan(numbers[:-1])
+        differ: Mask = (numbers[1:] != numbers[:-1]) & ~nothing
+        return differ
+    changed = compute.not_equal(column.slice(1), column.slice(0, max(len(column) - 1, 0)))
+    return to_numpy_mask(changed)
+
+
+def _check_counts(rows: pa.Table, goes_on: bool) -> None:
+    """Check that k counts 0, 1, 2, ... in every run."""
+    k: NDArray[np.int64] = rows["k"].to_numpy()
+    wanted = np.append(0, k[:-1] + 1)
+    wanted[_new(rows)] = 0
+    if goes_on:  # The first row was checked with the previous batch.
+        wanted[0] = k[0]
+    bad = k != wanted
+    if bad.any():
+        row = int(bad.argmax())
+        run = rows["run"][row].as_py()
+        raise CellError(row, "k", f"{wanted[row]}, the next of {run}", str(k[row]))
+
+
+def _described(rows: pa.Table) -> list[str]:
+    """List the columns that are constant within a run."""
+    names = rows.column_names
+    return [name for name in names if name in RUN_CONSTANT_COLUMNS or name.startswith("true_")]
+
+
+def _check_same(rows: pa.Table) -> None:
+    """Check that the columns that describe a run are constant within it."""
+    within = ~_new(rows)[1:]
+    for name in _described(rows):
+        bad = _changes(rows[name]) & within
+        if bad.any():
+            row = int(bad.argmax()) + 1
+            values = rows[name].slice(row - 1, 2).to_pylist()
+            raise CellError(row, name, f"{values[0]} as in the row before", str(values[1]))
+
+
+def _summarise_new_runs(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFrame:
+    """Return one line for each run that begins in these rows."""
+    new = _new(rows)
+    if goes_on:
+        new[0] = False
+    places = np.flatnonzero(new)
+    keys = rows.select(["run", *_described(rows)])
+    told: pd.DataFrame = keys.take(places).to_pandas()
+    return told.assign(row=places + offset - goes_on)

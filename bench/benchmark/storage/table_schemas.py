@@ -1,0 +1,346 @@
+"""Declaration of every column and key in the files of a result folder.
+
+`storage.cell_validation` checks the cells of a column, `storage.runs_reader` the rows of a run, and
+`storage.integrity_checks` the consistency between files. A column that is added later is
+`required=False` and has a `default`, so that older folders can still be read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+from bench.benchmark.problem.experiment import RANGES
+from bench.benchmark.storage.run_status import STATUSES
+
+SHOT_STATUSES = (*STATUSES, "no plan", "no recording")
+"""Possible statuses of a bounce shot."""
+ERROR_METRICS = (
+    "param_abs_error",
+    "param_error",
+    "stiff_error",
+    "sloppy_error",
+    "obs_error",
+    "heldout_error",
+)
+"""Error metrics in table.csv, which are columns of runs.parquet."""
+
+
+class EmptyCellRule(Enum):
+    """Where cells of a column are empty, that is empty text or NaN."""
+
+    NEVER = "never"
+    MAY = "anywhere"
+    AT_START = "where k = 0, and nowhere else"
+    NO_TRUTH = "on a recording, and nowhere else"
+
+
+@dataclass(frozen=True)
+class ColumnSpec:
+    """Declaration of a column.
+
+    Attributes:
+        name: Name; ``PARAMETER`` or ``CHANNEL`` in it stands for each parameter or channel.
+        kind: str, int, float or bool.
+        low: Smallest allowed number.
+        high: Largest allowed number.
+        words: Allowed texts; empty for any text.
+        empty: Where cells are empty.
+        infinite: Whether a number may be infinite.
+        required: Whether a file without the column is damaged.
+        default: Value if the column is missing.
+    """
+
+    name: str
+    kind: type
+    low: float = -math.inf
+    high: float = math.inf
+    words: tuple[str, ...] = ()
+    empty: EmptyCellRule = EmptyCellRule.NEVER
+    infinite: bool = False
+    required: bool = True
+    default: Any = None
+
+    @property
+    def expected_text(self) -> str:
+        """Description of a valid cell, for messages."""
+        if self.words:
+            return f"one of {', '.join(word for word in self.words if word)}"
+        if self.kind in (str, bool):
+            return {str: "text", bool: "True or False"}[self.kind]
+        ends = {
+            (False, False): "",
+            (True, False): f" of at least {self.low:g}",
+            (True, True): f" from {self.low:g} to {self.high:g}",
+        }[self.low > -math.inf, self.high < _LARGEST]
+        number = "a whole number" if self.kind is int else "a number"
+        return f"{number}{ends}"
+
+
+Columns = Sequence[ColumnSpec]
+_LARGEST = 2.0**53
+"""Upper limit of whole numbers that a float represents exactly."""
+
+
+def _size(name: str, empty: EmptyCellRule = EmptyCellRule.NEVER, **options: Any) -> ColumnSpec:
+    """Declare a column of non-negative numbers."""
+    return ColumnSpec(name, float, low=0.0, empty=empty, **options)
+
+
+def _count(name: str, low: int = 0, **options: Any) -> ColumnSpec:
+    """Declare a column of whole numbers that are not negative."""
+    return ColumnSpec(name, int, low=low, high=_LARGEST, **options)
+
+
+_TRUSTED = ColumnSpec("trusted", bool, required=False, default=False)
+_RANGE = ColumnSpec("range", str, words=RANGES)
+
+RUN_COLUMNS: Columns = (
+    *(ColumnSpec(name, str) for name in ("run", "experiment", "tuner", "simulator", "target")),
+    _count("seed"),
+    _RANGE,
+    _count("k"),
+    _size("loss", EmptyCellRule.AT_START, infinite=True),
+    _size("param_error", EmptyCellRule.NO_TRUTH),
+    _size("param_abs_error", EmptyCellRule.NO_TRUTH, required=False),
+    _size("stiff_error", EmptyCellRule.MAY, required=False),
+    _size("sloppy_error", EmptyCellRule.MAY, required=False),
+    _size("outside", EmptyCellRule.NO_TRUTH),
+    ColumnSpec("proposal_PARAMETER", float, empty=EmptyCellRule.AT_START),
+    ColumnSpec("recommendation_PARAMETER", float),
+    ColumnSpec("true_PARAMETER", float, empty=EmptyCellRule.NO_TRUTH),
+    _size("obs_error", EmptyCellRule.MAY, infinite=True),
+    _size("heldout_error", EmptyCellRule.MAY, infinite=True),
+    _size("obs_error_CHANNEL_in_noise", EmptyCellRule.MAY, infinite=True),
+    _size("obs_error_CHANNEL", EmptyCellRule.MAY, infinite=True),
+    _size("heldout_error_CHANNEL", EmptyCellRule.MAY, infinite=True),
+    _size("tuner_seconds", EmptyCellRule.AT_START),
+    _size("simulator_seconds", EmptyCellRule.AT_START),
+    _TRUSTED,
+)
+"""Columns of runs.parquet, parts and records: one row per simulation."""
+
+RUN_CONSTANT_COLUMNS = (
+    "experiment",
+    "tuner",
+    "simulator",
+    "target",
+    "seed",
+    "range",
+    "outside",
+    "trusted",
+)
+"""Columns of `RUN_COLUMNS` that are constant within a run, as are all true parameters."""
+
+STATUS_COLUMNS: Columns = (
+    *(ColumnSpec(name, str) for name in ("run", "tuner", "simulator")),
+    ColumnSpec("target", str, empty=EmptyCellRule.MAY),  # Of a tuner that was skipped.
+    _count("seed"),
+    ColumnSpec("status", str, words=STATUSES),
+    ColumnSpec("reason", str, empty=EmptyCellRule.MAY),
+    _count("simulations"),
+    _size("seconds"),
+    _TRUSTED,
+)
+"""Columns of a comparison's status.csv and of stored statuses: one row per run."""
+
+TRAINING_COLUMNS: Columns = (
+    ColumnSpec("tuner", str),
+    _count("seed"),
+    _count("simulations"),
+    _size("seconds"),
+    _TRUSTED,
+)
+"""Columns of training.csv: one row per training."""
+
+IDENTIFIABILITY_COLUMNS: Columns = (
+    ColumnSpec("experiment", str),
+    ColumnSpec("target", str),
+    _RANGE,
+    _count("direction", low=1),
+    _size("eigenvalue", infinite=True),
+    _size("sigma", infinite=True),
+    ColumnSpec("stiff", bool),
+    ColumnSpec("PARAMETER", float, low=-1.0 - 1e-9, high=1.0 + 1e-9),
+)
+"""Columns of identifiability.csv: one row per target and direction."""
+
+ERROR_TABLE_COLUMNS: Columns = (
+    ColumnSpec("experiment", str),
+    ColumnSpec("tuner", str),
+    ColumnSpec("range", str, words=(*RANGES, "")),
+    _count("simulations"),
+    ColumnSpec("metric", str, words=(*ERROR_METRICS, "")),
+    *(_size(name, EmptyCellRule.MAY, infinite=True) for name in ("median", "mean", "low", "high")),
+    _count("runs"),
+    _count("failures"),
+    _size("fit_simulations"),
+    _size("fit_seconds"),
+    _size("tuner_seconds", EmptyCellRule.MAY),
+    _size("simulator_seconds", EmptyCellRule.MAY),
+    ColumnSpec("salt", str, words=("secret", "public"), required=False),
+    _TRUSTED,
+)
+"""Columns of a comparison's table.csv."""
+
+_MODEL = ColumnSpec("model", str, words=("plain", "extended"))
+MISSPECIFICATION_TABLE_COLUMNS: Columns = (
+    ColumnSpec("experiment", str),
+    _MODEL,
+    ColumnSpec("tuner", str),
+    ColumnSpec("metric", str, words=("bias", "absolute_error", "param_error", "heldout_error")),
+    ColumnSpec("parameter", str, empty=EmptyCellRule.MAY),
+    ColumnSpec("unit", str),
+    *(ColumnSpec(name, float, empty=EmptyCellRule.MAY) for name in ("mean", "low", "high")),
+    _count("targets"),
+    _count("runs"),
+    _count("failures"),
+    _TRUSTED,
+)
+"""Columns of table.csv of a study of a missing effect; errors over all parameters name none."""
+
+_RANKED = ColumnSpec("metric", str, words=("param_error", "heldout_error"))
+MISSPECIFICATION_RANK_COLUMNS: Columns = (
+    ColumnSpec("experiment", str),
+    _RANKED,
+    ColumnSpec("tuner", str),
+    *(_size(name) for name in ("plain", "extended")),
+    _TRUSTED,
+)
+"""Columns of ranks.csv of a study of a missing effect: mean rank over targets by simulator."""
+
+RANK_AGREEMENT_COLUMNS: Columns = (
+    ColumnSpec("experiment", str),
+    _RANKED,
+    _count("tuners"),
+    _count("targets"),
+    *(
+        ColumnSpec(name, float, empty=EmptyCellRule.MAY, low=-1.0, high=1.0)
+        for name in ("tau", "low", "high", "tau_of_halves")
+    ),
+    *(
+        _size(name, EmptyCellRule.MAY, high=1.0)
+        for name in ("p_value", "friedman_plain", "friedman_extended")
+    ),
+    _TRUSTED,
+)
+"""Columns of ranking.csv of a study of a missing effect: agreement of tuner rankings."""
+
+SHOT_MODEL_COLUMNS: Columns = (
+    ColumnSpec("method", str),
+    _size("restitution", EmptyCellRule.MAY),
+    _count("simulations"),
+    _size("seconds", EmptyCellRule.MAY),
+    ColumnSpec("status", str, words=SHOT_STATUSES),
+    ColumnSpec("reason", str, empty=EmptyCellRule.MAY),
+    _size("height", EmptyCellRule.MAY),
+    ColumnSpec("margin", float, empty=EmptyCellRule.MAY),
+)
+"""Keys of a model in shots/NAME.json, in addition to its ``effects``."""
+
+SHOT_COLUMNS: Columns = (
+    *(ColumnSpec(name, str) for name in ("shot", "ball", "method")),
+    ColumnSpec("hit", bool),
+    *(
+        ColumnSpec(name, float, empty=EmptyCellRule.MAY, infinite=True)
+        for name in ("off", "margin", "planned_margin")
+    ),
+    _size("prediction_error", EmptyCellRule.MAY),
+    _size("drop_height", EmptyCellRule.MAY),
+    _size("restitution", EmptyCellRule.MAY),
+    _size("true_restitution"),
+    ColumnSpec("effects", str, empty=EmptyCellRule.MAY),
+    _count("simulations"),
+    _size("seconds", EmptyCellRule.MAY),
+    ColumnSpec("status", str, words=SHOT_STATUSES),
+    ColumnSpec("reason", str, empty=EmptyCellRule.MAY),
+    _size("seen", high=1.0),
+    _TRUSTED,
+)
+"""Columns of a bounce shot's shots.csv; rows in shots/NAME.json lack the last column."""
+
+SHOT_STATUS_COLUMNS: Columns = tuple(
+    replace(column, words=SHOT_STATUSES)
+    if column.name == "status"
+    else replace(column, empty=EmptyCellRule.MAY)
+    if column.name == "seconds"
+    else column
+    for column in STATUS_COLUMNS
+)
+"""Columns of a bounce shot's status.csv."""
+
+SHOT_TABLE_COLUMNS: Columns = (
+    ColumnSpec("method", str),
+    ColumnSpec("ball", str),
+    _count("shots", low=1),
+    _count("hits"),
+    *(_size(name, high=1.0) for name in ("rate", "low", "high")),
+    *(_size(name, EmptyCellRule.MAY, infinite=True) for name in ("off_median", "off_90")),
+    *(_size(f"prediction_error_{name}", EmptyCellRule.MAY) for name in ("median", "mean")),
+    _size("simulations"),
+    _size("seconds", EmptyCellRule.MAY),
+    _count("failures"),
+    _TRUSTED,
+)
+"""Columns of a bounce shot's table.csv."""
+
+ENVIRONMENT_KEYS: Mapping[str, Any] = {
+    "simgap": str,
+    "experiment": str,
+    "plugins": tuple[str, ...],
+    "jobs": int,
+    "seals": tuple[str, ...],
+    "started": str,
+    "python": str,
+    "platform": str,
+    "machine": str,
+    "processors": int,
+    "fingerprint": Mapping[str, str],
+    "stepping": str,
+    "packages": Mapping[str, str],
+    "redrawn_targets": int,
+    "target_draws": int,
+}
+"""Types of the values in environment.json, by key; a file may have further keys."""
+OPTIONAL_ENVIRONMENT_KEYS = ("fingerprint", "seals", "stepping", "redrawn_targets", "target_draws")
+"""Keys that folders of an older simgap may lack; the last two belong to tuner comparisons only."""
+
+
+def expand_columns(
+    columns: Columns, parameters: Iterable[str], channels: Iterable[str]
+) -> list[ColumnSpec]:
+    """Replace placeholder columns by one column for each parameter and channel.
+
+    Args:
+        columns: Declared columns.
+        parameters: Names that replace ``PARAMETER``.
+        channels: Names that replace ``CHANNEL``.
+    """
+    names = {"PARAMETER": list(parameters), "CHANNEL": list(channels)}
+    result = []
+    for column in columns:
+        marks = [mark for mark in names if mark in column.name]
+        if not marks:
+            result.append(column)
+        for mark in marks:
+            result += [replace(column, name=column.name.replace(mark, n)) for n in names[mark]]
+    return result
+
+
+def list_parameters(names: Iterable[str]) -> list[str]:
+    """List the parameters in the names of a file's columns."""
+    return _spoken_of(names, "proposal_", "recommendation_", "true_")
+
+
+def list_channels(names: Iterable[str]) -> list[str]:
+    """List the channels in the names of a file's columns."""
+    found = _spoken_of(names, "obs_error_", "heldout_error_")
+    return list(dict.fromkeys(name.removesuffix("_in_noise") for name in found))
+
+
+def _spoken_of(names: Iterable[str], *prefixes: str) -> list[str]:
+    rests = [name[len(p) :] for name in names for p in prefixes if name.startswith(p)]
+    return list(dict.fromkeys(rests))

@@ -1,0 +1,118 @@
+"""Results table of a bounce-shot study: hits with Wilson intervals, and prediction errors."""
+
+from __future__ import annotations
+
+import math
+
+import pandas as pd
+
+from bench.benchmark.storage.run_status import FAILED_STATUSES
+
+ALL_BALLS = "all"
+"""Value of the column ball for all kinds of balls together."""
+RESULT_COLUMNS = [
+    "method",
+    "ball",
+    "shots",
+    "hits",
+    "rate",
+    "low",
+    "high",
+    "off_median",
+    "off_90",
+    "prediction_error_median",
+    "prediction_error_mean",
+    "simulations",
+    "seconds",
+    "failures",
+]
+NO_SHOT_STATUSES = (*FAILED_STATUSES, "no plan", "no recording")
+"""Statuses of a method without a shot, or without one that was planned in a tuned model."""
+
+
+def compute_wilson_interval(
+    hits: int, shots: int, z: float = 1.959963984540054
+) -> tuple[float, float]:
+    """Compute the 95 % score interval of a proportion by Wilson's method.
+
+    For a proportion p of n shots (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
+    doi:10.2307/2276774):
+
+        centre = (p + z^2 / 2n) / (1 + z^2 / n)                                  (1)
+        half = z / (1 + z^2 / n) sqrt(p (1 - p) / n + z^2 / 4n^2)                (2)
+
+    Args:
+        hits: number of hits.
+        shots: number of shots.
+        z: quantile of the normal distribution.
+
+    Returns:
+        Lower and upper bound; NaN without shots.
+    """
+    if shots < 1:
+        return float("nan"), float("nan")
+    share, n = hits / shots, float(shots)
+    centre = (share + z * z / (2 * n)) / (1 + z * z / n)  # (1)
+    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))  # (2)
+    # Rounding errors may exceed the range of a proportion slightly.
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def build_result_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Build the results table: one line per method and ball, and one per method for all balls.
+
+    Distances are in m. `off` is the distance from the hoop's centre in the plane of the hoop; it is
+    infinite for a shot that never meets the plane.
+    """
+    lines = []
+    for method, part in rows.groupby("method", sort=False):
+        balls = [(ball, group) for ball, group in part.groupby("ball", sort=False)]
+        lines += [
+            _line(str(method), str(ball), group) for ball, group in [*balls, (ALL_BALLS, part)]
+        ]
+    return pd.DataFrame(lines, columns=RESULT_COLUMNS)
+
+
+def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
+    shots, hits = len(part), int(part["hit"].sum())
+    off = part["off"].abs().fillna(math.inf)
+    errors = part["prediction_error"]
+    failures = int(part["status"].isin(NO_SHOT_STATUSES).sum())
+    # Not interpolated, because values may be infinite.
+    near = off.quantile([0.5, 0.9], interpolation="higher").tolist()
+    return [
+        method,
+        ball,
+        shots,
+        hits,
+        hits / shots,
+        *compute_wilson_interval(hits, shots),
+        *near,
+        errors.median(),
+        errors.mean(),
+        part["simulations"].mean(),
+        part["seconds"].mean(),
+        failures,
+    ]
+
+
+def format_result_table(lines: pd.DataFrame) -> str:
+    """Format the table for the terminal: hits by ball, hit rate with interval, prediction error."""
+    balls = [ball for ball in lines["ball"].unique() if ball != ALL_BALLS]
+    width = max(len(m) for m in lines["method"])
+    head = (
+        f"{'hits of shots':{width}}  "
+        + "  ".join(f"{b:>12}" for b in balls)
+        + "   all (95 %, Wilson)   path off by"
+    )
+    told = [head]
+    for method, part in lines.groupby("method", sort=False):
+        by = part.set_index("ball")
+        cells = [f"{f'{by.hits[b]}/{by.shots[b]}':>12}" for b in balls]
+        share = f"{by.rate[ALL_BALLS]:6.1%} ({by.low[ALL_BALLS]:.0%}–{by.high[ALL_BALLS]:.0%})"
+        told.append(
+            f"{method:{width}}  "
+            + "  ".join(cells)
+            + f"   {share:18}   {by.prediction_error_mean[ALL_BALLS]:.3f} m"
+        )
+    return "\n".join(told)

@@ -1,0 +1,164 @@
+"""Animation of a shot: the filmed and tracked drop, then the planned and executed shots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_execution import SAMPLING_RATE_HZ
+from bench.bounce_shot.shot_figures import (
+    ExampleShot,
+    draw_shot_panel,
+    execute_example,
+    find_path_end,
+)
+from bench.bounce_shot.shot_sampling import RECORDINGS_FOLDER, ShotSetup
+from bench.figures.style import BLUE, TRUSTED_TUNERS_NOTE, VERMILION, make_panel_grid
+from sims.core.simulator import Array, InputError
+from sims.recording.recording import read_recording
+from sims.systems.ball import Ball
+from sims.vision.ball_renderer import RgbImage
+from sims.vision.video_files import VideoFile
+
+_FRAMES_PER_SECOND = 12
+"""Frame rate of the animation, Hz."""
+_SLOW_MOTION_FACTOR = 2.0
+"""Slow-motion factor of the shots."""
+_HOLD_FRAMES = 9
+"""Number of frames for which the end is shown."""
+_DPI = 70
+
+
+class FilmFrames(NamedTuple):
+    """Film of a drop, resampled to the frame rate of the animation.
+
+    Attributes:
+        pictures: frames of the film.
+        tracks: for each frame, the ball centres tracked until then, pixels, (n, 2).
+    """
+
+    pictures: list[RgbImage]
+    tracks: list[Array]
+
+
+class _Moving(NamedTuple):
+    """Flown path (T, 3) until sample `end`, its line, and the ball at the end of the line."""
+
+    path: Array
+    end: int
+    line: Any
+    ball: Any
+
+    def show(self, sample: int) -> None:
+        now = min(sample, self.end - 1)
+        self.line.set_data(self.path[: now + 1, 0], self.path[: now + 1, 2])
+        self.ball.set_data(self.path[now : now + 1, 0], self.path[now : now + 1, 2])
+
+
+class _Filmed(NamedTuple):
+    """Panel of the film: frame, track so far, and a ring around its end."""
+
+    picture: Any
+    track: Any
+    ring: Any
+
+    def show(self, picture: RgbImage, track: Array) -> None:
+        self.picture.set_data(picture)
+        self.track.set_data(*track.T)
+        self.ring.set_data(*track[-1:].T)
+
+
+def write_animation(
+    folder: Path,
+    settings: ShotConfig,
+    example: tuple[ShotSetup, list[str]],
+    kept: Mapping[str, Any],
+    trusted: bool = False,
+) -> Path:
+    """Write figures/shot.gif: a drop at normal speed, if it was filmed, and shots at half speed.
+
+    Args:
+        folder: result folder.
+        settings: the [shot] table.
+        example: the shot and its methods.
+        kept: stored results by name of the shot.
+        trusted: whether tuners ran without isolation, which the title then says.
+
+    Returns:
+        Path of the animation.
+    """
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    dealt, methods = example
+    film = _film(folder / RECORDINGS_FOLDER / f"{dealt.name}.mp4")
+    beside = int(bool(film.pictures))
+    # Margins are set once, below: a layout engine would move the panels from frame to frame.
+    figure, axes = make_panel_grid(
+        1,
+        len(methods) + beside,
+        (2.9 * len(methods) + 1.5 * beside, 3.2),
+        layout=None,
+        gridspec_kw={"width_ratios": [0.5] * beside + [1] * len(methods)},
+    )
+    shot = execute_example(settings, dealt, methods, kept)
+    panels = zip(axes[0, beside:], methods, strict=True)
+    moving = [_shot_panel(axis, dealt, method, shot) for axis, method in panels]
+    filmed = _film_panel(axes[0, 0], film) if beside else None
+    step = SAMPLING_RATE_HZ / _FRAMES_PER_SECOND / _SLOW_MOTION_FACTOR
+    shots = int(np.ceil(max(one.end for one in moving) / step)) + 1
+
+    def show(frame: int) -> list[Any]:
+        later = frame - len(film.pictures)
+        if filmed is not None and later < 0:
+            filmed.show(film.pictures[frame], film.tracks[frame])
+        else:
+            for one in moving:
+                one.show(round(later * step))
+        return []
+
+    if trusted:
+        figure.suptitle(TRUSTED_TUNERS_NOTE, fontsize=7)
+    figure.tight_layout()
+    path = folder / "figures" / "shot.gif"
+    frames = len(film.pictures) + shots + _HOLD_FRAMES
+    writer = PillowWriter(_FRAMES_PER_SECOND)
+    FuncAnimation(figure, show, frames=frames).save(path, writer, dpi=_DPI)
+    return path
+
+
+def _shot_panel(axis: Any, dealt: ShotSetup, method: str, shot: ExampleShot) -> _Moving:
+    """Draw the panel of one method in the initial state."""
+    draw_shot_panel(axis, dealt, method, shot)
+    line = axis.lines[-1]
+    line.set_data([], [])
+    (ball,) = axis.plot([], [], marker="o", color=VERMILION, markeredgecolor="black", markersize=7)
+    path = shot.throws[method].flown
+    return _Moving(path, find_path_end(path, dealt.scene), line, ball)
+
+
+def _film_panel(axis: Any, film: FilmFrames) -> _Filmed:
+    picture = axis.imshow(film.pictures[0])
+    (track,) = axis.plot([], [], color=BLUE, linewidth=0.7)
+    look = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": VERMILION}
+    (ring,) = axis.plot([], [], "o", **look)
+    axis.set_title("one drop,\nfilmed and tracked", fontsize=9)
+    axis.set(xticks=[], yticks=[])
+    return _Filmed(picture, track, ring)
+
+
+def _film(path: Path) -> FilmFrames:
+    """Read the film of a drop and its track; the result is empty if there is no film."""
+    try:
+        frames = list(VideoFile(path))
+        run = read_recording(path.with_suffix(".csv"), Ball, whole=True).runs[0]
+    except InputError:
+        return FilmFrames([], [])
+    times = np.array([time for time, _ in frames]) - frames[0][0]
+    wanted = np.arange(0.0, times[-1], 1.0 / _FRAMES_PER_SECOND)
+    track = np.stack([run.extra["u"], run.extra["v"]], axis=1)
+    pictures = [frames[int(np.searchsorted(times, time - 1e-6))][1] for time in wanted]
+    return FilmFrames(pictures, [track[run.times <= time + 1e-6] for time in wanted])

@@ -1,0 +1,143 @@
+"""Execute a planned shot in the true world, and compute the prediction error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_geometry import compute_hoop_crossings
+from bench.bounce_shot.shot_planner import simulate_flights
+from bench.bounce_shot.shot_planning import (
+    TunedModel,
+    get_planning_constants,
+    get_planning_theta,
+    make_planning_simulator,
+)
+from bench.bounce_shot.shot_sampling import ShotSetup
+from bench.bounce_shot.true_world import InclinedGround, simulate_shot
+from sims.core.simulator import Array
+
+SAMPLING_RATE_HZ = 240.0
+"""Sampling rate of a shot, Hz."""
+MAX_SHOT_SECONDS = 3.0
+"""Maximum duration of a shot, seconds."""
+
+
+@dataclass(frozen=True)
+class ShotResult:
+    """Result of one shot.
+
+    Attributes:
+        is_hit: whether the centre passed through the hoop.
+        miss_distance: where the centre passed the hoop's plane, m from the hoop's centre along x, >
+            0 beyond it; NaN if it did not.
+        prediction_error: mean distance in m between the planned and the flown centre at equal
+            times, from the release until one of them has passed the hoop's plane.
+        times: times, seconds, (T,).
+        planned: planned path, (T, 3); NaN if there was no plan.
+        flown: flown path, (T, 3).
+    """
+
+    is_hit: bool
+    miss_distance: float
+    prediction_error: float
+    times: Array
+    planned: Array
+    flown: Array
+
+
+def execute_shot(dealt: ShotSetup, settings: ShotConfig, model: TunedModel) -> ShotResult:
+    """Execute a planned shot, with the shot's release error.
+
+    Args:
+        dealt: the shot.
+        settings: the [shot] table.
+        model: tuned model with the plan.
+    """
+    times = np.arange(round(MAX_SHOT_SECONDS * SAMPLING_RATE_HZ) + 1) / SAMPLING_RATE_HZ
+    # Without a plan, the shot is a miss.
+    if not math.isfinite(model.height):
+        nothing = np.full((times.size, 3), np.nan)
+        return ShotResult(False, float("nan"), float("nan"), times, nothing, nothing)
+    heights = np.array([model.height])
+    known = get_planning_constants(settings, dealt.ball.radius)
+    planned = simulate_flights(
+        make_planning_simulator(model),
+        get_planning_theta(model),
+        dealt.scene,
+        known,
+        heights,
+        times,
+    )[0]
+    # The true ball, friction and release, which the planner does not know.
+    ground = InclinedGround(dealt.scene.angle, settings.friction)
+    start = (
+        dealt.release[0],
+        0.0,
+        dealt.scene.compute_contact_height(dealt.ball.radius) + model.height + dealt.release[1],
+    )
+    flown = simulate_shot(dealt.ball, ground, start, times)
+    x, y = compute_hoop_crossings(flown[None], dealt.scene)[0].tolist()
+    off = x - dealt.scene.hoop_x
+    hit = math.hypot(off, y) < dealt.scene.hoop_radius
+    # Beyond the hoop's plane, nothing was planned.
+    last = min(_through(planned, dealt.scene.hoop_z), _through(flown, dealt.scene.hoop_z))
+    error = float(np.linalg.norm(planned - flown, axis=1)[: last + 1].mean())
+    return ShotResult(hit, off, error, times, planned, flown)
+
+
+def _through(path: Array, height: float) -> int:
+    """Return the index of the sample after which a path descends through a height after its bounce.
+
+    If it does not, return the last index.
+    """
+    z = path[:, 2]
+    # Before its bounce, the ball falls through the same heights.
+    risen = np.logical_or.accumulate(z[1:] > z[:-1])
+    down = np.flatnonzero(risen & (z[:-1] > height) & (z[1:] <= height))
+    return int(down[0]) if down.size else len(z) - 1
+
+
+def build_shot_rows(
+    dealt: ShotSetup, settings: ShotConfig, made: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Execute the shot of each method, and build the result rows.
+
+    Args:
+        dealt: the shot.
+        settings: the [shot] table.
+        made: fields of the tuned model of each method.
+    """
+    return [
+        _row(dealt, model, execute_shot(dealt, settings, model))
+        for model in (TunedModel(**row) for row in made)
+    ]
+
+
+def _row(dealt: ShotSetup, model: TunedModel, made: ShotResult) -> dict[str, Any]:
+    effects: Mapping[str, Any] = model.effects
+    return {
+        "shot": dealt.name,
+        "ball": dealt.name.rpartition("-")[0],
+        "method": model.method,
+        "hit": made.is_hit,
+        "off": made.miss_distance,
+        "margin": dealt.scene.hoop_radius - abs(made.miss_distance),
+        "planned_margin": model.margin,
+        "prediction_error": made.prediction_error,
+        "drop_height": model.height,
+        "restitution": model.restitution,
+        "true_restitution": dealt.ball.restitution,
+        "effects": "; ".join(
+            f"{name} {', '.join(f'{v:.4g}' for v in values)}" for name, values in effects.items()
+        ),
+        "simulations": model.simulations,
+        "seconds": model.seconds,
+        "status": model.status,
+        "reason": model.reason.strip().splitlines()[-1] if model.reason.strip() else "",
+    }

@@ -1,0 +1,393 @@
+"""Figures of a bounce-shot study: hits by ball and method, misses, and example shots."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.bounce_shot.hit_rate_table import ALL_BALLS
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_execution import ShotResult, execute_shot
+from bench.bounce_shot.shot_geometry import ShotGeometry
+from bench.bounce_shot.shot_planning import (
+    EXPLAIN_METHOD,
+    EXPLAIN_SUFFIX,
+    UNTUNED_METHOD,
+    TunedModel,
+)
+from bench.bounce_shot.shot_sampling import ShotSetup
+from bench.figures.style import (
+    BLACK,
+    BLUE,
+    CAPTION_GREY,
+    GREY,
+    INCLINE_GREY,
+    VERMILION,
+    FigureFiles,
+    add_trust_note,
+    make_panel_grid,
+    render_all_formats,
+)
+from sims.core.simulator import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_GROUPS = {"untuned": (GREY, "s"), "tuned": (BLUE, "o"), "extended": (VERMILION, "D")}
+"""Colour and marker of each group of methods."""
+_WORDS = {
+    "untuned": "untuned simulator",
+    "tuned": "restitution tuned to one recorded drop",
+    "extended": "simulator extended by explain from the same drop",
+}
+_MAX_SHOWN_RADII = 6
+"""Range of the shown misses, in radii of the hoop."""
+_BELOW = 0.12
+"""Distance below the hoop down to which paths are drawn, m."""
+
+
+def draw_figures(
+    experiment: Experiment,
+    settings: ShotConfig,
+    dealt: Sequence[ShotSetup],
+    kept: Mapping[str, Any],
+    rows: pd.DataFrame,
+    lines: pd.DataFrame,
+) -> dict[str, FigureFiles]:
+    """Draw all figures.
+
+    Args:
+        experiment: the experiment.
+        settings: the [shot] table.
+        dealt: all shots.
+        kept: stored results by name of the shot.
+        rows: rows of shots.csv.
+        lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
+
+    Returns:
+        Printed figures by name.
+    """
+    figures = {
+        "success": draw_success_figure(experiment, lines),
+        "off": draw_miss_figure(settings, rows),
+    }
+    chosen = select_example_shots(dealt, kept, rows)
+    if chosen:
+        figures["shots"] = draw_shots_figure(settings, chosen, kept)
+    return {
+        name: render_all_formats(add_trust_note(figure, experiment.trusted))
+        for name, figure in figures.items()
+    }
+
+
+def get_method_group(method: str) -> str:
+    """Return the group of a method: untuned, tuned or extended."""
+    if method == UNTUNED_METHOD:
+        return "untuned"
+    return "extended" if method == EXPLAIN_METHOD or method.endswith(EXPLAIN_SUFFIX) else "tuned"
+
+
+def get_method_label(method: str) -> str:
+    """Return the label of a method in figures."""
+    return "explain's own fit" if method == EXPLAIN_METHOD else method
+
+
+def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
+    """Draw the hit rate over all balls (left) and hits with intervals by ball (right).
+
+    Args:
+        experiment: the experiment.
+        lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
+    """
+    methods = list(lines["method"].unique())
+    size = (11.5, 1.6 + 0.42 * len(methods))
+    figure, axes = make_panel_grid(1, 2, size, sharey=True, gridspec_kw={"width_ratios": [1, 1.9]})
+    _rates(axes[0, 0], lines, methods)
+    _by_ball(axes[0, 1], lines, methods)
+    _legend(figure, methods)
+    counts = sorted(set(lines.loc[lines["ball"] != ALL_BALLS, "shots"].tolist()))
+    shots = "–".join(str(n) for n in (counts if len(counts) == 1 else (counts[0], counts[-1])))
+    note = f"shots of each ball: {shots}, each with a ball and a recorded drop of its own"
+    title = experiment.title or experiment.name
+    figure.suptitle(f"{title}\n{note}; bars and ranges: 95 % (Wilson)", fontsize=10)
+    return figure
+
+
+def _rates(axis: Axes, lines: pd.DataFrame, methods: Sequence[str]) -> None:
+    """Draw the hit rate of each method over all balls, with its interval."""
+    over = lines[lines["ball"] == ALL_BALLS].set_index("method")
+    for place, method in enumerate(methods):
+        colour, marker = _GROUPS[get_method_group(method)]
+        rate, low, high = (100 * float(over[c][method]) for c in ("rate", "low", "high"))
+        axis.plot([low, high], [place, place], color=colour, linewidth=2)
+        axis.plot(rate, place, marker=marker, color=colour, markersize=7)
+        # A decimal prevents rounding to 0 % or 100 %.
+        near = 0 < rate < 0.5 or 99.5 <= rate < 100
+        axis.annotate(
+            f"{rate:.{1 if near else 0}f}",
+            (rate, place),
+            xytext=(0, 6),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+        )
+    axis.set(xlim=(-2, 104), xlabel="shots through the hoop, all balls [%]")
+    _methods_down(axis, methods)
+    axis.grid(visible=True, axis="x", linewidth=0.4, alpha=0.5)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _by_ball(axis: Axes, lines: pd.DataFrame, methods: Sequence[str]) -> None:
+    """Draw the hits as cells by method and ball; lighter cells have more hits."""
+    balls = [ball for ball in lines["ball"].unique() if ball != ALL_BALLS]
+    for line in lines[lines["ball"] != ALL_BALLS].to_dict("records"):
+        x, y, rate = balls.index(line["ball"]), methods.index(line["method"]), float(line["rate"])
+        axis.add_patch(_cell(x, y, rate))
+        interval = f"{100 * line['low']:.0f}–{100 * line['high']:.0f} %"
+        axis.text(
+            x,
+            y,
+            f"{line['hits']}/{line['shots']}   {interval}",
+            ha="center",
+            va="center",
+            fontsize=7.5,
+            color="white" if rate < 0.45 else "black",
+        )
+    axis.set(xlim=(-0.5, len(balls) - 0.5), ylim=(len(methods) - 0.5, -0.5))
+    axis.set_xticks(range(len(balls)), balls, fontsize=9)
+    axis.xaxis.tick_top()
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
+
+
+def _methods_down(axis: Axes, methods: Sequence[str]) -> None:
+    axis.set_yticks(range(len(methods)), [get_method_label(m) for m in methods])
+    axis.invert_yaxis()
+
+
+def _cell(x: int, y: int, rate: float) -> Any:
+    from matplotlib.patches import Rectangle
+
+    shade = 0.25 + 0.72 * rate
+    return Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=(shade, shade, shade), linewidth=0)
+
+
+def _legend(figure: Figure, methods: Sequence[str]) -> None:
+    """Draw the legend of the groups that occur, below the figure."""
+    from matplotlib.lines import Line2D
+
+    present = {get_method_group(method) for method in methods}
+    handles = []
+    for group, (colour, marker) in _GROUPS.items():
+        if group in present:
+            handles.append(Line2D([], [], color=colour, marker=marker, label=_WORDS[group]))
+    columns = len(handles)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, fontsize=8, frameon=False
+    )
+
+
+def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
+    """Draw where shots met the hoop's plane (left) and the prediction error (right) as box plots.
+
+    Args:
+        settings: the [shot] table.
+        rows: rows of shots.csv.
+    """
+    methods = list(rows["method"].unique())
+    figure, axes = make_panel_grid(1, 2, (11.5, 1.6 + 0.42 * len(methods)), sharey=True)
+    left, right = axes[0]
+    for place, method in enumerate(methods):
+        part = rows[rows["method"] == method]
+        colour, _ = _GROUPS[get_method_group(method)]
+        _box(left, 100 * part["off"].dropna().to_numpy(), place, colour)
+        _box(right, 100 * part["prediction_error"].dropna().to_numpy(), place, colour)
+    radius = 100 * settings.hoop_radius
+    left.axvspan(-radius, radius, color=BLACK, alpha=0.08, linewidth=0)
+    left.axvline(0, color=CAPTION_GREY, linewidth=0.8)
+    left.set_xlabel(
+        "where shots met the hoop's plane, from its centre [cm]\n"
+        f"grey: the hoop; beyond {_MAX_SHOWN_RADII} of its radii not shown"
+    )
+    left.set_xlim(-_MAX_SHOWN_RADII * radius, _MAX_SHOWN_RADII * radius)
+    right.set_xlabel("mean distance between planned and flown path [cm]")
+    right.set_xscale("log")
+    right.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+    right.minorticks_off()
+    _methods_down(left, methods)
+    for axis in (left, right):
+        axis.grid(visible=True, axis="x", which="both", linewidth=0.3, alpha=0.5)
+        axis.spines[["top", "right"]].set_visible(False)
+    _legend(figure, methods)
+    shots, balls = rows["shot"].nunique(), rows["ball"].nunique()
+    title = f"How far off: {shots} shots of {balls} kinds of ball by every method"
+    note = "box: quartiles and median, whiskers: 5 % and 95 %, dots: shots outside"
+    figure.suptitle(f"{title}\n{note}", fontsize=10)
+    return figure
+
+
+def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
+    if not values.size:
+        return
+    axis.boxplot(
+        values,
+        positions=[place],
+        orientation="horizontal",
+        whis=(5, 95),
+        widths=0.55,
+        patch_artist=True,
+        boxprops={"facecolor": colour, "alpha": 0.45, "edgecolor": colour},
+        medianprops={"color": "black"},
+        flierprops={"marker": ".", "markersize": 3, "markeredgecolor": colour},
+        whiskerprops={"color": colour},
+        capprops={"color": colour},
+    )
+
+
+def select_example_shots(
+    dealt: Sequence[ShotSetup], kept: Mapping[str, Any], rows: pd.DataFrame
+) -> list[tuple[ShotSetup, list[str]]]:
+    """Select example shots: a typical one and the worst one of a tuned method.
+
+    The typical one is a shot that the untuned simulator missed, if there is one.
+
+    Args:
+        dealt: all shots.
+        kept: stored results by name of the shot.
+        rows: rows of shots.csv.
+
+    Returns:
+        The shots, each with the methods to show.
+    """
+    by_name = {one.name: one for one in dealt}
+    tuned = [m for m in rows["method"].unique() if get_method_group(m) == "tuned"]
+    if not tuned:
+        return []
+    first = next((m for m in ("tunenet-vision", "tunenet") if m in tuned), tuned[0])
+    shown = [m for m in (UNTUNED_METHOD, first, EXPLAIN_METHOD) if (rows["method"] == m).any()]
+    # Only shots with a result of all shown methods can be compared.
+    wide = rows.pivot(index="shot", columns="method", values="off")[shown].abs().dropna()
+    if wide.empty:
+        return []
+    missed = rows[(rows["method"] == UNTUNED_METHOD) & (rows["hit"].astype(float) == 0)]["shot"]
+    telling = wide[wide.index.isin(missed)]
+    telling = wide if telling.empty else telling
+    typical = (telling[first] - wide[first].median()).abs().idxmin()
+    worst = wide[first].idxmax()
+    return [(by_name[str(name)], shown) for name in dict.fromkeys((typical, worst)) if name in kept]
+
+
+class ExampleShot(NamedTuple):
+    """Example shot.
+
+    Attributes:
+        models: tuned models by method.
+        throws: executed shots by method.
+        top: upper limit of the height axis, m.
+    """
+
+    models: dict[str, TunedModel]
+    throws: dict[str, ShotResult]
+    top: float
+
+
+def execute_example(
+    settings: ShotConfig, dealt: ShotSetup, methods: Sequence[str], kept: Mapping[str, Any]
+) -> ExampleShot:
+    """Execute one shot again with each of some methods.
+
+    Args:
+        settings: the [shot] table.
+        dealt: the shot.
+        methods: names of the methods.
+        kept: stored results by name of the shot.
+    """
+    models = {model["method"]: TunedModel(**model) for model in kept[dealt.name]["models"]}
+    throws = {method: execute_shot(dealt, settings, models[method]) for method in methods}
+    top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
+    return ExampleShot(models, throws, top)
+
+
+def draw_shots_figure(
+    settings: ShotConfig, chosen: Sequence[tuple[ShotSetup, list[str]]], kept: Mapping[str, Any]
+) -> Figure:
+    """Draw example shots as planned and as flown.
+
+    Args:
+        settings: the [shot] table.
+        chosen: examples as returned by `select_example_shots`, one per row.
+        kept: stored results by name of the shot.
+    """
+    columns = max(len(methods) for _, methods in chosen)
+    size = (4.1 * columns, 0.9 + 3.1 * len(chosen))
+    figure, axes = make_panel_grid(len(chosen), columns, size)
+    for row, (dealt, methods) in zip(axes, chosen, strict=True):
+        shot = execute_example(settings, dealt, methods, kept)
+        for axis, method in zip(row, methods, strict=False):
+            draw_shot_panel(axis, dealt, method, shot)
+        row[0].set_ylabel(f"{dealt.name}\nheight [m]")
+    for axis in axes[-1]:
+        axis.set_xlabel("distance [m]")
+    axes[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
+    note = (
+        "Above a usual shot, of those that the untuned simulator missed if any; "
+        "below the worst of the tuned."
+    )
+    figure.suptitle("Planned in the simulator, flown in the world", fontsize=11)
+    figure.supxlabel(textwrap.fill(note, 140), fontsize=7.5)
+    return figure
+
+
+def draw_shot_panel(axis: Axes, dealt: ShotSetup, method: str, shot: ExampleShot) -> None:
+    """Draw incline, hoop, planned and flown path of one shot; the flown path is the last line.
+
+    Args:
+        axis: axes to draw on.
+        dealt: the shot.
+        method: name of the method.
+        shot: the executed example.
+    """
+    scene, flight = dealt.scene, shot.throws[method]
+    slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
+    axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color=INCLINE_GREY, linewidth=0)
+    rim = [scene.hoop_x - scene.hoop_radius, scene.hoop_x + scene.hoop_radius]
+    level = [scene.hoop_z] * 2
+    axis.plot(rim, level, color="black", linewidth=3, solid_capstyle="butt", label="hoop")
+    for path, colour, line, name in (
+        (flight.planned, BLUE, (0, (4, 2)), "planned"),
+        (flight.flown, VERMILION, "-", "flown"),
+    ):
+        part = path[: find_path_end(path, scene)]
+        axis.plot(part[:, 0], part[:, 2], linewidth=1.7, label=name, color=colour, linestyle=line)
+    result = f"{'hit' if flight.is_hit else 'miss'}, {100 * flight.miss_distance:+.0f} cm"
+    restitution = shot.models[method].restitution
+    axis.set_title(
+        f"{get_method_label(method)}: {result}\nrestitution {restitution:.2f}", fontsize=9
+    )
+    reach = scene.hoop_x + 4 * scene.hoop_radius
+    axis.set(xlim=(-0.25, reach), ylim=(-0.35, shot.top), aspect="equal")
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def find_path_end(path: Array, scene: ShotGeometry) -> int:
+    """Return the index of the sample at which a path is below the hoop after its bounce.
+
+    Args:
+        path: positions, (T, 3).
+        scene: incline and hoop.
+
+    Returns:
+        Index of the sample, or the number of samples.
+    """
+    z = path[:, 2]
+    # Before the bounce, the ball falls through the same heights.
+    risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])
+    falling = np.concatenate([[0], np.diff(z)]) < 0
+    below = np.flatnonzero(risen & (z < scene.hoop_z - _BELOW) & falling)
+    return int(below[0]) if below.size else len(z)

@@ -1,0 +1,118 @@
+"""Plan the drop height for which a simulator scores with the largest distance to the rim."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.bounce_shot.shot_geometry import ShotGeometry, compute_rim_margins
+from sims.core.simulator import Array, InputError, Scenario
+from sims.systems.bounce_shot import BounceShot
+
+_GRID = 48
+"""Number of heights of the first grid, over the whole range."""
+_ROUNDS = 4
+"""Number of successive grids, each around the best height of the previous one."""
+_ZOOM = 9
+"""Number of heights of each later grid, which covers two intervals of the previous one."""
+
+
+@dataclass(frozen=True)
+class ShotPlan:
+    """Planned shot.
+
+    Attributes:
+        height: Drop height, m; NaN if the simulator crosses the hoop's plane from no height.
+        rim_margin: Simulated distance to the rim, m; negative if a miss is expected.
+        times: (T,) times of the path, s.
+        path: (T, 3) simulated x, y, z of the centre, m.
+    """
+
+    height: float
+    rim_margin: float
+    times: Array
+    path: Array
+
+    @property
+    def is_found(self) -> bool:
+        """Whether a drop height was found."""
+        return bool(np.isfinite(self.height))
+
+
+def plan_shot(
+    simulator: BounceShot,
+    theta: Array,
+    scene: ShotGeometry,
+    constants: Mapping[str, float],
+    heights: tuple[float, float],
+    seconds: float = 3.0,
+    rate: float = 240.0,
+) -> ShotPlan:
+    """Find the drop height with the largest distance to the rim, by successively finer grids.
+
+    Grids are used because the distance may have several maxima, and because heights from which the
+    hoop is not reached give no search direction.
+
+    Args:
+        simulator: Tuned simulator with channels x, y, z.
+        theta: (dim,) parameters of the simulator.
+        scene: Geometry of incline and hoop.
+        constants: Known constants of the ball, such as radius and friction.
+        heights: Minimum and maximum height, m.
+        seconds: Length of the simulated flight, s.
+        rate: Sampling rate in Hz; the crossing of the hoop's plane is interpolated linearly.
+
+    Raises:
+        InputError: The heights are not positive and increasing.
+    """
+    low, high = heights
+    if not 0 < low < high:
+        raise InputError(f"expected drop heights above 0, the first the lower, found {heights}")
+    times = np.arange(round(seconds * rate) + 1) / rate
+    grid = np.linspace(low, high, _GRID)
+    best = float("nan")
+    for _ in range(_ROUNDS):
+        room = compute_rim_margins(
+            simulate_flights(simulator, theta, scene, constants, grid, times), scene
+        )
+        if not np.isfinite(room).any():
+            break
+        best = float(grid[np.nanargmax(room)])
+        reach = float(grid[1] - grid[0])
+        # Up to the neighbours of the best height: the maximum is between them.
+        grid = np.linspace(max(low, best - reach), min(high, best + reach), _ZOOM)
+    if not np.isfinite(best):
+        return ShotPlan(best, float("nan"), times, np.full((times.size, 3), np.nan))
+    path = simulate_flights(simulator, theta, scene, constants, np.array([best]), times)
+    return ShotPlan(best, float(compute_rim_margins(path, scene)[0]), times, path[0])
+
+
+def simulate_flights(
+    simulator: BounceShot,
+    theta: Array,
+    scene: ShotGeometry,
+    constants: Mapping[str, float],
+    heights: Array,
+    times: Array,
+) -> Array:
+    """Simulate the paths from several drop heights.
+
+    Args:
+        simulator: Simulator with channels x, y, z.
+        theta: (dim,) parameters of the simulator.
+        scene: Geometry of incline and hoop.
+        constants: Known constants of the ball.
+        heights: (n,) drop heights, m.
+        times: (T,) sample times, s.
+
+    Returns:
+        Centres (n, T, 3), m.
+    """
+    known = {**constants, "incline_angle": scene.angle}
+    scenarios = []
+    for height in heights:
+        scenarios.append(Scenario(times, constants={**known, "drop_height": float(height)}))
+    rows = np.repeat(np.atleast_2d(theta), len(heights), axis=0)
+    return simulator.simulate_batch(rows, scenarios)

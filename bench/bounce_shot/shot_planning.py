@@ -1,0 +1,334 @@
+"""Tuned models from the recording of a drop, and the shot planned in each.
+
+No code in this module uses the true ball. The models are those of the tuners, in the original
+simulator and in the one that `explain` extended from the same recording, and the fit of `explain`
+itself. Heights are shifted as if every ball had the radius of the experiment, so that one trained
+network serves all balls. Vision tuners get pixel rows instead (`bounce_shot.pixel_observations`).
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.isolation.tuner_client import relocate as elsewhere
+from bench.benchmark.problem.experiment import Experiment, TunerEntry
+from bench.benchmark.problem.recorded_runs import ObservedRuns, make_scenario
+from bench.benchmark.problem.targets import BlindedTarget
+from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
+from bench.bounce_shot.pixel_observations import build_pixel_runs, make_pixel_experiment
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_geometry import ShotGeometry
+from bench.bounce_shot.shot_planner import ShotPlan
+from bench.bounce_shot.shot_planner import plan_shot as plan
+from sims.core.simulator import Array, InputError, Scenario
+from sims.recording.recording import Recording, read_recording
+from sims.systems.ball import Ball as BallSimulator
+from sims.systems.bounce_shot import BounceShot, ShotSystem
+
+UNTUNED_METHOD = "nominal"
+"""Method without tuning."""
+EXPLAIN_METHOD = "explain"
+"""Method that uses the fit of explain itself."""
+EXPLAIN_SUFFIX = " + explain"
+"""Suffix of the label of a tuner that tunes the simulator extended by explain."""
+EffectCoefficients = Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True)
+class TunedModel:
+    """Tuned simulator and the shot planned in it.
+
+    Attributes:
+        method: label of the method.
+        restitution: tuned restitution.
+        effects: coefficients of the effects that explain added and that act on the shot.
+        simulations: number of simulations used on this target.
+        seconds: time used.
+        status: as in status.csv; ``no plan`` if the model reaches the hoop from no height.
+        reason: explanation of the status.
+        height: planned drop height, m; NaN if there is none.
+        margin: planned distance to the rim, m.
+    """
+
+    method: str
+    restitution: float
+    effects: EffectCoefficients
+    simulations: int
+    seconds: float
+    status: str
+    reason: str = ""
+    height: float = float("nan")
+    margin: float = float("nan")
+
+
+@dataclass(frozen=True)
+class ShotInputs:
+    """Input of a method for a shot.
+
+    Attributes:
+        name: name of the shot.
+        recording: recording of the ball's drop.
+        scene: incline and hoop.
+        weights: files of trained weights, by tuner.
+        tuned: specifications of the tuners that run in isolated processes, by label.
+        hidden: folders that isolated tuners must not read.
+    """
+
+    name: str
+    recording: Path
+    scene: ShotGeometry
+    weights: Mapping[str, Path]
+    tuned: Mapping[str, TunerSpec] = field(default_factory=dict)
+    hidden: tuple[str, ...] = ()
+
+    def list_files(self) -> tuple[Path, ...]:
+        """List the files that another machine needs."""
+        plugins = {Path(tuned.file) for tuned in self.tuned.values() if tuned.file}
+        described = self.recording.with_suffix(".toml")
+        return self.recording, described, *self.weights.values(), *sorted(plugins)
+
+    def relocate(self, places: Mapping[Path, Path]) -> ShotInputs:
+        """Return a copy for another machine, where the files have other paths."""
+        weights = {label: places[path] for label, path in self.weights.items()}
+        tuned = {label: elsewhere(one, places) for label, one in self.tuned.items()}
+        return replace(self, recording=places[self.recording], weights=weights, tuned=tuned)
+
+
+def tune_and_plan(
+    experiment: Experiment, settings: ShotConfig, known: ShotInputs
+) -> list[dict[str, Any]]:
+    """Tune all methods to a recording, and plan a shot with each.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        known: input of the methods.
+
+    Returns:
+        Fields of a `TunedModel` for each method.
+    """
+    recording = read_recording(known.recording, BallSimulator, whole=True)
+    made = [TunedModel(UNTUNED_METHOD, _nominal(), {}, 0, 0.0, "done")]
+    made += [
+        _tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners
+    ]
+    explained, acting = _explained(known.recording)
+    made.append(explained)
+    # If explain failed, there is no extended simulator to tune.
+    if explained.status == "done":
+        again = [
+            _tuned(experiment, settings, entry, known, recording, acting)
+            for entry in experiment.tuners
+        ]
+        made += [
+            replace(model, method=model.method + EXPLAIN_SUFFIX, effects=explained.effects)
+            for model in again
+        ]
+    radius = _constants(recording)["radius"]
+    return [asdict(_planned(model, settings, known.scene, radius)) for model in made]
+
+
+def _nominal() -> float:
+    return BallSimulator.system.parameters[0].nominal
+
+
+def _tuned(
+    experiment: Experiment,
+    settings: ShotConfig,
+    entry: TunerEntry,
+    known: ShotInputs,
+    recording: Recording,
+    effects: EffectCoefficients,
+) -> TunedModel:
+    """Run a tuner in the simulator with given effects."""
+    label, radius = entry.label, _constants(recording)["radius"]
+    experiment = make_tuning_experiment(experiment, settings, entry)
+    if effects:
+        fixed = {name: list(values) for name, values in effects.items()}
+        experiment = experiment.chosen(settings={**experiment.settings, "fixed": fixed})
+    try:
+        problem = get_problem(experiment)
+        start = problem.cube.to_unit_cube(np.array([p.nominal for p in problem.cube.parameters]))
+        seen = (
+            build_pixel_runs(recording, experiment, radius)
+            if label in settings.rows
+            else _side(recording, experiment)
+        )
+        nothing = ObservedRuns((), np.empty((0, seen.observed.shape[1])))
+        target = BlindedTarget(known.name, "real", start, seen, nothing)
+        order = RunRequest(
+            label,
+            entry,
+            0,
+            target,
+            entry.budget or experiment.budget,
+            known.weights.get(entry.label),
+            known.tuned.get(entry.label),
+            known.hidden,
+        )
+        outcome = execute_run(experiment, order)
+    except InputError as error:
+        return TunedModel(label, _nominal(), {}, 0, 0.0, "crashed", str(error))
+    trace = outcome.trace
+    found = float(problem.cube.to_physical(trace.recommendations[-1])[0])
+    return TunedModel(
+        label, found, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
+    )
+
+
+def make_tuning_experiment(
+    experiment: Experiment, settings: ShotConfig, entry: TunerEntry
+) -> Experiment:
+    """Adapt the experiment to a tuner: to pixel rows if the tuner uses them.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        entry: the tuner.
+    """
+    return (
+        make_pixel_experiment(experiment, settings) if entry.label in settings.rows else experiment
+    )
+
+
+def _side(recording: Recording, experiment: Experiment) -> ObservedRuns:
+    """Convert the recorded run to fitting data of the experiment's simulator.
+
+    The ball is released at rest at time 0, even if it is first seen later.
+    """
+    (run,) = recording.runs
+    scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)
+    # The radius of the experiment replaces that of the ball: one network serves balls of all sizes.
+    radius = experiment.fixed["radius"]
+    shift = radius - _constants(recording)["radius"]
+    z = run.channels["z"] + shift
+    seen = run.channels["z"][np.isfinite(run.channels["z"])]
+    # Released at rest at t = 0, the ball has the speed g t when it is first seen.
+    fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(
+        run.times[0]
+    )
+    first = {"z": float(seen[0]), "vz": -fallen, **scenario.initial}
+    initial = {**first, "z": first["z"] + shift}
+    moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
+    return ObservedRuns((moved,), z[:, None])
+
+
+def _constants(recording: Recording) -> dict[str, float]:
+    """Return the constants of the recorded run, with defaults of the system."""
+    return {**BallSimulator().constant_values, **recording.constants, **recording.runs[0].constants}
+
+
+def _explained(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
+    """Run explain on the recording.
+
+    Returns:
+        Its model, with the effects that act on the shot, and all effects that it found.
+    """
+    from bench.diagnosis.explain import explain
+
+    started = perf_counter()
+    try:
+        found = explain(recording)
+    except Exception:  # the failure of one method is a row of the table
+        last = traceback.format_exc()
+        return TunedModel(
+            EXPLAIN_METHOD, _nominal(), {}, 0, perf_counter() - started, "crashed", last
+        ), {}
+    acting = {
+        name: tuple(number.value for number in numbers.values())
+        for name, numbers in found.extended.effects.items()
+    }
+    carried = select_transferable_effects(acting, found.extended.constants.get("gravity", 9.81))
+    reason = f"{found.verdict}: {', '.join(acting) or 'nothing'}"
+    restitution = found.extended.parameters["restitution"].value
+    seconds = perf_counter() - started
+    simulations = found.answer.simulations
+    model = TunedModel(EXPLAIN_METHOD, restitution, carried, simulations, seconds, "done", reason)
+    return model, acting
+
+
+def select_transferable_effects(
+    effects: EffectCoefficients, gravity: float
+) -> dict[str, tuple[float, ...]]:
+    """Select the effects of a drop that act on a shot.
+
+    They are effects of the ball and the air, not of the camera. A constant vertical force is
+    converted to a change of gravity.
+
+    Args:
+        effects: coefficients by name.
+        gravity: gravitational acceleration, m/s^2.
+    """
+    from sims import effects as library
+
+    carried: dict[str, tuple[float, ...]] = {}
+    for name, values in effects.items():
+        kind = library.get_effect(name)
+        # A constant acceleration c along z is a change of gravity by -c / g.
+        if name == "force.bias":
+            carried["gravity.scale"] = (-values[0] / gravity,)
+        elif kind.hook in ("force", "contact") and kind.fits(ShotSystem):
+            carried[name] = tuple(values)
+    return carried
+
+
+def make_planning_simulator(model: TunedModel) -> BounceShot:
+    """Make the planning simulator of a model."""
+    return BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
+
+
+def get_planning_constants(settings: ShotConfig, radius: float) -> dict[str, float]:
+    """Return the constants of a ball that the planner assumes.
+
+    Args:
+        settings: the [shot] table.
+        radius: radius of the ball, m.
+    """
+    return {
+        "radius": radius,
+        "friction": settings.planned_friction,
+        "inertia_ratio": settings.planned_inertia,
+    }
+
+
+def get_planning_theta(model: TunedModel) -> Array:
+    """Return the parameters of a model's planning simulator."""
+    return np.array([model.restitution])
+
+
+def plan_shot(
+    model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
+) -> ShotPlan:
+    """Plan a shot in a model.
+
+    Args:
+        model: the tuned model.
+        settings: the [shot] table.
+        scene: incline and hoop.
+        radius: radius of the ball, m.
+    """
+    known = get_planning_constants(settings, radius)
+    return plan(
+        make_planning_simulator(model), get_planning_theta(model), scene, known, settings.heights
+    )
+
+
+def _planned(
+    model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
+) -> TunedModel:
+    if model.status == "crashed":
+        return model
+    made = plan_shot(model, settings, scene, radius)
+    if not made.is_found and model.status in ("done", "converged"):
+        return replace(
+            model, status="no plan", reason="the model reaches the hoop's plane from no height"
+        )
+    return replace(model, height=made.height, margin=made.rim_margin)

@@ -1,0 +1,156 @@
+"""Write the tables, figures and HTML report of a bounce-shot study and print a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.results_report import REPORT_FILE
+from bench.benchmark.statistics.provenance_columns import add_trust_column
+from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
+from bench.benchmark.storage.run_status import STATUS_COLUMNS
+from bench.bounce_shot.hit_rate_table import (
+    NO_SHOT_STATUSES,
+    build_result_table,
+    format_result_table,
+)
+from bench.bounce_shot.shot_animation import write_animation
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_figures import draw_figures, select_example_shots
+from bench.bounce_shot.shot_page import render_page
+from bench.bounce_shot.shot_sampling import ShotSetup
+from bench.bounce_shot.shot_store import read_shot
+from bench.figures import style
+from sims.core.atomic_files import write_atomically
+
+SIMULATOR_NAME = "bounce-shot"
+"""Name of the simulator in status.csv."""
+_NUMBERS = (
+    "off",
+    "margin",
+    "planned_margin",
+    "prediction_error",
+    "drop_height",
+    "restitution",
+    "seconds",
+)
+"""Numeric columns of the shots that may be empty."""
+_FAILED = ("crashed", "timeout")
+"""Failures of the method and not of its plan, which make the command fail."""
+
+
+class ReportableShotStudy(Protocol):
+    """Protocol of the studies that can be reported.
+
+    Attributes:
+        folder: result folder.
+    """
+
+    folder: Path
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment, with the tuners that can be used here."""
+
+    @property
+    def config(self) -> ShotConfig:
+        """The [shot] table."""
+
+    @property
+    def shots(self) -> list[ShotSetup]:
+        """All planned shots."""
+
+    @property
+    def skipped_tuners(self) -> Mapping[str, str]:
+        """Reasons why tuners cannot be used here, by label."""
+
+
+def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
+    """Write tables, figures and HTML report from the shots that exist.
+
+    Args:
+        study: the study to report.
+        say: prints a line.
+
+    Returns:
+        Number of methods and shots that crashed or exceeded their time.
+    """
+    folder = study.folder
+    kept = {}
+    for one in study.shots:
+        if (shot := read_shot(folder, one)) is not None:
+            kept[one.name] = shot
+    if not kept:
+        say("no shot was made")
+        return 0
+    rows = pd.DataFrame([row for shot in kept.values() for row in shot["rows"]])
+    for name in _NUMBERS:
+        # A column that is empty has no numeric type.
+        rows[name] = pd.to_numeric(rows[name])
+    lines = add_trust_column(build_result_table(rows), study.experiment)
+    rows = add_trust_column(rows, study.experiment)
+    statuses = add_trust_column(_statuses(rows, study.skipped_tuners), study.experiment)
+    for name, frame in (("table", lines), ("shots", rows), ("status", statuses)):
+        write_atomically(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
+    pictures = draw_figures(study.experiment, study.config, study.shots, kept, rows, lines)
+    figures = [
+        style.write_figure_files(folder / "figures" / name, picture.png, picture.pdf)[0]
+        for name, picture in pictures.items()
+    ]
+    write_atomically(
+        folder / REPORT_FILE, render_page(study.experiment, str(folder), lines, rows, pictures)
+    )
+    for example in select_example_shots(study.shots, kept, rows)[:1]:
+        figures.append(
+            write_animation(folder, study.config, example, kept, study.experiment.trusted)
+        )
+    # Every new folder has an empty journal folder, which a bounce-shot study does not use.
+    journal = folder / SEGMENTS_FOLDER
+    if journal.is_dir() and not any(journal.iterdir()):
+        journal.rmdir()
+    say("\n" + format_result_table(lines))
+    failed = rows[rows["status"].isin(NO_SHOT_STATUSES)]
+    _say_faults(failed, study.skipped_tuners, say)
+    say(f"\ntable   {folder / 'table.csv'}\nshots   {folder / 'shots.csv'}")
+    for figure in figures:
+        say(f"figure  {figure}")
+    say(f"report  {folder / REPORT_FILE}")
+    return int(failed["status"].isin(_FAILED).sum())
+
+
+def _say_faults(
+    failed: pd.DataFrame, skipped: Mapping[str, str], say: Callable[[str], None]
+) -> None:
+    for label, reason in skipped.items():
+        say(f"skipped {label}: {reason}")
+    for (method, status), part in failed.groupby(["method", "status"]):
+        say(f"{status}: {method} in {len(part)} shots; {part['reason'].iloc[0]}")
+
+
+def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
+    """Build the rows of status.csv: one per method and shot, and one per tuner that was skipped."""
+    made = pd.DataFrame(
+        {
+            "run": rows["method"] + "/" + rows["shot"],
+            "tuner": rows["method"],
+            "simulator": SIMULATOR_NAME,
+            "target": rows["shot"],
+            "seed": 0,
+            "status": rows["status"],
+            "reason": rows["reason"],
+            "simulations": rows["simulations"],
+            "seconds": rows["seconds"],
+        }
+    )
+    # Concatenating an empty frame would change the types of the columns.
+    if not skipped:
+        return made
+    left = [
+        (label, label, SIMULATOR_NAME, "", 0, "skipped", reason, 0, 0.0, False)
+        for label, reason in skipped.items()
+    ]
+    return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMNS)])

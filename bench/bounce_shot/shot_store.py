@@ -1,0 +1,157 @@
+"""Stored result of each shot: a file with the tuned model and the outcome of every method."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.benchmark.storage.cell_validation import (
+    CellError,
+    parse_json_column,
+    select_declared_columns,
+)
+from bench.benchmark.storage.cell_validation import check_cells as check_cells
+from bench.benchmark.storage.table_schemas import SHOT_COLUMNS as SHOT_COLUMNS
+from bench.benchmark.storage.table_schemas import SHOT_MODEL_COLUMNS, Columns, ColumnSpec
+from bench.bounce_shot.shot_config import ShotConfig
+from bench.bounce_shot.shot_execution import build_shot_rows
+from bench.bounce_shot.shot_sampling import ShotSetup
+from sims.core.atomic_files import write_atomically
+from sims.core.simulator import InputError
+
+SHOTS_FOLDER = "shots"
+"""Name of the folder of finished shots, in the folder of a study."""
+_REMEDY = "damaged; delete it, and resume to make it again"
+_NUMBERS = ("height", "margin", "restitution", "seconds")
+"""Numbers of a model that may be missing."""
+
+
+def get_shot_path(folder: Path, dealt: ShotSetup) -> Path:
+    """Return the file of a shot; it exists once the shot has been executed.
+
+    Args:
+        folder: result folder of the study.
+        dealt: the shot.
+    """
+    return folder / SHOTS_FOLDER / f"{dealt.name}.json"
+
+
+def list_missing_shots(folder: Path, dealt: Sequence[ShotSetup]) -> list[ShotSetup]:
+    """List the shots that have not been executed.
+
+    Args:
+        folder: result folder of the study.
+        dealt: all shots.
+    """
+    return [one for one in dealt if not get_shot_path(folder, one).exists()]
+
+
+def store_shot(
+    folder: Path, dealt: ShotSetup, settings: ShotConfig, models: list[dict[str, Any]], seen: float
+) -> None:
+    """Execute a shot with the model of every method, and store the result atomically.
+
+    Args:
+        folder: result folder of the study.
+        dealt: ball, scene and release error.
+        settings: the [shot] table of the study.
+        models: models as returned by `bench.bounce_shot.shot_planning.tune_and_plan`.
+        seen: fraction of the drop's sample times at which its recording has a height.
+    """
+    rows = [{**row, "seen": seen} for row in build_shot_rows(dealt, settings, models)]
+    document = _plain({"models": models, "rows": rows})
+    write_atomically(
+        get_shot_path(folder, dealt), json.dumps(document, indent=1, allow_nan=False) + "\n"
+    )
+
+
+def read_shot(folder: Path, dealt: ShotSetup) -> dict[str, Any] | None:
+    """Read the stored result of a shot; return None if the shot has not been executed.
+
+    Args:
+        folder: result folder of the study.
+        dealt: the shot.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = get_shot_path(folder, dealt)
+    if not path.exists():
+        return None
+    try:
+        kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        _check(kept, "models", SHOT_MODEL_COLUMNS)
+        _check(kept, "rows", tuple(c for c in SHOT_COLUMNS if c.required))
+    except CellError as error:
+        raise InputError(f"{path}, {error.says}; {_REMEDY}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise InputError(f"{path}: {_REMEDY}") from None
+    wanted = (dealt.name, [model["method"] for model in kept["models"]])
+    found = {row["shot"] for row in kept["rows"]}, [row["method"] for row in kept["rows"]]
+    if found != ({wanted[0]}, wanted[1]):
+        says = f"expected a row of {wanted[0]} for each model, found others"
+        raise InputError(f"{path}: {says}; {_REMEDY}")
+    for model in kept["models"]:
+        # JSON has no NaN, so missing numbers are stored as null.
+        model.update({name: math.nan for name in _NUMBERS if model[name] is None})
+    return kept
+
+
+def check_shots(folder: Path, dealt: Sequence[ShotSetup]) -> None:
+    """Validate the stored results of shots.
+
+    Args:
+        folder: result folder of the study.
+        dealt: the shots.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    for one in dealt:
+        read_shot(folder, one)
+
+
+def _check(kept: dict[str, Any], name: str, columns: Columns) -> None:
+    """Validate the models or the rows of a shot.
+
+    Raises:
+        CellError: a value does not match its declaration.
+        KeyError: the part is missing.
+        TypeError: the part is not a list of tables.
+    """
+    tables = kept[name]
+    try:
+        for row, table in enumerate(tables):
+            select_declared_columns(list(table), columns, row)
+            if name == "models":
+                _check_effects(row, table["effects"])
+        for column in columns:
+            check_cells(column, parse_json_column(column, [table[column.name] for table in tables]))
+    except CellError as error:
+        error.says = f"{name}, {(error.row or 0) + 1}: {error.says}"
+        raise
+
+
+def _check_effects(row: int, effects: Any) -> None:
+    """Validate the coefficients of a model's effects."""
+    coefficient = ColumnSpec("effects", float)
+    for values in effects.values():
+        try:
+            check_cells(coefficient, parse_json_column(coefficient, values))
+        except CellError as error:
+            error.row = row
+            raise
+
+
+def _plain(value: Any) -> Any:
+    """Convert a value for JSON: numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

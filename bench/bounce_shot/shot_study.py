@@ -1,0 +1,351 @@
+"""Bounce-shot study in its result folder: record drops, plan with every method, store the shots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+from bench.benchmark.isolation.linux_syscalls import not_dumpable
+from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.runner.experiment_runner import (
+    ProgressFactory,
+    check_classes_importable,
+    check_tuners,
+    no_progress,
+)
+from bench.benchmark.runner.plugin_discovery import describe_plugins
+from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
+from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.tuner_training import TrainingRequest, TrainingResult, train_or_load
+from bench.benchmark.runner.tuner_training import get_weights_folder as trained
+from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
+from bench.benchmark.storage.result_folder import read_configuration
+from bench.benchmark.storage.salt_file import read_salt, reveal_salt
+from bench.benchmark.storage.study_progress import (
+    MISSING_STATUS,
+    RunEnd,
+    StudyOutcome,
+    StudyProgress,
+)
+from bench.bounce_shot import shot_planning, true_world
+from bench.bounce_shot.shot_config import ShotConfig, read_shot_config
+from bench.bounce_shot.shot_sampling import (
+    RECORDINGS_FOLDER,
+    ShotSetup,
+    compute_visible_share,
+    draw_shots,
+    record_drop,
+)
+from bench.bounce_shot.shot_store import SHOTS_FOLDER, list_missing_shots, store_shot
+from bench.bounce_shot.shot_store import check_shots as check_kept
+from bench.core.plugin_registries import tuners
+from sims.core.simulator import InputError
+from sims.vision import video_packages
+
+PrintLine = Callable[[str], None]
+
+
+class BounceShotStudy:
+    """Study of shots by several methods, stored in a folder; implements `study.Study`.
+
+    Args:
+        folder: result folder of a bounce-shot study.
+
+    Attributes:
+        folder: result folder.
+        configuration: stored configuration of the study.
+        plugins: plugin files that its tuners need.
+
+    Raises:
+        InputError: the folder does not contain such a study, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.configuration = read_configuration(folder)
+        self.plugins = self.configuration.plugins
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+        salt: str | None = None,
+    ) -> BounceShotStudy:
+        """Create a study in a new folder, without running it; see `Study.begin`.
+
+        Args:
+            experiment: experiment with a [shot] table.
+            plugins: plugin files that its tuners need.
+            folder: new result folder; None for the default one.
+            jobs: number of worker processes that will be used; 0 runs everything in this process.
+            salt: random string from which shots are drawn; see `bench.studies.study.Study.begin`.
+        """
+        from bench.benchmark.runner.run_ids import compute_fingerprint
+
+        if read_shot_config(experiment).filmed:
+            video_packages.check_installed("; or set shot.filmed = 0")
+        if experiment.simulator != "ball" or experiment.observe != ("z",):
+            raise InputError(
+                f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
+            )
+        new = prepare_study(experiment, folder, jobs, salt)
+        # Validated before the folder is created: an error of the user leaves no files.
+        check_tuners(new.experiment)
+        if jobs:
+            check_classes_importable(new.experiment)
+        return cls(new.create_folder(plugins, compute_fingerprint(new.experiment, plugins)))
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:
+        """Open an interrupted study to run what is missing; see `bench.studies.study.Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: further plugin files.
+        """
+        from bench.benchmark.runner.run_ids import check_resumable
+
+        study = cls(folder)
+        study.plugins = check_resumable(folder, study.configuration, plugins)
+        check_kept(folder, study.shots)
+        return study
+
+    @cached_property
+    def skipped_tuners(self) -> dict[str, str]:
+        """Tuners that cannot be used here, by label, with the reason."""
+        return check_tuners(self.configuration.experiment)
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """The experiment, with the tuners that can be used."""
+        whole = self.configuration.experiment
+        # Skipped tuners would have empty lines; `finish` reports why they are missing.
+        labels = [entry.label for entry in whole.tuners if entry.label not in self.skipped_tuners]
+        return whole.with_tuners(labels)
+
+    @cached_property
+    def config(self) -> ShotConfig:
+        """The [shot] table."""
+        return read_shot_config(self.configuration.experiment)
+
+    @cached_property
+    def shots(self) -> list[ShotSetup]:
+        """All shots of the study."""
+        experiment = self.configuration.experiment
+        salt = read_salt(self.folder, experiment) or experiment.salt
+        return draw_shots(experiment, self.config, salt)
+
+    def run(
+        self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
+    ) -> StudyOutcome:
+        """Execute the missing shots; see `bench.studies.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes.
+            progress: makes progress callbacks; None for no progress output.
+            pool: worker pool; None to create one.
+        """
+        if reason := true_world.find_missing_requirement():
+            return self._made(skipped=reason)
+        if pool is not None or jobs:
+            check_classes_importable(self.experiment)
+        try:
+            left = list_missing_shots(self.folder, self.shots)
+            if left:
+                _ShotStages(self, left, progress or no_progress).run(jobs, pool)
+        except KeyboardInterrupt:  # the kinds of balls alternate, so a partial result covers all
+            return self._made(interrupted=True)
+        except PoolLostError as error:
+            return self._made(stopped=str(error))
+        return self._made()
+
+    def _made(self, **why: Any) -> StudyOutcome:
+        left = list_missing_shots(self.folder, self.shots)
+        if not left and not why:
+            experiment = self.configuration.experiment
+            reveal_salt(self.folder, read_salt(self.folder, experiment))
+            self.configuration = read_configuration(self.folder)
+        return StudyOutcome(len(self.shots) - len(left), len(self.shots), **why)
+
+    def close(self) -> None:
+        """Close the study; it holds no open files."""
+
+    def status(self) -> StudyProgress:
+        """Return which shots are stored and which are missing.
+
+        Raises:
+            InputError: the file of a shot is damaged.
+        """
+        check_kept(self.folder, self.shots)
+        left = {one.name for one in list_missing_shots(self.folder, self.shots)}
+        ends = tuple(
+            RunEnd(one.name, one.ball.name, MISSING_STATUS if one.name in left else "made")
+            for one in self.shots
+        )
+        held = self.configuration
+        return StudyProgress(held.experiment.name, "shots made", held.fingerprint, ends)
+
+    def report(self, say: PrintLine) -> int:
+        """Write tables, figures and HTML report, and print a summary.
+
+        Args:
+            say: prints a line.
+
+        Returns:
+            Number of failures of methods.
+
+        Raises:
+            InputError: the file of a shot is damaged.
+        """
+        from bench.bounce_shot.shot_report import write_report
+
+        return write_report(self, say)
+
+
+class _ShotStages:
+    """Execution of the missing shots, in several stages."""
+
+    def __init__(
+        self, study: BounceShotStudy, left: list[ShotSetup], progress: ProgressFactory
+    ) -> None:
+        self._study, self._left, self._progress = study, left, progress
+        self._experiment, self._settings = study.experiment, study.config
+        self._tuned: dict[str, TunerSpec] = {}
+        if not self._experiment.trusted:
+            self._tuned = {entry.label: make_tuner_spec(entry) for entry in self._experiment.tuners}
+        self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
+        self._paths = [study.folder / RECORDINGS_FOLDER / f"{one.name}.csv" for one in left]
+
+    def run(self, jobs: int, pool: Pool | None) -> None:
+        """Record the drops, train tuners, tune and plan, and execute the shots.
+
+        Args:
+            jobs: number of worker processes.
+            pool: worker pool; None to create one.
+
+        Raises:
+            LostError: the workers are no longer available.
+            WeightsError: stored trained weights are damaged.
+        """
+        for name in (SHOTS_FOLDER, RECORDINGS_FOLDER):
+            (self._study.folder / name).mkdir(exist_ok=True)
+        # These workers know the true balls and run no tuner; other workers run the tuners.
+        with make_pool(jobs) as workers:
+            faults = self._record(workers)
+        # The true balls are in the memory of this process, and a tuner's process may run as the
+        # same user.
+        hidden = nullcontext() if self._experiment.trusted else not_dumpable()
+        with hidden, pool or make_pool(jobs) as workers:
+            workers.load_plugins(describe_plugins(self._study.plugins, self._experiment))
+            weights = self._train(workers)
+            self._shoot(workers, faults, weights)
+
+    def _record(self, workers: Pool) -> dict[int, BaseException]:
+        """Record every drop.
+
+        Returns:
+            Errors by index of the shot.
+        """
+        calls: list[Call] = [
+            (record_drop, (self._experiment, one, self._settings, path))
+            for one, path in zip(self._left, self._paths, strict=True)
+        ]
+        step = self._progress("dropping", len(calls))
+        faults: dict[int, BaseException] = {}
+        for place, fault in workers.iterate_results(calls, self._experiment.timeout):
+            if isinstance(fault, BaseException):
+                faults[place] = fault
+            step()
+        return faults
+
+    def _train(self, workers: Pool) -> dict[str, Path]:
+        """Train the tuners that need training.
+
+        Returns:
+            Files of the trained weights, by label.
+
+        Raises:
+            Exception: a training failed; an untrained tuner must not be used as a trained one.
+        """
+        learned = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
+        grounds = [
+            shot_planning.make_tuning_experiment(self._experiment, self._settings, entry)
+            for entry in learned
+        ]
+        calls: list[Call] = [
+            (
+                train_or_load,
+                (ground, TrainingRequest(entry, 0, self._tuned.get(entry.label), self._hidden)),
+            )
+            for ground, entry in zip(grounds, learned, strict=True)
+        ]
+        step = self._progress("training", len(calls))
+        weights = {}
+        for place, training in workers.iterate_results(calls, math.inf):
+            if not isinstance(training, TrainingResult):
+                raise training
+            weights[learned[place].label] = training.path
+            step()
+        return weights
+
+    def _shoot(
+        self, workers: Pool, faults: dict[int, BaseException], weights: dict[str, Path]
+    ) -> None:
+        """Tune and plan with every method, and execute the shots."""
+        seen = [place for place in range(len(self._left)) if place not in faults]
+        calls: list[Call] = []
+        for place in seen:
+            one = self._left[place]
+            known = shot_planning.ShotInputs(
+                one.name, self._paths[place], one.scene, weights, self._tuned, self._hidden
+            )
+            calls.append((shot_planning.tune_and_plan, (self._experiment, self._settings, known)))
+        step = self._progress("shooting", len(self._left))
+        for place, fault in faults.items():
+            status = "no recording" if isinstance(fault, InputError) else "crashed"
+            self._keep(place, _failed(self._experiment, fault, status), 0.0)
+            step()
+        for at, models in workers.iterate_results(calls, self._experiment.timeout):
+            place = seen[at]
+            if isinstance(models, BaseException):
+                models = _failed(self._experiment, models)
+            self._keep(place, models, compute_visible_share(self._paths[place], self._experiment))
+            step()
+
+    def _keep(self, place: int, models: list[dict[str, Any]], seen: float) -> None:
+        store_shot(self._study.folder, self._left[place], self._settings, models, seen)
+
+
+def _failed(
+    experiment: Experiment, error: BaseException, status: str = "crashed"
+) -> list[dict[str, Any]]:
+    """Make failed models for a shot without a recording, or whose worker died or was too slow.
+
+    None of them has a plan.
+    """
+    if isinstance(error, TimeoutError):
+        status = "timeout"
+    nothing = partial(
+        shot_planning.TunedModel,
+        effects={},
+        simulations=0,
+        seconds=math.nan,
+        status=status,
+        reason=str(error),
+    )
+    labels = [entry.label for entry in experiment.tuners]
+    methods = [
+        shot_planning.UNTUNED_METHOD,
+        *labels,
+        shot_planning.EXPLAIN_METHOD,
+        *(label + shot_planning.EXPLAIN_SUFFIX for label in labels),
+    ]
+    return [vars(nothing(method=method, restitution=math.nan)) for method in methods]

@@ -1,0 +1,240 @@
+"""True world of the bounce shot: MuJoCo, with physics that the planning simulator lacks.
+
+A free rigid sphere flies through still air with quadratic drag and the lift of its spin,
+
+    drag = -1/2 rho Cd A |v| v                                             (1)
+    lift = 1/2 rho A r omega x v                                           (2)
+
+(C_L = r omega / v; G. Robinson, I. Robinson, Physica Scripta 88, 018101, 2013,
+doi:10.1088/0031-8949/88/01/018101), integrated by MuJoCo's Runge-Kutta 4. Contact takes time:
+MuJoCo's spring and damper between ball and ground act for about `CONTACT_SECONDS` seconds. The
+damping
+gives the restitution at the impact's speed: with damping ratio D, contact that ends when the force
+becomes zero gives
+
+    e = exp(-D / w atan2(2 D w, 2 D^2 - 1)),        w = sqrt(1 - D^2)      for D < 1    (3)
+    e = exp(-D / s log((D + s) / (D - s))),         s = sqrt(D^2 - 1)      for D > 1    (4)
+
+(T. Schwager, T. Poeschel, Phys. Rev. E 78, 051304, 2008, doi:10.1103/PhysRevE.78.051304, equation
+12). MuJoCo's friction is a convex relaxation that turns slip into lift. Therefore its contact is
+frictionless here, and Coulomb friction is applied at each step with the normal force N that MuJoCo
+reports: the ball slides until it rolls, and spins. A force f at its surface changes the slip of a
+sphere of moment of inertia k m r^2 by f (1 + 1 / k) / m per second, so that within a step h
+
+    |f| = min(mu N, k / (1 + k) m |slip| / h)                              (5)
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.bounce_shot.ball_kinds import BallKind
+from sims.core.simulator import Array, InputError
+
+AIR_DENSITY = 1.2
+"""Density of air, kg/m^3."""
+GRAVITY = 9.81
+"""Gravitational acceleration, downward, m/s^2."""
+CONTACT_SECONDS = 3e-3
+"""Duration of an impact in seconds; it is 5 ms for tennis balls and 0.5 ms for golf balls."""
+_FLIGHT = 1e-3
+"""Length of a step in flight, s."""
+_IMPACT = 3e-5
+"""Length of a step in contact in seconds, a hundredth of an impact."""
+_IMPEDANCE = 0.9999
+"""Constraint impedance of the contact, the largest that MuJoCo allows."""
+_MOST_DAMPED = 60.0
+"""Damping ratio at which the restitution is practically zero."""
+
+
+def find_missing_requirement() -> str:
+    """Return why this world is not available here; empty if it is."""
+    if importlib.util.find_spec("mujoco"):
+        return ""
+    return "the world needs mujoco, not installed (pip install mujoco)"
+
+
+@dataclass(frozen=True)
+class InclinedGround:
+    """Inclined plane through the origin: its angle in rad, descending towards x, and friction."""
+
+    angle: float = 0.0
+    friction: float = 0.3
+
+
+def simulate_shot(
+    ball: BallKind,
+    ground: InclinedGround,
+    start: tuple[float, float, float],
+    times: Array,
+    air: float = AIR_DENSITY,
+) -> Array:
+    """Simulate the path of a ball that is released at rest.
+
+    Args:
+        ball: Properties of the ball.
+        ground: Inclined plane.
+        start: Initial position of its centre above the plane, m.
+        times: (T,) sample times, increasing from 0, s.
+        air: Density of the air, kg/m^3.
+
+    Returns:
+        Centres (T, 3), m.
+
+    Raises:
+        InputError: MuJoCo is missing, or the ball begins in the ground.
+    """
+    if reason := find_missing_requirement():
+        raise InputError(reason)
+    flight = _Flight(ball, ground, air)
+    if flight.gap(*start) <= 0:
+        raise InputError(f"expected a ball above the ground, found its centre at {start}")
+    return flight.run(start, times)
+
+
+@functools.cache
+def compute_damping_ratio(restitution: float) -> float:
+    """Return the damping ratio of a spring-damper contact with this restitution, 0 < e <= 1."""
+    # Bisection, because restitution decreases with damping; eighty halvings reach rounding
+    # accuracy.
+    low = 0.0
+    high = _MOST_DAMPED
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _restitution(middle) > restitution else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _restitution(ratio: float) -> float:
+    """Return the restitution for a damping ratio by Schwager and Poeschel, equation (12)."""
+    # Both formulas are 0 / 0 at a damping ratio of 1, where their limit is exp(-2).
+    if ratio == 0.0 or abs(ratio - 1.0) < 1e-9:
+        return 1.0 if ratio == 0.0 else math.exp(-2.0)
+    if ratio < 1.0:
+        w = math.sqrt(1.0 - ratio * ratio)
+        return math.exp(-ratio / w * math.atan2(2.0 * ratio * w, 2.0 * ratio * ratio - 1.0))  # (3)
+    s = math.sqrt(ratio * ratio - 1.0)
+    return math.exp(-ratio / s * math.log((ratio + s) / (ratio - s)))  # (4)
+
+
+class _Flight:
+    def __init__(self, ball: BallKind, ground: InclinedGround, air: float) -> None:
+        import mujoco
+
+        self._ball = ball
+        self._friction = ground.friction
+        self._normal = math.sin(ground.angle), math.cos(ground.angle)
+        area = math.pi * ball.radius**2
+        self._drag = 0.5 * air * ball.drag * area
+        self._lift = 0.5 * air * area * ball.radius
+        self._step = mujoco.mj_step
+        self._model = mujoco.MjModel.from_xml_string(_mjcf(ball, ground))
+        self._data = mujoco.MjData(self._model)
+        self._touches = False
+
+    def gap(self, x: float, _y: float, z: float) -> float:
+        """Return the distance of the ball's surface from the plane, m."""
+        return x * self._normal[0] + z * self._normal[1] - self._ball.radius
+
+    def run(self, start: tuple[float, float, float], times: Array) -> Array:
+        data = self._data
+        last = float(times[-1])
+        data.qpos[:3] = start
+        rows = [(0.0, *start, 0.0, 0.0, 0.0)]
+        while data.time < last:
+            self._advance()
+            rows.append((data.time, *data.qpos[:3].tolist(), *data.qvel[:3].tolist()))
+        return _sampled(np.array(rows), times)
+
+    def _advance(self) -> None:
+        """Make one step, a short one if the ball touches the ground or soon will."""
+        data = self._data
+        position = data.qpos[:3].tolist()
+        velocity = data.qvel.tolist()
+        gap = self.gap(*position)
+        rate = velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
+        # Look two steps ahead: a step of flight must not penetrate the ground.
+        near = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT * rate)
+        self._model.opt.timestep = _IMPACT if near else _FLIGHT
+        if gap > 0.0:
+            self._touches = False
+        # Set the damping once per impact, at its initial speed: restitution refers to the whole
+        # impact.
+        if not self._touches and rate < 0.0 and gap + rate * _IMPACT <= 0.0:
+            self._prepare(-rate)
+        self._push(velocity)
+        self._step(self._model, data)
+
+    def _prepare(self, speed: float) -> None:
+        """Set the contact damping for an impact at this speed."""
+        self._touches = True
+        # Rounded, so that almost equal impacts share the cached result.
+        ratio = compute_damping_ratio(round(self._ball.compute_restitution(speed), 9))
+        # The contact of a spring lasts half of its period.
+        frequency = math.pi / CONTACT_SECONDS
+        self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency
+
+    def _push(self, velocity: list[float]) -> None:
+        """Apply drag, lift and friction as force and torque of the next step."""
+        # The spin is in the ball's frame, which makes no difference for a spin about y.
+        vx, vy, vz, wx, wy, wz = velocity
+        # Forces are constant during the step, so they are evaluated at its midpoint.
+        vz -= 0.5 * GRAVITY * self._model.opt.timestep
+        pull = -self._drag * math.sqrt(vx * vx + vy * vy + vz * vz)
+        force = [  # (1) and (2)
+            pull * vx + self._lift * (wy * vz - wz * vy),
+            pull * vy + self._lift * (wz * vx - wx * vz),
+            pull * vz + self._lift * (wx * vy - wy * vx),
+        ]
+        torque = 0.0
+        if self._data.ncon and self._friction > 0.0:
+            rub = self._rub(vx, vz, wy)
+            force[0] += rub * self._normal[1]
+            force[2] -= rub * self._normal[0]
+            torque = -rub * self._ball.radius
+        self._data.xfrc_applied[1] = (*force, 0.0, torque, 0.0)
+
+    def _rub(self, vx: float, vz: float, spin: float) -> float:
+        """Return the Coulomb friction down the slope, N; it does not reverse the slip in a step."""
+        slip = vx * self._normal[1] - vz * self._normal[0] - spin * self._ball.radius
+        k = self._ball.inertia_ratio
+        stops = self._ball.mass * k / (1.0 + k) * abs(slip) / self._model.opt.timestep
+        held = self._friction * float(self._data.efc_force[0])
+        return -math.copysign(min(stops, held), slip)  # (5)
+
+
+def _mjcf(ball: BallKind, ground: InclinedGround) -> str:
+    inertia = ball.inertia_ratio * ball.mass * ball.radius**2
+    moments = f"{inertia!r} {inertia!r} {inertia!r}"
+    return f"""
+    <mujoco>
+      <compiler angle="radian"/>
+      <option gravity="0 0 {-GRAVITY}" integrator="RK4"/>
+      <worldbody>
+        <geom type="plane" size="0 0 1" euler="0 {ground.angle!r} 0" condim="1"/>
+        <body>
+          <freejoint/>
+          <inertial pos="0 0 0" mass="{ball.mass!r}" diaginertia="{moments}"/>
+          <geom type="sphere" size="{ball.radius!r}" condim="1" priority="1"
+            solimp="{_IMPEDANCE} {_IMPEDANCE} 0.001 0.5 2"/>
+        </body>
+      </worldbody>
+    </mujoco>"""
+
+
+def _sampled(rows: Array, times: Array) -> Array:
+    """Interpolate positions (T, 3) at the sample times by cubic Hermite splines between steps.
+
+    Args:
+        rows: Time, position and velocity after each step (S, 7).
+        times: (T,) sample times, s.
+    """
+    from scipy.interpolate import CubicHermiteSpline
+
+    path: Array = CubicHermiteSpline(rows[:, 0], rows[:, 1:4], rows[:, 4:7])(times)
+    return path

@@ -1,0 +1,257 @@
+"""Catalogue of the program as documents, which `simgap list` prints as text or JSON.
+
+It lists commands with their options, tuners, simulators, systems, effects, diagnosers, experiments,
+references and schemas.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from typing import Any
+
+from bench.cli.output import EXIT_CODES, JsonDocument
+
+_TYPES = {
+    "_StoreTrueAction": "flag",
+    "positive": "whole number",
+    "natural": "whole number",
+    "int": "whole number",
+    "float": "number",
+    "seconds": "number",
+    "place": "path",
+    "file": "path",
+}
+"""Type of an option's value, by the function that parses it or the class of argparse's action."""
+
+
+def build_catalogue(parser: argparse.ArgumentParser) -> JsonDocument:
+    """Build the whole catalogue from the parser of the command line."""
+    return {
+        "commands": list_commands(parser),
+        **{name: make() for name, make in CATALOGUE_SECTIONS.items()},
+    }
+
+
+def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
+    """List every command with its options, as `simgap --help` does."""
+    # argparse has no public way to list the arguments of a parser.
+    (choices,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    says = {action.dest: action.help for action in choices._choices_actions}
+    return [
+        {
+            "name": name,
+            "says": says[name],
+            "schema": name,
+            "exit_codes": list(EXIT_CODES),
+            "options": [
+                _option(action)
+                for action in command._actions
+                if not isinstance(action, argparse._HelpAction)
+            ],
+        }
+        for name, command in choices.choices.items()
+    ]
+
+
+def _option(action: argparse.Action) -> JsonDocument:
+    """Describe an argument or option."""
+    default = None if action.default in ([], "") else action.default
+    read = getattr(action.type, "__name__", "")
+    flag = _TYPES.get(type(action).__name__)
+    return {
+        "name": action.dest,
+        "flags": list(action.option_strings),
+        "metavar": action.metavar or action.dest.upper(),
+        "type": flag or _TYPES.get(read, "text"),
+        "choices": list(action.choices) if action.choices else None,
+        "default": default,
+        "required": action.required,
+        "several": action.nargs in ("+", "*"),
+        "repeatable": isinstance(action, argparse._AppendAction | argparse._ExtendAction),
+        "says": action.help or "",
+    }
+
+
+def is_path_argument(action: argparse.Action) -> bool:
+    """Return whether an argument is the path of a file or folder."""
+    return _TYPES.get(getattr(action.type, "__name__", "")) == "path"
+
+
+def list_tuners() -> list[JsonDocument]:
+    """List every tuner: whether it learns, whether it is stochastic, and what it requires."""
+    from bench.core.plugin_registries import tuners as registry
+
+    def told(kind: Any) -> JsonDocument:
+        return {
+            "learned": bool(kind.learned),
+            "stochastic": bool(kind.stochastic),
+            "requires": list(getattr(kind, "requires", ())),
+        }
+
+    return [_part(registry, name, told) for name in registry.names()]
+
+
+def list_simulators() -> list[JsonDocument]:
+    """List every simulator with its description."""
+    from bench.core.plugin_registries import simulators as registry
+
+    return [_part(registry, name, lambda _: {}) for name in registry.names()]
+
+
+def list_systems() -> list[JsonDocument]:
+    """List every simulator's declared numbers, states and signals, with units and ranges."""
+    from bench.core.plugin_registries import simulators as registry
+
+    return [_part(registry, name, _declared) for name in registry.names()]
+
+
+def _declared(kind: Any) -> JsonDocument:
+    parameters = [
+        {
+            "name": p.name,
+            "unit": p.unit,
+            "nominal": p.nominal,
+            "bounds": p.bounds,
+            "training": p.training,
+            "log": p.log,
+            "says": p.says,
+        }
+        for p in kind.parameters
+    ]
+    constants = [
+        {"name": c.name, "unit": c.unit, "value": c.value, "says": c.says} for c in kind.constants
+    ]
+    return {
+        "parameters": parameters,
+        "constants": constants,
+        "inputs": _channels(kind.inputs),
+        "states": [{"name": name, "value": value} for name, value in kind.states.items()],
+        "channels": _channels(kind.channels),
+    }
+
+
+def _channels(channels: Iterable[Any]) -> list[JsonDocument]:
+    return [{"name": c.name, "unit": c.unit, "says": c.says} for c in channels]
+
+
+def list_effects() -> list[JsonDocument]:
+    """List every effect, with unit and plausible range of each coefficient on each system kind."""
+    from sims.effects import registry
+
+    return [_part(registry, name, _acting) for name in registry.names()]
+
+
+def _acting(effect: Any) -> JsonDocument:
+    from sims.core.system import SYSTEM_KINDS
+
+    coefficients = [
+        {
+            "name": c.name,
+            "on": [
+                {"kind": kind, "unit": unit, "low": c.range(kind)[0], "high": c.range(kind)[1]}
+                for kind in SYSTEM_KINDS
+                if (unit := c.unit(kind)) is not None
+            ],
+        }
+        for c in effect.coefficients
+    ]
+    return {
+        "noun": effect.noun,
+        "hook": effect.hook,
+        "places": getattr(effect, "at", None),
+        "needs": effect.needs,
+        "contains": list(effect.contains),
+        "source": effect.source,
+        "coefficients": coefficients,
+    }
+
+
+def list_diagnosers() -> list[JsonDocument]:
+    """List every diagnoser: whether it learns, and what it requires."""
+    from bench.core.plugin_registries import diagnosers as registry
+
+    def told(kind: Any) -> JsonDocument:
+        return {"learned": bool(kind.learned), "requires": list(kind.requires)}
+
+    return [_part(registry, name, told) for name in registry.names()]
+
+
+def list_experiments() -> list[JsonDocument]:
+    """List every experiment of the project, and what is missing for it on this machine."""
+    from bench.benchmark.problem import experiment
+    from bench.benchmark.problem.availability import availability
+
+    told = []
+    for name in experiment.list_experiment_names():
+        each = experiment.load_experiment(name)
+        lacks = availability(each)
+        told.append(
+            {
+                "name": each.name,
+                "says": each.says,
+                "skipped": lacks.skipped or None,
+                "needs": lacks.data_set.command if lacks.data_set else None,
+                "title": each.title,
+                "tags": list(each.tags),
+                "simulator": each.simulator,
+                "model": each.model or None,
+                "ranges": list(each.ranges),
+                "targets": each.targets,
+                "budget": each.budget,
+                "tuners": [asdict(entry)["label"] for entry in each.tuners],
+                "tuners_skipped": dict(lacks.tuners),
+            }
+        )
+    return told
+
+
+def list_references() -> list[JsonDocument]:
+    """List every reference result that `simgap plot --behind NAME` draws."""
+    from bench.benchmark.storage.reference_results import find_reference, list_reference_names
+
+    return [
+        {
+            "name": each.name,
+            "says": each.document.get("title") or each.document.get("says", ""),
+            "simgap": each.simgap,
+            "revision": each.revision or None,
+            "started": each.started,
+            "budget": each.document.get("budget"),
+            "targets": each.document.get("targets"),
+            "tuners": each.tuners,
+        }
+        for each in map(find_reference, list_reference_names())
+    ]
+
+
+def list_schemas() -> list[JsonDocument]:
+    """List every schema that `simgap schema NAME` prints."""
+    from bench.schemas import list_schema_names, load_schema
+
+    return [{"name": name, "says": load_schema(name)["title"]} for name in list_schema_names()]
+
+
+def _part(registry: Any, name: str, told: Callable[[Any], JsonDocument]) -> JsonDocument:
+    """Describe a registered part, or why it cannot be used here."""
+    from bench.core.plugin_registries import PartUnavailableError
+
+    try:
+        part = registry.get(name)
+    except PartUnavailableError as error:
+        return {"name": name, "says": None, "skipped": error.reason}
+    return {"name": name, "says": registry.describe(name), "skipped": None, **told(part)}
+
+
+CATALOGUE_SECTIONS: dict[str, Callable[[], list[JsonDocument]]] = {
+    "tuners": list_tuners,
+    "simulators": list_simulators,
+    "systems": list_systems,
+    "effects": list_effects,
+    "diagnosers": list_diagnosers,
+    "experiments": list_experiments,
+    "references": list_references,
+    "schemas": list_schemas,
+}
+"""Sections of the catalogue in addition to commands and places of a robot, by name."""

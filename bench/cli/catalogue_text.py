@@ -1,0 +1,102 @@
+"""Format the documents of `bench.cli.catalogue` as text for `simgap list`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from bench.cli.catalogue import CATALOGUE_SECTIONS
+from bench.cli.output import JsonDocument
+
+
+def format_catalogue(what: str) -> list[str]:
+    """Return the lines of one section of the catalogue.
+
+    Args:
+        what: One of `bench.cli.catalogue.CATALOGUE_SECTIONS`, e.g. tuners, simulators or schemas.
+    """
+    return format_documents(what, CATALOGUE_SECTIONS[what]())
+
+
+def format_documents(what: str, documents: list[JsonDocument]) -> list[str]:
+    """Format given documents of a section of the catalogue.
+
+    Args:
+        what: Name of the section.
+        documents: Documents of its entries.
+    """
+    lay = _LAID_OUT.get(what, _plain)
+    return [line for document in documents for line in lay(document)]
+
+
+def _plain(each: JsonDocument) -> list[str]:
+    return [f"{each['name']:18} {_format_sentence(each)}"]
+
+
+def _format_sentence(each: JsonDocument) -> str:
+    """Return the description of an entry, or why it cannot be used here."""
+    skipped = each.get("skipped")
+    return f"skipped: {skipped}" if skipped else each["says"]
+
+
+def _experiment(each: JsonDocument) -> list[str]:
+    """Format an experiment: what is missing on this machine, its description, its tags."""
+    lacks = []
+    if each["skipped"]:
+        lacks.append(f"skipped: {each['skipped']}")
+    if each["needs"]:
+        lacks.append(f"needs `{each['needs']}`")
+    if each["tuners_skipped"] and not each["skipped"]:
+        reasons = "; ".join(sorted(set(each["tuners_skipped"].values())))
+        lacks.append(f"without {', '.join(each['tuners_skipped'])}: {reasons}")
+    words = f"{'; '.join(lacks)}. {each['says']}" if lacks else each["says"]
+    return [f"{each['name']:22} {words} [{', '.join(each['tags'])}]"]
+
+
+def _system(each: JsonDocument) -> list[str]:
+    result = [f"{each['name']}: {_format_sentence(each)}"]
+    if each["skipped"]:
+        return result
+    for p in each["parameters"]:
+        low, high = p["bounds"]
+        training = p["training"]
+        inner = f", training {training[0]:g} to {training[1]:g}" if training else ""
+        result.append(
+            f"  parameter {p['name']:18} {p['unit']:12} {low:g} to {high:g}{inner}; nominal "
+            f"{p['nominal']:g}  {p['says']}"
+        )
+    result += [
+        f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
+        for c in each["constants"]
+    ]
+    result += _channels("input", each["inputs"])
+    result += [f"  state     {s['name']:18} {s['value']:>12g}" for s in each["states"]]
+    return result + _channels("channel", each["channels"])
+
+
+def _channels(what: str, channels: list[JsonDocument]) -> list[str]:
+    return [f"  {what:9} {c['name']:18} {c['unit']:12} {c['says']}".rstrip() for c in channels]
+
+
+def _effect(each: JsonDocument) -> list[str]:
+    """Format an effect, with its coefficients' units and plausible ranges by kind of system."""
+    if each["skipped"]:
+        return [f"{each['name']}: {_format_sentence(each)}"]
+    result = [f"{each['name']} ({each['hook']}): {each['says']}"]
+    for c in each["coefficients"]:
+        for on in c["on"]:
+            spread = f"{on['low']:g} to {on['high']:g}"
+            result.append(f"  {c['name']:14} {on['kind']:7} {on['unit']:18} {spread}")
+    return result
+
+
+def _reference(each: JsonDocument) -> list[str]:
+    what = f"{each['says']} [simgap {each['simgap']}, {each['started'][:10]}, "
+    return [f"{each['name']:26} {what}{each['targets']} targets, budget {each['budget']}]"]
+
+
+_LAID_OUT: dict[str, Callable[[JsonDocument], list[str]]] = {
+    "systems": _system,
+    "effects": _effect,
+    "experiments": _experiment,
+    "references": _reference,
+}

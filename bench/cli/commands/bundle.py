@@ -1,0 +1,50 @@
+"""The command `simgap bundle`."""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.cli.output import CommandResult, PrintLine
+from bench.cli.shared_options import parse_path
+
+
+def add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap bundle`."""
+    parser.add_argument(
+        "run",
+        metavar="RUN",
+        type=parse_path,
+        help="the folder of a finished comparison, or what `simgap explain` has written",
+    )
+    parser.add_argument(
+        "--with",
+        dest="recordings",
+        metavar="LOG.csv",
+        type=parse_path,
+        action="append",
+        default=[],
+        help="of an explanation: a recording that goes with it, with its .toml, so that its "
+        "held-out error can be checked",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE.zip",
+        type=parse_path,
+        help="archive to write (default: RUN.zip here)",
+    )
+    parser.set_defaults(command=_run_bundle)
+
+
+def _run_bundle(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.studies.archive_bundle import write_bundle
+
+    made = write_bundle(options.run, options.out, options.recordings)
+    document = made.to_document()
+    size = f"{document['bytes'] / 1e6:.3g} MB"
+    say(f"{made.archive}: {made.kind}, {made.files} files, {size}")
+    say(f"SHA-256 {document['sha256']}")
+    for line in made.left_out:
+        say(f"left out: {line}")
+    say(f"to make it again: {made.command}")
+    say(f"to check it: simgap verify {made.archive}")
+    return CommandResult(document)

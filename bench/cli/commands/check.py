@@ -1,0 +1,35 @@
+"""The command `simgap check`."""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, PrintLine
+from bench.cli.shared_options import parse_file_name
+
+
+def add_check_arguments(check: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap check`."""
+    check.add_argument(
+        "name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear"
+    )
+    check.add_argument(
+        "--plugin",
+        type=parse_file_name,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="Python file that defines it",
+    )
+    check.set_defaults(command=_run_check)
+
+
+def _run_check(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.conformance.run_checks import run_suite
+    from bench.core.plugin_registries import load_plugins
+
+    load_plugins(options.plugin)
+    checked = run_suite(options.name, options.plugin, say)
+    return CommandResult(
+        checked.to_document(), EXIT_OK if checked.has_passed else EXIT_PROBLEMS_FOUND
+    )

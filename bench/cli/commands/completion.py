@@ -1,0 +1,82 @@
+"""The command `simgap completion`: a completion script for a shell.
+
+The script completes commands, options, files and names without starting Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from bench.cli.catalogue import is_path_argument
+from bench.cli.output import CommandResult, PrintLine
+
+SHELLS = ("bash", "zsh", "fish", "tcsh")
+_FUNCTIONS = """
+_simgap_experiments() {{ compgen -W "{experiments}" -- "$1"; compgen -f -- "$1"; }}
+_simgap_parts() {{ compgen -W "{parts}" -- "$1"; }}
+_simgap_schemas() {{ compgen -W "{schemas}" -- "$1"; }}
+"""
+"""Functions of bash that complete names; the other shells complete files instead."""
+
+
+def add_completion_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap completion`."""
+    parser.add_argument("shell", choices=SHELLS, help="which shell the script is for")
+    parser.set_defaults(command=_completion)
+
+
+def _completion(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    script = build_completion_script(options.parser, options.shell)
+    say(script.rstrip("\n"))
+    return CommandResult({"shell": options.shell, "script": script})
+
+
+def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
+    """Build the completion script for a shell.
+
+    Args:
+        parser: Parser of the command line.
+        shell: One of `SHELLS`.
+    """
+    import shtab
+
+    from bench.benchmark.problem import experiment
+    from bench.core.plugin_registries import REGISTRIES
+    from bench.schemas import list_schema_names
+
+    (commands,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for name, command in commands.choices.items():
+        for action in command._actions:
+            _complete(name, action, shtab)
+    words = {
+        "experiments": experiment.list_experiment_names(),
+        "parts": [name for registry in REGISTRIES for name in registry.names()],
+        "schemas": list_schema_names(),
+    }
+    known = {key: " ".join(values) for key, values in words.items()}
+    functions = _FUNCTIONS.format(**known) if shell == "bash" else ""
+    script: str = shtab.complete(parser, shell=shell, preamble=functions)
+    return script
+
+
+_WORDS = {
+    ("compare", "experiment"): "_simgap_experiments",
+    ("train", "experiment"): "_simgap_experiments",
+    ("check", "name"): "_simgap_parts",
+    ("schema", "name"): "_simgap_schemas",
+}
+"""Functions of bash that complete an argument, by command and argument."""
+
+
+def _complete(command: str, action: argparse.Action, shtab: Any) -> None:
+    """Set the completion of an argument: known names, or a file."""
+    known = _WORDS.get((command, action.dest))
+    if known:
+        complete = {**shtab.FILE, "bash": known}
+    elif is_path_argument(action):
+        complete = shtab.FILE
+    else:
+        return
+    # The library shtab reads an attribute of this name.
+    action.complete = complete  # type: ignore[attr-defined]

@@ -1,0 +1,74 @@
+"""The command `simgap diff`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, PrintLine
+from bench.cli.shared_options import parse_path
+
+if TYPE_CHECKING:
+    from bench.studies.diff_comparisons import ComparisonDiff
+    from bench.studies.diff_explanations import ExplanationDiff
+
+
+def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap diff`."""
+    for name in ("a", "b"):
+        parser.add_argument(
+            name,
+            metavar=name.upper(),
+            type=parse_path,
+            help="the folder of a comparison, or what `simgap explain` has written",
+        )
+    parser.add_argument(
+        "--out",
+        metavar="FILE.csv",
+        type=parse_path,
+        help="write the numbers as a table, a new file",
+    )
+    parser.add_argument(
+        "--fail-on",
+        choices=("change", "worse"),
+        help="end with exit code 1 where something differs significantly, or where B is "
+        "significantly worse or fails more often; else the exit code says only that it ran",
+    )
+    parser.set_defaults(command=_run_diff)
+
+
+def _run_diff(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from sims.recording.recording_writer import check_absent, write_files
+
+    if options.out is not None:
+        check_absent([options.out])
+    found = _found(options.a, options.b)
+    fails = options.fail_on == "worse" and found.is_worse
+    fails = fails or (options.fail_on == "change" and found.has_changed)
+    for line in found.format_lines():
+        say(line)
+    if options.out is not None:
+        write_files({options.out: found.to_table().to_csv(index=False)})
+        say(f"table   {options.out}")
+    return CommandResult(found.to_document(), EXIT_PROBLEMS_FOUND if fails else EXIT_OK)
+
+
+def _found(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
+    """Compare two folders of one kind.
+
+    Raises:
+        InputError: They are of two kinds, or one is neither.
+    """
+    from bench.studies import diff_comparisons, diff_explanations
+    from sims.core.simulator import InputError
+
+    told = [(folder / diff_explanations.VERDICT).is_file() for folder in (a, b)]
+    if all(told):
+        return diff_explanations.ExplanationDiff(
+            diff_explanations.load_side(a), diff_explanations.load_side(b)
+        )
+    if any(told):
+        one, other = (a, b) if told[0] else (b, a)
+        raise InputError(f"expected two of one kind: {one} is an explanation, {other} is none")
+    return diff_comparisons.diff_comparisons(a, b)

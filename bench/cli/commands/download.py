@@ -1,0 +1,168 @@
+"""The command `simgap download`: data sets that experiments need."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.cli.output import CommandResult, JsonDocument, PrintLine
+from bench.cli.shared_options import parse_path
+
+if TYPE_CHECKING:
+    from bench.datasets.dataset_catalogue import DataSet
+
+_ALL = "all"
+
+
+def add_download(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap download`."""
+    parser.add_argument(
+        "names",
+        metavar="NAME",
+        nargs="*",
+        default=[],
+        help="data sets to download, or `all`; without a name the data sets are listed",
+    )
+    parser.add_argument(
+        "--from",
+        dest="source",
+        metavar="FOLDER_OR_URL",
+        default="",
+        help="take the files from this folder (a clone at the data set's commit, or the files "
+        "alone) or below this address, in place of GitHub",
+    )
+    parser.add_argument(
+        "--out",
+        type=parse_path,
+        metavar="DIR",
+        help="write the data set's folder into this one (default: SIMGAP_DATA or SIMGAP_ROBOTS "
+        "where set, else simgap/ in XDG_DATA_HOME or ~/.local/share)",
+    )
+    parser.set_defaults(command=_download)
+
+
+def _download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.datasets import dataset_catalogue
+
+    chosen = (
+        dataset_catalogue.names() if _ALL in options.names else list(dict.fromkeys(options.names))
+    )
+    wanted = [dataset_catalogue.get(name) for name in chosen]
+    if not wanted:
+        every = [dataset_catalogue.get(name) for name in dataset_catalogue.names()]
+        for data_set in every:
+            for line in _lines(data_set):
+                say(line)
+        return CommandResult({"data_sets": [_document(each) for each in every], "downloaded": []})
+    downloaded = []
+    for data_set in wanted:
+        present = _present(data_set, options.out)
+        if present:
+            say(f"{data_set.name}: already in {present}")
+            continue
+        say(f"{data_set.name}: {_fetch(data_set, options.source, options.out)}")
+        downloaded.append(data_set.name)
+        if options.out:
+            say(_how_found(data_set, options.out))
+        for name in _experiments(data_set):
+            say(f"needed by: simgap compare {name}")
+    documents = [_document(each, options.out) for each in wanted]
+    return CommandResult({"data_sets": documents, "downloaded": downloaded})
+
+
+def _fetch(data_set: DataSet, source: str, out: Path | None) -> Path:
+    """Download one data set with a progress bar; return its folder."""
+    import sys
+
+    from tqdm import tqdm
+
+    from bench.datasets.dataset_catalogue import search_folders
+    from bench.datasets.dataset_download import download
+
+    with tqdm(
+        total=data_set.bytes,
+        desc=data_set.name,
+        unit="B",
+        unit_scale=True,
+        file=sys.stderr,
+        disable=not sys.stderr.isatty(),
+        leave=False,
+    ) as bar:
+
+        def advance(count: int) -> None:
+            bar.update(count)
+
+        return download(data_set, out or next(search_folders(data_set.kind)), source, advance)
+
+
+def _present(data_set: DataSet, out: Path | None) -> Path | None:
+    """Return the folder of a data set that is already present; None if it must be downloaded."""
+    if out is None:
+        return data_set.folder()
+    folder = out / data_set.name
+    return folder if all((folder / file).is_file() for file in data_set.provides) else None
+
+
+def _how_found(data_set: DataSet, out: Path) -> str:
+    """Explain how experiments find a data set in a folder other than the default one."""
+    from bench.datasets.dataset_catalogue import FOLDER_VARIABLES, search_folders
+
+    if out.resolve() in [folder.resolve() for folder in search_folders(data_set.kind)]:
+        return f"{data_set.name}: experiments find it there"
+    variable = FOLDER_VARIABLES[data_set.kind]
+    return f"{data_set.name}: experiments find it with {variable}={os.fspath(out.resolve())}"
+
+
+def _lines(data_set: DataSet) -> list[str]:
+    here = data_set.folder()
+    state = f"in {here}" if here else f"not here: run `{data_set.command}`"
+    needed = ", ".join(_experiments(data_set))
+    return [
+        f"{data_set.name:22} {data_set.size:>7}  {data_set.licence:11} {state}",
+        f"  {data_set.title}",
+        f"  needed by {needed}",
+        f"  {data_set.repository} at {data_set.commit[:7]}; {data_set.cite}",
+    ]
+
+
+def _experiments(data_set: DataSet) -> list[str]:
+    """Return the names of the project's experiments that need a data set."""
+    from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
+    from bench.datasets.dataset_catalogue import providing
+
+    found = []
+    for name in list_experiment_names():
+        each = load_experiment(name)
+        paths = [("robot", each.model)]
+        if each.recording:
+            paths.append(("recording", each.recording.path))
+        if data_set in [providing(*path) for path in paths]:
+            found.append(name)
+    return found
+
+
+def _document(data_set: DataSet, out: Path | None = None) -> JsonDocument:
+    return {
+        "name": data_set.name,
+        "title": data_set.title,
+        "kind": data_set.kind,
+        "licence": data_set.licence,
+        "cite": data_set.cite,
+        "repository": data_set.repository,
+        "commit": data_set.commit,
+        "bytes": data_set.bytes,
+        "files": [
+            {
+                "path": file.path,
+                "url": f"{data_set.base_url}/{file.path}",
+                "bytes": file.bytes,
+                "sha256": file.sha256,
+            }
+            for file in data_set.files
+        ],
+        "provides": list(data_set.provides),
+        "folder": _present(data_set, out),
+        "experiments": _experiments(data_set),
+    }

@@ -1,0 +1,323 @@
+"""The commands `simgap explain` and `simgap score`."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from bench.cli.interrupt_handler import InterruptHandler
+from bench.cli.output import (
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    EXIT_PROBLEMS_FOUND,
+    CommandResult,
+    PrintLine,
+)
+from bench.cli.shared_options import (
+    add_force_option,
+    add_model_option,
+    add_pdf,
+    add_plugin_option,
+    make_cluster_pool,
+    parse_name_list,
+    parse_path,
+    parse_positive_int,
+    parse_seconds,
+)
+
+_FIGURE_SUFFIXES = (".html", ".png", ".pdf")
+"""File extensions of figures and reports, which are not listed one by one."""
+
+_RESULT_RELEVANT_OPTIONS = (
+    "system", "model", "engine", "free", "tuner", "seed", "budget", "whole", "pieces", "thorough",
+    "force", "plugin",
+)  # fmt: skip
+"""Options that affect the result."""
+
+
+def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap explain`."""
+    parser.add_argument(
+        "recordings",
+        metavar="RECORDING.csv",
+        type=parse_path,
+        nargs="+",
+        help="the table; its .toml stands beside it. Several of one system, in the order of time, "
+        "are explained together, and what each says by itself is compared",
+    )
+    parser.add_argument(
+        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
+    )
+    add_model_option(parser)
+    parser.add_argument(
+        "--engine",
+        metavar="NAME",
+        default="batch",
+        help="pybullet, mujoco or batch (default: batch)",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=parse_path,
+        help="folder to write (default: a new one below results/)",
+    )
+    parser.add_argument(
+        "--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)"
+    )
+    parser.add_argument(
+        "--free",
+        metavar="A,B,...",
+        default="",
+        help="constants to estimate with the parameters; "
+        "of a robot numbers of its model file, as damping@* or mass@forearm",
+    )
+    parser.add_argument(
+        "--tuner",
+        metavar="NAME",
+        help="a tuner that finds where the base fit begins (default: a grid)",
+    )
+    parser.add_argument(
+        "--budget",
+        type=parse_seconds,
+        metavar="S",
+        help="seconds after which the search ends with what it has (default: it comes to its end); "
+        "Ctrl-C ends it likewise",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=parse_positive_int,
+        metavar="N",
+        help="processes that work at once, where that pays; the answer is the same with any number "
+        "(default: one for each core)",
+    )
+    parser.add_argument(
+        "--whole",
+        action="store_true",
+        help="look at all of a long recording of a robot (default: at pieces from all over it)",
+    )
+    parser.add_argument(
+        "--pieces",
+        type=parse_seconds,
+        metavar="S",
+        help="cut runs into pieces of S seconds, each with an initial state of its own: for motion "
+        "that drifts or is unstable",
+    )
+    parser.add_argument(
+        "--thorough",
+        action="store_true",
+        help="search on where causes are found and something is left over: further causes are "
+        "taken that held-out runs bear out (about twice as long there)",
+    )
+    parser.add_argument(
+        "--each",
+        action="store_true",
+        help="explain every recording by itself, --jobs of them at once: a folder for each and one "
+        "table of all; what --out holds of an earlier call is not made again",
+    )
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="with --each: on the Dask cluster with this scheduler, which must see the same files",
+    )
+    parser.add_argument(
+        "--ranges",
+        action="store_true",
+        help="for a robot: also write ranges for domain randomisation, the 95 %% intervals of what "
+        "its model file then has, as ranges.toml, ranges.csv and code for Isaac Lab and MuJoCo "
+        "Playground",
+    )
+    add_pdf(parser)
+    add_plugin_option(parser, "systems")
+    add_force_option(parser)
+    parser.set_defaults(command=_run_explain)
+
+
+def add_score_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap score`."""
+    parser.add_argument(
+        "model",
+        metavar="MODEL",
+        type=parse_path,
+        help="extended.toml as `simgap explain` writes it, or a robot's extended.xml",
+    )
+    parser.add_argument(
+        "recording",
+        metavar="OTHER.csv",
+        type=parse_path,
+        help="the recording; its .toml stands beside it",
+    )
+    parser.add_argument(
+        "--held-out", action="store_true", help="only the runs that are marked held_out"
+    )
+    add_plugin_option(parser, "systems")
+    add_force_option(parser)
+    parser.set_defaults(command=_run_score)
+
+
+def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Explain a recording, write the results, print the text summary."""
+    from bench.api.explain import explain
+    from bench.benchmark.storage.provenance import get_utc_time, write_explanation_environment
+    from bench.cli.search_progress import ProgressDisplay
+    from bench.core.plugin_registries import load_plugins
+    from bench.diagnosis.report.summary_text import format_summary
+    from sims.core.atomic_files import check_folder_empty, make_timestamped_path
+    from sims.core.simulator import InputError
+
+    if options.cluster and not options.each:
+        raise InputError("--cluster: expected --each beside it, as it is for many recordings")
+    if options.ranges and options.each:
+        raise InputError(
+            "--ranges: not possible together with --each; explain the recordings together, or one "
+            "by one"
+        )
+    load_plugins(options.plugin)
+    if options.each:
+        return _run_explain_batch(options, say)
+    # Check this before the work, which may take minutes.
+    if options.out is not None:
+        check_folder_empty(options.out)
+    started = get_utc_time()
+    with ProgressDisplay(options.budget, silent=options.json) as display:
+        with InterruptHandler(display.note) as interrupts:
+            explanation = explain(
+                options.recordings,
+                system=options.system,
+                model=options.model,
+                engine=options.engine,
+                free=parse_name_list(options.free),
+                tuner=options.tuner,
+                seed=options.seed,
+                force=options.force,
+                budget=options.budget,
+                jobs=options.jobs,
+                whole=options.whole,
+                pieces=options.pieces,
+                thorough=options.thorough,
+                say=display.note,
+                stop=interrupts.is_stop_requested,
+                listener=display,
+            )
+        display.finish("drawing the figures and writing the report")
+        folder = options.out or make_timestamped_path(
+            Path("results"), f"explain-{options.recordings[0].stem}"
+        )
+        paths = explanation.write(folder, pdf=options.pdf, ranges=options.ranges)
+    settings = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS}
+    made = write_explanation_environment(folder, started, settings, options.recordings)
+    for line in format_summary(explanation.story):
+        say(line)
+    left_out = explanation.ranges.left_out if options.ranges else ()
+    for line in (*explanation.unsaid, *left_out):
+        say(line)
+    say(f"\nreport  {paths[-1]}")
+    for path in paths:
+        if path.suffix not in _FIGURE_SUFFIXES:
+            say(f"{path.stem:7} {path}")
+    cut = explanation.answer.cut
+    document = {
+        "verdict": explanation.answer.to_document(),
+        "title": explanation.story.title,
+        "unsaid": explanation.unsaid,
+        "folder": folder,
+        "files": [*paths, made],
+    }
+    if options.ranges:
+        document["ranges"] = [one.document() for one in explanation.ranges.ranges]
+        document["ranges_left_out"] = left_out
+    interrupted = cut is not None and cut.reason == "interrupt"
+    return CommandResult(document, EXIT_INTERRUPTED if interrupted else EXIT_OK)
+
+
+def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Explain every recording separately, print each result, then print the overall summary."""
+    from bench.benchmark.runner.plugin_discovery import Plugin
+    from bench.benchmark.runner.worker_pools import make_pool
+    from bench.benchmark.storage.provenance import (
+        format_explain_command,
+        get_utc_time,
+        write_explanation_environment,
+    )
+    from bench.cli.search_progress import ProgressDisplay
+    from bench.diagnosis.batch.log_rows import (
+        LOGS_TABLE_FILE,
+        LogResult,
+        format_cause,
+        summarise_causes,
+    )
+    from bench.diagnosis.batch.run_batch import explain_batch, list_logs
+    from bench.diagnosis.batch.summary_page import BatchPageInput, write_summary_page
+    from bench.diagnosis.evaluation.worker_pool import count_available_cores
+    from sims.core.atomic_files import make_timestamped_path
+
+    settings = {
+        name: getattr(options, name)
+        for name in (
+            "system", "model", "engine", "tuner", "seed", "force", "budget", "whole", "pieces",
+            "thorough",
+        )
+    } | {"free": tuple(parse_name_list(options.free))}  # fmt: skip
+    out = options.out or make_timestamped_path(Path("results"), "explain-each")
+    logs = list_logs(options.recordings, out, settings)
+    started = get_utc_time()
+
+    finished = 0
+
+    def done(row: LogResult) -> None:
+        nonlocal finished
+        finished += 1
+        causes = [format_cause(cause) for cause in row.causes]
+        seconds = "" if row.seconds is None else f" ({row.seconds:.0f} s)"
+        with display.paused():
+            say(f"{row.log}: {row.error or row.verdict} {'; '.join(causes)}".rstrip() + seconds)
+        display.advance()
+        display.completed(finished / len(logs))
+
+    display = ProgressDisplay(silent=options.json, hint=False)
+    with display, InterruptHandler(display.note) as interrupts:
+        display.stage("explaining each recording", len(logs))
+        pool = make_cluster_pool(options.cluster) or make_pool(
+            min(options.jobs or count_available_cores(), len(logs))
+        )
+        with pool:
+            pool.load_plugins([Plugin(str(path)) for path in options.plugin])
+            rows = explain_batch(logs, out, settings, pool, done, interrupts.is_stop_requested)
+    left = len(logs) - len(rows)
+    folders = {log.name: log.folder for log in logs}
+    given = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS} | {"each": True}
+    words = format_explain_command(options.recordings, {**given, "out": out})
+    recordings = dict(zip(folders, options.recordings, strict=True))
+    report = write_summary_page(rows, BatchPageInput(out, folders, recordings, words, left))
+    write_explanation_environment(out, started, given, options.recordings)
+    together = summarise_causes(rows)
+    for line in ("", *together, f"\nreport  {report}", f"table   {out / LOGS_TABLE_FILE}"):
+        say(line)
+    code = EXIT_PROBLEMS_FOUND if any(row.error for row in rows) else EXIT_OK
+    if left:
+        say(f"{left} of {len(logs)} left: the same command goes on with them")
+        code = EXIT_INTERRUPTED
+    found = [{**asdict(row), "folder": folders[row.log]} for row in rows]
+    document = {
+        "logs": found,
+        "together": together,
+        "left": left,
+        "table": out / LOGS_TABLE_FILE,
+        "report": report,
+    }
+    return CommandResult(document, code)
+
+
+def _run_score(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Print a model's error on a recording."""
+    from bench.api.explain import score
+    from bench.core.plugin_registries import load_plugins
+
+    load_plugins(options.plugin)
+    result = score(options.model, options.recording, held_out=options.held_out, force=options.force)
+    units = result.pop("units")
+    for channel, error in result["rmse"].items():
+        say(f"{channel}: RMSE {error:.4g} {units[channel]}")
+    counts = f"{result['runs']} runs, {result['samples']} samples"
+    say(f"{result['normalised_rmse']:.4g} times the noise; {counts}")
+    return CommandResult(result)

@@ -1,0 +1,124 @@
+"""The commands `simgap film` and `simgap track`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from bench.cli.output import CommandResult, PrintLine
+from bench.cli.shared_options import add_force_option, add_pdf, parse_path
+
+
+def add_film_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap film`."""
+    parser.add_argument(
+        "recording",
+        metavar="RECORDING.csv",
+        type=parse_path,
+        help="a recording of a ball, with channel z",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILM.mp4",
+        type=parse_path,
+        required=True,
+        help="video to write, a new one",
+    )
+    parser.add_argument("--run", metavar="NAME", help="which run (default: the first)")
+    parser.add_argument(
+        "--size", metavar="PX", type=int, default=100, help="width and height (default: 100)"
+    )
+    parser.add_argument(
+        "--camera-seed",
+        metavar="K",
+        type=int,
+        default=0,
+        help="camera, light, colours (default: 0)",
+    )
+    add_force_option(parser)
+    parser.set_defaults(command=run_film)
+
+
+def add_track_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap track`."""
+    parser.add_argument(
+        "video",
+        metavar="VIDEO",
+        type=parse_path,
+        help="a film of one dropped ball by a camera that stands",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="NAME.csv",
+        type=parse_path,
+        required=True,
+        help="recording to write, a new one",
+    )
+    parser.add_argument(
+        "--ball-diameter", metavar="M", type=float, help="the ball's diameter in metres"
+    )
+    parser.add_argument(
+        "--fps", metavar="F", type=float, help="frames a second (default: the file's time stamps)"
+    )
+    parser.add_argument(
+        "--scale",
+        choices=("camera", "diameter", "fall"),
+        help="where metres come from (default: VIDEO.camera.toml if there, else the diameter if "
+        "given, else the fall)",
+    )
+    add_pdf(parser)
+    parser.set_defaults(command=run_track)
+
+
+def run_film(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Film a recorded ball.
+
+    Args:
+        options: Options of `simgap film`.
+        say: Prints a line of text.
+    """
+    from bench.logs.film_recording import write_film
+
+    frames, seconds = write_film(
+        options.recording,
+        options.out,
+        options.run,
+        options.size,
+        options.camera_seed,
+        options.force,
+    )
+    camera = options.out.with_suffix(".camera.toml")
+    say(f"{options.out}: {frames} frames, {seconds:.4g} s, {options.size} x {options.size} px")
+    say(f"{camera}: the camera")
+    return CommandResult(
+        {
+            "film": options.out,
+            "camera": camera,
+            "frames": frames,
+            "seconds": seconds,
+            "pixels": options.size,
+        }
+    )
+
+
+def run_track(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Track a ball; write the recording and its figure.
+
+    Args:
+        options: Options of `simgap track`.
+        say: Prints a line of text.
+    """
+    from bench.figures.track_figure import render_track_figure
+    from bench.logs.film_tracking import track_film
+
+    diameter, fps, scale = options.ball_diameter, options.fps, options.scale
+    found = track_film(
+        options.video, options.out, render_track_figure, diameter, fps, scale, options.pdf
+    )
+    for note in found.notes:
+        print(f"simgap: {options.video}: {note}", file=sys.stderr)
+    for line in found.lines:
+        say(line)
+    endings = (".csv", ".toml", ".png", ".pdf") if options.pdf else (".csv", ".toml", ".png")
+    files = [options.out.with_suffix(ending) for ending in endings]
+    return CommandResult({**found.to_document(), "recording": options.out, "files": files})

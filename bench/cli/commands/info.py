@@ -1,0 +1,180 @@
+"""The command `simgap info`: information about the machine for bug reports."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from bench.cli.output import CommandResult, JsonDocument, PrintLine
+
+
+def add_info_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap info`."""
+    parser.set_defaults(command=_info)
+
+
+def _info(options: argparse.Namespace, say: PrintLine) -> CommandResult:  # noqa: ARG001
+    found = collect_info()
+    for line in _format_info(found):
+        say(line)
+    return CommandResult(found)
+
+
+def collect_info() -> JsonDocument:
+    """Collect versions, engines, platform and paths."""
+    import os
+    import platform
+
+    from bench import __version__
+
+    return {
+        "simgap": __version__,
+        "revision": _revision(),
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "processors": _processors(),
+        "memory": _memory(),
+        "paths": {
+            "simgap": str(_HOME),
+            "cache": str(_cache()),
+            "data sets": str(_data_sets()),
+            "SIMGAP_DATA": os.environ.get("SIMGAP_DATA"),
+            "SIMGAP_ROBOTS": os.environ.get("SIMGAP_ROBOTS"),
+        },
+        "engines": list(_engines()),
+        "packages": list(_packages()),
+    }
+
+
+_HOME = Path(__file__).resolve().parents[3]
+"""Folder that contains simgap's packages."""
+
+
+def _cache() -> Path:
+    from bench.benchmark.runner.tuner_training import get_weights_folder
+
+    return get_weights_folder()
+
+
+def _data_sets() -> Path:
+    from bench.datasets.dataset_catalogue import user_folder
+
+    return user_folder()
+
+
+def _revision() -> str | None:
+    """Return the commit of a checkout, with + if files were changed; None for a wheel."""
+    import subprocess
+
+    if not (_HOME / ".git").exists():
+        return None
+    said = ("git", "-C", str(_HOME), "describe", "--always", "--dirty=+", "--abbrev=12")
+    try:
+        done = subprocess.run(said, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None
+
+
+def _processors() -> int | None:
+    import os
+
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count()
+
+
+def _memory() -> int | None:
+    """Return the memory of the machine in bytes; None if unknown."""
+    import os
+
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _engines() -> Iterator[JsonDocument]:
+    """List every engine; each package is imported, since an installed one may not work."""
+    from bench import __version__
+    from sims.engines.adapters import bullet_world, mujoco_bodies
+
+    loads = {"pybullet": bullet_world.import_pybullet, "mujoco": mujoco_bodies.import_mujoco}
+    yield {"name": "batch", "version": __version__, "missing": None}
+    for name, load in loads.items():
+        yield {"name": name, "version": _version(name), "missing": _missing(name, load)}
+
+
+def _packages() -> Iterator[JsonDocument]:
+    """List the packages that simgap and its extras require, by the installed metadata."""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    from packaging.requirements import Requirement
+
+    try:
+        wanted = [Requirement(text) for text in requires("simgap") or ()]
+    except PackageNotFoundError:  # Run from the source, without an installation.
+        wanted = []
+    for each in wanted:
+        extra = _extra(str(each.marker or ""))
+        if extra == "dev" or not (each.marker is None or each.marker.evaluate({"extra": extra})):
+            continue
+        version = _version(each.name)
+        # simgap is in no package index, so its extras cannot be installed by name.
+        remedy = f'pip install "{each.name}{each.specifier}"'
+        missing = None if version else f"not installed ({remedy})"
+        if version and not each.specifier.contains(version, prereleases=True):
+            missing = f"expected {each.specifier}"
+        yield {"name": each.name, "of": extra, "version": version, "missing": missing}
+
+
+def _extra(marker: str) -> str:
+    """Return the extra that a requirement belongs to; empty if it belongs to none."""
+    _, _, behind = marker.partition("extra == ")
+    return behind.split()[0].strip("\"')") if behind else ""
+
+
+def _version(package: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _missing(package: str, load: Callable[[], Any]) -> str | None:
+    """Return why a package cannot be used; None if it can."""
+    try:
+        load()
+    except ModuleNotFoundError:
+        return f"not installed (pip install {package})"
+    except Exception as error:  # Built for another machine, or incompletely installed.
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def _format_info(found: JsonDocument) -> Iterator[str]:
+    """Format the information as text."""
+    revision = f" ({found['revision']})" if found["revision"] else ""
+    yield f"simgap {found['simgap']}{revision}, {found['implementation']} {found['python']}"
+    memory = f", {found['memory'] / 2**30:.3g} GiB" if found["memory"] else ""
+    yield f"{found['platform']}, {found['processors']} processors{memory}"
+    yield ""
+    for name, path in found["paths"].items():
+        yield f"{name:14} {path or 'not set'}"
+    yield ""
+    yield from (_line(engine, "engine ") for engine in found["engines"])
+    yield ""
+    for package in found["packages"]:
+        yield _line(package, f"[{package['of']}] " if package["of"] else "")
+
+
+def _line(each: JsonDocument, before: str) -> str:
+    version = each["version"] or ""
+    missing = f"MISSING: {each['missing']}" if each["missing"] else ""
+    return f"{before + each['name']:26} {'  '.join(filter(None, [version, missing]))}"

@@ -1,0 +1,68 @@
+"""The commands `simgap list` and `simgap schema`."""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.cli.output import CommandResult, PrintLine, format_json
+from bench.cli.shared_options import add_model_option, add_plugin_option
+
+_LISTS = (
+    "tuners", "simulators", "systems", "effects", "diagnosers", "experiments", "references",
+    "schemas", "commands", "places",
+)  # fmt: skip
+
+
+def add_list_arguments(listing: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap list`."""
+    listing.add_argument(
+        "what",
+        choices=_LISTS,
+        nargs="?",
+        help="which list (default, with --json: all but the last)",
+    )
+    add_model_option(listing, "whose places are listed: an MJCF or URDF")
+    add_plugin_option(listing, "of them")
+    listing.set_defaults(command=_list)
+
+
+def add_schema_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap schema`."""
+    parser.add_argument("name", metavar="NAME", help="a command, or see `simgap list schemas`")
+    parser.set_defaults(command=_schema)
+
+
+def _list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.cli import catalogue
+    from bench.cli.catalogue_text import format_documents
+    from bench.core.plugin_registries import load_plugins
+    from sims.core.simulator import InputError
+
+    load_plugins(options.plugin)
+    if (options.what == "places") != (options.model is not None):
+        raise InputError("list places and --model FILE go together")
+    if options.model is not None:
+        from bench.cli import robot_places
+
+        for line in robot_places.format_places(options.model):
+            say(line)
+        return CommandResult({"places": robot_places.list_places(options.model)})
+    if options.what is None:
+        if not options.json:
+            raise InputError(f"expected one of {', '.join(_LISTS)}; with --json all are listed")
+        return CommandResult(catalogue.build_catalogue(options.parser))
+    if options.what == "commands":
+        found = catalogue.list_commands(options.parser)
+    else:
+        found = catalogue.CATALOGUE_SECTIONS[options.what]()
+    for line in format_documents(options.what, found):
+        say(line)
+    return CommandResult({options.what: found})
+
+
+def _schema(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.schemas import load_schema
+
+    found = load_schema(options.name)
+    say(format_json(found))
+    return CommandResult(found)

@@ -1,0 +1,124 @@
+"""The command `simgap plot`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.cli.output import CommandResult, JsonDocument, PrintLine
+from bench.cli.shared_options import add_pdf, add_plugin_option, parse_path
+
+if TYPE_CHECKING:
+    from bench.benchmark.storage.reference_results import ReferenceResult
+
+
+def add_plot_arguments(plot: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap plot`."""
+    plot.add_argument(
+        "runs",
+        metavar="RUN",
+        type=parse_path,
+        nargs="+",
+        help="the folder of a comparison or bounce shot; several comparisons: ranks",
+    )
+    plot.add_argument(
+        "--out",
+        metavar="DIR",
+        type=parse_path,
+        help="folder for what several comparisons give together",
+    )
+    plot.add_argument(
+        "--behind",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="draw errors against simulations again, with this reference result in grey behind "
+        "them: see `simgap list references`, or the folder of a comparison",
+    )
+    add_pdf(plot)
+    add_plugin_option(plot, "simulators")
+    plot.set_defaults(command=_plot)
+
+
+def _plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+    from bench.benchmark.storage.reference_results import find_reference
+    from bench.studies.study import list_study_folders, open_study
+    from sims.core.simulator import InputError
+
+    files = [str(path.resolve()) for path in map(Path, options.plugin)]
+    for folder in options.runs:
+        for part in list_study_folders(folder):
+            load_plugins_for_experiment(files, open_study(part).configuration.experiment)
+    references = [find_reference(name) for name in options.behind]
+    if len(options.runs) == 1 and not options.out:
+        # Check the references before anything is drawn.
+        for part in list_study_folders(options.runs[0]):
+            for reference in references:
+                reference.find_mismatches(open_study(part).configuration.experiment)
+        return _report_again(options.runs[0], references, say)
+    if not options.out:
+        raise InputError("several comparisons give one result: name a folder for it with --out DIR")
+    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.multi_problem import compare_across_problems
+
+    for folder in options.runs:
+        if not isinstance(study := open_study(folder), Comparison):
+            asked = study.configuration.experiment
+            found = "a bounce shot" if asked.shot else "a study of two comparisons"
+            found = "a comparison of diagnosers" if asked.diagnosis else found
+            raise InputError(f"{folder}: expected the folder of a comparison, found {found}")
+    document = compare_across_problems(options.runs, options.out, say).to_document()
+    return CommandResult(
+        {
+            **document,
+            "behind": _draw_each_with_references(options.runs, references, options.out, say),
+        }
+    )
+
+
+def _report_again(
+    folder: Path, references: Sequence[ReferenceResult], say: PrintLine
+) -> CommandResult:
+    """Report again a study, or the studies of a sweep or of a file with several studies."""
+    from bench.cli.study_summary import summarise_study
+    from bench.studies.study import list_study_folders, open_study, report_jointly
+
+    comparisons = []
+    for part in list_study_folders(folder):
+        study = open_study(part)
+        failed = study.report(say)
+        behind = _draw_with_references(part, references, part, say)
+        comparisons.append({**summarise_study(study), "failed": failed, "behind": behind})
+    report_jointly(folder, say)
+    return CommandResult({"comparisons": comparisons})
+
+
+def _draw_each_with_references(
+    folders: Sequence[Path], references: Sequence[ReferenceResult], out: Path, say: PrintLine
+) -> list[JsonDocument]:
+    """Draw each of several comparisons over the references that belong to its problem."""
+    from sims.core.simulator import InputError
+
+    drawn = []
+    for number, folder in enumerate(folders, 1):
+        for reference in references:
+            name = f"{number}-{folder.resolve().name}-{reference.name.replace('/', '-')}-"
+            try:
+                drawn += _draw_with_references(folder, [reference], out, say, name)
+            except InputError as error:
+                say(f"not drawn: {error}")
+    return drawn
+
+
+def _draw_with_references(
+    folder: Path, references: Sequence[ReferenceResult], out: Path, say: PrintLine, name: str = ""
+) -> list[JsonDocument]:
+    """Draw a comparison over references in grey; draw nothing without references."""
+    if not references:
+        return []
+    from bench.benchmark.reference_overlay import draw_with_references
+
+    return draw_with_references(folder, references, out, say, name)

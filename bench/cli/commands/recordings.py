@@ -1,0 +1,285 @@
+"""The commands `simgap simulate` and `simgap inspect`."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDocument, PrintLine
+from bench.cli.shared_options import (
+    add_force_option,
+    add_model_option,
+    add_pdf,
+    add_plugin_option,
+    parse_name_list,
+    parse_path,
+    parse_positive_int,
+)
+
+if TYPE_CHECKING:
+    from bench.diagnosis.conventions.convention_comparison import ConventionDifference
+    from sims.core.simulator import Simulator
+    from sims.recording.recording import Recording
+
+
+def add_simulate_arguments(simulate: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap simulate`."""
+    simulate.add_argument(
+        "system", metavar="SYSTEM", nargs="?", default="", help="see `simgap list systems`"
+    )
+    add_model_option(simulate, "simulate this robot in place of a system: an MJCF or URDF")
+    for name, metavar, text in (
+        (
+            "theta",
+            "NAME=VALUE",
+            "parameters, or all values in order with commas between (default: nominal)",
+        ),
+        ("effect", "NAME=VALUE[,VALUE]", "effects that act, with their coefficients"),
+        ("constant", "NAME=VALUE", "constants other than the system's defaults"),
+        ("noise", "S", "sensor noise, 1 sigma: of every channel, or NAME=S (default: none)"),
+        (
+            "input",
+            "NAME=SIGNAL",
+            "a number, sine:AMPLITUDE:HERTZ, square:A:HZ, steps:A:SECONDS, chirp:A:HZ:HZ, "
+            "multisine:A:HZ:HZ; several are added with ' + ' between",
+        ),
+        ("initial", "NAME=VALUE", "initial states, or NAME=LOW:HIGH to draw each run's"),
+    ):
+        simulate.add_argument(
+            f"--{name}", action="extend", nargs="+", default=[], metavar=metavar, help=text
+        )
+    simulate.add_argument(
+        "--observe", metavar="A,B,...", help="channels to record (default: the system's usual ones)"
+    )
+    simulate.add_argument(
+        "--runs",
+        type=parse_positive_int,
+        metavar="N",
+        default=4,
+        help="number of runs (default: 4)",
+    )
+    simulate.add_argument(
+        "--seconds", type=float, metavar="T", default=4.0, help="length of a run (default: 4)"
+    )
+    simulate.add_argument(
+        "--rate", type=float, metavar="HZ", default=100.0, help="samples a second (default: 100)"
+    )
+    simulate.add_argument(
+        "--engine", metavar="NAME", help="pybullet, mujoco or batch (default: batch)"
+    )
+    simulate.add_argument(
+        "--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)"
+    )
+    simulate.add_argument(
+        "--held-out", type=int, metavar="M", help="mark the last M runs (default: a third)"
+    )
+    simulate.add_argument(
+        "--out", type=parse_path, metavar="FILE.csv", required=True, help="file to write, a new one"
+    )
+    add_plugin_option(simulate, "systems")
+    add_force_option(simulate)
+    simulate.set_defaults(command=_simulate)
+
+
+def add_inspect_arguments(inspect: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap inspect`."""
+    inspect.add_argument(
+        "recording",
+        metavar="FILE.csv",
+        type=parse_path,
+        help="the table; its .toml stands beside it",
+    )
+    inspect.add_argument(
+        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
+    )
+    add_model_option(inspect)
+    inspect.add_argument(
+        "--out",
+        metavar="DIR",
+        type=parse_path,
+        help="folder for the figure (default: results/inspect)",
+    )
+    inspect.add_argument(
+        "--check",
+        action="store_true",
+        help="say what the recording can fix, before any fit; exit code 1 if a free number is "
+        "not identifiable",
+    )
+    inspect.add_argument(
+        "--free",
+        metavar="A,B,...",
+        help="with --check: constants, or numbers of a model file, that are to be estimated",
+    )
+    inspect.add_argument(
+        "--fix",
+        metavar="NAME.toml",
+        type=parse_path,
+        help="of a robot: write the description with the conventions that the model file means, "
+        "a new file",
+    )
+    add_pdf(inspect)
+    add_plugin_option(inspect, "systems")
+    inspect.set_defaults(command=_inspect)
+
+
+def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.api.recordings import simulate
+    from bench.cli.key_value_args import build_simulation_spec_args
+    from bench.core.plugin_registries import load_plugins
+    from bench.logs.synthetic_recording import check_output_path
+
+    load_plugins(options.plugin)
+    check_output_path(options.out)
+    simulated = simulate(
+        options.system,
+        model=options.model,
+        observe=parse_name_list(options.observe or ""),
+        runs=options.runs,
+        seconds=options.seconds,
+        rate=options.rate,
+        engine=options.engine,
+        seed=options.seed,
+        held_out=options.held_out,
+        force=options.force,
+        **build_simulation_spec_args(
+            options.theta,
+            options.effect,
+            options.constant,
+            options.noise,
+            options.input,
+            options.initial,
+        ),
+    )
+    simulated.write(options.out)
+    first = simulated.recording.runs[0]
+    truth = options.out.with_suffix(".truth.toml")
+    runs = f"{options.runs} run{'s' * (options.runs > 1)}"
+    say(
+        f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels "
+        f"{', '.join(first.channels)}"
+    )
+    say(f"{truth}: what made it")
+    return CommandResult(
+        {
+            "recording": options.out,
+            "description": options.out.with_suffix(".toml"),
+            "truth": truth,
+            "system": simulated.recording.system,
+            "runs": options.runs,
+            "seconds": options.seconds,
+            "rate": options.rate,
+            "channels": list(first.channels),
+            "inputs": list(first.inputs),
+        }
+    )
+
+
+def _inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.core.plugin_registries import load_plugins
+    from bench.figures.recording_figure import write_recording_figure
+    from bench.logs import robot_summary, signal_statistics
+    from bench.logs.inspection import format_summary, load_recording
+    from bench.logs.quality.floating_base_check import find_missing_base_poses
+    from bench.logs.quality.log_quality import check_log_quality
+    from bench.logs.quality.timestamp_check import find_anomalies, odd_logs
+    from sims.core.simulator import InputError
+
+    load_plugins(options.plugin)
+    if options.free and not options.check:
+        raise InputError("--free says what --check asks about; give --check besides")
+    recording, kind = load_recording(options.recording, options.system, options.model)
+    about = list(robot_summary.format_robot_summary(kind))
+    found = [
+        *odd_logs(recording),
+        *find_anomalies(recording, kind),
+        *find_missing_base_poses(recording, kind),
+    ]
+    odd = [*(o.text for o in found), *robot_summary.format_log_warnings(recording, kind)]
+    findings = list(check_log_quality(recording, kind))
+    differences, fixes = _differing_conventions(options, recording, kind)
+    for line in (
+        *about,
+        *format_summary(recording, kind),
+        *(f"odd: {text}" for text in odd),
+        *(f"finding: {finding.text_line}" for finding in findings),
+        *(f"convention: {one.description}" for one in differences),
+        *(f"    set {line}" for line in fixes),
+    ):
+        say(line)
+    folder = options.out or Path("results/inspect", options.recording.resolve().parent.name)
+    corrected: list[Path] = []
+    if options.fix:
+        from bench.diagnosis.conventions.corrected_description import write_corrected
+
+        corrected = write_corrected(options.recording, kind, differences, options.fix)
+    files = [*write_recording_figure(recording, kind, folder), *corrected]
+    for path in files:
+        say(str(path))
+    numbers = _print_identifiability(options, say) if options.check else None
+    document = {
+        **signal_statistics.to_document(recording, kind),
+        "robot": about,
+        "odd": odd,
+        "findings": [finding._asdict() for finding in findings],
+        "conventions": [
+            {
+                "text": one.hypothesis.description,
+                "alternatives": [other.description for other in one.alternatives],
+            }
+            for one in differences
+        ],
+        "fixes": fixes,
+        "check": numbers,
+        "files": files,
+    }
+    lost = any(n["free"] and n["word"] == "not identifiable" for n in numbers or ())
+    return CommandResult(document, EXIT_PROBLEMS_FOUND if lost else EXIT_OK)
+
+
+def _differing_conventions(
+    options: argparse.Namespace, recording: Recording, kind: type[Simulator]
+) -> tuple[list[ConventionDifference], list[str]]:
+    """Return a robot log's conventions that differ from its model file, and their corrections.
+
+    The corrections are lines of keys of the description.
+
+    Raises:
+        InputError: A corrected description is requested, but nothing differs.
+    """
+    from sims.core.simulator import InputError
+    from sims.system_simulator import SystemSimulator
+
+    differences: list[ConventionDifference] = []
+    if issubclass(kind, SystemSimulator) and kind.has_model:
+        from bench.diagnosis.conventions.convention_comparison import ConventionComparison
+        from bench.diagnosis.conventions.unit_check import Subject
+
+        differences = ConventionComparison(Subject(kind, recording, None)).differences()
+    if options.fix and not differences:
+        raise InputError(
+            f"{options.recording}: expected conventions that differ from those of the model file, "
+            "found none; leave --fix out"
+        )
+    if not differences:
+        return [], []
+    from bench.diagnosis.conventions.corrected_description import lines_of
+    from sims.recording.recording_description import read_meta
+
+    _, meta = read_meta(options.recording)
+    return differences, list(lines_of(meta, kind, differences))
+
+
+def _print_identifiability(options: argparse.Namespace, say: PrintLine) -> list[JsonDocument]:
+    """Print the identifiability of every number, before any fit."""
+    from bench.diagnosis.identifiability import format_identifiability
+    from bench.diagnosis.recording_check import check_identifiability
+
+    free = parse_name_list(options.free or "")
+    numbers = check_identifiability(options.recording, options.system, options.model, free)
+    say("\n".join(("", *format_identifiability(numbers))))
+    return [
+        {**asdict(number), "mixed": [{"with": n, "correlation": c} for n, c in number.mixed]}
+        for number in numbers
+    ]

@@ -1,0 +1,156 @@
+"""The command `simgap status`."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDocument, PrintLine
+from bench.cli.shared_options import parse_path
+
+if TYPE_CHECKING:
+    from bench.benchmark.storage.study_progress import RunEnd, StudyProgress
+    from bench.studies.study import Study
+
+_MAX_LISTED_RUNS = 20
+"""Maximum number of runs that are listed without ``--runs``."""
+
+
+def add_status_arguments(status: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap status`."""
+    status.add_argument(
+        "run",
+        metavar="DIR",
+        type=parse_path,
+        nargs="?",
+        help="the folder of a comparison or bounce shot; without it: which seals hold around "
+        "tuners on this machine",
+    )
+    status.add_argument("--runs", action="store_true", help="list every run or shot")
+    status.set_defaults(command=_status)
+
+
+def _status(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.studies.study import list_study_folders, open_study
+
+    if options.run is None:
+        return CommandResult({"seals": _print_isolation_layers(say)})
+    studies = [
+        _print_progress(open_study(part), options.runs, say)
+        for part in list_study_folders(options.run)
+    ]
+    complete = all(study["complete"] for study in studies)
+    return CommandResult({"studies": studies}, EXIT_OK if complete else EXIT_PROBLEMS_FOUND)
+
+
+def _print_isolation_layers(say: PrintLine) -> list[JsonDocument]:
+    """Print which isolation layers are available on this machine."""
+    from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
+    from bench.benchmark.runner.sandboxed_tuner import list_active_isolation_layers
+
+    there = list_active_isolation_layers()
+    say("seals around a tuner's process on this machine (docs/sealing.md)")
+    for name, says in ISOLATION_LAYERS.items():
+        say(f"  {name:10} {'holds' if name in there else 'DOES NOT HOLD':14} {says}")
+    return [
+        {"name": name, "holds": name in there, "says": says}
+        for name, says in ISOLATION_LAYERS.items()
+    ]
+
+
+def _describe_isolation(study: Study) -> JsonDocument:
+    """Describe how the tuners of a study are isolated from the true parameters."""
+    from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
+
+    held = study.configuration
+    experiment = held.experiment
+    missing = [name for name in ISOLATION_LAYERS if name not in held.isolation_layers]
+    return {
+        "trusted": experiment.trusted,
+        "isolation": experiment.isolation,
+        "missing": [] if experiment.trusted else missing,
+        "salt": "secret" if experiment.salt_sha256 else "public",
+        "salt_sha256": experiment.salt_sha256 or None,
+        "revealed": bool(experiment.salt_sha256 and experiment.salt),
+    }
+
+
+def _format_isolation(seal: JsonDocument) -> str:
+    """Format the isolation of a study as text."""
+    if seal["trusted"]:
+        return "trusted: its tuners run inside the harness"
+    missing, salt = seal["missing"], seal["salt_sha256"]
+    kept = "sealed: a process for each "
+    kept += "run" if seal["isolation"] == "run" else "tuner and seed"
+    without = f", WITHOUT the seals {', '.join(missing)}" if missing else ", every seal holds"
+    told = f"; salt with SHA-256 {salt[:12]}" if salt else "; its salt is public"
+    return kept + without + told + (", revealed" if seal["revealed"] else "")
+
+
+def _print_progress(study: Study, every: bool, say: PrintLine) -> JsonDocument:
+    """Print the progress of a study, and return it as a document."""
+    standing = study.status()
+    planned, what = len(standing.ends), standing.what
+    seal, groups = _describe_isolation(study), _count_endings(standing)
+    resume = None if standing.is_complete else f"simgap compare --resume {study.folder}"
+    shown = standing.ends if every else _select_notable_runs(standing)
+
+    complete = ", complete" if standing.is_complete else ""
+    say(f"{standing.name}: {standing.finished} of {planned} {what}{complete}")
+    say("  " + ", ".join(f"{name} {value}" for name, value in standing.hashes.items()))
+    say(f"  {_format_isolation(seal)}")
+    for line in _format_counts(groups):
+        say(f"  {line}")
+    for end in shown:
+        say(f"{end.status:10} {end.name}  {_reason(end)}".rstrip())
+    if len(standing.ends) > len(shown):
+        say(f"({len(shown)} of {len(standing.ends)} listed; --runs lists all)")
+    if resume:
+        say(f"to finish it: {resume}")
+    return {
+        "name": standing.name,
+        "folder": study.folder,
+        "what": what,
+        "finished": standing.finished,
+        "planned": planned,
+        "complete": standing.is_complete,
+        "hashes": dict(standing.hashes),
+        "seal": seal,
+        "groups": groups,
+        "runs": [end._asdict() for end in shown],
+        "resume": resume,
+    }
+
+
+def _count_endings(standing: StudyProgress) -> dict[str, dict[str, int]]:
+    """Count the runs of each tuner or kind of ball by status."""
+    groups: dict[str, Counter[str]] = {}
+    for end in standing.ends:
+        groups.setdefault(end.group, Counter())[end.status] += 1
+    return {group: dict(sorted(ends.items())) for group, ends in groups.items()}
+
+
+def _format_counts(groups: dict[str, dict[str, int]]) -> list[str]:
+    """Format the counts as text, missing runs last."""
+    from bench.benchmark.storage.study_progress import MISSING_STATUS
+
+    width = max(map(len, groups), default=0)
+    lines = []
+    for group, ends in groups.items():
+        ordered = sorted(ends, key=lambda status: (status == MISSING_STATUS, status))
+        lines.append(f"{group:{width}}  {', '.join(f'{ends[s]} {s}' for s in ordered)}")
+    return lines
+
+
+def _select_notable_runs(standing: StudyProgress) -> tuple[RunEnd, ...]:
+    """Select the runs to list: those without success, or all; at most `_MAX_LISTED_RUNS`."""
+    from bench.benchmark.storage.study_progress import SUCCESS_STATUSES
+
+    telling = tuple(end for end in standing.ends if end.status not in SUCCESS_STATUSES)
+    return (telling or standing.ends)[:_MAX_LISTED_RUNS]
+
+
+def _reason(end: RunEnd) -> str:
+    # The last line of a traceback names the error.
+    return (end.reason.strip().splitlines() or [""])[-1]

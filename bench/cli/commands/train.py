@@ -1,0 +1,117 @@
+"""The command `simgap train`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench.cli.output import CommandResult, PrintLine
+from bench.cli.shared_options import (
+    add_force_option,
+    add_pdf,
+    add_plugin_option,
+    add_trust_option,
+    parse_path,
+    parse_positive_int,
+)
+
+
+def add_train_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap train`."""
+    parser.add_argument(
+        "tuner",
+        metavar="TUNER",
+        help="a learned tuner, by registered name or the experiment's label",
+    )
+    parser.add_argument(
+        "simulator",
+        metavar="SIMULATOR",
+        help="see `simgap list simulators`; or the name of an experiment, to train in its settings",
+    )
+    parser.add_argument(
+        "--experiment",
+        metavar="NAME",
+        help="train in the settings of this experiment, a name or TOML file (default: the "
+        "simulator's own, which is printed)",
+    )
+    parser.add_argument(
+        "--budget",
+        type=parse_positive_int,
+        metavar="N",
+        help="simulations to learn from (default: its own)",
+    )
+    parser.add_argument(
+        "--seeds",
+        type=parse_positive_int,
+        metavar="N",
+        help="trainings, each from its own seed (default: all)",
+    )
+    parser.add_argument(
+        "--again", action="store_true", help="train although there are weights, and replace them"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=parse_path,
+        help="folder of losses (default: below results/train)",
+    )
+    add_pdf(parser)
+    add_plugin_option(parser, "of them")
+    add_trust_option(parser)
+    add_force_option(parser)
+    parser.set_defaults(command=_train)
+
+
+def _train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.api.train import LossRecorder, select_training, train_or_load
+    from bench.benchmark.runner.experiment_runner import count_seeds
+    from bench.benchmark.runner.resource_checks import check_training_size
+    from bench.cli.progress_display import ProgressBars
+    from methods.learning.training_data import TrainingBudgetTooSmallError
+    from sims.core.simulator import InputError
+
+    experiment, entry = select_training(
+        options.tuner,
+        options.simulator,
+        options.experiment,
+        options.budget,
+        options.plugin,
+        options.trust,
+    )
+    seeds = options.seeds or count_seeds(experiment, entry)
+    check_training_size(experiment, entry, seeds, options.force)
+    if options.experiment is None:
+        say(f"experiment: {experiment.name}")
+    trained, files = [], []
+    with ProgressBars("epoch") as bars:
+        losses = LossRecorder(experiment, bars.start_bar)
+        for seed in range(seeds):
+            losses.start_training(f"{entry.label} seed {seed}", seed)
+            try:
+                training = train_or_load(experiment, entry, seed, losses, options.again)
+            except TrainingBudgetTooSmallError as error:
+                raise InputError(f"tuner {entry.label}: {error}; give a larger --budget") from None
+            how = "trained earlier with" if training.was_cached else "trained with"
+            cost = f"{training.simulations} simulations in {training.seconds:.1f} s"
+            say(f"{training.path}: {how} {cost}")
+            trained.append(
+                {
+                    "seed": seed,
+                    "weights": training.path,
+                    "found": training.was_cached,
+                    "simulations": training.simulations,
+                    "seconds": training.seconds,
+                }
+            )
+    if losses.rows:
+        folder = options.out or Path("results", "train", f"{entry.label}-{experiment.name}")
+        title = f"{entry.label} on {experiment.name}, {training.simulations} simulations"
+        files = losses.write(folder, title)
+        for path in files:
+            say(str(path))
+    budget = f" --training-budget {options.budget}" if options.budget else ""
+    trust = " --trust" if options.trust else ""
+    command = f"simgap compare {options.experiment or experiment.name}{budget}{trust}"
+    say(f"found by: {command}")
+    told = {"tuner": entry.label, "experiment": experiment.name, "found_by": command}
+    return CommandResult({**told, "trainings": trained, "files": files})

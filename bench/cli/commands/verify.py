@@ -1,0 +1,50 @@
+"""The command `simgap verify`."""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDocument, PrintLine
+from bench.cli.shared_options import add_plugin_option, parse_path
+
+
+def add_verify_arguments(verify: argparse.ArgumentParser) -> None:
+    """Add the options of `simgap verify`."""
+    verify.add_argument(
+        "run",
+        metavar="RUN",
+        type=parse_path,
+        help="the folder of a finished comparison or an explanation, or an archive of "
+        "`simgap bundle`",
+    )
+    verify.add_argument(
+        "--all", action="store_true", help="make every simulation again, and not a share of them"
+    )
+    add_plugin_option(verify, "simulators")
+    verify.set_defaults(command=_verify)
+
+
+def _verify(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    from bench.studies.archive_bundle import VERDICT_FILE, verify_archive, verify_explanation
+    from bench.studies.study import list_study_folders
+    from bench.studies.verification import verify_comparison
+
+    if options.run.is_file():
+        archived = verify_archive(options.run, say, options.plugin, options.all)
+        return CommandResult(
+            archived.to_document(), EXIT_OK if archived.is_consistent else EXIT_PROBLEMS_FOUND
+        )
+    document: JsonDocument = {"archive": None, "comparisons": [], "explanation": None}
+    if (options.run / VERDICT_FILE).is_file():
+        document["explanation"] = verify_explanation(options.run, say).to_document()
+        follows = document["explanation"]["follows"]
+    else:
+        parts = [
+            verify_comparison(part, say, options.plugin, options.all)
+            for part in list_study_folders(options.run)
+        ]
+        document["comparisons"] = [part.to_document() for part in parts]
+        follows = all(part.is_consistent for part in parts)
+    return CommandResult(
+        {"follows": follows, **document}, EXIT_OK if follows else EXIT_PROBLEMS_FOUND
+    )

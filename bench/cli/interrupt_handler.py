@@ -1,0 +1,45 @@
+"""Interrupt handler: the first Ctrl-C requests a clean stop, the second interrupts at once."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable
+
+
+class InterruptHandler:
+    """Context in which the first Ctrl-C requests a stop, and the second one interrupts as usual.
+
+    Args:
+        say: Prints what the first Ctrl-C does; a line on stderr if None.
+    """
+
+    def __init__(self, say: Callable[[str], None] | None = None) -> None:
+        self._asked = False
+        self._say = say or _print_line
+
+    def is_stop_requested(self) -> bool:
+        """Return whether a stop has been requested."""
+        return self._asked
+
+    def __enter__(self) -> InterruptHandler:
+        # Python handles signals in the main thread only.
+        self._answers = threading.current_thread() is threading.main_thread()
+        # Keep ignoring SIGINT if it is ignored, as for background jobs of a shell.
+        if self._answers and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._first)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._answers and signal.getsignal(signal.SIGINT) == self._first:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _first(self, *_: object) -> None:
+        self._asked = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._say("ending with what there is; Ctrl-C again ends at once")
+
+
+def _print_line(text: str) -> None:
+    print(f"\nsimgap: {text}", file=sys.stderr, flush=True)

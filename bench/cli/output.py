@@ -1,0 +1,176 @@
+"""Print the results of commands, as text or with ``--json`` as one JSON document.
+
+A command is a function of its options and of `say`, which prints one line of text at once. It
+returns an `CommandResult`, which contains the same information as JSON. One of the two printers
+here prints either the one or the other; so every command has ``--json``, and errors have one form.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
+from pathlib import PurePath
+from typing import Any, Literal, NamedTuple, Protocol
+
+JsonDocument = dict[str, Any]
+"""Data that can be written as JSON after conversion by `to_json_value`."""
+PrintLine = Callable[[str], None]
+"""Prints a line of text."""
+ErrorKind = Literal["usage", "input", "memory", "interrupted", "internal"]
+
+EXIT_OK = 0
+"""Exit code of a command that succeeded."""
+EXIT_PROBLEMS_FOUND = 1
+"""Exit code of a command that completed but found a problem."""
+EXIT_ERROR = 2
+"""Exit code of a command that could not begin or continue."""
+EXIT_INTERRUPTED = 130
+"""Exit code of a command that was interrupted, by the convention of shells."""
+EXIT_CODES = {
+    EXIT_OK: "done",
+    EXIT_PROBLEMS_FOUND: "done, and something failed in it: a run, a check, a claim; or what was asked to make "
+    "it so",
+    EXIT_ERROR: "a fault of the input, told in one line; nothing was half-written",
+    EXIT_INTERRUPTED: "interrupted; what was finished is kept",
+}
+"""Meaning of every exit code."""
+
+
+class CommandResult(NamedTuple):
+    """Result of a command for a program.
+
+    Attributes:
+        document: JSON document by the schema of the command's name (`simgap schema NAME`).
+        code: Exit code of the program, one of `EXIT_CODES`.
+    """
+
+    document: JsonDocument
+    code: int = EXIT_OK
+
+
+class OutputWriter(Protocol):
+    """Prints the results of commands."""
+
+    def print_line(self, line: str) -> None:
+        """Print a line of text."""
+        ...
+
+    def capture_output(self) -> AbstractContextManager[None]:
+        """Return the context in which the command runs."""
+        ...
+
+    def print_result(self, answer: CommandResult) -> None:
+        """Print the result of the command."""
+        ...
+
+    def print_error(self, kind: ErrorKind, message: str, code: int) -> None:
+        """Print why the command failed.
+
+        Args:
+            kind: Kind of the error.
+            message: One line.
+            code: Exit code of the program.
+        """
+        ...
+
+
+class TextWriter:
+    """Prints for a person: every line at once."""
+
+    def print_line(self, line: str) -> None:
+        """Print the line."""
+        print(line)
+
+    def capture_output(self) -> AbstractContextManager[None]:
+        """Return a context that changes nothing."""
+        return nullcontext()
+
+    def print_result(self, answer: CommandResult) -> None:
+        """Print nothing: all lines have been printed before."""
+
+    def print_error(self, kind: ErrorKind, message: str, code: int) -> None:  # noqa: ARG002
+        """Print one line on stderr, except for internal errors, which have a traceback."""
+        _warn(kind, message)
+
+
+class JsonWriter:
+    """Prints for a program: one JSON document on stdout, and nothing else there."""
+
+    def print_line(self, line: str) -> None:
+        """Ignore the line: the document contains its information."""
+
+    def capture_output(self) -> AbstractContextManager[None]:
+        """Return a context that redirects all output to stderr."""
+        return _stdout_to_stderr()
+
+    def print_result(self, answer: CommandResult) -> None:
+        """Print the document."""
+        print(format_json(answer.document))
+
+    def print_error(self, kind: ErrorKind, message: str, code: int) -> None:
+        """Print the error as JSON, and as a line on stderr for logs."""
+        _warn(kind, message)
+        print(format_json({"error": {"kind": kind, "message": message, "code": code}}))
+
+
+def _warn(kind: ErrorKind, message: str) -> None:
+    if kind != "internal":
+        print(f"simgap: {message}", file=sys.stderr)
+
+
+def format_json(document: JsonDocument) -> str:
+    """Format a document as indented JSON."""
+    return json.dumps(to_json_value(document), indent=1, allow_nan=False, ensure_ascii=False)
+
+
+def to_json_value(value: Any) -> Any:
+    """Convert a value to JSON types: paths to text, tuples to lists, NaN and infinity to None."""
+    if isinstance(value, Mapping):
+        return {str(key): to_json_value(inner) for key, inner in value.items()}
+    if isinstance(value, tuple | list | set | frozenset):
+        return [to_json_value(inner) for inner in value]
+    if isinstance(value, PurePath):
+        return str(value)
+    # NumPy numbers and arrays have this method.
+    if hasattr(value, "tolist"):
+        return to_json_value(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    # Text from files or system calls may contain lone surrogates, which cannot be encoded.
+    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
+
+
+@contextmanager
+def _stdout_to_stderr() -> Iterator[None]:
+    """Redirect to stderr what Python, C libraries and worker processes print."""
+    sys.stdout.flush()
+    with redirect_stdout(sys.stderr):
+        try:
+            descriptor = sys.__stdout__.fileno() if sys.__stdout__ else None
+        except (OSError, ValueError):
+            descriptor = None
+        if descriptor is None:
+            yield
+            return
+        kept = os.dup(descriptor)
+        try:
+            os.dup2(2, descriptor)
+            yield
+        finally:
+            _flush_c()
+            os.dup2(kept, descriptor)
+            os.close(kept)
+
+
+def _flush_c() -> None:
+    """Flush the output buffers of C; at exit they would be written into the JSON output."""
+    import ctypes
+
+    try:
+        ctypes.CDLL(None).fflush(None)
+    except (AttributeError, OSError, TypeError):  # C's library is not accessible in the program.
+        return

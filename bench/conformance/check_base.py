@@ -1,0 +1,93 @@
+"""Shared parts of all conformance checks."""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array
+
+
+class CheckError(AssertionError):
+    """Error of a subject that does not conform.
+
+    The message says what was expected, what was found, and where to look.
+    """
+
+
+class NotApplicable(NamedTuple):
+    """Result of a check that found nothing to check; it has neither passed nor failed.
+
+    Attributes:
+        reason: why the check does not apply to the subject.
+    """
+
+    reason: str
+
+
+Check = Callable[[Any], NotApplicable | None]
+"""Function that raises `CheckError` if its subject does not conform."""
+
+
+def check(condition: bool, expected: str, found: object, look: str) -> None:
+    """Raise `CheckError` unless a condition holds.
+
+    Args:
+        condition: the condition.
+        expected: what was expected.
+        found: what was found.
+        look: where the author of the subject should look.
+    """
+    if not condition:
+        raise CheckError(f"expected {expected}; found {found}; see {look}")
+
+
+def is_bitwise_equal(a: Array, b: Array) -> bool:
+    """Return whether two arrays have the same shape and the same bits, NaN included."""
+    return a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+@contextmanager
+def check_global_random_state(look: str) -> Iterator[None]:
+    """Check that a block does not use the global random generators.
+
+    The generators are those of `random`, NumPy and, if it is loaded, torch. Before the block, the
+    first two are set to unusual seeds, so that seeding with a common number is detected; afterwards
+    they are restored.
+
+    Args:
+        look: where the author of the subject should look.
+
+    Raises:
+        CheckError: the block draws from a global generator or seeds it.
+    """
+    python = random.getstate()
+    legacy = np.random.get_state()  # noqa: NPY002 - it is what must not change
+    # Large primes as seeds: a method that seeds with 0 or 42 certainly changes the state.
+    random.seed(82_589_933)
+    np.random.seed(30_402_457)  # noqa: NPY002
+    before = _random_states()
+    try:
+        yield
+        after = _random_states()
+    finally:
+        random.setstate(python)
+        np.random.set_state(legacy)  # noqa: NPY002
+    touched = [name for name in before if before[name] != after[name]]
+    check(not touched, "global random state left alone", f"changed: {', '.join(touched)}", look)
+
+
+def _random_states() -> dict[str, object]:
+    legacy: Any = np.random.get_state(legacy=True)  # noqa: NPY002
+    states: dict[str, object] = {
+        "random": random.getstate(),
+        "numpy": (legacy[1].tobytes(), *legacy[2:]),
+    }
+    if "torch" in sys.modules:
+        states["torch"] = sys.modules["torch"].random.get_rng_state().numpy().tobytes()
+    return states

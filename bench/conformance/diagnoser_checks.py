@@ -1,0 +1,296 @@
+"""Conformance checks of diagnosers, independent of their method.
+
+The checks use two small recordings of a slider, one with strong linear drag and one without a
+hidden cause. Accuracy is not checked but measured (`simgap compare diagnosis-small`).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.benchmark.isolation.message_channel import pack_arrays
+from bench.conformance.check_base import (
+    Check,
+    CheckError,
+    NotApplicable,
+    check,
+    check_global_random_state,
+)
+from bench.core.diagnoser import (
+    Answer,
+    Diagnoser,
+    DiagnoserTrainingTask,
+    DiagnosisCase,
+    list_named_sets,
+    list_observable_effects,
+)
+from bench.logs.synthetic_recording import SimulatedRecording, SimulationSpec, simulate_recording
+from sims import effects
+from sims.core.simulation_counter import SIMULATION_COUNTER, SimulationBudgetExceededError
+from sims.core.simulator import Array, InputError
+from sims.recording.recording import Recording, read_recording
+from sims.system_simulator import SystemSimulator
+
+TEST_SYSTEM = "slider"
+SIMULATION_BUDGET = 60_000
+"""Simulation budget of an answer."""
+TINY_SIMULATION_BUDGET = 40
+"""Simulation budget that is too small for a useful answer."""
+TRAINING_BUDGET = 12_000
+"""Simulation budget of the training; small, so that the suite is fast."""
+TIME_LIMIT_SECONDS = 60.0
+"""Time limit of an answer, seconds."""
+
+TRAINED_DIAGNOSERS: dict[type[Diagnoser], dict[str, Array]] = {}
+"""Trained state of each diagnoser in this process."""
+
+
+@cache
+def _made(hidden: bool) -> SimulatedRecording:
+    """Simulate a recording of the slider, with strong drag or without a hidden cause."""
+    return simulate_recording(
+        SimulationSpec(
+            system=TEST_SYSTEM,
+            effects={"drag.linear": (0.6,)} if hidden else {},
+            noise={"x": 0.002},
+            observe=("x",),
+            inputs={"u": "sine:2:0.7"},
+            runs=3,
+            seconds=2.0,
+            rate=50.0,
+            engine="batch",
+            seed=7,
+        )
+    )
+
+
+@contextmanager
+def _case(
+    kind: type[Diagnoser],
+    hidden: bool = True,
+    budget: int = SIMULATION_BUDGET,
+    missing: bool = False,
+) -> Iterator[DiagnosisCase]:
+    """Make a case as a diagnoser gets it; its folder is deleted afterwards."""
+    made = _made(hidden)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recording.csv"
+        made.write(path)
+        path.with_suffix(".truth.toml").unlink()
+        simulator = type(made.simulator)
+        assert issubclass(simulator, SystemSimulator)
+        recording = read_recording(path, simulator)
+        if missing:
+            recording = _with_gaps(recording)
+        SIMULATION_COUNTER.reset(budget)
+        try:
+            yield DiagnosisCase(
+                path,
+                recording,
+                simulator,
+                list_observable_effects(simulator, recording),
+                np.random.default_rng(3),
+                budget,
+                TIME_LIMIT_SECONDS,
+                _learned(kind),
+            )
+        finally:
+            SIMULATION_COUNTER.reset()
+
+
+def _with_gaps(recording: Recording) -> Recording:
+    """Return the recording with every seventh sample missing."""
+    runs = []
+    for run in recording.runs:
+        channels = {name: values.copy() for name, values in run.channels.items()}
+        for values in channels.values():
+            values[3::7] = np.nan
+        runs.append(replace(run, channels=channels))
+    return replace(recording, runs=tuple(runs))
+
+
+def _learned(kind: type[Diagnoser]) -> dict[str, Array]:
+    """Train a diagnoser with a small budget, once per process."""
+    if not kind.learned:
+        return {}
+    if kind not in TRAINED_DIAGNOSERS:
+        arrays, _ = _train(kind)
+        TRAINED_DIAGNOSERS[kind] = arrays
+    return TRAINED_DIAGNOSERS[kind]
+
+
+def _train(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
+    simulator = type(_made(False).simulator)
+    assert issubclass(simulator, SystemSimulator)
+    library = effects.list_effects_for(simulator.system)
+    SIMULATION_COUNTER.reset(TRAINING_BUDGET)
+    try:
+        lesson = DiagnoserTrainingTask(
+            simulator, library, np.random.default_rng(5), TRAINING_BUDGET
+        )
+        return {n: np.asarray(a) for n, a in kind().train(lesson).items()}, SIMULATION_COUNTER.used
+    finally:
+        SIMULATION_COUNTER.reset()
+
+
+class _Run(NamedTuple):
+    """Answer of a diagnoser and side effects of the diagnosis.
+
+    Attributes:
+        answer: the answer.
+        foreign: named effects that the recording could not show.
+        changed: whether the recording or its files were changed.
+        touched: description of changes of the global random state; empty for none.
+    """
+
+    answer: Answer
+    foreign: tuple[str, ...]
+    changed: bool
+    touched: str
+
+
+@cache
+def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  # noqa: ARG001
+    """Run a diagnoser; the result is cached for several checks, once for each value of `turn`."""
+    with _case(kind, hidden) as case:
+        before, touched = _bytes(case), ""
+        answers: list[Answer] = []
+        try:
+            with check_global_random_state(f"case.rng in {kind.__name__}.diagnose"):
+                answers.append(_answer(kind, case))
+        except CheckError as error:
+            # Without an answer, there is nothing else to check.
+            if not answers:
+                raise
+            touched = str(error)
+        (answer,) = answers
+        names = {name for group in list_named_sets(answer) for name in group}
+        foreign = tuple(sorted(names - set(case.library)))
+        return _Run(answer, foreign, _bytes(case) != before, touched)
+
+
+def _answer(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
+    """Run a diagnoser and validate its answer.
+
+    Raises:
+        CheckError: the result is not a valid answer.
+    """
+    given = kind().diagnose(case)
+    try:
+        return Answer.of(given)
+    except InputError as error:
+        look = f"{kind.__name__}.diagnose"
+        raise CheckError(f"expected an answer; found {error}; see {look}") from None
+
+
+def _bytes(case: DiagnosisCase) -> list[bytes]:
+    arrays = [
+        array.tobytes()
+        for run in case.recording.runs
+        for array in (run.times, *run.channels.values(), *run.inputs.values())
+    ]
+    return [*arrays, case.path.read_bytes(), case.path.with_suffix(".toml").read_bytes()]
+
+
+def check_answers(kind: type[Diagnoser]) -> None:
+    """Check that the diagnoser answers about a recording with a cause, and about one without."""
+    for hidden in (True, False):
+        answer = _diagnose_cached(kind, hidden).answer
+        empty = answer.verdict in ("named", "ambiguous") and not answer.causes
+        check(not empty, "causes where something is named", answer.document(), kind.__name__)
+
+
+def check_names_what_there_is(kind: type[Diagnoser]) -> None:
+    """Check that named effects are observable in the recording, and occur once in a set."""
+    run, look = _diagnose_cached(kind), f"{kind.__name__}.diagnose"
+    check(not run.foreign, "names of case.library", run.foreign, look)
+    double = [names for names in list_named_sets(run.answer) if len(set(names)) < len(names)]
+    check(not double, "each effect once in a set", double, look)
+
+
+def check_same_answer_again(kind: type[Diagnoser]) -> None:
+    """Check that the same random seed gives the same answer."""
+    first, again = (_diagnose_cached(kind, turn=turn).answer.document() for turn in (0, 1))
+    check(first == again, "the same answer again", again, f"case.rng in {kind.__name__}")
+
+
+def check_leaves_the_recording_alone(kind: type[Diagnoser]) -> None:
+    """Check that neither the arrays nor the files of the recording are changed."""
+    check(
+        not _diagnose_cached(kind).changed, "the recording as it was", "another one", kind.__name__
+    )
+
+
+def check_leaves_global_chance_alone(kind: type[Diagnoser]) -> None:
+    """Check that all random numbers come from case.rng."""
+    if said := _diagnose_cached(kind).touched:
+        raise CheckError(said)
+
+
+def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
+    """Check that the diagnoser answers with a tiny budget, or stops with the budget error."""
+    with _case(kind, budget=TINY_SIMULATION_BUDGET) as case:
+        try:
+            _answer(kind, case)
+        except SimulationBudgetExceededError:
+            return
+        used = case.used
+    check(
+        used <= TINY_SIMULATION_BUDGET,
+        f"at most {TINY_SIMULATION_BUDGET} simulations",
+        used,
+        f"{kind.__name__}.diagnose",
+    )
+
+
+def check_takes_missing_samples(kind: type[Diagnoser]) -> None:
+    """Check that the diagnoser answers about a recording with missing samples."""
+    with _case(kind, missing=True) as case:
+        _answer(kind, case)
+
+
+def check_learns_within_its_budget(kind: type[Diagnoser]) -> NotApplicable | None:
+    """Check that the training stays within its budget and results in numeric arrays."""
+    if not kind.learned:
+        return NotApplicable("it does not learn")
+    arrays, used = _train(kind)
+    check(
+        used <= TRAINING_BUDGET,
+        f"at most {TRAINING_BUDGET} simulations",
+        used,
+        f"{kind.__name__}.train",
+    )
+    try:
+        pack_arrays(arrays)
+    except ValueError as error:
+        raise CheckError(
+            f"expected arrays of numbers; found {error}; see {kind.__name__}"
+        ) from None
+    TRAINED_DIAGNOSERS.setdefault(kind, arrays)
+    return None
+
+
+DIAGNOSER_CHECKS: tuple[Check, ...] = (
+    check_answers,
+    check_names_what_there_is,
+    check_same_answer_again,
+    check_leaves_the_recording_alone,
+    check_leaves_global_chance_alone,
+    check_keeps_to_its_budget,
+    check_takes_missing_samples,
+    check_learns_within_its_budget,
+)
+"""All checks of diagnosers, in the order in which they run."""
+
+DIAGNOSER_NEEDS: Mapping[Check, tuple[Check, ...]] = dict.fromkeys(
+    DIAGNOSER_CHECKS[1:], (check_answers,)
+)
+"""For each check, the checks that must pass for it to be meaningful."""

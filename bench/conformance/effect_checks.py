@@ -1,0 +1,288 @@
+"""Conformance checks of an effect on every system that can have it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+
+import numpy as np
+
+from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
+from bench.conformance.first_order_tank import FirstOrderTank
+from bench.conformance.robot_arm_fixture import list_effect_places
+from bench.conformance.robot_place_checks import (
+    PLACE_CHECKS,
+    check_family_is_the_sum_of_its_members,
+    check_it_acts_at_its_place_alone,
+    check_lanes_of_a_robot_are_independent,
+    check_nothing_at_zero_at_a_place,
+    check_places_are_declared,
+)
+from bench.core.plugin_registries import PartUnavailableError, simulators
+from sims import effects
+from sims.core.simulator import Array, InputError, Scenario
+from sims.core.system import (
+    Contact,
+    Effect,
+    Force,
+    Friction,
+    HiddenStateEffect,
+    Input,
+    Level,
+    Sensor,
+    Signal,
+    StateSnapshot,
+    System,
+)
+from sims.own_simulator import OwnSimulator
+from sims.system_simulator import SystemSimulator
+
+_NAME = re.compile(r"[a-z]+(\.[a-z_]+)?$")
+_SAMPLES = 60
+"""Number of samples of a run."""
+_RATE = 30.0
+"""Sampling rate of a run, Hz."""
+
+
+def _declared() -> Iterator[type[SystemSimulator]]:
+    """Yield the registered simulators of declared systems whose packages are installed."""
+    for name in simulators.names():
+        with suppress(PartUnavailableError):
+            kind = simulators.get(name)
+            if issubclass(kind, SystemSimulator):
+                yield kind
+
+
+def _find_supporting_systems(effect: type[Effect]) -> Iterator[type[SystemSimulator]]:
+    """Return the simulators whose systems can have the effect."""
+    kinds: tuple[type[SystemSimulator], ...] = (*_declared(), FirstOrderTank)
+    return (kind for kind in kinds if not effect.misses(kind.system))
+
+
+def _make_simulator_with_effect(
+    host: type[SystemSimulator], effect: type[Effect]
+) -> SystemSimulator:
+    """Make a simulator with the effect, and register the effect if necessary.
+
+    It uses the batch engine, or its own engine if it is a user-defined simulator.
+
+    Raises:
+        CheckError: another effect has the same name.
+    """
+    known = effects.list_names()
+    if effect.name not in known or effects.get_effect(effect.name) is not effect:
+        if effect.name in known:
+            raise CheckError(
+                f"expected a name of its own; found {effect.name}; see {effect.__name__}.name"
+            )
+        effects.register_effect(effect)
+    return host(engine=_engine(host), effects=[effect.name])
+
+
+def _engine(host: type[SystemSimulator]) -> str | None:
+    return None if issubclass(host, OwnSimulator) else "batch"
+
+
+def _scenario(system: type[System]) -> Scenario:
+    """Make a run with nonzero velocities in all directions and inputs that change."""
+    times = np.arange(_SAMPLES) / _RATE
+    # Initial values of states that are neither coordinates nor rates, such as levels, are among the
+    # rates.
+    initial = dict.fromkeys(system.rates, 0.7) | dict.fromkeys(system.coordinates, 0.4)
+    if system.bounces:
+        initial[system.coordinates[-1]] = 2.0
+    # Both signs and a change every 0.4 s, so that dead bands, delays and lags are observable.
+    inputs = {c.name: np.where(times % 0.8 < 0.4, 1.1, -0.3) for c in system.inputs}
+    return Scenario(times, initial, inputs)
+
+
+def _theta(simulator: SystemSimulator, share: float) -> Array:
+    """Return nominal parameters, and all coefficients at a fraction of their plausible range."""
+    # The coefficients of the effect follow the parameters of the system.
+    own = len(simulator.system.parameters)
+    values = [p.nominal for p in simulator.parameters[:own]]
+    values += [
+        p.bounds[0] + share * (p.bounds[1] - p.bounds[0]) for p in simulator.parameters[own:]
+    ]
+    return np.array([values])
+
+
+def check_declaration_is_complete(effect: type[Effect]) -> None:
+    """Check that the declaration of the effect is complete.
+
+    It needs a name, a description and a source, and for each coefficient a unit and a range on at
+    least one kind of system.
+    """
+    look = effect.__name__
+    check(bool(_NAME.match(effect.name)), "a name family.form in lower case", effect.name, look)
+    check(
+        bool(effect.says) and bool(effect.source),
+        "a sentence and a source",
+        (effect.says, effect.source),
+        look,
+    )
+    check(bool(effect.coefficients), "at least one coefficient", "none", look)
+    for c in effect.coefficients:
+        for unit, (low, high) in zip(c.units, c.plausible, strict=True):
+            check(unit is None or low < high, f"a plausible range for {c.name}", (low, high), look)
+    hosted = any(True for _ in _find_supporting_systems(effect)) or bool(list_effect_places(effect))
+    check(hosted, "a registered system or a robot that can have it", "none", look)
+
+
+def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable | None:
+    """Check that the effect contributes nothing at zero, bit for bit.
+
+    The hook itself is called: engines skip effects that are zero, so a simulation would not show a
+    contribution.
+    """
+    hosts = list(_find_supporting_systems(effect))
+    for host in hosts:
+        system, acting = host.system(), effect()
+        c = np.zeros((len(effect.coefficients), 2, 1))
+        same = all(
+            is_bitwise_equal(given, nothing)
+            for given, nothing in _contributions(acting, c, host, system)
+        )
+        check(same, f"no contribution on {host.name} at zero", "one", effect.__name__)
+    return None if hosts else NO_SUPPORTING_SYSTEM
+
+
+def _contributions(
+    acting: Effect, c: Array, host: type[SystemSimulator], system: System
+) -> list[tuple[Array, Array]]:
+    """Return pairs of the hook's result and the expected result of an inactive effect."""
+    moment = _make_state_snapshot(host, system)
+    speed, e = np.array([[0.3], [2.0]]), np.array([[0.4], [0.8]])
+    values = np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.6]])
+    times = np.cumsum(np.full((2, 3), 0.1), axis=1)
+    signal = Signal(values, np.full((2, 3), 0.1), np.array([[0.7], [0.2]]), times)
+    # Adding zero turns -0.0, the result of a product with zero, into 0.0.
+    if isinstance(acting, Force):
+        return [(acting.force(c, moment) + 0.0, np.zeros_like(moment.x))]
+    if isinstance(acting, Friction):
+        return [(acting.limit(c, moment) + np.zeros((2, 1)), np.zeros((2, 1)))]
+    if isinstance(acting, Contact):
+        return [
+            (acting.restitution(c, e, speed), e),
+            (acting.friction(c) + np.zeros((2, 1)), np.zeros((2, 1))),
+        ]
+    if isinstance(acting, Input):
+        return [(acting.times(c, times), times), (acting.apply(c, signal), values)]
+    if isinstance(acting, HiddenStateEffect):
+        return []  # engines do not call it if its first coefficient is zero
+    if isinstance(acting, Sensor):
+        return [(acting.times(c, times), times), (acting.read(c, signal), values)]
+    if isinstance(acting, Level):
+        return [(acting.limit_level(c, e), e)]
+    raise CheckError(
+        f"expected one of the hook classes; found {type(acting).__mro__}; see sims.core.system"
+    )
+
+
+def _make_state_snapshot(host: type[SystemSimulator], system: System) -> StateSnapshot:
+    """Make the state of two batch elements in motion."""
+    shape = (2, len(system.coordinates))
+    theta = np.repeat([[p.nominal for p in system.parameters]], 2, axis=0)
+    constants = {c.name: np.full((2, 1), c.value) for c in host.constants}
+    inputs = {c.name: np.full((2, 1), 0.3) for c in host.inputs}
+    numbers = np.linspace(0.2, 1.1, 2 * shape[1])
+    return StateSnapshot(
+        system,
+        theta,
+        constants,
+        np.full((2, 1), 0.4),
+        numbers.reshape(shape),
+        -numbers.reshape(shape),
+        inputs,
+    )
+
+
+def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | None:
+    """Check that the effect changes the observations and keeps them finite.
+
+    The change must occur somewhere within the plausible range; the observations at 0.7 of the range
+    must be finite. Several fractions of the range are tested, because a limit acts at the low end
+    of its range, and a force may destabilise the system at the high end.
+    """
+    hosts = list(_find_supporting_systems(effect))
+    for host in hosts:
+        simulator, plain, scenario = (
+            _make_simulator_with_effect(host, effect),
+            host(engine=_engine(host)),
+            _scenario(host.system),
+        )
+        thetas = np.concatenate([_theta(simulator, share) for share in (0.05, 0.3, 0.7)])
+        seen = simulator.simulate(thetas, scenario)
+        look = f"{effect.__name__} on {host.name}"
+        check(bool(np.isfinite(seen[-1]).all()), "finite observations", "others", look)
+        before = plain.simulate(thetas[:1, : len(host.system.parameters)], scenario)
+        check(bool((seen != before).any()), "a change inside the plausible range", "none", look)
+    return None if hosts else NO_SUPPORTING_SYSTEM
+
+
+def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
+    """Check that observations do not depend on other elements of the batch, bit for bit."""
+    hosts = list(_find_supporting_systems(effect))
+    for host in hosts:
+        simulator, scenario = _make_simulator_with_effect(host, effect), _scenario(host.system)
+        lanes = np.concatenate([_theta(simulator, share) for share in (0.2, 0.5, 0.9)])
+        together = simulator.simulate(lanes, scenario)
+        alone = np.concatenate([simulator.simulate(lane[None], scenario) for lane in lanes])
+        check(
+            is_bitwise_equal(together, alone),
+            "the same bits alone and among others",
+            "others",
+            effect.__name__,
+        )
+    return None if hosts else NO_SUPPORTING_SYSTEM
+
+
+def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | None:
+    """Check that a system that cannot have the effect is rejected by name."""
+    impossible = [host for host in _declared() if effect.misses(host.system)]
+    for host in impossible:
+        try:
+            _make_simulator_with_effect(host, effect)
+        except InputError as error:
+            named = effect.name in str(error)
+            check(named, "a message that names the effect", error, effect.__name__)
+            continue
+        raise CheckError(
+            f"expected {host.name} to refuse it; found that it did not; see {effect.__name__}.needs"
+        )
+    return None if impossible else NotApplicable("every registered system can have it")
+
+
+NO_SUPPORTING_SYSTEM = NotApplicable("no registered system can have it")
+
+EFFECT_CHECKS: tuple[Check, ...] = (
+    check_declaration_is_complete,
+    check_contribution_is_nothing_at_zero,
+    check_it_shows_and_stays_finite,
+    check_lanes_are_independent,
+    check_impossible_hosts_are_refused,
+    *PLACE_CHECKS,
+)
+
+EFFECT_NEEDS: Mapping[Check, tuple[Check, ...]] = {
+    check_contribution_is_nothing_at_zero: (check_declaration_is_complete,),
+    check_it_shows_and_stays_finite: (check_declaration_is_complete,),
+    check_lanes_are_independent: (check_declaration_is_complete,),
+    check_impossible_hosts_are_refused: (check_declaration_is_complete,),
+    check_places_are_declared: (check_declaration_is_complete,),
+    check_nothing_at_zero_at_a_place: (
+        check_places_are_declared,
+        check_contribution_is_nothing_at_zero,
+    ),
+    check_it_acts_at_its_place_alone: (check_places_are_declared, check_it_shows_and_stays_finite),
+    check_family_is_the_sum_of_its_members: (
+        check_places_are_declared,
+        check_lanes_are_independent,
+    ),
+    check_lanes_of_a_robot_are_independent: (
+        check_places_are_declared,
+        check_lanes_are_independent,
+    ),
+}
+"""For each check, the checks that must pass for it to be meaningful."""

@@ -1,0 +1,66 @@
+"""Conformance check of a tuner in its isolated process."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+
+import numpy as np
+
+from bench.benchmark.isolation.isolation_layers import PROJECT_ROOT
+from bench.benchmark.isolation.process_exit import KilledExternallyError, RunEndedError
+from bench.benchmark.isolation.tuner_client import IsolatedRun, TunerSpec
+from bench.benchmark.runner.sandboxed_tuner import find_preloadable_packages, start_isolated_tuner
+from bench.benchmark.runner.tuner_loop import drive_tuner
+from bench.conformance.check_base import NotApplicable, check
+from bench.conformance.toy_problem import make_evaluate, make_task, make_trained_tuner, run_tuner
+from methods.tuner import Tuner
+
+_BUDGET = 5
+"""Number of simulations of a run, enough for a tuner to use all of its features."""
+_SEED = 0
+
+
+def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
+    """Check that the tuner runs in an isolated process, with the same result as in this process.
+
+    An isolated process cannot start other processes and cannot access files or the network.
+    """
+    tuned = _make_tuner_spec(kind)
+    if tuned is None:
+        return NotApplicable("its class is in no plugin file and no installed package")
+    here = run_tuner(make_trained_tuner(kind, 2), 2, _BUDGET, _SEED)
+    state = make_trained_tuner(kind, 2).state() if kind.learned else None
+    task, _ = make_task(2, _BUDGET)
+    look = f"{kind.__name__}: what needs files, the network or processes; docs/sealing.md"
+    try:
+        with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
+            words = np.array([_SEED], dtype=np.uint32)
+            sealed = IsolatedRun(tuner, words, float("inf"))
+            there = drive_tuner(sealed, task, make_evaluate(task), np.random.default_rng(_SEED))
+    except (RunEndedError, KilledExternallyError) as error:
+        found = str(error).strip().splitlines()[-1:]
+        check(False, "a run in a process of its own", found, look)
+        raise
+    ended = there.reason.strip().splitlines()[-1:] if there.status != here.status else ""
+    check(there.status == here.status, f"the end {here.status} when sealed", ended, look)
+    same = np.array_equal(there.proposals, here.proposals)
+    check(same, "the same run when sealed", "another one", look)
+    return None
+
+
+def _make_tuner_spec(kind: type[Tuner]) -> TunerSpec | None:
+    """Return the tuner specification for an isolated process; None if the class cannot load."""
+    module = sys.modules.get(kind.__module__)
+    if getattr(module, kind.__name__, None) is not kind:
+        return None
+    file = inspect.getsourcefile(kind) or ""
+    if kind.__module__.startswith("simgap_plugin_"):
+        return TunerSpec(kind.name, "", file, {}, find_preloadable_packages(file))
+    # A class of a script or a test is in a file that an isolated process cannot read.
+    own = file.startswith(str(PROJECT_ROOT / "methods")) or "site-packages" in file
+    return (
+        TunerSpec(kind.name, kind.__module__, "", {}, find_preloadable_packages(file))
+        if own
+        else None
+    )

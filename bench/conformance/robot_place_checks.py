@@ -1,0 +1,269 @@
+"""Conformance checks of an effect at the places of a robot, on the arm of `conformance.robot_arm_fixture`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
+from bench.conformance.robot_arm_fixture import (
+    OBSERVED_CHANNELS,
+    list_effect_places,
+    make_arm_simulator,
+    make_scenario,
+)
+from sims.core.simulator import Array, InputError
+from sims.core.system import (
+    Effect,
+    Force,
+    Friction,
+    HiddenState,
+    HiddenStateEffect,
+    ModelValueEffect,
+    Sensor,
+)
+
+NO_PLACE = NotApplicable("a robot has no place for it")
+_SHARES = (0.3, 0.9)
+"""Fractions of the plausible range at which coefficients of the batch elements are set."""
+
+
+def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
+    """Check that the effect is declared at each place of the robot.
+
+    It needs a name, and for each coefficient a unit and a finite range. A place that does not exist
+    must be rejected with a list of those that do.
+    """
+    classes = list_effect_places(effect)
+    for one in classes:
+        look = f"{effect.__name__} at {one.place or 'the world'}"
+        named = f"{effect.name}@{one.place}" if one.place else effect.name
+        check(one.name == named, f"name {named}", one.name, look)
+        for c in one.coefficients:
+            finite = all(np.isfinite(ends).all() and ends[0] < ends[1] for ends in c.plausible)
+            check(finite, f"a finite range for {c.name}", c.plausible, look)
+            check(all(c.units), f"a unit for {c.name} ('1' for a number)", c.units, look)
+    if not classes:
+        return NO_PLACE
+    places = [one.place for one in classes if one.place]
+    if places:
+        _refuses(effect, places)
+    return None
+
+
+def _refuses(effect: type[Effect], places: Sequence[str]) -> None:
+    try:
+        make_arm_simulator(effect).system.find_effect(f"{effect.name}@nowhere")
+    except InputError as error:
+        listed = all(place in str(error) for place in places)
+        check(listed, f"a message that lists {', '.join(places)}", error, effect.__name__)
+        return
+    raise CheckError(f"expected place nowhere to be refused; found it is not; see {effect.name}")
+
+
+def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | None:
+    """Check that the effect at a place has no influence at zero, bit for bit.
+
+    It must add no force and change neither the model nor the motion, whatever other batch elements
+    do.
+    """
+    classes = list_effect_places(effect)
+    kind = make_arm_simulator(effect)
+    for one in classes:
+        look = f"{effect.__name__} at {one.place or 'the world'}"
+        c = np.zeros((len(one.coefficients), 2, 1))
+        for part, own in one().parts(c):
+            none = _acts_on(part, own, kind) == ()
+            check(none, "no contribution at zero", "one", look)
+        lanes = np.concatenate([_theta(one, 0.0), _theta(one, 0.7)])
+        seen = kind(observe=OBSERVED_CHANNELS, effects=[one]).simulate(lanes, make_scenario())
+        plain = kind(observe=OBSERVED_CHANNELS).simulate(np.empty((1, 0)), make_scenario())
+        check(
+            is_bitwise_equal(seen[:1] + 0.0, plain + 0.0), "the plain motion at zero", "other", look
+        )
+    return None if classes else NO_PLACE
+
+
+def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | None:
+    """Check that the effect is observable, stays finite, and acts only at its place.
+
+    The observations must be finite at 0.9 of the plausible range.
+    """
+    classes = list_effect_places(effect)
+    kind = make_arm_simulator(effect)
+    touched = {}
+    for one in classes:
+        look = f"{effect.__name__} at {one.place or 'the world'}"
+        thetas = np.concatenate([_theta(one, share) for share in (0.05, *_SHARES)])
+        seen = kind(observe=OBSERVED_CHANNELS, effects=[one]).simulate(thetas, make_scenario())
+        plain = kind(observe=OBSERVED_CHANNELS).simulate(np.empty((1, 0)), make_scenario())
+        # Only the last element is tested: at the low end of its range, a force may destabilise a
+        # joint.
+        check(bool(np.isfinite(seen[-1]).all()), "finite observations", "others", look)
+        shown = one.signal in ("", *OBSERVED_CHANNELS) or not issubclass(one, Sensor)
+        check(bool((seen != plain).any()) == shown, "a change where it is seen", "none", look)
+        if issubclass(one, Sensor) and one.signal in OBSERVED_CHANNELS:
+            others = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != one.signal]
+            same = bool((seen[:, :, others] == plain[:, :, others]).all())
+            check(same, "other channels left alone", "changes", look)
+        for part, own in one().parts(np.ones((len(one.coefficients), 2, 1))):
+            touched[part.name] = _acts_on(part, own, kind)
+    apart = len({ends for ends in touched.values() if ends}) == sum(map(bool, touched.values()))
+    check(apart, "each place to be touched by one alone", touched, effect.__name__)
+    return None if classes else NO_PLACE
+
+
+def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicable | None:
+    """Check that an effect family equals its members with the same coefficients, bit for bit."""
+    kind = make_arm_simulator(effect)
+    families = [one for one in list_effect_places(effect) if hasattr(one, "members")]
+    for whole in families:
+        members = [type(member) for member in whole.members]
+        one = kind(observe=OBSERVED_CHANNELS, effects=[whole])
+        several = kind(observe=OBSERVED_CHANNELS, effects=members)
+        # A family with one coefficient applies it at every place.
+        shared = len(one.parameters) < len(several.parameters)
+        theta = _theta(whole, 0.3)
+        each = np.tile(theta, len(members)) if shared else theta
+        check(
+            is_bitwise_equal(
+                one.simulate(theta, make_scenario()), several.simulate(each, make_scenario())
+            ),
+            "the motion of all members together",
+            "another",
+            whole.name,
+        )
+    return None if families else NotApplicable("it has no family")
+
+
+def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicable | None:
+    """Check that observations do not depend on other elements of the batch, bit for bit.
+
+    The order of the batch elements must not matter either. The effect acts at another place in each
+    of them.
+    """
+    classes = list_effect_places(effect)
+    simulator = make_arm_simulator(effect)(observe=OBSERVED_CHANNELS, effects=classes)
+    rows = [np.zeros((1, len(simulator.parameters)))]
+    begin = 0
+    for one in classes:
+        end = begin + len(one.coefficients)
+        for share in _SHARES:
+            row = rows[0].copy()
+            row[:, begin:end] = _theta(one, share)
+            rows.append(row)
+        begin = end
+    lanes = np.concatenate(rows)
+    together = simulator.simulate(lanes, make_scenario())
+    alone = np.concatenate([simulator.simulate(row, make_scenario()) for row in rows])
+    turned = simulator.simulate(lanes[::-1], make_scenario())[::-1]
+    same = is_bitwise_equal(together, alone) and is_bitwise_equal(
+        together, np.ascontiguousarray(turned)
+    )
+    check(same, "the same bits alone, among others and in any order", "others", effect.__name__)
+    return None if classes else NO_PLACE
+
+
+def _theta(effect: type[Effect], share: float) -> Array:
+    """Return coefficients (1, K) at a fraction of their plausible ranges; all zero for 0."""
+    ends = np.array([c.plausible[0] for c in effect.coefficients])
+    theta: Array = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    return theta[None] * (share != 0.0)
+
+
+def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
+    """Return what an effect at one place changes.
+
+    Args:
+        effect: the effect.
+        c: coefficients, (K, 2, 1).
+        kind: simulator class of the robot.
+
+    Returns:
+        Model fields with indices, coordinates with forces, or the signal; empty if nothing changes.
+    """
+    from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+
+    if effect.of in MODEL_FIELD_EFFECTS and isinstance(effect, ModelValueEffect | Force | Friction):
+        return _find_changed_fields(effect, c, kind)
+    if isinstance(effect, HiddenStateEffect) and effect.between:
+        return _put_in_series(effect, c, kind)
+    if isinstance(effect, Force | Friction | HiddenStateEffect):
+        return _find_forced_coordinates(effect, c, kind)
+    return (effect.signal,) if c.any() else ()
+
+
+def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
+    """Return the model fields that an effect changes, with the indices of the changed numbers."""
+    from sims.robot.coupled_drives import COUPLING_PLACEHOLDER as COUPLED
+    from sims.robot.dynamics.series_joints import add_series_joints
+    from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+
+    robot, native = kind.robot, MODEL_FIELD_EFFECTS[effect.of]  # type: ignore[attr-defined]
+    if effect.of == COUPLED[1]:
+        robot = add_series_joints(robot, (COUPLED,))
+    fields, changes = {}, []
+    for name in native.fields:
+        owner, _, field = name.rpartition(".")
+        stated = getattr(robot.compiled.opt if owner else robot.compiled, field)
+        fields[name] = np.repeat(np.array(stated)[None], 2, axis=0)
+    before = {name: values.copy() for name, values in fields.items()}
+    native.write(fields, robot, effect.place, c[:, :, 0])
+    for name, values in fields.items():
+        places = np.nonzero(values != before[name])[1]
+        changes += [(name, int(place)) for place in np.unique(places)]
+    # Fields indexed by place must change at one place; fields of the world are indexed by axis.
+    if effect.place and len({place for _, place in changes}) > 1:
+        raise CheckError(f"expected one place; found {changes}; see {effect.name}")
+    return tuple(changes)
+
+
+def _put_in_series(effect: HiddenStateEffect, c: Array, kind: type) -> tuple[object, ...]:
+    """Return the model fields that an effect changes on the joint in series with its own joint."""
+    from sims.robot.dynamics import series_joints
+
+    if not c.any():
+        return ()
+    robot = series_joints.add_series_joints(kind.robot, ((effect.place, effect.of),))  # type: ignore[attr-defined]
+    model = robot.compiled
+    fields = {
+        name: np.repeat(np.array(getattr(model, name))[None], 2, 0)
+        for name in series_joints.USED_FIELDS
+    }
+    before = {name: values.copy() for name, values in fields.items()}
+    series_joints.write_series_effects(fields, robot, ((effect, c),))
+    changed = [name for name, values in fields.items() if (values != before[name]).any()]
+    return tuple((name, effect.place) for name in changed)
+
+
+def _find_forced_coordinates(
+    effect: Force | Friction | HiddenStateEffect, c: Array, kind: type
+) -> tuple[object, ...]:
+    """Return the coordinates on which an effect exerts a force or friction."""
+    from sims.robot.dynamics.effect_forces import make_snapshot
+
+    system = kind.system()  # type: ignore[attr-defined]
+    x = np.array([[0.3, -0.4], [0.8, 0.2]])
+    inputs = {c.name: np.full((2, 1), 0.3) for c in system.inputs}
+    stiffness = np.ones_like(x)
+    carried = np.stack([0.5 + x, 0.4 + x])
+    moment = make_snapshot(system, np.full((2, 1), 0.4), x, 1.0 - x, inputs, carried, stiffness)
+    if isinstance(effect, Friction):
+        return (effect.coordinate,) if np.any(effect.limit(c, moment)) else ()
+    if isinstance(effect, HiddenStateEffect):
+        force, _ = effect.compute_force_and_rate(
+            c, moment, HiddenState(np.full((2, 1), 0.1), np.full((2, 1), 0.5))
+        )
+    else:
+        force = effect.force(c, moment)
+    return tuple(int(joint) for joint in np.unique(np.nonzero(force)[1]))
+
+
+PLACE_CHECKS: tuple[Check, ...] = (
+    check_places_are_declared,
+    check_nothing_at_zero_at_a_place,
+    check_it_acts_at_its_place_alone,
+    check_family_is_the_sum_of_its_members,
+    check_lanes_of_a_robot_are_independent,
+)

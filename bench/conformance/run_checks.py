@@ -1,0 +1,218 @@
+"""Run the conformance suite of one subject (`simgap check NAME`), each check in a worker process.
+
+The subject is a tuner, a simulator, an effect or a diagnoser. A check is not run if another check
+that it needs has failed, so that one cause gives one failure.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench.benchmark.runner.plugin_discovery import Plugin
+from bench.benchmark.runner.worker_pools import LocalPool
+from bench.conformance.check_base import Check, CheckError
+from bench.conformance.check_suites import SUITES, failed_need, title_of
+from bench.conformance.subprocess_calls import CALL_TIMEOUT_SECONDS
+from bench.conformance.tuner_checks import check_same_run_in_other_processes
+from bench.core.plugin_registries import REGISTRIES
+from sims.core.simulator import InputError, make_unknown_name_error
+
+_MULTIPROCESS_CHECKS = (check_same_run_in_other_processes,)
+"""Checks that start worker processes themselves."""
+_EXPECTED_FAILURE_PREFIX = "known: "
+"""Prefix of the line of a check that fails on purpose."""
+_NOT_APPLICABLE_PREFIX = "not applicable: "
+"""Prefix of the line of a check that does not apply to the subject."""
+_LEFT_OUT = "not tested: "
+"""Prefix of the line of a check that was not run."""
+_MARKS = {_EXPECTED_FAILURE_PREFIX: "known ", _NOT_APPLICABLE_PREFIX: "-     ", _LEFT_OUT: "-     "}
+_OUTCOMES = {
+    _EXPECTED_FAILURE_PREFIX: "known",
+    _NOT_APPLICABLE_PREFIX: "not applicable",
+    _LEFT_OUT: "not tested",
+}
+"""Outcome for programs, by the prefix of a line."""
+
+
+class SuiteResult(NamedTuple):
+    """Result of a conformance suite.
+
+    Attributes:
+        name: name of the subject.
+        kind: tuner, simulator, effect or diagnoser.
+        qualified: qualified name of its class.
+        lines: line of each check by its title; empty if the check passed.
+    """
+
+    name: str
+    kind: str
+    qualified: str
+    lines: dict[str, str]
+
+    @property
+    def has_passed(self) -> bool:
+        """Whether no check failed."""
+        return all(_outcome(line) != "failed" for line in self.lines.values())
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        checks = [
+            {"check": title, "outcome": _outcome(line), "says": line.strip()}
+            for title, line in self.lines.items()
+        ]
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "class": self.qualified,
+            "passed": self.has_passed,
+            "checks": checks,
+        }
+
+
+def find_part_kind(name: str) -> str:
+    """Return whether a name is that of a tuner, simulator, effect or diagnoser.
+
+    Raises:
+        InputError: nothing is registered under this name.
+    """
+    for registry in REGISTRIES:
+        if name in registry.names():
+            return registry.kind
+    names = [name for registry in REGISTRIES for name in registry.names()]
+    raise make_unknown_name_error("tuner, simulator, effect or diagnoser", name, names)
+
+
+def _subject(kind: str, name: str) -> Any:
+    return {registry.kind: registry for registry in REGISTRIES}[kind].get(name)
+
+
+def run_check(kind: str, name: str, place: int) -> str:
+    """Run one check in this process.
+
+    Args:
+        kind: kind of the subject.
+        name: name of the subject.
+        place: index of the check in its suite.
+
+    Returns:
+        Description of the failure, or an empty text.
+    """
+    check, subject = SUITES[kind][place], _subject(kind, name)
+    known = getattr(subject, "known_failures", {}).get(check.__name__)
+    try:
+        outcome = check(subject)
+    except CheckError as error:
+        return f"{_EXPECTED_FAILURE_PREFIX}{known}" if known else str(error)
+    except InputError as error:
+        return str(error)
+    except Exception as error:
+        return f"expected no exception; found {type(error).__name__}: {error}; {_raised_at(error)}"
+    if known:
+        return f"expected to fail ({known}); found that it passes; see {name}.known_failures"
+    return f"{_NOT_APPLICABLE_PREFIX}{outcome.reason}" if outcome else ""
+
+
+def _raised_at(error: Exception) -> str:
+    """Describe where the subject's own code raised an exception, or else where it was raised."""
+    frames = traceback.extract_tb(error.__traceback__)
+    packages = Path(__file__).parents[2]
+    folders = [str(packages / name) for name in ("bench", "methods", "sims")]
+    own = [frame for frame in frames if not frame.filename.startswith(tuple(folders))]
+    frame = (own or list(frames))[-1]
+    return f"see {Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
+
+
+def run_suite(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> SuiteResult:
+    """Run all checks and print the result of each.
+
+    Args:
+        name: registered name of a tuner, simulator, effect or diagnoser.
+        plugins: plugin files, which are already loaded in this process.
+        say: prints a line.
+
+    Raises:
+        InputError: the name does not exist, or the subject cannot be used here.
+    """
+    kind = find_part_kind(name)
+    subject = _subject(kind, name)
+    lines = {}
+    for check, line in _lines(kind, name, plugins):
+        lines[title_of(check)] = line
+        below = f"\n        {line.removeprefix(_EXPECTED_FAILURE_PREFIX)}" if line else ""
+        say(f"{_mark(line)}  {title_of(check)}{below}")
+    checked = SuiteResult(name, kind, f"{subject.__module__}.{subject.__qualname__}", lines)
+    say(f"{kind} {name} ({checked.qualified}): {_summary(checked)}")
+    return checked
+
+
+def _summary(checked: SuiteResult) -> str:
+    """Summarise how many checks failed and how many were not run."""
+    outcomes = [_outcome(line) for line in checked.lines.values()]
+    idle = {what: outcomes.count(what) for what in ("not tested", "not applicable")}
+    made, failed = len(outcomes) - sum(idle.values()), outcomes.count("failed")
+    rest = "".join(f", {count} {what}" for what, count in idle.items() if count)
+    if failed:
+        return f"{failed} of {made} checks failed{rest}"
+    return f"all {made} checks passed{rest}"
+
+
+def _outcome(line: str) -> str:
+    """Return the outcome that a check's line stands for."""
+    for begin, outcome in _OUTCOMES.items():
+        if line.startswith(begin):
+            return outcome
+    return "failed" if line else "passed"
+
+
+def _mark(line: str) -> str:
+    """Return the label printed before a check's title."""
+    for begin, mark in _MARKS.items():
+        if line.startswith(begin):
+            return mark
+    return "FAILED" if line else "ok    "
+
+
+def _lines(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check, str]]:
+    """Run the checks one after another, and yield each with its line (empty if it passed).
+
+    After two checks that were killed or whose process died, no more checks are run.
+    """
+    failed: list[Check] = []
+    lost = 0
+    with LocalPool(1) as pool:
+        pool.load_plugins([Plugin(path) for path in plugins])
+        for place, check in enumerate(SUITES[kind]):
+            needed = failed_need(check, failed)
+            if needed is not None:
+                line = f"{_LEFT_OUT}needs '{title_of(needed)}'"
+            elif lost == 2 or (lost and check in _MULTIPROCESS_CHECKS):
+                line = f"{_LEFT_OUT}the process of other checks died, or had to be killed"
+            elif check in _MULTIPROCESS_CHECKS:
+                # This check runs the subject in this process too; earlier checks have shown that
+                # this is safe.
+                line = run_check(kind, name, place)
+            else:
+                ((_, end),) = pool.iterate_results(
+                    [(run_check, (kind, name, place))], CALL_TIMEOUT_SECONDS
+                )
+                lost += isinstance(end, Exception) and not isinstance(end, InputError)
+                line = _line(end)
+            if _outcome(line) == "failed":
+                failed.append(check)
+            yield check, line.strip().replace("\n", "\n        ")
+
+
+def _line(end: Any) -> str:
+    """Return the line of a check that ran in a worker process."""
+    if isinstance(end, TimeoutError):
+        return (
+            f"expected an end within {CALL_TIMEOUT_SECONDS:g} s; found none; see what it waits for"
+        )
+    if isinstance(end, InputError):
+        return str(end)
+    if isinstance(end, Exception):
+        return f"expected to survive; found {type(end).__name__}: {end}; see where it says"
+    return str(end)

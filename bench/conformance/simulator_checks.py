@@ -1,0 +1,308 @@
+"""Conformance checks of a simulator, with its default options."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from bench.conformance.check_base import Check, CheckError, NotApplicable, check, is_bitwise_equal
+from bench.conformance.own_simulator_checks import (
+    check_forces_act,
+    check_hooks_have_the_declared_shapes,
+    check_levels_can_be_set,
+    check_step_goes_on_by_its_seconds,
+)
+from sims.core.simulator import (
+    Array,
+    Channel,
+    Constant,
+    InputError,
+    Parameter,
+    Scenario,
+    Simulator,
+    UnitCube,
+)
+from sims.recording.unit_conversion import is_unit
+
+_NAME = re.compile(r"[a-z][a-z0-9_.]*$")
+
+
+def _scenario(
+    kind: type[Simulator], samples: int = 40, rate: float = 60.0, size: float = 0.0
+) -> Scenario:
+    """Make a run from the default initial state.
+
+    Args:
+        kind: class of the simulator.
+        samples: number of samples.
+        rate: samples per second.
+        size: amplitude of the inputs, in units of their `scale`.
+    """
+    times = np.arange(samples) / rate
+    waves = {c.name: c.scale * size * np.cos((3.0 + i) * times) for i, c in enumerate(kind.inputs)}
+    return Scenario(times, inputs=waves)
+
+
+def _points(simulator: Simulator, n: int, seed: int = 0) -> Array:
+    cube = UnitCube(simulator.parameters)
+    return cube.to_physical(np.random.default_rng(seed).uniform(size=(n, cube.dim)))
+
+
+def _named(kind: type[Simulator]) -> list[Parameter | Channel | Constant]:
+    return [*kind.parameters, *kind.channels, *kind.constants, *kind.inputs]
+
+
+def check_declaration_is_complete(kind: type[Simulator]) -> None:
+    """Check that the declaration has valid names and a description, and no duplicates."""
+    look = kind.__name__
+    check(
+        bool(kind.parameters and kind.channels and kind.says),
+        "parameters, channels and a sentence",
+        "none",
+        look,
+    )
+    groups: tuple[tuple[Parameter | Channel | Constant, ...], ...]
+    groups = (kind.parameters, kind.channels, kind.constants, kind.inputs)
+    for group in groups:
+        names = [thing.name for thing in group]
+        check(len(set(names)) == len(names), "different names", names, look)
+    for thing in _named(kind):
+        # The names of a robot are those of its model file and may contain any character.
+        plain = kind.has_model or bool(_NAME.match(thing.name))
+        check(plain, "a name in lower case", thing.name, look)
+
+
+def check_units_are_known(kind: type[Simulator]) -> None:
+    """Check that every parameter, channel, constant and input has a unit that can be converted."""
+    for thing in _named(kind):
+        check(
+            is_unit(thing.unit),
+            f"a unit for {thing.name} (such as m/s, rad, N*m; '1' for a number)",
+            repr(thing.unit),
+            kind.__name__,
+        )
+
+
+def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
+    """Check that observations are (n, T, C) and finite, for several n and T."""
+    simulator, look = kind(), f"{kind.__name__}.simulate"
+    for n, samples in ((1, 2), (3, 40), (1, 1)):
+        seen = simulator.simulate(_points(simulator, n), _scenario(kind, samples))
+        shape = (n, samples, len(simulator.channels))
+        check(seen.shape == shape, f"observations of shape {shape}", seen.shape, look)
+        for place, channel in enumerate(simulator.channels):
+            bad = seen[:, :, place][~np.isfinite(seen[:, :, place])]
+            what = f"finite values of {channel.name} for parameters inside the bounds"
+            check(not bad.size, what, bad[:1], look)
+    simulator.close()
+
+
+def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
+    """Check that a simulation is reproducible bit for bit.
+
+    It must not depend on earlier simulations, in this simulator or another, nor on other parameter
+    vectors of the same call.
+    """
+    simulator, other = kind(), kind()
+    points = _points(simulator, 6)
+    # Nonzero inputs, because their lasting effects, such as heat, would not be visible otherwise.
+    run, longer = _scenario(kind, size=1.0), _scenario(kind, 300, 50.0, size=3.0)
+    together = simulator.simulate(points.copy(), run)
+
+    def compare(seen: Array, after: str) -> None:
+        if not is_bitwise_equal(together, seen):
+            what = f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__
+            raise CheckError(
+                f"expected the same numbers {after}; found "
+                f"{_first_difference(kind, together, seen)}; see {what}: it must set everything "
+                "that a run has changed"
+            )
+
+    simulator.simulate(_points(simulator, 2, seed=9), longer)
+    compare(simulator.simulate(points.copy(), run), "after a run with other inputs")
+    alone = [simulator.simulate(point[None].copy(), run) for point in points[::-1]]
+    compare(np.concatenate(alone[::-1]), "one by one as all together")
+    compare(other.simulate(points.copy(), run), "in a new simulator")
+    simulator.close()
+    compare(simulator.simulate(points.copy(), run), "after close()")
+    simulator.close()
+    other.close()
+
+
+def _first_difference(kind: type[Simulator], expected: Array, seen: Array) -> str:
+    """Describe where two observations (n, T, C) first differ in time."""
+    if expected.shape != seen.shape:
+        return f"shape {seen.shape} in place of {expected.shape}"
+    differs = (expected != seen) & ~(np.isnan(expected) & np.isnan(seen))
+    if not differs.any():
+        return "zeros of another sign"
+    lane, sample, channel = min(np.argwhere(differs).tolist(), key=lambda at: at[1])
+    before, after = expected[lane, sample, channel], seen[lane, sample, channel]
+    # All digits are shown if the values differ only by rounding.
+    digits = 6 if f"{before:.6g}" != f"{after:.6g}" else 17
+    name = kind.channels[channel].name
+    return f"{name} = {after:.{digits}g} in place of {before:.{digits}g} at sample {sample}"
+
+
+def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
+    """Check that the simulator does not change `theta` and the scenario."""
+    simulator, scenario = kind(), _scenario(kind)
+    points = _points(simulator, 3)
+    before, times = points.copy(), scenario.times.copy()
+    simulator.simulate(points, scenario)
+    check(
+        is_bitwise_equal(before, points) and is_bitwise_equal(times, scenario.times),
+        "arguments as they were",
+        "changed ones",
+        kind.__name__,
+    )
+    simulator.close()
+
+
+def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simulator]) -> None:
+    """Check that a NaN parameter makes its own batch element NaN, and no other."""
+    simulator, look = kind(), f"{kind.__name__}.simulate"
+    points = _points(simulator, 3)
+    clean = simulator.simulate(points, _scenario(kind))
+    # The middle element has neighbours on both sides.
+    points[1] = np.nan
+    seen = simulator.simulate(points, _scenario(kind))
+    check(bool(np.isnan(seen[1]).all()), "a lane of NaN", seen[1][:2], look)
+    check(is_bitwise_equal(clean[[0, 2]], seen[[0, 2]]), "neighbours as they were", "others", look)
+    simulator.close()
+
+
+def check_every_parameter_shows(kind: type[Simulator]) -> None:
+    """Check that each parameter changes some channel, in a run of ten seconds."""
+    simulator = kind(observe=[c.name for c in kind.channels])
+    cube = UnitCube(simulator.parameters)
+    # Points inside the training range: outside it, a large friction may prevent all motion.
+    low, high = cube.training
+    points = np.tile(low + 0.4 * (high - low), (1 + cube.dim, 1))
+    # One point for each parameter, changed in that direction alone.
+    points[1:] += 0.2 * np.diag(high - low)
+    inputs = {c.name: np.ones(600) for c in simulator.inputs}
+    seen = simulator.simulate(
+        cube.to_physical(points), Scenario(np.arange(600) / 60.0, inputs=inputs)
+    )
+    for parameter, lane in zip(simulator.parameters, seen[1:], strict=True):
+        check(
+            not np.array_equal(lane, seen[0]),
+            f"parameter {parameter.name} to change something",
+            "nothing",
+            kind.__name__,
+        )
+    simulator.close()
+
+
+def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
+    """Check that each initial state changes some channel, in a run of ten seconds."""
+    if not kind.states:
+        return NotApplicable("it has no initial state")
+    simulator = kind(observe=[c.name for c in kind.channels])
+    scales = {c.name: c.scale for c in kind.channels}
+    theta = np.array([[p.nominal for p in simulator.parameters]])
+    run = _scenario(kind, 600, size=1.0)
+    seen = simulator.simulate(theta, run)
+    for name, value in kind.states.items():
+        other = value + _MOVED * max(abs(value), scales.get(name, 1.0))
+        moved = Scenario(run.times, {name: other}, run.inputs)
+        check(
+            not np.array_equal(seen, simulator.simulate(theta, moved)),
+            f"initial state {name} = {other:g} in place of {value:g} to change something",
+            "the same observation",
+            f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__,
+        )
+    simulator.close()
+    return None
+
+
+_MOVED = 0.01
+"""Change of an initial state, as a fraction of its value or of the scale of its channel."""
+
+
+def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
+    """Check that unknown names are rejected by a message that contains them.
+
+    They are names of constants, channels, inputs and initial states.
+    """
+    scenarios = (
+        Scenario(np.arange(3.0), initial={"no_such": 1.0}),
+        Scenario(np.arange(3.0), inputs={"no_such": np.zeros(3)}),
+        Scenario(np.arange(3.0), constants={"no_such": 1.0}),
+    )
+
+    def simulating(scenario: Scenario) -> Callable[[], object]:
+        return lambda: kind().simulate(_points(kind(), 1), scenario)
+
+    attempts: list[Callable[[], object]] = [simulating(s) for s in scenarios]
+    attempts += [lambda: kind(constants={"no_such": 1.0}), lambda: kind(observe=["no_such"])]
+    for attempt in attempts:
+        try:
+            attempt()
+        except InputError as error:
+            check("no_such" in str(error), "a message that names it", error, kind.__name__)
+            continue
+        raise CheckError(
+            f"expected InputError for an unknown name; found none; see {kind.__name__}"
+        )
+
+
+def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotApplicable | None:
+    """Check that `simulate_toy_problem` selects and orders columns without changing their values."""
+    everything = kind()
+    names = [c.name for c in everything.channels][::-1]
+    if len(names) == 1:
+        everything.close()
+        return NotApplicable("it has one channel")
+    chosen = kind(observe=names)
+    points = _points(everything, 2)
+    same = is_bitwise_equal(
+        np.ascontiguousarray(everything.simulate(points, _scenario(kind))[:, :, ::-1]),
+        np.ascontiguousarray(chosen.simulate(points, _scenario(kind))),
+    )
+    check(
+        same, "the same columns in the order asked for", "others", f"{kind.__name__}: self.columns"
+    )
+    everything.close()
+    chosen.close()
+    return None
+
+
+SIMULATOR_CHECKS: tuple[Check, ...] = (
+    check_declaration_is_complete,
+    check_units_are_known,
+    check_observations_have_the_declared_shape,
+    check_arguments_are_not_changed,
+    check_same_proposal_gives_the_same_bits,
+    check_parameters_that_are_not_numbers_spoil_only_their_lane,
+    check_every_parameter_shows,
+    check_initial_states_show,
+    check_unknown_names_are_refused,
+    check_chosen_channels_are_the_same_columns,
+    check_hooks_have_the_declared_shapes,
+    check_step_goes_on_by_its_seconds,
+    check_forces_act,
+    check_levels_can_be_set,
+)
+
+_SIMULATES = check_observations_have_the_declared_shape
+_REPEATS = check_same_proposal_gives_the_same_bits
+
+SIMULATOR_NEEDS: Mapping[Check, tuple[Check, ...]] = {
+    _SIMULATES: (check_declaration_is_complete,),
+    check_arguments_are_not_changed: (_SIMULATES,),
+    _REPEATS: (check_arguments_are_not_changed,),
+    check_parameters_that_are_not_numbers_spoil_only_their_lane: (_REPEATS,),
+    check_every_parameter_shows: (_REPEATS,),
+    check_initial_states_show: (_REPEATS,),
+    check_unknown_names_are_refused: (_SIMULATES,),
+    check_chosen_channels_are_the_same_columns: (_REPEATS,),
+    check_hooks_have_the_declared_shapes: (_SIMULATES,),
+    check_step_goes_on_by_its_seconds: (_REPEATS, check_hooks_have_the_declared_shapes),
+    check_forces_act: (_REPEATS, check_hooks_have_the_declared_shapes),
+    check_levels_can_be_set: (_REPEATS, check_hooks_have_the_declared_shapes),
+}
+"""For each check, the checks that must pass for it to be meaningful."""

@@ -1,0 +1,420 @@
+"""Conformance checks of a tuner, with its default options."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import pickle
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from bench.benchmark.runner.tuner_loop import RunTrace
+from bench.conformance.check_base import (
+    Check,
+    CheckError,
+    NotApplicable,
+    check,
+    check_global_random_state,
+    is_bitwise_equal,
+)
+from bench.conformance.isolation_checks import check_same_run_when_sealed
+from bench.conformance.subprocess_calls import call_in_processes
+from bench.conformance.toy_problem import (
+    TRAINED_TUNERS,
+    make_task,
+    make_trained_tuner,
+    run_tuner,
+    simulate_toy_problem,
+)
+from methods.tuner import Evaluation, Proposal, Task, Tuner, TunerGenerator
+from sims.core.simulator import Array
+
+_NAME = re.compile(r"[a-z][a-z0-9_-]*$")
+
+
+def _check_run_completed(kind: type[Tuner], trace: RunTrace, when: str) -> None:
+    found, look = f"{trace.status}: {trace.reason}", f"{kind.__name__}.tune"
+    check(trace.status in ("done", "converged"), f"a run that ends well {when}", found, look)
+
+
+def check_api_is_complete(kind: type[Tuner]) -> None:
+    """Check that the interface of the tuner is complete.
+
+    It needs a valid name, default options, a generator `tune` and, if it is trained, `fit`, `state`
+    and `restore`.
+    """
+    look = kind.__name__
+    check(bool(_NAME.match(kind.name)), "a name in lower case", repr(kind.name), f"{look}.name")
+    try:
+        tuner = kind()
+    except TypeError as error:
+        raise CheckError(
+            f"expected a default for every option; found {error}; see {look}.__init__"
+        ) from None
+    # The returned object is tested: a `tune` that returns a list would only fail in the harness's
+    # loop.
+    steps = make_trained_tuner(kind, 2).tune(make_task(2, 5)[0], np.random.default_rng(0))
+    check(
+        inspect.isgenerator(steps),
+        "a generator (with a yield)",
+        type(steps).__name__,
+        f"{look}.tune",
+    )
+    if tuner.learned:
+        missing = [
+            name
+            for name in ("fit", "state", "restore")
+            if getattr(kind, name) is getattr(Tuner, name)
+        ]
+        check(
+            not missing,
+            "fit, state and restore of a learned tuner",
+            f"no {', '.join(missing)}",
+            look,
+        )
+
+
+def check_runs_in_one_and_in_ten_dimensions(kind: type[Tuner]) -> None:
+    """Check that the tuner works with one and with ten parameters."""
+    # With one parameter, vector code meets a scalar; with ten, a full grid does not fit into
+    # memory.
+    for dim in (1, 10):
+        _check_run_completed(
+            kind, run_tuner(make_trained_tuner(kind, dim), dim, 25), f"with {dim} parameters"
+        )
+
+
+def check_budget_is_exact(kind: type[Tuner]) -> None:
+    """Check that budgets of 1 to 7 simulations are used and never exceeded.
+
+    A tuner may end early if it gives a reason.
+    """
+    tuner = make_trained_tuner(kind, 2)
+    # Populations are larger than these budgets, so a batch must be cut.
+    for budget in range(1, 8):
+        trace = run_tuner(tuner, 2, budget)
+        _check_run_completed(kind, trace, f"with budget {budget}")
+        # Fewer simulations are correct if the tuner gives a reason.
+        used = len(trace.losses)
+        exact = used == budget or (trace.status == "converged" and used < budget)
+        check(exact, f"{budget} simulations", used, f"{kind.__name__}.tune")
+
+
+def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
+    """Check that the tuner does not write to the task and the evaluations of the harness."""
+    task, _ = make_task(2, 20)
+    task = replace(
+        task, start=task.start.copy(), observed=task.observed.copy(), training=task.training.copy()
+    )
+    # Writable copies: with read-only arrays, the tuner would crash before the check could report
+    # it.
+    given = [task.start, task.observed, task.scale, task.training]
+    before = [array.copy() for array in given]
+    steps = make_trained_tuner(kind, 2).tune(task, np.random.default_rng(0))
+    try:
+        asked = next(steps)
+        for _ in range(10):
+            points = np.array(
+                asked[0] if isinstance(asked, Proposal) else asked, dtype=np.float64, ndmin=2
+            ).clip(0.0, 1.0)
+            observations = simulate_toy_problem(points)
+            losses = np.sqrt(((observations - task.observed) ** 2).mean(axis=(1, 2)))
+            shown = [points, observations, losses]
+            given, before = given + shown, before + [array.copy() for array in shown]
+            asked = steps.send(Evaluation(points, observations, losses))
+    except StopIteration:
+        pass
+    finally:
+        steps.close()
+    changed = [a.shape for a, b in zip(given, before, strict=True) if not is_bitwise_equal(a, b)]
+    check(
+        not changed,
+        "arguments as they were",
+        f"changed arrays of shapes {changed}",
+        f"{kind.__name__}.tune",
+    )
+
+
+def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
+    """Check that all proposals and recommendations are in the unit cube.
+
+    The harness would clip others without informing the tuner.
+    """
+    asked: list[Array] = []
+
+    # A wrapper around the tuner, because the harness's loop clips what it records.
+    class Watched(Tuner):
+        def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+            steps = make_trained_tuner(kind, 2).tune(task, rng)
+            try:
+                wanted = next(steps)
+                while True:
+                    points, recommended = wanted if isinstance(wanted, Proposal) else (wanted, None)
+                    asked.extend(np.atleast_2d(p) for p in (points, recommended) if p is not None)
+                    wanted = steps.send((yield wanted))
+            except StopIteration as stop:
+                return str(stop.value)
+            finally:
+                steps.close()
+
+    run_tuner(Watched(), 2, 30)
+    given = np.concatenate(asked)
+    outside = given[~((given >= 0.0) & (given <= 1.0)).all(axis=1)]
+    check(not len(outside), "points inside the unit cube", outside[:1], f"{kind.__name__}.tune")
+
+
+def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
+    """Check that two runs with the same seed agree bit for bit.
+
+    The global random generators have different states in the two runs.
+    """
+    # Two runs of one instance, because state left by a run must not matter either.
+    tuner = make_trained_tuner(kind, 2)
+    first = run_tuner(tuner, 2, 25, seed=3)
+    saved = np.random.get_state()  # noqa: NPY002
+    np.random.seed(12345)  # noqa: NPY002 - a tuner that draws from it would now differ
+    try:
+        second = run_tuner(tuner, 2, 25, seed=3)
+    finally:
+        np.random.set_state(saved)  # noqa: NPY002
+    same = is_bitwise_equal(first.proposals, second.proposals) and is_bitwise_equal(
+        first.recommendations, second.recommendations
+    )
+    check(same, "the same run for the same seed", "another", f"{kind.__name__}.tune: use rng")
+
+
+def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
+    """Check that a run on a used instance equals one on a fresh instance."""
+    used = make_trained_tuner(kind, 2)
+    run_tuner(used, 2, 15, seed=1)
+    again, fresh = (
+        run_tuner(used, 2, 15, seed=2),
+        run_tuner(make_trained_tuner(kind, 2), 2, 15, seed=2),
+    )
+    same = is_bitwise_equal(again.proposals, fresh.proposals)
+    check(
+        same,
+        "nothing kept from run to run",
+        "a different run",
+        f"what {kind.__name__}.tune keeps in self",
+    )
+
+
+def check_global_random_state_is_left_alone(kind: type[Tuner]) -> None:
+    """Check that neither training nor tuning uses or seeds a global random generator."""
+    run_tuner(make_trained_tuner(kind, 2), 2, 3)  # performs lazy imports
+    with check_global_random_state(f"{kind.__name__}.fit and .tune: use rng"):
+        run_tuner(make_trained_tuner(kind, 2, anew=True), 2, 15)
+
+
+def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
+    """Check that a tuner declared as not stochastic gives the same run for every seed."""
+    if kind.stochastic:
+        return NotApplicable("it says that it uses chance")
+    tuner = make_trained_tuner(kind, 2)
+    same = is_bitwise_equal(
+        run_tuner(tuner, 2, 15, seed=1).proposals, run_tuner(tuner, 2, 15, seed=2).proposals
+    )
+    look = f"{kind.__name__}.stochastic"
+    check(same, "stochastic = True", "another run with another seed", look)
+    return None
+
+
+def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
+    """Check that the tuner tolerates simulations that give NaN and an infinite loss.
+
+    The first simulation, every third one, or all of them fail.
+    """
+    tuner = make_trained_tuner(kind, 2)
+    # Methods start from the first simulation; if all fail, nothing can be fitted.
+    for fails, when in (
+        (lambda k: k == 1, "when the first simulation fails"),
+        (lambda k: k % 3 == 0, "when every third simulation fails"),
+        (lambda _: True, "when every simulation fails"),
+    ):
+        trace = run_tuner(tuner, 2, 15, fails=fails)
+        # A run without a finite loss has the status `diverged`, however the tuner ends it.
+        if trace.status != "diverged" or np.isfinite(trace.losses).any():
+            _check_run_completed(kind, trace, when)
+
+
+def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
+    """Check that the tuner improves the start on a smooth, identifiable problem.
+
+    The error of the recommendation after 60 simulations must be below half of the start's.
+    """
+    trace = run_tuner(make_trained_tuner(kind, 2), 2, 60)
+    task, truth = make_task(2, 60)
+    before, after = (
+        np.abs(point - truth).mean() for point in (task.start, trace.recommendations[-1])
+    )
+    check(
+        after < before / 2,
+        f"an error below half of the start's, {before / 2:.3g}",
+        f"{after:.3g}",
+        kind.__name__,
+    )
+
+
+_SEQUENTIAL_TEST_TARGETS = (6, 12, 24)
+"""Numbers of targets after which random search is compared, each at a third of 5 %."""
+
+
+def check_beats_random_search(kind: type[Tuner]) -> None:
+    """Check that errors after 30 simulations on the easy problem are below those of random search.
+
+    The test is a one-sided Wilcoxon signed-rank test of the paired log errors (scipy), at 5 % over
+    at most three looks, so that a clear case is decided early.
+    """
+    from scipy.stats import wilcoxon
+
+    tuner, chance = make_trained_tuner(kind, 2), _RandomSearchBaseline()
+    logs: list[Array] = []
+    for look in _SEQUENTIAL_TEST_TARGETS:
+        logs += [_final_logs((tuner, chance), target) for target in range(len(logs), look)]
+        mine, random = np.array(logs).T
+        differ = (mine != random).any()  # the test is undefined without a difference
+        p = float(wilcoxon(mine, random, alternative="less").pvalue) if differ else 1.0
+        # Bonferroni correction: three looks at 5 % in total.
+        if p < 0.05 / len(_SEQUENTIAL_TEST_TARGETS):
+            return
+    medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (mine, random)]
+    found = f"p = {p:.2g}, median error {' against '.join(medians)}"
+    expected = f"errors below random search's (p < {0.05 / len(_SEQUENTIAL_TEST_TARGETS):.2g})"
+    raise CheckError(f"expected {expected}; found {found}; see {kind.__name__}.tune")
+
+
+def _final_logs(subjects: tuple[Tuner, ...], target: int) -> Array:
+    """Compute the logarithms of the final errors of several tuners on one target."""
+    _, truth = make_task(2, 30, target)
+    traces = [run_tuner(tuner, 2, 30, seed=target, target=target) for tuner in subjects]
+    return np.log(
+        [max(np.abs(trace.recommendations[-1] - truth).mean(), 1e-12) for trace in traces]
+    )
+
+
+class _RandomSearchBaseline(Tuner):
+    """Random search, the baseline that every tuner should beat."""
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Propose uniformly distributed points."""
+        while True:
+            yield rng.uniform(size=(1, task.dim))
+
+
+def compute_run_digests(
+    kind: type[Tuner], seeds: tuple[int, ...], learned: dict[str, Array] | None = None
+) -> list[str]:
+    """Compute a hash of a run for each seed, for comparison between processes.
+
+    Args:
+        kind: class of the tuner.
+        seeds: seeds of the runs.
+        learned: trained state; None to train if necessary.
+    """
+    if learned:
+        TRAINED_TUNERS[kind, 2] = learned
+    traces = [run_tuner(make_trained_tuner(kind, 2), 2, 12, seed) for seed in seeds]
+    return [
+        hashlib.sha256(t.proposals.tobytes() + t.recommendations.tobytes()).hexdigest()[:16]
+        for t in traces
+    ]
+
+
+def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
+    """Check that runs agree bit for bit here, in another process, and in 1 and 4 workers."""
+    look = f"{kind.__name__}: what depends on the process, e.g. hash(), the clock, threads"
+    seeds = (0, 1, 2, 3)
+    here = compute_run_digests(kind, seeds)
+    # One worker trains by itself, four get the state trained here; all must agree with this
+    # process.
+    for workers, learned in ((1, None), (4, TRAINED_TUNERS.get((kind, 2)))):
+        there = call_in_processes(
+            compute_run_digests, [(kind, (seed,), learned) for seed in seeds], workers, kind
+        )
+        ended = [str(digest) for digest in there if isinstance(digest, Exception)]
+        check(not ended, f"runs that end in {workers} worker(s)", ended[:1], look)
+        same = [digest for (digest,) in there] == here
+        check(same, f"the same runs in {workers} worker(s) as in this process", "others", look)
+
+
+def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | None:
+    """Check that `state` and `restore` round-trip, and that the state of another tuner is rejected.
+
+    The state must consist of plain numeric arrays.
+    """
+    if not kind.learned:
+        return NotApplicable("it does not learn")
+    tuner, other = make_trained_tuner(kind, 2), kind()
+    state = tuner.state()
+    plain = all(isinstance(a, np.ndarray) and a.dtype.kind in "fiu" for a in state.values())
+    found = {name: type(array) for name, array in state.items()}
+    check(bool(state) and plain, "plain numeric arrays", found, f"{kind.__name__}.state")
+    # A run is compared and not only the arrays, because scales and settings may be stored
+    # elsewhere.
+    other.restore(state)
+    same = is_bitwise_equal(run_tuner(tuner, 2, 5).proposals, run_tuner(other, 2, 5).proposals)
+    check(same, "the same run after restore", "another one", f"{kind.__name__}.restore")
+    # Weights of another version or another tuner must not be accepted.
+    try:
+        kind().restore({"weights": np.zeros(3)})
+    except ValueError:
+        return None
+    raise CheckError(
+        f"expected ValueError for foreign weights; found none; see {kind.__name__}.restore"
+    )
+
+
+def check_instances_can_be_sent_to_workers(kind: type[Tuner]) -> None:
+    """Check that an instance with its options can be pickled."""
+    try:
+        pickle.loads(pickle.dumps(kind()))
+    except Exception as error:
+        raise CheckError(
+            f"expected a tuner that can be pickled; found {error!r}; see {kind.__name__}"
+        ) from error
+
+
+TUNER_CHECKS: tuple[Check, ...] = (
+    check_api_is_complete,
+    check_runs_in_one_and_in_ten_dimensions,
+    check_budget_is_exact,
+    check_arguments_are_not_changed,
+    check_proposals_stay_in_the_unit_cube,
+    check_global_random_state_is_left_alone,
+    check_same_seed_gives_the_same_run,
+    check_runs_do_not_touch_each_other,
+    check_stochastic_is_declared,
+    check_failed_simulations_are_survived,
+    check_easy_problem_is_improved,
+    check_beats_random_search,
+    check_what_was_learned_can_be_stored,
+    check_instances_can_be_sent_to_workers,
+    check_same_run_in_other_processes,
+    check_same_run_when_sealed,
+)
+
+_RUNS = check_runs_in_one_and_in_ten_dimensions
+_REPEATS = check_same_seed_gives_the_same_run
+
+TUNER_NEEDS: Mapping[Check, tuple[Check, ...]] = {
+    _RUNS: (check_api_is_complete,),
+    check_budget_is_exact: (_RUNS,),
+    check_arguments_are_not_changed: (_RUNS,),
+    check_proposals_stay_in_the_unit_cube: (_RUNS,),
+    check_global_random_state_is_left_alone: (_RUNS,),
+    _REPEATS: (_RUNS, check_global_random_state_is_left_alone),
+    check_runs_do_not_touch_each_other: (_REPEATS,),
+    check_stochastic_is_declared: (_REPEATS,),
+    check_failed_simulations_are_survived: (_RUNS,),
+    check_easy_problem_is_improved: (_RUNS,),
+    check_beats_random_search: (check_easy_problem_is_improved,),
+    check_what_was_learned_can_be_stored: (_REPEATS,),
+    check_instances_can_be_sent_to_workers: (check_api_is_complete,),
+    check_same_run_in_other_processes: (_REPEATS,),
+    check_same_run_when_sealed: (check_same_run_in_other_processes,),
+}
+"""For each check, the checks that must pass for it to be meaningful."""

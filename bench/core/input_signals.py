@@ -1,0 +1,154 @@
+"""Input signals described by text, for simulated recordings.
+
+``sine:2:0.5`` is 2 sin(2 pi 0.5 t), and ``0.3 + sine:2:0.5`` adds a constant of 0.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.core.value_limits import MAX_NUMBER, truncate_text
+
+_TAU = 2 * np.pi
+"""Radians of one period."""
+
+_MOST_CHANGES = 1e8
+"""Maximum number of periods or levels of a signal; a larger number is a typing error."""
+
+_MULTISINE_COUNT = 6
+"""Number of sines of a multisine; their frequencies are evenly spaced on a logarithmic scale."""
+_RAMP_UP_SHARE = 0.5
+"""Rise time of a multisine's amplitude, in periods of its lowest frequency."""
+_EDGE_TOLERANCE_SHARE = 1e-9
+"""Tolerance for rounded sample times at a step, as a share of the step's duration.
+
+A sample that is earlier than the step by less than this share belongs to the new level.
+"""
+
+
+# All functions take the generator, so that they can be called in the same way.
+
+
+def _constant(t: Array, rng: np.random.Generator, value: float) -> Array:  # noqa: ARG001
+    return np.full(t.size, value)
+
+
+def _sine(
+    t: Array,
+    rng: np.random.Generator,  # noqa: ARG001
+    amplitude: float,
+    frequency: float,
+) -> Array:
+    signal: Array = amplitude * np.sin(_TAU * frequency * t)
+    return signal
+
+
+def _square(
+    t: Array,
+    rng: np.random.Generator,  # noqa: ARG001
+    amplitude: float,
+    frequency: float,
+) -> Array:
+    half_periods = np.floor(2 * frequency * t)
+    return np.where(half_periods % 2 == 0, amplitude, -amplitude)
+
+
+def _steps(t: Array, rng: np.random.Generator, amplitude: float, seconds: float) -> Array:
+    place = np.floor(t / seconds + _EDGE_TOLERANCE_SHARE).astype(int)
+    levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
+    held: Array = levels[place]
+    return held
+
+
+def _chirp(
+    t: Array,
+    rng: np.random.Generator,  # noqa: ARG001
+    amplitude: float,
+    low: float,
+    high: float,
+) -> Array:
+    # The phase is the integral of a frequency that increases linearly with time.
+    periods = low * t + (high - low) * t * t / (2 * t[-1])
+    signal: Array = amplitude * np.sin(_TAU * periods)
+    return signal
+
+
+def _multisine(
+    t: Array, rng: np.random.Generator, amplitude: float, low: float, high: float
+) -> Array:
+    frequencies = np.geomspace(low, high, _MULTISINE_COUNT)
+    phases = rng.uniform(0.0, _TAU, _MULTISINE_COUNT)
+    total = np.sin(_TAU * frequencies * t[:, None] + phases).sum(axis=1)
+    # It starts at zero, because a sudden start would make the largest error of a servo at t = 0.
+    rise = np.minimum(t * low / _RAMP_UP_SHARE, 1.0)
+    largest = float(np.abs(rise * total).max())
+    faded: Array = amplitude * rise * total / max(largest, 1e-12)
+    return faded
+
+
+_FORMS: dict[str, tuple[Callable[..., Array], str]] = {
+    "constant": (_constant, "VALUE"),
+    "sine": (_sine, "AMPLITUDE:HERTZ"),
+    "square": (_square, "AMPLITUDE:HERTZ"),
+    "steps": (_steps, "AMPLITUDE:SECONDS"),
+    "chirp": (_chirp, "AMPLITUDE:HERTZ:HERTZ"),
+    "multisine": (_multisine, "AMPLITUDE:HERTZ:HERTZ"),
+}
+"""Function and argument names of each form of signal, by name."""
+
+SIGNAL_FORMS_HELP = ", ".join(f"{name}:{form}" for name, (_, form) in _FORMS.items())
+"""List of the forms of signals for a help text."""
+
+
+def evaluate_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
+    """Compute the values of the signal that a text describes.
+
+    A plain number is constant, and signals separated by `` + `` are added. `steps` holds random
+    levels, uniform within the amplitude. `chirp` sweeps from one frequency to the other.
+    `multisine` is a sum of sines between two frequencies with random phases; it starts at zero and
+    reaches the amplitude.
+
+    Args:
+        text: description of the signal.
+        times: (T,) sample times in seconds.
+        rng: random generator of levels and phases.
+
+    Returns:
+        (T,) values.
+
+    Raises:
+        InputError: there is no such form, or its numbers are not valid.
+    """
+    first, *others = text.split(" + ")
+    result = _one(first.strip(), times, rng)
+    for other in others:
+        result = result + _one(other.strip(), times, rng)
+    return result
+
+
+def _one(text: str, times: Array, rng: np.random.Generator) -> Array:
+    """Compute the values of one signal without sums."""
+    name, *given = text.split(":")
+    if not given:
+        name, given = "constant", [text]
+    if name not in _FORMS:
+        raise make_unknown_name_error("signal", name, list(_FORMS))
+    make, form = _FORMS[name]
+    try:
+        numbers = [float(number) for number in given]
+    except ValueError:
+        numbers = []
+    complete = len(numbers) == len(form.split(":")) and np.isfinite(numbers).all()
+    # All numbers except the first are frequencies or durations.
+    if not complete or min([1.0, *numbers[1:]]) <= 0:
+        wanted = f"{name}:{form} with numbers, all but the first > 0"
+        raise InputError(f"signal '{truncate_text(text)}': expected {wanted}")
+    span = float(times[-1])
+    changes = [span / n if make is _steps else span * n for n in numbers[1:]]
+    if max(map(abs, numbers)) > MAX_NUMBER or max([0.0, *changes]) > _MOST_CHANGES:
+        wanted = f"numbers within {MAX_NUMBER:g}, and at most {_MOST_CHANGES:g} periods or levels"
+        raise InputError(f"signal '{truncate_text(text)}': expected {wanted} in its {span:g} s")
+    return make(times, rng, *numbers)

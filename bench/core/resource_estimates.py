@@ -1,0 +1,160 @@
+"""Estimate the resources that work needs, and compare them with those of the machine.
+
+Estimates are low on purpose: only work that is not feasible is refused, not work that takes long.
+The user can skip the check (``--force``, ``force=True``).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from sims.core.simulator import InputError, Simulator
+from sims.system_simulator import SystemSimulator
+
+FORCE_HINT = "or insist with --force (force=True in Python)"
+"""End of messages about checks that the user can skip."""
+MAX_STEPS_PER_SIMULATION = 1e9
+"""Maximum number of steps of one simulation; the fastest engine takes hours for them."""
+MAX_TOTAL_SECONDS = 30 * 86400.0
+"""Maximum duration of work in seconds."""
+MIN_STEP_SECONDS = 1e-7
+"""Minimum duration of a time step in seconds."""
+MIN_SIMULATION_SECONDS = 1e-6
+"""Minimum duration of a simulation in seconds."""
+BYTES_PER_STEP = 32
+"""Memory of a step of a running simulation in bytes: its length, its end, and applied inputs."""
+BYTES_PER_NUMBER = 8
+"""Size of a number in bytes."""
+_CONTROL = Path("/sys/fs/cgroup/memory.max")
+"""File in which Linux states the memory limit of a container."""
+
+
+@dataclass(frozen=True)
+class MachineResources:
+    """Resources of a machine; infinite if the system does not state them.
+
+    Attributes:
+        memory: memory in bytes.
+        disk: free disk space in bytes.
+        files: number of files that can be created.
+    """
+
+    memory: float = math.inf
+    disk: float = math.inf
+    files: float = math.inf
+
+
+@dataclass(frozen=True)
+class ResourceNeed:
+    """Minimum resources that work needs.
+
+    Attributes:
+        made: what the work consists of, for example ``2 runs x budget 100``.
+        change: what to change to need less.
+        memory: memory in bytes.
+        disk: disk space in bytes.
+        files: number of files.
+        steps: number of time steps in one simulation.
+        seconds: duration in seconds.
+    """
+
+    made: str
+    change: str
+    memory: float = 0.0
+    disk: float = 0.0
+    files: float = 0.0
+    steps: float = 0.0
+    seconds: float = 0.0
+
+    def find_excess(self, machine: MachineResources) -> str:
+        """Describe the first need that exceeds the machine; empty if none does."""
+        for wanted, there, unit in (
+            (self.memory, machine.memory, "of memory"),
+            (self.disk, machine.disk, "of free disk"),
+        ):
+            if wanted > there:
+                return f"{format_bytes(wanted)} {unit}, where there are {format_bytes(there)}"
+        if self.files > machine.files:
+            return f"{self.files:.3g} files, where there is room for {machine.files:.3g}"
+        if self.steps > MAX_STEPS_PER_SIMULATION:
+            return f"{self.steps:.3g} steps in one simulation, where {MAX_STEPS_PER_SIMULATION:g} take hours"
+        if self.seconds > MAX_TOTAL_SECONDS:
+            return f"{_long(self.seconds)}, where {_long(MAX_TOTAL_SECONDS)} are the most"
+        return ""
+
+
+def check_feasible(
+    who: str, need: ResourceNeed, machine: MachineResources, force: bool = False
+) -> None:
+    """Raise an error for work that is not feasible on this machine.
+
+    Args:
+        who: beginning of the message.
+        need: resources that the work needs.
+        machine: resources of the machine.
+        force: True to skip the check.
+
+    Raises:
+        InputError: the work needs more than is available.
+    """
+    if not force and (what := need.find_excess(machine)):
+        raise InputError(f"{who}: {need.made} would need {what}; {need.change}, {FORCE_HINT}")
+
+
+def get_machine_resources(folder: Path | None = None) -> MachineResources:
+    """Return the resources of this machine.
+
+    Args:
+        folder: folder to write to, which need not exist; None for the current one.
+    """
+    place = (folder or Path()).absolute()
+    while not place.is_dir() and place != place.parent:
+        place = place.parent
+    try:
+        disk = float(shutil.disk_usage(place).free)
+    except OSError:
+        disk = math.inf
+    return MachineResources(_memory(), disk, _files(place))
+
+
+def get_max_step(simulator: Simulator) -> float:
+    """Return a simulator's largest time step in seconds; infinite if it does not state one."""
+    return simulator.engine.largest_step if isinstance(simulator, SystemSimulator) else math.inf
+
+
+def _memory() -> float:
+    """Return the memory in bytes: the machine's, or the limit of a container."""
+    limits = [math.inf]
+    with suppress(AttributeError, OSError, ValueError):  # a system that does not state it
+        limits.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
+    with suppress(OSError, ValueError):  # no container, or the limit "max"
+        limits.append(float(_CONTROL.read_text()))
+    return min(limit for limit in limits if limit > 0)
+
+
+def _files(place: Path) -> float:
+    try:
+        free = os.statvfs(place).f_favail
+    except (AttributeError, OSError):
+        return math.inf
+    # File systems that create inodes on demand report 0.
+    return float(free) or math.inf
+
+
+def format_bytes(count: float) -> str:
+    """Format a number of bytes with a unit."""
+    for unit in ("B", "kB", "MB", "GB", "TB", "PB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} EB"
+
+
+def _long(seconds: float) -> str:
+    days = seconds / 86400
+    return f"{days:.3g} days" if days < 1000 else f"{days / 365.25:.3g} years"

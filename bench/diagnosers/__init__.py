@@ -1,1 +1,0 @@
-"""Built-in diagnosers, one per module; see `bench.diagnoser`."""

@@ -1,0 +1,173 @@
+"""Explain many recordings separately: one folder for each, and one table of all.
+
+The calls may run in any order, locally or on a cluster. A log that cannot be explained becomes a
+row with the reason and does not affect the others.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.runner.worker_pools import Pool
+from bench.diagnosis.batch.log_rows import LOGS_TABLE_FILE, LogResult, format_log_table
+from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.explain import explain
+from bench.figures.figure_files import is_pdf_wanted
+from bench.logs.joined_recordings import make_log_names
+from bench.logs.recording_digest import compute_recording_digest, read_content
+from sims.core.atomic_files import check_folder_empty, get_first_line, write_atomically
+from sims.core.simulator import InputError
+
+BATCH_STATE_FILE = "logs.json"
+"""File name of the batch state, which is rewritten whenever a log is done."""
+
+
+@dataclass(frozen=True)
+class BatchLog:
+    """Recording of a batch, with its output folder.
+
+    Attributes:
+        name: Short name that is unique in the batch.
+        path: Path of its table or description.
+        folder: Folder for verdict, extended simulator, figures and report.
+        digest: Digest of its files, including those in its description, and of the settings.
+    """
+
+    name: str
+    path: Path
+    folder: Path
+    digest: str
+
+
+def list_logs(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> list[BatchLog]:
+    """List the logs with their names and folders.
+
+    Args:
+        paths: Paths of the recordings.
+        out: Output folder of the batch.
+        settings: Arguments of `explain`, and its ``budget`` in seconds.
+
+    Raises:
+        InputError: A file does not exist.
+    """
+    told = repr(sorted((key, str(value)) for key, value in settings.items()))
+    if settings.get("model") is not None:
+        told += read_content(Path(settings["model"])).hex()
+    return [
+        BatchLog(
+            name,
+            path.absolute(),
+            out.absolute() / name.replace("/", "_"),
+            compute_recording_digest(path, told),
+        )
+        for name, path in zip(make_log_names(paths), paths, strict=True)
+    ]
+
+
+def explain_batch(
+    logs: Sequence[BatchLog],
+    out: Path,
+    settings: Mapping[str, Any],
+    pool: Pool,
+    done: Callable[[LogResult], None],
+    stop: Callable[[], bool] = lambda: False,
+) -> list[LogResult]:
+    """Explain every log that is not explained yet, and write the table of all.
+
+    Args:
+        logs: Logs of the batch.
+        out: Output folder of the batch; results of an earlier call in it are reused.
+        settings: Settings as for `list_logs`.
+        pool: Worker pool that makes the calls.
+        done: Callback that receives the result of each log.
+        stop: Function that is called after each log; if it returns True, the other logs remain for
+            another call.
+
+    Returns:
+        Results in the order of the logs.
+    """
+    rows = _load_previous_results(out, logs)
+    for row in rows.values():
+        done(row)
+    left = [log for log in logs if log.name not in rows]
+    # A worker process does not know the figure settings of this process.
+    calls = [(explain_log, (log, dict(settings), is_pdf_wanted())) for log in left]
+    for place, result in pool.iterate_results(calls, np.inf):
+        log = left[place]
+        row = (
+            result
+            if isinstance(result, LogResult)
+            else LogResult(log.name, log.digest, error=_said(result))
+        )
+        rows[log.name] = row
+        ordered = [rows[one.name] for one in logs if one.name in rows]
+        _write(out, ordered)
+        done(row)
+        if stop():
+            break
+    ordered = [rows[log.name] for log in logs if log.name in rows]
+    _write(out, ordered)
+    return ordered
+
+
+def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -> LogResult:
+    """Explain a log and write its results, in any process.
+
+    Args:
+        log: Log to explain.
+        settings: Settings as for `list_logs`.
+        pdf: Also write each figure as PDF.
+    """
+    try:
+        given = {key: value for key, value in settings.items() if key != "budget"}
+        explanation = explain(log.path, watch=SearchControl(settings.get("budget")), **given)
+        explanation.write(log.folder, pdf=pdf)
+    except InputError as error:
+        return LogResult(log.name, log.digest, error=get_first_line(error))
+    found = explanation.answer.to_document()
+    held_out = found["heldout"]
+    closed = held_out["gap_closed"] if held_out else None
+    causes = tuple(found["causes"])
+    return LogResult(log.name, log.digest, found["verdict"], causes, closed, found["seconds"])
+
+
+def _said(error: object) -> str:
+    """Format the error that ended a call in one line."""
+    said = get_first_line(error) if isinstance(error, BaseException) else "no result"
+    return said if isinstance(error, InputError) else f"{type(error).__name__}: {said}"
+
+
+def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, LogResult]:
+    """Load the results of an earlier call for unchanged files and settings."""
+    path = out / BATCH_STATE_FILE
+    if not path.exists():
+        check_folder_empty(out)
+        return {}
+    try:
+        stored = [LogResult(**row) for row in json.loads(path.read_text())]
+    except (OSError, ValueError, TypeError):
+        raise InputError(f"{path}: is none of simgap's; name another folder") from None
+    by_name = {row.log: row for row in stored}
+    same = {log.name: by_name[log.name] for log in logs if log.name in by_name}
+    digests = {log.name: log.digest for log in logs}
+    return {
+        name: row for name, row in same.items() if row.digest == digests[name] and not row.error
+    }
+
+
+def _write(out: Path, rows: Sequence[LogResult]) -> None:
+    """Write the batch state and the table."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomically(
+            out / BATCH_STATE_FILE, json.dumps([asdict(row) for row in rows], indent=1) + "\n"
+        )
+        write_atomically(out / LOGS_TABLE_FILE, format_log_table(rows))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror})") from None

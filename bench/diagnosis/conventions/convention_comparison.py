@@ -1,0 +1,424 @@
+"""Compare conventions of a robot's log by the model's own prediction errors.
+
+A Kalman filter with the model follows the log under each hypothesis
+(`bench.diagnosis.kalman.filter_and_smoother`). Hypotheses are compared by the likelihood of the
+recorded values y,
+
+    log L(y | hypothesis) = log L(transformed y) + Σ_c N_c log |k_c|                             (1)
+
+with k_c the factor of channel c and N_c its number of samples. A convention differs if (1) is
+clearly larger than for the log as it is described, and larger than with the best set of causes that
+prediction-error identification selects (`prediction_error.effect_selection`): friction,
+delays and small offsets are causes, not conventions.
+
+Hypotheses are compared on a short part of some runs; the selected ones are confirmed on all
+samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from bench.diagnosis.conventions.convention_hypotheses import (
+    MAX_NAMED,
+    MIN_OFFSET,
+    ConventionHypothesis,
+    HypothesisGenerator,
+    JointSignals,
+)
+from bench.diagnosis.conventions.unit_check import Subject
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.friction_form_verdict import soft_kind
+from bench.diagnosis.identifiability import listed
+from bench.diagnosis.kalman.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
+from bench.diagnosis.kalman.likelihood_fit import maximise_likelihood
+from bench.diagnosis.prediction_error.effect_selection import identify
+from bench.diagnosis.prediction_error.joint_effects import MANY_SHAPES
+from bench.diagnosis.prediction_error.library_columns import group_coefficients
+from bench.diagnosis.prediction_error.model_filters import GAUSS_NEWTON_STEPS, soft_friction_models
+from bench.diagnosis.search.candidate_directions import first_probes
+from bench.diagnosis.search.explained_variance import DirectionGroup
+from bench.diagnosis.search.lack_of_fit import list_hat_effects as force_probes
+from sims.recording.recording import Recording, Run
+from sims.robot.robot_simulator import RobotSimulator
+
+LOG_LIKELIHOOD_MARGIN = 20.0
+"""Minimum gain in log-likelihood of a hypothesis over the log as it is described."""
+CAUSES_MARGIN = 10.0
+"""Minimum gain in log-likelihood of a hypothesis over the best set of causes."""
+EQUAL_LOG_LIKELIHOOD = 3.0
+"""Maximum difference of log-likelihoods of two hypotheses that explain a log equally well."""
+MIN_MISSING_FORCE, LARGE_MISSING_FORCE = 0.1, 0.3
+"""Limits of the largest missing force of a joint, as a share of its typical force. Below the first
+no convention is tested, and below the second only those of this joint.
+"""
+SUSPECT_SHARE = 0.1
+"""Minimum missing force of a joint whose conventions are tested, as a share of its typical force,
+and of the largest such share if that exceeds 1.
+"""
+OFF_FACTOR = 1e-6
+"""Factor that switches an input off."""
+MAX_REMAINING_FORCE = 0.3
+"""Maximum missing force with corrected conventions, as a share of the one before."""
+MAX_SUSPECT_LIMIT = 0.5
+"""Missing force of a joint, as a share of its typical force, above which its conventions are tested
+in any case.
+"""
+PART_SAMPLES = 60
+"""Number of samples of the part of a run on which hypotheses are compared."""
+PART_RUNS = 3
+"""Maximum number of runs of which parts are used."""
+MAX_REFINED = 4
+"""Maximum number of hypotheses whose offsets are refined."""
+MAX_DIFFERENCES = 3
+"""Maximum number of conventions that are searched one after another."""
+MIN_REFINEMENT_GAIN = 0.1
+"""Minimum gain in log-likelihood of a step of the refinement."""
+FIRST_OFFSET_STEP = 0.3
+"""First step of the refinement of an offset, in rad."""
+OFFSET_ACCURACY = 1e-3
+"""Accuracy of a refined offset, in rad."""
+GAIN_EFFECTS = frozenset({"input.gain", "sensor.gain"})
+"""Effects that contain reversed signs and wrong units, and therefore do not compete with them."""
+
+
+@dataclass(frozen=True)
+class ConventionDifference:
+    """Convention of the log that differs from that of the model file.
+
+    Attributes:
+        hypothesis: Difference between the conventions.
+        gain: Gain in log-likelihood on the short parts.
+        alternatives: Hypotheses that explain the log equally well.
+    """
+
+    hypothesis: ConventionHypothesis
+    gain: float
+    alternatives: tuple[ConventionHypothesis, ...] = ()
+
+    @property
+    def description(self) -> str:
+        """Description of the difference and of its alternatives."""
+        if not self.alternatives:
+            return self.hypothesis.description
+        others = listed([one.description for one in self.alternatives], MAX_NAMED)
+        return f"{self.hypothesis.description} (or {others})"
+
+
+class ConventionComparison:
+    """Comparison of the conventions of a robot's log with those of its model file.
+
+    Args:
+        subject: Recording of a robot.
+
+    Attributes:
+        subject: Recording of a robot.
+        evaluations: Number of hypotheses that were evaluated by a filter.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        self.evaluations = 0
+        self._generator = HypothesisGenerator(subject)
+
+    def differences(self) -> list[ConventionDifference]:
+        """Return the conventions that differ, in the order of the search; empty if none."""
+        described = corrected = self.subject.recording
+        differences: list[ConventionDifference] = []
+        for _ in range(MAX_DIFFERENCES):
+            suspects = self._suspects(self._follow(self._parts(corrected)))
+            best = self._best_hypothesis(corrected, suspects) if suspects else None
+            if best is None:
+                break
+            differences.append(best)
+            corrected = best.hypothesis.applied(corrected)
+        gain = sum(one.gain for one in differences)
+        if not differences or gain < self._gain_of_causes(corrected) + CAUSES_MARGIN:
+            return []
+        if not self._removes_missing_force(described, corrected):
+            return []
+        before, after = (_log_likelihood(self._follow(one)) for one in (described, corrected))
+        after += sum(_log_scales(one.hypothesis, described) for one in differences)
+        return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
+
+    def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
+        """Return whether the corrections leave only a small part of the largest missing force."""
+        before, after = map(self._largest_missing_force, (described, corrected))
+        return after <= MAX_REMAINING_FORCE * before
+
+    def _largest_missing_force(self, recording: Recording) -> float:
+        """Return the largest missing force of a joint, as a share of its typical force.
+
+        It is infinite if the filter diverges.
+        """
+        followed = self._follow(self._parts(recording))
+        return float((followed.force / followed.typical).max()) if followed.is_sound else np.inf
+
+    def _suspects(self, followed: FollowedRuns) -> list[JointSignals]:
+        """Return the joints with a large missing force; all joints if the filter diverges."""
+        if not followed.is_sound:
+            return self._generator.joints
+        coordinates = self.subject.kind.system.coordinates
+        shares = (followed.force / followed.typical)[: len(coordinates)]
+        if not followed.missing_forces.any() or shares.max() <= MIN_MISSING_FORCE:
+            return []
+        limit = min(SUSPECT_SHARE * max(1.0, float(shares.max())), MAX_SUSPECT_LIMIT)
+        if shares.max() < LARGE_MISSING_FORCE:
+            limit = float(np.nextafter(shares.max(), 0.0))
+        share_of = dict(zip(coordinates, shares.tolist(), strict=True))
+        return [j for j in self._generator.joints if share_of[f"q.{j.name}"] > limit]
+
+    def _best_hypothesis(
+        self, recording: Recording, suspects: Sequence[JointSignals]
+    ) -> ConventionDifference | None:
+        """Return the hypothesis with the largest likelihood; None if none is clearly better."""
+        limit = self._evaluate(ConventionHypothesis(""), recording) + LOG_LIKELIHOOD_MARGIN
+        # Most hypotheses already fail on one run.
+        first_limit = self._evaluate(ConventionHypothesis(""), recording, runs=1)
+        scored: dict[str, tuple[float, ConventionHypothesis]] = {}
+        evaluated: list[object] = []
+        for hypothesis in self._generator.generate(recording, suspects):
+            key = dict(hypothesis.changes), hypothesis.late
+            if key in evaluated:
+                continue
+            evaluated.append(key)
+            if not self._evaluate(hypothesis, recording, runs=1) > first_limit:
+                continue
+            score = self._evaluate(hypothesis, recording)
+            # For several offsets of one signal, the best one is refined.
+            known = scored.get(hypothesis.description, (limit, hypothesis))
+            if score > known[0]:
+                scored[hypothesis.description] = score, hypothesis
+        ahead = sorted(scored.values(), key=lambda pair: -pair[0])
+        refined = [self._refine(*pair, recording) for pair in ahead[:MAX_REFINED]]
+        clear = [
+            (score, one)
+            for score, one in (*refined, *ahead[MAX_REFINED:])
+            if score > limit and self._uses_inputs(score, one, recording)
+        ]
+        if not clear:
+            return None
+        best = max(score for score, _ in clear)
+        equal = [one for score, one in clear if score > best - EQUAL_LOG_LIKELIHOOD]
+        first, *others = sorted(equal, key=lambda one: one.size)
+        gain = best - limit + LOG_LIKELIHOOD_MARGIN
+        return ConventionDifference(first, gain, tuple(others[: MAX_NAMED - 1]))
+
+    def _uses_inputs(
+        self, score: float, hypothesis: ConventionHypothesis, recording: Recording
+    ) -> bool:
+        """Return whether a hypothesis on units of inputs alone is better than no inputs at all.
+
+        A factor that only switches an input off is not a unit.
+        """
+        inputs = recording.runs[0].inputs
+        changes = hypothesis.changes
+        scales_inputs = all(name in inputs and abs(c.scale) != 1.0 for name, c in changes.items())
+        if not changes or not scales_inputs:
+            return True
+        off = {name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in changes.items()}
+        without = self._evaluate(replace(hypothesis, changes=off), recording)
+        return score > without + LOG_LIKELIHOOD_MARGIN
+
+    def _refine(
+        self, score: float, hypothesis: ConventionHypothesis, recording: Recording
+    ) -> tuple[float, ConventionHypothesis]:
+        """Improve the offset of a hypothesis by a pattern search.
+
+        The method is that of R. Hooke, T. A. Jeeves, J. ACM 8(2), 212, 1961,
+        doi:10.1145/321062.321069.
+        """
+        if not hypothesis.has_free_offset:
+            return score, hypothesis
+        step = FIRST_OFFSET_STEP
+        while step > OFFSET_ACCURACY:
+            for signed in (step, -step):
+                moved = hypothesis.shifted(signed)
+                moved_score = self._evaluate(moved, recording)
+                if moved_score > score + MIN_REFINEMENT_GAIN:
+                    score, hypothesis = moved_score, moved
+                    break
+            else:
+                step /= 2.0
+        offset = max(abs(change.offset) for change in hypothesis.changes.values())
+        return (score if offset > MIN_OFFSET else -np.inf), hypothesis
+
+    def _evaluate(
+        self, hypothesis: ConventionHypothesis, recording: Recording, runs: int = PART_RUNS
+    ) -> float:
+        """Return the log-likelihood (1) on the short parts of a recording.
+
+        Args:
+            hypothesis: Difference between the conventions.
+            recording: Recording as it is described, or with some conventions corrected.
+            runs: Maximum number of runs.
+        """
+        self.evaluations += 1
+        parts = self._parts(hypothesis.applied(recording), runs)
+        followed = self._follow(parts, max_linearisations=1)
+        return _log_likelihood(followed) + _log_scales(hypothesis, parts)
+
+    def _follow(
+        self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
+    ) -> FollowedRuns:
+        """Filter the training runs of a recording with the model file's numbers."""
+        world = self.subject.world(recording)
+        followed = FollowedRuns.follow(
+            world,
+            world.get_nominal_theta(),
+            _white_noise(world, recording),
+            None,
+            max_linearisations=max_linearisations,
+        )
+        world.close()
+        return followed
+
+    def _gain_of_causes(self, corrected: Recording) -> float:
+        """Return the penalised log-likelihood that the best set of causes gains on short parts.
+
+        Each effect has a penalty of half the logarithm of the number of samples for each
+        coefficient (BIC), and of the logarithm of the number of effects. With large missing forces,
+        regression is inaccurate, so the gain is computed by filters with the effects in the model.
+        If the corrected log is not explained either, the larger of both gains is used.
+
+        Args:
+            corrected: Recording with its conventions corrected.
+        """
+        subject = self.subject
+        parts = self._parts(subject.recording)
+        world = RunEvaluator(
+            subject.kind, parts, parts.training(), subject.engine, force_probes(subject.kind)
+        )
+        followed = FollowedRuns.follow(
+            world, world.get_nominal_theta(), _white_noise(world, parts), None
+        )
+        if not followed.is_sound:
+            world.close()
+            return 0.0
+        left_out = MANY_SHAPES | GAIN_EFFECTS
+        names = [name for name in world.library if name.partition("@")[0] not in left_out]
+        base = _unfitted(world)
+        probes = [probe for name in names for probe in first_probes(world, base, name)]
+        selected = identify(followed, followed.columns(probes))
+        before = followed.with_parameters(world.get_nominal_theta()).log_likelihood
+        samples = int(followed.runs.recorded.sum())
+        gain, penalty = 0.0, 0.0
+        for count, group in enumerate(selected.groups, start=1):
+            penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(len(names))
+            groups = selected.groups[:count]
+            theta = world.get_nominal_theta()
+            for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
+                theta[world.slots[one.effect]] = group_coefficients(world, probes, one, numbers)
+            fitted = _with_best_coefficients(followed.with_parameters(theta), groups)
+            gain = max(gain, fitted.log_likelihood - before - penalty)
+        gain = max(gain, _log_likelihood_of_soft_friction(followed) - before)
+        world.close()
+        if self._largest_missing_force(corrected) < LARGE_MISSING_FORCE:
+            return gain
+        return max(gain, selected.log_likelihood - followed.log_likelihood - penalty)
+
+    def _parts(self, recording: Recording, runs: int = PART_RUNS) -> Recording:
+        """Return the parts of some training runs with the largest movement."""
+        pairs = zip(recording.training(), self._slices[:runs], strict=False)
+        return replace(recording, runs=tuple(run.part(part) for run, part in pairs))
+
+    @cached_property
+    def _slices(self) -> list[slice]:
+        """Samples of the parts of the runs.
+
+        If a joint is not recorded, only the beginning of a run has a known pose.
+        """
+        runs = self.subject.recording.training()[:PART_RUNS]
+        coordinates = self.subject.kind.system.coordinates
+        if not all(coordinate in runs[0].channels for coordinate in coordinates):
+            return [slice(0, min(run.times.size, PART_SAMPLES)) for run in runs]
+        return [_liveliest_part(run) for run in runs]
+
+
+def _log_likelihood(followed: FollowedRuns) -> float:
+    """Return the log-likelihood of the innovations; minus infinity if the filter diverges."""
+    likelihood = followed.log_likelihood
+    return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
+
+
+def _log_scales(hypothesis: ConventionHypothesis, recording: Recording) -> float:
+    """Return the last term of (1) for the training runs of a recording."""
+    result = 0.0
+    for name, change in hypothesis.changes.items():
+        samples = [run.channels[name] for run in recording.training() if name in run.channels]
+        count = sum(int(np.isfinite(values).sum()) for values in samples)
+        result += count * math.log(abs(change.scale))
+    return result
+
+
+def _white_noise(world: RunEvaluator, recording: Recording) -> NoiseModel:
+    sigma = compute_noise_floor(world, recording).sigma
+    return NoiseModel(sigma, np.zeros(len(sigma)))
+
+
+def _unfitted(world: RunEvaluator) -> TrajectoryFit:
+    """Return the model file's numbers as a fit, the starting point of candidate directions."""
+    empty = np.zeros(0)
+    return TrajectoryFit(
+        (), world.get_nominal_theta(), world.guess, np.zeros(0, np.intp), empty, empty, 0.0
+    )
+
+
+def _with_best_coefficients(
+    followed: FollowedRuns, groups: Sequence[DirectionGroup]
+) -> FollowedRuns:
+    """Improve the coefficients of effects by Gauss-Newton steps of the filter's likelihood."""
+    world = followed.world
+    names = [group.effect for group in groups]
+    return maximise_likelihood(
+        followed,
+        [place for name in names for place in world.get_coefficient_indices(name)],
+        [bounds for name in names for bounds in compute_coefficient_bounds(world, name)],
+        GAUSS_NEWTON_STEPS,
+        lambda theta, best: best.with_parameters(theta),
+    )
+
+
+def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
+    """Return the largest log-likelihood with dry friction in MuJoCo's soft form.
+
+    The friction acts at the joint with the largest missing force, and is not part of the
+    regression. The result is minus infinity without such an effect.
+    """
+    world = followed.world
+    thetas = [theta for _, theta in soft_friction_models(followed, world.get_nominal_theta())]
+    if not thetas:
+        return -np.inf
+    simulator = world.simulator_of(soft_kind(world.kind))
+    assert isinstance(simulator, RobotSimulator)
+    likelihoods = [followed.with_parameters(theta, simulator).log_likelihood for theta in thetas]
+    simulator.close()
+    return max(likelihoods)
+
+
+def _liveliest_part(run: Run) -> slice:
+    """Return the part of a run in which its channels move most."""
+    count = run.times.size
+    if count <= PART_SAMPLES:
+        return slice(0, count)
+
+    def movement(begin: int) -> float:
+        total = 0.0
+        for values in run.channels.values():
+            part = values[begin : begin + PART_SAMPLES]
+            if np.isfinite(part).any():
+                total += float(np.nanstd(part)) / max(float(np.nanstd(values)), 1e-12)
+        return total
+
+    begins = range(0, count - PART_SAMPLES + 1, PART_SAMPLES // 2)
+    best = max(begins, key=movement)
+    return slice(best, best + PART_SAMPLES)

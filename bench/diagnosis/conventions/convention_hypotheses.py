@@ -1,0 +1,410 @@
+"""Hypotheses on how the conventions of a robot's log differ from those of its model file.
+
+Each hypothesis transforms the recorded signals to the conventions of the model. It changes a sign,
+a zero position, a unit or the order of joints, restores whole turns, or shifts commands in time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from bench.diagnosis.conventions.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
+from bench.diagnosis.identifiability import listed
+from bench.logs.importing.joint_order import least_order
+from sims.core.simulator import Array
+from sims.recording.angle_unwrapping import unwrapped
+from sims.recording.log_formats.lerobot_calibration import range_scale
+from sims.recording.recording import Recording, Run
+
+ANGLES = np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
+"""Offsets of a zero position that are tried, in rad; the best one is refined."""
+MIN_OFFSET = 0.1
+"""Minimum offset of a zero position that counts as a convention, in rad. Smaller offsets are errors
+of calibration and assembly, which are causes.
+"""
+LATE_SAMPLES = (1, 2, 3, 4, 5, 6, 8)
+"""Delays of command time stamps that are tried, in samples."""
+TICKS_PER_TURN = (4096.0, 4095.0, 8192.0, 16384.0, 65536.0, 1024.0, 1023.0)
+"""Common encoder resolutions, in ticks per turn."""
+NORMALISED_RANGE = 100.0
+"""Upper end of positions that are normalised to the range of a joint."""
+WRAP_JUMP = 1.5 * math.pi
+"""Minimum difference of successive positions that indicates a wrapped position, in rad."""
+MAX_NAMED = 4
+"""Maximum number of signals that a sentence names."""
+QUANTITIES = ("q", "qd", "tau")
+"""Prefixes of the channels of a joint: position, velocity, torque."""
+
+
+@dataclass(frozen=True)
+class SignalChange:
+    """Signal of the model as a function of a recorded signal, in SI units.
+
+    Attributes:
+        source: Name of the recorded signal.
+        scale: Factor.
+        offset: Offset that is added after the factor.
+        unwrap: Whether whole turns are restored first.
+        command: Name of the command that determines the turn of a position; empty without one.
+    """
+
+    source: str
+    scale: float = 1.0
+    offset: float = 0.0
+    unwrap: bool = False
+    command: str = ""
+
+    def applied(self, signals: Mapping[str, Array]) -> Array:
+        """Return the signal (T,) in the convention of the model.
+
+        Args:
+            signals: Recorded signals by name, each (T,).
+        """
+        values = signals[self.source]
+        if self.unwrap:
+            values = unwrapped(values, signals.get(self.command))
+        return self.scale * values + self.offset
+
+
+@dataclass(frozen=True)
+class ConventionHypothesis:
+    """Convention that may differ.
+
+    Attributes:
+        description: Sentence without its final period.
+        changes: Signals that differ, by their name in the model.
+        unit: Unit of the recorded values, if only the specified unit is wrong.
+        has_free_offset: Whether the offsets of all changes are one unknown angle.
+        late: Delay of the command time stamps, in s.
+    """
+
+    description: str
+    changes: Mapping[str, SignalChange] = field(default_factory=dict)
+    unit: str | None = None
+    has_free_offset: bool = False
+    late: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of signals that differ."""
+        return len(self.changes) + (self.late != 0.0)
+
+    def applied(self, recording: Recording) -> Recording:
+        """Return the recording with its signals in the conventions of the model."""
+        noise = dict(recording.noise)
+        for name, change in self.changes.items():
+            if change.source in recording.noise:
+                noise[name] = abs(change.scale) * recording.noise[change.source]
+        return replace(recording, noise=noise, runs=tuple(map(self._applied_to, recording.runs)))
+
+    def _applied_to(self, run: Run) -> Run:
+        signals = {**run.inputs, **run.channels}
+        earlier = {name: values[1] for name, values in run.before.items()}
+
+        def changed(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
+            return {
+                name: self.changes[name].applied(source) if name in self.changes else old
+                for name, old in values.items()
+            }
+
+        before = {
+            name: np.stack([run.before[name][0], values])
+            for name, values in changed(earlier, earlier).items()
+        }
+        return replace(
+            run,
+            channels=changed(run.channels, signals),
+            inputs=changed(run.inputs, signals),
+            before=before,
+            initial={} if self.changes else run.initial,
+            offset=run.offset - self.late,
+        )
+
+    def shifted(self, step: float) -> ConventionHypothesis:
+        """Return the hypothesis with a step in rad added to its offsets."""
+        changes = {
+            name: replace(change, offset=change.offset + step)
+            for name, change in self.changes.items()
+        }
+        return replace(self, changes=changes)
+
+
+@dataclass(frozen=True)
+class JointSignals:
+    """Joint and its recorded signals.
+
+    Attributes:
+        name: Name of the joint.
+        channels: Names of recorded channels by quantity: ``q``, ``qd``, ``tau``.
+        inputs: Names of the inputs of its actuators.
+        servo_inputs: Names of the inputs of its position servos.
+        range: Limits of its position, in rad or m; None if the model specifies none.
+        is_hinge: Whether it is a hinge joint.
+    """
+
+    name: str
+    channels: Mapping[str, str]
+    inputs: tuple[str, ...]
+    servo_inputs: tuple[str, ...]
+    range: tuple[float, float] | None
+    is_hinge: bool
+
+
+def recorded_joints(subject: Subject) -> list[JointSignals]:
+    """Return the joints of a robot, in the order of its coordinates, with their signals."""
+    kind: Any = subject.kind
+    run = subject.recording.runs[0]
+    units = {channel.name: channel.unit for channel in kind.channels}
+    joints = []
+    for coordinate in kind.system.coordinates:
+        name = coordinate.removeprefix("q.")
+        actuators = [a for a in kind.robot.actuators if a.joint == name]
+        recorded = [a for a in actuators if f"u.{a.name}" in run.inputs]
+        joints.append(
+            JointSignals(
+                name=name,
+                channels={q: f"{q}.{name}" for q in QUANTITIES if f"{q}.{name}" in run.channels},
+                inputs=tuple(f"u.{a.name}" for a in recorded),
+                servo_inputs=tuple(f"u.{a.name}" for a in recorded if a.kind == "position"),
+                range=getattr(kind.robot.joint(name), "range", None),
+                is_hinge=units.get(coordinate) == "rad",
+            )
+        )
+    return joints
+
+
+class HypothesisGenerator:
+    """Generator of hypotheses on the conventions of a recording.
+
+    Args:
+        subject: Recording of a robot.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        channels = list(subject.recording.runs[0].channels)
+        self.joints = [joint for joint in recorded_joints(subject) if joint.channels]
+        self._signals = {signal.name: signal for signal in subject.signals(channels)}
+
+    def generate(
+        self, recording: Recording, suspects: Sequence[JointSignals]
+    ) -> Iterator[ConventionHypothesis]:
+        """Yield hypotheses.
+
+        Args:
+            recording: Recording as read, or with some conventions corrected.
+            suspects: Joints whose own conventions are tested. Conventions of the whole log are
+                tested if at least half of the joints are suspects.
+        """
+        suspects = [joint for joint in suspects if joint.channels]
+        for joint in suspects:
+            yield from _signs(joint)
+            yield from _zeros(joint, recording)
+            for name in dict.fromkeys((*joint.channels.values(), *joint.inputs)):
+                yield from _units([self._signals[name]], recording)
+        yield from _wraps(suspects, recording)
+        yield from _orders(self.joints, recording, suspects)
+        if 2 * len(suspects) >= len(self.joints):
+            yield from self._units_of_log(recording)
+            yield from self._normalised()
+        yield from _late_commands(recording)
+
+    def _units_of_log(self, recording: Recording) -> Iterator[ConventionHypothesis]:
+        """Yield other units for all signals of a kind."""
+        positions = self._channels("q")
+        commands = [name for joint in self.joints for name in joint.servo_inputs]
+        groups = positions, commands, [*positions, *commands], self._channels("qd")
+        for names in (*groups, self._channels("tau")):
+            signals = [self._signals[name] for name in names]
+            if len({(s.si, s.stated, s.gain) for s in signals}) == 1:
+                yield from _units(signals, recording)
+
+    def _channels(self, quantity: str) -> list[str]:
+        return [joint.channels[quantity] for joint in self.joints if quantity in joint.channels]
+
+    def _normalised(self) -> Iterator[ConventionHypothesis]:
+        """Yield positions and commands that are normalised to the range of each joint."""
+        limited = [joint for joint in self.joints if joint.range and "q" in joint.channels]
+        if not limited:
+            return
+        for low in (-NORMALISED_RANGE, 0.0):
+            changes: dict[str, SignalChange] = {}
+            for joint in limited:
+                assert joint.range is not None
+                scale = range_scale(*joint.range, from_zero=low == 0.0)
+                for name in (joint.channels["q"], *joint.servo_inputs):
+                    gain = scale.gain / self._signals[name].gain
+                    changes[name] = SignalChange(name, gain, scale.offset)
+            yield ConventionHypothesis(
+                f"positions and commands look normalised to {low:g} to {NORMALISED_RANGE:g} over "
+                "the range of each joint",
+                changes,
+            )
+
+
+def _signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
+    """Yield reversed signs: of position, command, both, velocity alone, torque alone."""
+    positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
+    groups = [positions, list(joint.inputs)]
+    if len(joint.channels) > 1:
+        groups += [[joint.channels[q]] for q in ("qd", "tau") if q in joint.channels]
+    for names in groups:
+        if names:
+            text = f"the sign of {listed(names, MAX_NAMED)} looks reversed"
+            yield ConventionHypothesis(text, {name: SignalChange(name, -1.0) for name in names})
+    if positions and joint.inputs:
+        names = [*joint.channels.values(), *joint.inputs]
+        text = f"the axis of joint {joint.name} looks reversed, command and position"
+        yield ConventionHypothesis(text, {name: SignalChange(name, -1.0) for name in names})
+
+
+def _zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypothesis]:
+    """Yield other zero positions: of the encoder, and of encoder and command."""
+    position = joint.channels.get("q")
+    if position is None or not joint.is_hinge:
+        return
+    offsets = ANGLES.tolist()
+    if joint.servo_inputs:
+        command = joint.servo_inputs[0]
+        runs = recording.training()
+        differences = [run.inputs[command] - run.channels[position] for run in runs]
+        offsets = [float(np.mean([np.nanmean(values) for values in differences]))]
+        text = f"joint {joint.name} looks counted from another zero, command and position"
+        for offset in ANGLES.tolist():
+            names = (position, *joint.servo_inputs)
+            changes = {name: SignalChange(name, 1.0, offset) for name in names}
+            yield ConventionHypothesis(text, changes, has_free_offset=True)
+    text = f"position {position} looks counted from another zero"
+    for offset in offsets:
+        if abs(offset) > MIN_OFFSET:
+            changes = {position: SignalChange(position, 1.0, offset)}
+            yield ConventionHypothesis(text, changes, has_free_offset=True)
+
+
+def _wraps(joints: Sequence[JointSignals], recording: Recording) -> Iterator[ConventionHypothesis]:
+    """Yield positions from which whole turns are missing."""
+    for joint in joints:
+        name = joint.channels.get("q")
+        if name is None or not joint.is_hinge:
+            continue
+        jumps = [_largest_jump(run.channels[name]) for run in recording.training()]
+        if max(jumps) > WRAP_JUMP:
+            command = joint.servo_inputs[0] if joint.servo_inputs else ""
+            text = f"position {name} looks wrapped: whole turns are left out"
+            yield ConventionHypothesis(
+                text, {name: SignalChange(name, unwrap=True, command=command)}
+            )
+
+
+def _largest_jump(values: Array) -> float:
+    """Return the largest difference of successive samples; missing samples are skipped."""
+    return float(np.abs(np.diff(values[np.isfinite(values)])).max(initial=0.0))
+
+
+def _orders(
+    joints: Sequence[JointSignals], recording: Recording, suspects: Sequence[JointSignals]
+) -> Iterator[ConventionHypothesis]:
+    """Yield other orders of the joints: of channels, of commands, and of both.
+
+    Pairs of suspects are exchanged. Whole orders are the alphabetical one, the reversed one, and
+    the one in which positions follow commands best.
+    """
+    numbers = range(len(joints))
+    has_commands = all(len(joint.inputs) == 1 for joint in joints)
+    quantities = [q for q in QUANTITIES if all(q in joint.channels for joint in joints)]
+    places = [i for i in numbers if joints[i] in suspects]
+    orders = [{a: b, b: a} for a, b in combinations(places, 2)]
+    alphabetical = sorted(numbers, key=lambda i: joints[i].name)
+    orders += [
+        {i: alphabetical.index(i) for i in numbers},
+        dict(enumerate(alphabetical)),
+        {i: len(joints) - 1 - i for i in numbers},
+    ]
+    if has_commands and "q" in quantities:
+        orders.append(_order_of_commands(joints, recording))
+    for order in orders:
+        moved = {a: b for a, b in order.items() if a != b}
+        if not moved:
+            continue
+        names = listed([joints[a].name for a in sorted(moved)], MAX_NAMED)
+        channels = {
+            joints[a].channels[q]: SignalChange(joints[b].channels[q])
+            for a, b in moved.items()
+            for q in quantities
+        }
+        if channels:
+            yield ConventionHypothesis(f"the channels of {names} look exchanged", channels)
+        if not has_commands:
+            continue
+        commands = {
+            joints[a].inputs[0]: SignalChange(joints[b].inputs[0]) for a, b in moved.items()
+        }
+        yield ConventionHypothesis(f"the commands of {names} look exchanged", commands)
+        if channels:
+            text = f"the channels and commands of {names} look exchanged"
+            yield ConventionHypothesis(text, {**channels, **commands})
+
+
+def _order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> dict[int, int]:
+    """Return the order of positions that follows the commands best, by linear assignment."""
+    count = len(joints)
+    costs = np.zeros((count, count))
+    for run in recording.training():
+        for a, b in np.ndindex(count, count):
+            difference = run.channels[joints[b].channels["q"]] - run.inputs[joints[a].inputs[0]]
+            costs[a, b] += float(np.nanvar(difference))
+    return dict(enumerate(least_order(costs)))
+
+
+def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[ConventionHypothesis]:
+    """Yield other units of signals that share one, and encoder ticks if all values are integers."""
+    first = signals[0]
+    names = [signal.name for signal in signals]
+    text = listed(names, MAX_NAMED)
+    for unit, gain in UNITS.get(first.si, {}).items():
+        scale = first.scale * gain / first.gain
+        if not math.isclose(scale, 1.0, rel_tol=1e-6):
+            words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.stated))
+            yield ConventionHypothesis(
+                f"the numbers of {text} look like {words}, stated as {stated}",
+                {name: SignalChange(name, scale) for name in names},
+                unit=unit,
+            )
+    if first.si != "rad" or not _are_whole(signals, recording):
+        return
+    for ticks in TICKS_PER_TURN:
+        scale = 2.0 * math.pi / ticks / first.gain
+        for zero in (0.0, math.pi):
+            yield ConventionHypothesis(
+                f"the numbers of {text} look like ticks, {ticks:g} a turn",
+                {name: SignalChange(name, scale, -zero) for name in names},
+            )
+
+
+def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
+    """Return whether all values of these columns are integers."""
+    for run in recording.training():
+        recorded = {**run.inputs, **run.channels}
+        for signal in signals:
+            numbers = recorded[signal.name] / signal.gain
+            numbers = numbers[np.isfinite(numbers)]
+            if not np.allclose(numbers, np.rint(numbers), rtol=0.0, atol=1e-6):
+                return False
+    return True
+
+
+def _late_commands(recording: Recording) -> Iterator[ConventionHypothesis]:
+    """Yield delays of command time stamps: the robot responds before them."""
+    run = recording.runs[0]
+    if not run.inputs or run.times.size < 2:
+        return
+    interval = float(np.median(np.diff(run.times)))
+    for count in LATE_SAMPLES:
+        late = count * interval
+        text = f"commands look stamped {late:.4g} s late: the robot answers before them"
+        yield ConventionHypothesis(text, late=late)

@@ -1,0 +1,166 @@
+"""Description of a recording with corrected conventions: the keys to change, and a file."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.diagnosis.conventions.convention_comparison import ConventionDifference
+from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis, SignalChange
+from sims.core.simulator import InputError
+from sims.core.toml_validation import toml_key, toml_text
+from sims.recording.recording_description import DeclaredSignals, dotted, read_meta
+from sims.recording.recording_writer import write_files
+from sims.recording.unit_conversion import compute_unit_scale
+
+KINDS = ("channels", "inputs")
+"""Tables of the description that contain signals."""
+SHOWN = ("column", "unit", "scale", "offset", "unwrap")
+"""Keys of a signal that a correction changes, in the order in which they are shown."""
+
+
+def corrected(
+    meta: Mapping[str, Any], declared: DeclaredSignals, differences: Sequence[ConventionDifference]
+) -> dict[str, Any]:
+    """Return the content of a description with conventions corrected one after another.
+
+    Args:
+        meta: Content of the description.
+        declared: Simulator of the robot, with the units of its signals.
+        differences: Differences to correct, in this order.
+    """
+    result = copy.deepcopy(dict(meta))
+    units = {
+        "channels": {c.name: c.unit for c in declared.channels},
+        "inputs": {c.name: c.unit for c in declared.inputs},
+    }
+    for kind in KINDS:
+        result[kind] = dotted(result.get(kind, {}), units[kind])
+    for one in differences:
+        hypothesis = one.hypothesis
+        for kind in KINDS:
+            before = copy.deepcopy(result[kind])
+            for name, change in hypothesis.changes.items():
+                if name in before:
+                    own = _moved(before[change.source], name, change)
+                    result[kind][name] = _changed(own, units[kind][name], change, hypothesis)
+        if hypothesis.late:
+            time = dict(result.get("time", {}))
+            time["offset"] = _rounded(float(time.get("offset", 0.0)) - hypothesis.late)
+            result["time"] = time
+    return result
+
+
+def _moved(table: Mapping[str, Any], name: str, change: SignalChange) -> dict[str, Any]:
+    """Return the table of a signal whose values are in the column of another signal."""
+    own = dict(table)
+    if change.source != name:
+        own.setdefault("column", change.source)
+        if own["column"] == name:
+            del own["column"]
+    return own
+
+
+def _changed(
+    table: dict[str, Any], si: str, change: SignalChange, hypothesis: ConventionHypothesis
+) -> dict[str, Any]:
+    """Return the table of a signal with another unit, scale or offset.
+
+    With the gain g of the specified unit, recorded values r are g (k r + b) in SI units. The change
+    converts them to c (g (k r + b)) + d, with d in SI units.
+    """
+    gain = compute_unit_scale(table["unit"], si).gain
+    factor, offset = change.scale, change.offset
+    if hypothesis.unit is not None:
+        table["unit"] = hypothesis.unit
+        return table
+    k, b = float(table.get("scale", 1.0)), float(table.get("offset", 0.0))
+    if factor != 1.0:
+        table["scale"] = _rounded(factor * k)
+    if offset or b:
+        table["offset"] = _rounded(factor * b + offset / gain)
+    if change.unwrap:
+        table["unwrap"] = change.command or True
+    return table
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.9g}")
+
+
+def lines_of(
+    meta: Mapping[str, Any], declared: DeclaredSignals, differences: Sequence[ConventionDifference]
+) -> Iterator[str]:
+    """Yield the tables of the signals that a correction changes, one line each.
+
+    Args:
+        meta: Content of the description.
+        declared: Simulator of the robot, with the units of its signals.
+        differences: Differences to correct.
+    """
+    after, before = corrected(meta, declared, differences), corrected(meta, declared, ())
+    for kind in KINDS:
+        names = [
+            name for one in differences for name in one.hypothesis.changes if name in after[kind]
+        ]
+        for name in dict.fromkeys(names):
+            table = after[kind][name]
+            was = before[kind][name]
+            own = [key for key in SHOWN if key in table and table[key] != was.get(key)]
+            keys = [f"{key} = {_shown(table[key])}" for key in own]
+            yield f"[{kind}.{toml_key(name)}] {', '.join(keys)}"
+    if any(one.hypothesis.late for one in differences):
+        yield f"[time] offset = {after['time']['offset']:.9g}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return toml_text(value) if isinstance(value, str) else f"{value:.9g}"
+
+
+def write_corrected(
+    recording: Path,
+    declared: DeclaredSignals,
+    differences: Sequence[ConventionDifference],
+    path: Path,
+) -> list[Path]:
+    """Write the corrected description to a new file.
+
+    If the recording has a table with the name of its description, a copy of it is written next to
+    the new description, with the new name.
+
+    Args:
+        recording: Table or description of the recording.
+        declared: Simulator of the robot.
+        differences: Differences to correct.
+        path: ``NAME.toml``, a new file.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        InputError: A file exists already, or the path does not end in ``.toml``.
+    """
+    import tomli_w
+
+    if path.suffix != ".toml":
+        raise InputError(f"{path}: expected NAME.toml for the corrected description")
+    description, meta = read_meta(recording)
+    content = corrected(meta, declared, differences)
+    if "model" in content:
+        model = (description.parent / content["model"]).resolve()
+        content["model"] = os.path.relpath(model, path.parent.resolve())
+    contents: dict[Path, str | bytes] = {path: tomli_w.dumps(content)}
+    table = description.with_suffix(".csv")
+    if table.exists():
+        contents[path.with_suffix(".csv")] = table.read_bytes()
+    elif path.parent.resolve() != description.parent.resolve():
+        where = f"expected a file in {description.parent}, where the log's files are"
+        raise InputError(f"{path}: {where}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_files(contents)
+    return list(contents)

@@ -1,0 +1,569 @@
+"""Recognise a wrong unit or a reversed sign of recorded signals before causes are searched.
+
+A column in another unit than its description specifies is wrong by a known factor, which no effect
+of the library should explain. Each hypothesis multiplies one signal, or several with the same
+mistake, by such a factor k, or by -1; the base model is fitted again to the rescaled recording.
+With e the excess RMS residual (the RMS of the residual in units of the noise, minus one), the
+hypothesis holds if
+
+    e(k) <= REMAINING e(1),    e(k) < e(k / STEP),    e(k) < e(k STEP)                          (1)
+
+that is, if it removes most of the misfit, and if other factors do not fit as well. The remaining
+residual may have other causes, which move the best factor a little. But if a factor within 4 % of k
+leaves less than a third of it, the signal has a gain error instead: for example a gain of 6.0,
+close to the 2 pi of turns. Parameters may absorb the scale of an input; then a factor of zero,
+which switches the input off, must fit clearly worse. No hypothesis is tested unless the base model
+misses some channel by more than `GROSS` of its standard deviation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import bound_of
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import FIT_HORIZONS, BaseFit, fit_base_model, misfit_of_starts
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.identifiability import listed
+from bench.diagnosis.verdict import Cause, RecordingFault
+from sims.core.simulator import Array, InputError
+from sims.core.toml_validation import toml_key
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_description import stated_columns
+from sims.system_simulator import SystemSimulator
+
+GROSS = 0.1
+"""Minimum residual of the base model, as a share of the standard deviation of a channel, for which
+units are checked. A gain error of 5 % stays below it.
+"""
+REMAINING = 0.3
+"""Maximum share of the misfit that remains with a correct unit."""
+STEP = 1.25
+"""Factor by which a hypothesis is changed to test whether another factor fits as well."""
+NEAR = 1.04
+"""Factor by which a hypothesis is changed a little, to test whether a factor that is not a unit
+explains the data far better.
+"""
+FAR_BETTER = 1.0 / 3.0
+"""Maximum share of a hypothesis's misfit that remains with a nearby factor that rejects it."""
+FOLLOWED = 0.2
+"""Maximum residual that remains with a hypothesis, as a share of the standard deviation of a
+channel.
+"""
+EXPLAINED = 1.5
+"""Maximum RMS residual, in units of the noise, at which a hypothesis explains the data, so that no
+nearby factor is tested.
+"""
+EQUAL = 1.05
+"""Maximum ratio of two misfits that count as equal."""
+SHARP = 7.0
+"""Minimum gain in twice the log-likelihood of a factor over others near it."""
+OFF = 1e-6
+"""Factor that switches an input off."""
+WORSE = 3.0
+"""Minimum ratio of the misfit without an input to the misfit with it."""
+TRIED = 2
+"""Number of hypotheses that are fitted after each of two screenings: by the beginning of the runs,
+and by the whole runs.
+"""
+SCREENED = 12
+"""Number of hypotheses that are simulated over whole runs: those that fit the beginning of the runs
+best.
+"""
+WORST = 3
+"""Number of channels of a robot with the largest misfit whose joints are checked."""
+CLOSE = 0.02
+"""Maximum relative difference between a fitted gain and a unit conversion that are taken as equal.
+"""
+IGNORED = 0.2
+"""Maximum magnitude of a fitted sensor gain at which the reading hardly depends on the simulation;
+it is the lower bound of the gain's range.
+"""
+
+BEGINNING = FIT_HORIZONS[0].share
+"""First fraction of each run, by which hypotheses are screened."""
+_NAMED = 4
+"""Maximum number of signals that a sentence names."""
+_BEYOND = "parameter {} lies beyond the bounds of its range"
+"""Alternative explanation for a recording whose base fit ends at a bound."""
+_DEGREE = math.pi / 180.0
+_GRAVITY = 9.80665
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "rad": {"rad": 1.0, "deg": _DEGREE, "mrad": 1e-3, "turn": 2.0 * math.pi},
+    "rad/s": {
+        "rad/s": 1.0,
+        "deg/s": _DEGREE,
+        "rpm": math.pi / 30.0,
+        "turn/s": 2.0 * math.pi,
+    },
+    "rad/s^2": {"rad/s^2": 1.0, "deg/s^2": _DEGREE},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "m/s^2": {"m/s^2": 1.0, "g_0": _GRAVITY, "mm/s^2": 1e-3},
+    "N": {"N": 1.0, "kgf": _GRAVITY, "mN": 1e-3, "kN": 1e3},
+    "N*m": {"N*m": 1.0, "kgf*m": _GRAVITY, "N*cm": 1e-2, "mN*m": 1e-3, "kN*m": 1e3},
+    "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
+    "A": {"A": 1.0, "mA": 1e-3, "kA": 1e3},
+}
+"""Factors to the SI unit, by SI unit and by unit in which signals are often recorded."""
+_TOGETHER = (
+    {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"},
+    {"rad": "turn", "rad/s": "turn/s"},
+    {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2"},
+    {"m": "cm", "m/s": "cm/s"},
+)
+"""Sets of units that all signals of a log may share, by SI unit."""
+UNITS_IN_WORDS = {
+    "deg": "degrees",
+    "deg/s": "degrees per second",
+    "rad": "radians",
+    "rad/s": "radians per second",
+    "mrad": "milliradians",
+    "turn": "turns",
+    "turn/s": "turns per second",
+    "rpm": "revolutions per minute",
+    "m": "metres",
+    "mm": "millimetres",
+    "cm": "centimetres",
+    "g_0": "multiples of standard gravity",
+}
+"""Names of units in words."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Recorded channel or input.
+
+    Attributes:
+        name: Name of the column.
+        kind: Table of the signal in the description, ``render_channels`` or ``inputs``.
+        si: SI unit that the simulator uses.
+        stated: Unit that the description specifies.
+        gain: Factor from the values of the column to SI units.
+        scale: Part of `gain` that the description specifies as a separate factor.
+    """
+
+    name: str
+    kind: str
+    si: str
+    stated: str
+    gain: float
+    scale: float = 1.0
+
+    @property
+    def said(self) -> str:
+        """Signal in words, such as ``channel q``."""
+        return f"{self.kind.removesuffix('s')} {self.name}"
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Hypothesis that the values of signals have another unit or sign than specified.
+
+    Attributes:
+        signals: Signals that are concerned.
+        units: Actual units of their values; the specified units if only a factor is wrong.
+        scale: Factor of all signals, in addition to that of the units.
+    """
+
+    signals: tuple[Signal, ...]
+    units: tuple[str, ...]
+    scale: float = 1.0
+
+    def factors(self) -> dict[str, float]:
+        """Return the factors by which the SI values have to be multiplied, by signal."""
+        pairs = zip(self.signals, self.units, strict=True)
+        return {s.name: self.scale * _gain(s, unit) / s.gain for s, unit in pairs}
+
+    def fault(self, file: str, before: float | None, after: float | None) -> RecordingFault:
+        """Describe the hypothesis as a fault of the recording, with the lines to change.
+
+        Args:
+            file: Name of the description file.
+            before: RMS residual of the base model in units of the noise; None if not measured.
+            after: RMS residual with the correction; None if not measured.
+        """
+        factors = self.factors()
+        lines = []
+        for signal, unit in zip(self.signals, self.units, strict=True):
+            keys = [f'unit = "{unit}"'] * (unit != signal.stated)
+            keys += [f"scale = {self._scale(signal):.9g}"] * (self._scale(signal) != 1.0)
+            lines.append(f"[{signal.kind}.{toml_key(signal.name)}] {', '.join(keys)}")
+        return RecordingFault(
+            tuple(signal.name for signal in self.signals),
+            factors[self.signals[0].name],
+            self.units[0] if self.units[0] != self.signals[0].stated else None,
+            self._says(file, factors),
+            tuple(lines),
+            before,
+            after,
+        )
+
+    def _scale(self, signal: Signal) -> float:
+        """Return the key `scale` of a signal's table, including a factor already specified."""
+        return self.scale * signal.scale
+
+    def _says(self, file: str, factors: Mapping[str, float]) -> str:
+        first, unit = self.signals[0], self.units[0]
+        names = listed([signal.said for signal in self.signals], _NAMED)
+        table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
+        scale = f"set scale = {self._scale(first):.9g} in {table} of {file}"
+        if unit == first.stated and self.scale == -1.0:
+            return f"The sign of {names} looks reversed: {scale}"
+        if unit == first.stated:
+            return f"The recorded numbers of {names} look converted twice: {scale}"
+        turned = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
+        words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.stated))
+        wanted = dict.fromkeys(f'unit = "{one}"' for one in self.units)
+        return (
+            f"The recorded numbers of {names} look like {words}, stated as {stated} "
+            f"(factor {abs(factors[first.name]):.4g}): set {' and '.join(wanted)} in {table} of "
+            f"{file}{turned}"
+        )
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Input of the unit check.
+
+    Attributes:
+        kind: Simulator class.
+        recording: Whole recording, in the units that its description specifies.
+        engine: Name of the engine; None for the simulator's own.
+        free: Constants that are estimated with the parameters.
+    """
+
+    kind: type[SystemSimulator]
+    recording: Recording
+    engine: str | None
+    free: tuple[str, ...] = ()
+
+    @property
+    def file(self) -> str:
+        """Name of the description file."""
+        return self.recording.path.with_suffix(".toml").name
+
+    def signals(self, channels: Sequence[str]) -> tuple[Signal, ...]:
+        """Return the recorded signals with the units that the description specifies."""
+        try:
+            stated = stated_columns(self.recording.path, self.kind)
+        except InputError:
+            # A recording made in memory has no description and is in SI units.
+            stated = {}
+        inputs = [c for c in self.kind.inputs if c.name in self.recording.runs[0].inputs]
+        own = [c for c in self.kind.channels if c.name in channels]
+        found = []
+        for kind, declared in (("channels", own), ("inputs", inputs)):
+            for c in declared:
+                found.append(Signal(c.name, kind, c.unit, *stated.get(c.name, (c.unit, 1.0, 1.0))))
+        return tuple(found)
+
+    def rescaled(self, factors: Mapping[str, float]) -> Recording:
+        """Return the recording with signals multiplied by factors."""
+        recording = self.recording
+        noise = {n: abs(factors.get(n, 1.0)) * s for n, s in recording.noise.items()}
+        runs = tuple(_rescaled(run, factors) for run in recording.runs)
+        return replace(recording, noise=noise, runs=runs)
+
+    def world(self, recording: Recording) -> RunEvaluator:
+        """Return a run evaluator of a recording's runs for fitting, without any effects."""
+        return RunEvaluator(
+            self.kind, recording, recording.training(), self.engine, (), self.free, candidates=()
+        )
+
+
+def wrong_units(
+    subject: Subject, world: RunEvaluator, noise: NoiseModel, base: BaseFit
+) -> RecordingFault | None:
+    """Find the wrong unit or sign that explains nearly all of the misfit of the base model.
+
+    Args:
+        subject: Recording and simulator to check.
+        world: Run evaluator of the runs for fitting.
+        noise: Noise of each channel.
+        base: Fitted base model.
+
+    Returns:
+        The fault; None if there is none, or no channel has a gross misfit.
+    """
+    seen = np.isfinite(world.observed)
+    residual = np.where(seen, world.observed - base.fit.simulated, 0.0)
+    shares = _shares(world, residual, noise)
+    if not (shares > GROSS).any():
+        return None
+    before = _rms(residual, seen, noise)
+    known = before if np.isfinite(before) else None
+    signals = subject.signals(world.channels)
+    asked = list(_hypotheses(signals, _suspects(world, shares)))
+    excess = REMAINING * (before - 1.0)
+    good: list[tuple[Hypothesis, float]] = []
+    others: list[str] = []
+    for one in _promising(subject, asked):
+        after, missed = _fitted(subject, one.factors())
+        if after - 1.0 > excess or missed > FOLLOWED:
+            continue
+        how = _distinction(subject, one, after, int(seen.sum()))
+        if how == "sharp":
+            good.append((one, after))
+        elif how == "absorbed":
+            good.append((one, after))
+            others += [_BEYOND.format(name) for name in _ends(world, base.fit)]
+    if not good:
+        return None
+    # Among hypotheses that fit equally well, the simplest is preferred.
+    least = min(after for _, after in good)
+    alike = [pair for pair in good if pair[1] <= EQUAL * least]
+    alike.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
+    (best, after), *others_alike = alike
+    # Hypotheses that differ only in the sign are not alternatives.
+    same = best.signals, best.units
+    rest = [pair for pair in others_alike if (pair[0].signals, pair[0].units) != same]
+    others = [*(one.fault(subject.file, None, None).says for one, _ in rest), *others]
+    alternatives = tuple(dict.fromkeys(others))
+    return replace(best.fault(subject.file, known, after), alternatives=alternatives)
+
+
+def recognised(
+    subject: Subject, world: RunEvaluator, cause: Cause, base: TrajectoryFit
+) -> RecordingFault | None:
+    """Find the wrong unit or sign that a fitted gain of a sensor or an input imitates.
+
+    A gain that makes a reading nearly independent of the simulation is reported as a fault too.
+
+    Args:
+        subject: Recording and simulator to check.
+        world: Run evaluator of the runs for fitting.
+        cause: Diagnosed cause.
+        base: Fit of the base model; the gain may compensate for a parameter at a bound.
+
+    Returns:
+        The fault; None if the cause is not such a gain.
+    """
+    effect = cause.effect.partition("@")[0]
+    if effect not in ("sensor.gain", "input.gain") or len(cause.coefficients) != 1:
+        return None
+    (coefficient,) = cause.coefficients.values()
+    gain = 1.0 + coefficient.value
+    named = world.available_effects[cause.effect].signal
+    kind = "channels" if effect == "sensor.gain" else "inputs"
+    own = [s for s in subject.signals(world.channels) if s.kind == kind]
+    usual = world.simulator.system.reading(world.channels) if kind == "channels" else ""
+    signal = next((s for s in own if s.name == (named or usual)), own[0] if own else None)
+    if signal is None or not gain:
+        return None
+    # A sensor gain multiplies the true value, an input gain the commanded value.
+    factor = 1.0 / gain if kind == "channels" else gain
+    for one in _of_one((signal,)):
+        wanted = one.factors()[signal.name]
+        if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
+            others = tuple(_BEYOND.format(name) for name in _ends(world, base))
+            return replace(one.fault(subject.file, None, None), alternatives=others)
+    if kind == "channels" and abs(gain) <= IGNORED:
+        says = (
+            f"The fit makes {signal.said} nearly independent of the simulation (a sensor gain of "
+            f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "
+            f"sign of {signal.said} in {subject.file}"
+        )
+        others = tuple(_BEYOND.format(name) for name in _ends(world, base))
+        return RecordingFault((signal.name,), factor, None, says, (), None, None, others)
+    return None
+
+
+def _gain(signal: Signal, unit: str) -> float:
+    if unit == signal.stated:
+        return signal.gain
+    return signal.scale * UNITS[signal.si][unit]
+
+
+def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
+    def scaled(signals: Mapping[str, Array]) -> dict[str, Array]:
+        return {n: v * factors[n] if n in factors else v for n, v in signals.items()}
+
+    before = {
+        n: np.stack([v[0], v[1] * factors[n]]) if n in factors else v for n, v in run.before.items()
+    }
+    return replace(run, channels=scaled(run.channels), inputs=scaled(run.inputs), before=before)
+
+
+def _ends(world: RunEvaluator, fit: TrajectoryFit) -> list[str]:
+    """List the parameters that the base fit leaves at a bound."""
+    found = []
+    for place in fit.free.tolist():
+        parameter = world.parameters[place]
+        if bound_of(float(fit.theta[place]), *parameter.bounds) is not None:
+            found.append(parameter.name)
+    return found
+
+
+def _shares(world: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
+    """Compute the RMS residual beyond the noise, as a share of each channel's deviation (C,).
+
+    It is 0 for a channel that does not move beyond its noise.
+    """
+    shares = []
+    for c, sigma in enumerate(noise.sigma.tolist()):
+        there = np.isfinite(world.observed[..., c])
+        moved = float(np.std(world.observed[..., c][there])) if there.any() else 0.0
+        # A failed simulation counts as an infinite residual.
+        left = float(np.mean(np.nan_to_num(residual[..., c][there], nan=np.inf) ** 2))
+        beyond = max(left - sigma**2, 0.0) ** 0.5
+        shares.append(beyond / moved if moved > 3.0 * sigma else 0.0)
+    return np.array(shares)
+
+
+def _rms(residual: Array, seen: Any, noise: NoiseModel) -> float:
+    scaled = (residual / noise.sigma)[seen]
+    rms = float(np.sqrt(np.mean(np.square(scaled)))) if scaled.size else 0.0
+    return rms if np.isfinite(rms) else np.inf
+
+
+def _suspects(world: RunEvaluator, shares: Array) -> frozenset[str] | None:
+    """Return the joints and actuators of a robot to check; None for other systems: check all."""
+    if not world.kind.has_model:
+        return None
+    worst = np.argsort(-shares)[:WORST].tolist()
+    joints = {world.channels[c].partition(".")[2] for c in worst}
+    robot: Any = world.kind
+    drives = {a.name for a in robot.robot.actuators if a.joint in joints}
+    return frozenset(joints | drives)
+
+
+def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
+    """Yield all hypotheses.
+
+    They concern single signals, all signals with one unit, logs in one system of units, and joints
+    whose direction is reversed.
+    """
+    for signal in signals:
+        if suspects is None or signal.name.partition(".")[2] in suspects:
+            yield from _of_one((signal,))
+    by_unit: dict[tuple[str, str, str], list[Signal]] = {}
+    for signal in signals:
+        by_unit.setdefault((signal.kind, signal.si, signal.stated), []).append(signal)
+    for alike in by_unit.values():
+        if len(alike) > 1:
+            yield from _of_one(tuple(alike))
+    for units in _TOGETHER:
+        either = [s for s in signals if s.si in units]
+        for wanted in (units, {si: si for si in units}):
+            those = tuple(s for s in either if s.stated != wanted[s.si])
+            if len({s.si for s in those}) > 1:
+                yield Hypothesis(those, tuple(wanted[s.si] for s in those))
+        if len({s.si for s in either}) > 1:
+            si = either[0].si
+            stated = tuple(s.stated for s in either)
+            yield Hypothesis(tuple(either), stated, 1.0 / UNITS[si][units[si]])
+    yield from _reversed(signals, suspects)
+
+
+def _of_one(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
+    """Yield the hypotheses of signals that share a unit."""
+    first = signals[0]
+    own = (first.stated,) * len(signals)
+    yield Hypothesis(signals, own, -1.0)
+    units = UNITS.get(first.si, {})
+    stated = abs(first.gain / first.scale)
+    reached = {1.0}
+    for unit, gain in units.items():
+        if unit != first.stated and not math.isclose(gain, stated, rel_tol=1e-6):
+            yield Hypothesis(signals, (unit,) * len(signals))
+            yield Hypothesis(signals, (unit,) * len(signals), -1.0)
+            reached.add(gain / stated)
+    # These factors undo a conversion that was made twice.
+    for factor in [*(1.0 / gain for gain in units.values()), *([1e3, 1e-3] if not units else [])]:
+        if not any(math.isclose(factor, known, rel_tol=CLOSE) for known in reached):
+            yield Hypothesis(signals, own, factor)
+            yield Hypothesis(signals, own, -factor)
+
+
+def _reversed(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
+    """Yield hypotheses of joints with reversed direction: all their channels change sign."""
+    joints: dict[str, list[Signal]] = {}
+    for signal in signals:
+        quantity, _, joint = signal.name.partition(".")
+        if signal.kind == "channels" and quantity in ("q", "qd", "tau"):
+            joints.setdefault(joint, []).append(signal)
+    for joint, own in joints.items():
+        if len(own) > 1 and (suspects is None or joint in suspects):
+            yield Hypothesis(tuple(own), tuple(s.stated for s in own), -1.0)
+
+
+def _promising(subject: Subject, asked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Select the hypotheses that fit best from the starts of the base fit.
+
+    They are screened by the beginning of the runs, where wrong parameters matter least, and then by
+    the whole runs.
+    """
+
+    def best(those: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
+        scores = []
+        for one in those:
+            world, noise = _world(subject, one.factors())
+            scores.append(misfit_of_starts(world, noise, share))
+            world.close()
+        return [those[i] for i in np.argsort(scores, kind="stable").tolist()]
+
+    first = best(asked, BEGINNING)[:SCREENED]
+    return list(dict.fromkeys([*first[:TRIED], *best(first, 1.0)[:TRIED]]))
+
+
+def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[RunEvaluator, NoiseModel]:
+    recording = subject.rescaled(factors)
+    world = subject.world(recording)
+    sigma = compute_noise_floor(world, recording).sigma
+    return world, NoiseModel(sigma, np.zeros(len(sigma)))
+
+
+def _fitted(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
+    """Fit the base model to the rescaled recording.
+
+    Returns:
+        RMS residual in units of the noise, and the largest share of a channel's deviation.
+    """
+    world, noise = _world(subject, factors)
+    fit = fit_base_model(world, noise).fit
+    seen = np.isfinite(world.observed)
+    residual = np.where(seen, world.observed - fit.simulated, 0.0)
+    world.close()
+    return _rms(residual, seen, noise), float(_shares(world, residual, noise).max())
+
+
+def _distinction(
+    subject: Subject, one: Hypothesis, after: float, samples: int
+) -> Literal["sharp", "absorbed", "none"]:
+    """Test whether a hypothesis is distinct from nearby factors, the second half of (1).
+
+    Args:
+        subject: Recording and simulator to check.
+        one: Hypothesis to test.
+        after: RMS residual with the hypothesis, in units of the noise.
+        samples: Number of samples.
+
+    Returns:
+        ``sharp`` if no nearby factor fits as well; ``has_absorbed_gap`` if parameters absorb the
+        scale of an input, but its unit can be recognised; ``none`` otherwise.
+    """
+
+    def left(step: float) -> float:
+        return _fitted(subject, {name: step * k for name, k in one.factors().items()})[0]
+
+    if one.scale == -1.0 and one.units == tuple(s.stated for s in one.signals):
+        return "sharp"
+    if after > EXPLAINED:
+        near = min(left(1.0 / NEAR), left(NEAR))
+        if near - 1.0 < FAR_BETTER * (after - 1.0):
+            return "none"
+    near = min(left(1.0 / STEP), left(STEP))
+    if 2.0 * samples * math.log(near / after) > SHARP:
+        return "sharp"
+    # A factor that is not a unit cannot be recognised for an input of arbitrary scale.
+    is_unit = one.scale == 1.0 and all(signal.kind == "inputs" for signal in one.signals)
+    absorbed = is_unit and near * EQUAL > after and left(OFF) > WORSE * after
+    return "absorbed" if absorbed else "none"

@@ -1,0 +1,162 @@
+"""Build and write the data sheet of a joint or actuator (`simgap datasheet`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+from bench.diagnosis.datasheet.detection_limits import compute_detection_limits
+from bench.diagnosis.datasheet.drive_figure import render_diagram, render_pdf
+from bench.diagnosis.datasheet.html_sheet import render_page
+from bench.diagnosis.datasheet.mjcf_class import build_mjcf
+from bench.diagnosis.datasheet.sheet_content import SheetContent
+from bench.diagnosis.datasheet.sheet_rows import build_sheet_rows
+from bench.diagnosis.datasheet.subject import SheetSubject, make_subject
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.verdict import Verdict
+from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.segmentation import segment_recording
+from sims import effects as library
+from sims.core.argument_checks import check_arguments
+from sims.core.atomic_files import Content, write_all_atomically
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.system import ALL_PLACES, Effect
+from sims.extended_simulator import ExtendedSimulator
+from sims.recording.recording import Recording
+
+TRANSMISSION = frozenset({"joint.backlash", "joint.coupling", "joint.flexibility"})
+"""Effects between a drive and its joint."""
+
+
+class DataSheet(SheetContent):
+    """Data sheet of a joint or actuator that can be written to a folder."""
+
+    @check_arguments
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write sheet.toml, .html and .pdf, class.xml and models that use it: all or none.
+
+        A missing folder is created.
+
+        Args:
+            folder: Folder to write to.
+
+        Returns:
+            The files that were written.
+
+        Raises:
+            InputError: The folder cannot be created or written to.
+        """
+        import tomli_w
+
+        folder = Path(folder)
+        made = build_mjcf(self, folder)
+        drawn = render_diagram(self.diagram) if self.diagram is not None else None
+        contents: dict[Path, Content] = {
+            folder / "sheet.toml": tomli_w.dumps(self.document()),
+            folder / "sheet.html": render_page(self, drawn, made),
+            folder / "sheet.pdf": render_pdf(self),
+            **{folder / name: text for name, text in made.contents.items()},
+        }
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_all_atomically(contents)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+        return list(contents)
+
+
+def build_datasheet(
+    recording: Recording,
+    extended: ExtendedSimulator,
+    verdict: Verdict,
+    joint: str | None = None,
+    name: str | None = None,
+) -> DataSheet:
+    """Build the data sheet of a joint or actuator.
+
+    Args:
+        recording: Logs that were explained.
+        extended: Extended simulator that was identified from them; its class is known.
+        verdict: Verdict of the same diagnosis, with the evidence.
+        joint: Joint of a robot; None for the only one.
+        name: Name on the sheet; None for the name of the joint or the system.
+
+    Raises:
+        InputError: The joint does not exist, or the logs are not of this system.
+    """
+    kind = extended.kind
+    assert kind is not None
+    subject = make_subject(kind, joint)
+    for channel in extended.observe:
+        there = list(recording.runs[0].channels)
+        if channel not in there:
+            raise make_unknown_name_error(f"channel of {recording.path}", channel, there)
+    recording = replace(recording, constants={**extended.constants, **recording.constants})
+    recording, _ = leave_out_settling(recording, kind)
+    recording, _ = segment_recording(recording, kind)
+    is_driven = subject.is_driven(recording)
+    asked = tuple(
+        name
+        for name, effect in (
+            (name, library.find_effect(name, kind.system))
+            for name in list_absent_effects(subject, extended)
+        )
+        if (is_driven or not _needs_drive(name, effect)) and not _is_stop(effect)
+    )
+    candidates = [*extended.effects, *asked]
+    engine = None if kind.own_engine else extended.engine
+    world = RunEvaluator(kind, recording, recording.training(), engine, candidates=candidates)
+    with closing(world):
+        # An effect on a channel that is not recorded has no visible influence.
+        there = [
+            effect
+            for effect in asked
+            if not world.available_effects[effect].signal or _seen(world, effect)
+        ]
+        rows = build_sheet_rows(
+            subject, extended, verdict, compute_detection_limits(world, extended, there)
+        )
+    return DataSheet(
+        name or subject.joint or kind.name, subject, recording, verdict, extended, rows
+    )
+
+
+def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> Iterator[str]:
+    """List effects that can act here but are not in the model.
+
+    Simpler forms of the effects in the model are left out.
+
+    Args:
+        subject: Joint or system of the sheet.
+        extended: Extended simulator.
+    """
+    own = [
+        effect
+        for name, numbers in extended.effects.items()
+        for effect, _, number in subject.localise_effect(name, numbers)
+        if number.value != 0
+    ]
+    has = {*own, *extended.effects}
+    effects = {effect.name: effect for effect in subject.list_effects()}
+    simpler = {other for name in own for other in getattr(effects.get(name), "contains", ())}
+    for name in effects:
+        if name not in has | simpler and name.partition("@")[2] != ALL_PLACES:
+            yield name
+
+
+def _needs_drive(name: str, effect: Effect | type[Effect]) -> bool:
+    """Return whether an effect belongs to a drive or its transmission."""
+    return effect.at == "actuator" or name.partition("@")[0] in TRANSMISSION
+
+
+def _is_stop(effect: Effect | type[Effect]) -> bool:
+    """Return whether an effect is a stop, which shows by its position, not by its stiffness."""
+    return effect.coefficients[0].of == "stop"
+
+
+def _seen(world: RunEvaluator, effect: str) -> bool:
+    """Return whether the signal that an effect acts on was recorded."""
+    run = world.runs[0]
+    return world.available_effects[effect].signal in {*run.channels, *run.inputs}

@@ -1,0 +1,301 @@
+"""Detection limits: how large each absent effect would have to be for the data to reveal it.
+
+The limits are computed at a fitted model. A are the whitened derivatives by the parameters of the
+model, and d the derivatives by one more coefficient; the initial states of each run are projected
+out of both (`validation.gain_and_intervals`). The remaining information on the coefficient, after A
+is projected out too, is
+
+    power = d'd - d'A (A'A)^-1 A'd                                                              (1)
+
+Its 95 % interval extends 1.96 / sqrt(power) to both sides (E. Walter, L. Pronzato, Identification
+of Parametric Models from Experimental Data, 1997, chapter 4). With the residual e of the model, one
+Gauss-Newton step from zero would give the coefficient the value
+
+    c = (d'e - d'A (A'A)^-1 A'e) / power                                                        (2)
+
+The noise is the residual of the model with its autocorrelation (AR(1)). With a lack of fit it is
+larger than the sensor noise, and (2) may be far from zero although the effect is not a cause.
+The effect of a limit or backlash is not proportional to its size. It is detectable at the sizes at
+which it changes the runs by at least the smallest detectable amount (`diagnosis.identifiability`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.core.random_streams import make_rng
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.gauss_newton import compute_schur_complement
+from bench.diagnosis.fitting.model_set import ModelSet
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.identifiability import CONFOUNDING_CORRELATION, MIN_DETECTABLE_LIMIT_SIGMAS
+from bench.diagnosis.score_extended import build_theta
+from bench.diagnosis.search.candidate_directions import (
+    NONLINEAR_COEFFICIENT_KINDS,
+    CandidateDirection,
+    DirectionSet,
+    compute_directions,
+    compute_responses,
+)
+from bench.diagnosis.validation.gain_and_intervals import (
+    MAX_INTERVAL_WIDTH,
+    Z95,
+    compute_fisher_blocks_from_jacobian,
+    get_central_jacobian,
+    invert_scaled,
+)
+from bench.diagnosis.validation.held_out_runs import HeldOutRuns
+from bench.diagnosis.validation.run_consistency import ParameterConsistency, assess_consistency
+from sims.core.simulator import Array, InputError
+from sims.extended_simulator import ExtendedSimulator
+
+SAME_COEFFICIENT_CORRELATION = 0.999
+"""Minimum correlation for which the coefficient of an effect counts as equivalent to that of a
+simpler effect.
+"""
+
+
+GAP_HALVINGS = 5
+"""Number of times that the smallest backlash of the search is halved."""
+MIN_CONFOUNDING_SHARE = 0.1
+"""Minimum share of the largest contribution for a parameter to be reported as confounded."""
+
+
+@dataclass(frozen=True)
+class DetectionLimit:
+    """Detection limit of one coefficient.
+
+    Attributes:
+        size: Half its 95 % interval; for a limit or backlash the size at which it is detectable;
+            infinite if the data are insensitive to it.
+        estimate_if_fitted: Estimate after one Gauss-Newton step from zero, (2); zero for a limit or
+            backlash.
+        limit: ``above`` for backlash, which is detectable from that size on; ``below`` for a limit,
+            which is detectable up to it; empty for proportional effects.
+        confounded_with: Parameters of the model that are confounded with it.
+        vague: Whether it could be larger than all plausible values.
+    """
+
+    size: float
+    estimate_if_fitted: float = 0.0
+    limit: str = ""
+    confounded_with: tuple[str, ...] = ()
+    vague: bool = False
+
+    @property
+    def is_nonzero_if_fitted(self) -> bool:
+        """Return whether its estimate would differ from zero if it were fitted."""
+        return abs(self.estimate_if_fitted) > self.size
+
+
+@dataclass(frozen=True)
+class DetectionLimits:
+    """Detection limits and parameter uncertainty at a fitted model.
+
+    Attributes:
+        free: Names of the fitted parameters of the model.
+        covariance: (q, q) covariance of these parameters.
+        reaches: Detection limits of absent effects, by effect and coefficient.
+        prediction_half_widths: Half the 95 % interval of a parameter in a log, or a run, that is
+            not yet recorded, by name; only for parameters that several groups identify.
+    """
+
+    free: tuple[str, ...]
+    covariance: Array
+    reaches: Mapping[tuple[str, str], DetectionLimit]
+    prediction_half_widths: Mapping[str, float]
+
+
+def compute_detection_limits(
+    world: RunEvaluator, extended: ExtendedSimulator, names: Sequence[str]
+) -> DetectionLimits:
+    """Compute the detection limits of effects that an extended simulator does not contain.
+
+    Args:
+        world: Run evaluator of the runs, with the effects of the simulator and the absent ones.
+        extended: Extended simulator.
+        names: Absent effects.
+
+    Raises:
+        InputError: The simulation fails on the runs.
+    """
+    floor = compute_noise_floor(world, world.recording)
+    white = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
+    fit = _fitted(world, extended, white)
+    if not np.isfinite(fit.simulated[np.isfinite(world.observed)]).all():
+        raise InputError(f"{world.recording.path}: the simulation of it fails")
+    # The random stream is not used, because there is no search.
+    models = ModelSet(world, white, frozenset(), make_rng("sheet"), floor.is_stated)
+    model = models.add_fit(fit)
+    left = model.likelihood
+    # The residual of the model is taken as the noise, whatever the recording specifies.
+    noise = NoiseModel(np.maximum(left.sigma, 1e-300), left.phi)
+    found = _with_small_gaps(world, fit, compute_directions(world, fit, names))
+    about = _Shown(
+        world, noise, get_central_jacobian(models, fit), found, models.compute_residual(fit)
+    )
+    return about.shown(_another(assess_consistency(models, model)))
+
+
+def _another(found: Sequence[ParameterConsistency]) -> dict[str, float]:
+    """Return half the prediction interval of each parameter for a new log, or else a new run."""
+    by_run = {one.number: Z95 * one.prediction_sigma for one in found if one.by == "run"}
+    return by_run | {one.number: Z95 * one.prediction_sigma for one in found if one.by == "log"}
+
+
+def _with_small_gaps(world: RunEvaluator, fit: TrajectoryFit, found: DirectionSet) -> DirectionSet:
+    """Add directions with smaller backlash than a search tries, to find the detection limit."""
+    least: dict[str, CandidateDirection] = {}
+    for probe in found.candidates:
+        gap = (
+            probe.fixed
+            and world.available_effects[probe.effect].coefficients[0].of
+            not in NONLINEAR_COEFFICIENT_KINDS
+        )
+        if gap and (
+            probe.effect not in least or probe.coefficients[0] < least[probe.effect].coefficients[0]
+        ):
+            least[probe.effect] = probe
+    more = [
+        replace(p, coefficients=p.coefficients * 0.5**n)
+        for p in least.values()
+        for n in range(1, GAP_HALVINGS + 1)
+    ]
+    if not more:
+        return found
+    values = np.nan_to_num(
+        compute_responses(world, fit, [(probe.effect, probe.coefficients) for probe in more])
+    )
+    return DirectionSet(
+        (*found.candidates, *more),
+        np.concatenate([found.responses, np.moveaxis(values, 0, -1)], axis=3),
+    )
+
+
+def _fitted(world: RunEvaluator, extended: ExtendedSimulator, noise: NoiseModel) -> TrajectoryFit:
+    """Evaluate the simulator on the runs with derivatives; only initial states are fitted."""
+    theta = build_theta(world, extended)
+    (measured,) = HeldOutRuns(world, noise).fit_initial_states([theta])
+    own = [extended.parameters.get(p.name) for p in world.parameters[: world.own]]
+    # A parameter without an interval was not fitted.
+    frozen = {i for i, number in enumerate(own) if number is None or number.low is None}
+    start = FitStart(tuple(extended.effects), theta, measured.states)
+    return TrajectoryFitter(world, noise, frozenset(frozen)).fit_models([start], iterations=0)[0]
+
+
+class _Shown:
+    def __init__(
+        self,
+        world: RunEvaluator,
+        noise: NoiseModel,
+        fit: TrajectoryFit,
+        found: DirectionSet,
+        residual: Array,
+    ) -> None:
+        self.world, self.found = world, found
+        self.q = fit.free.size
+        self.places = fit.free.tolist()
+        self.free = tuple(world.parameters[i].name for i in fit.free.tolist())
+        own, states = fit.jacobian[..., : self.q], fit.jacobian[..., self.q :]
+        columns = np.concatenate([own, found.responses, residual[..., None], states], axis=3)
+        curved = compute_fisher_blocks_from_jacobian(
+            world, columns, columns.shape[3] - states.shape[3], noise
+        )
+        own_sum = curved.own.sum(axis=0)
+        self.left, _ = compute_schur_complement(own_sum, curved.cross, curved.inner)
+        inner = slice(0, self.q)
+        self.covariance = invert_scaled(own_sum[inner, inner], self.left[inner, inner])
+        beside = self.left[self.q : -1, : self.q]
+        self.along = along = beside @ self.covariance
+        raw = np.diagonal(self.left)[self.q : -1]
+        self.powers = np.maximum(raw - np.einsum("kq,kq->k", along, beside), 0.0)  # (1)
+        pull = self.left[self.q : -1, -1] - along @ self.left[: self.q, -1]
+        self.leaning = pull / np.maximum(self.powers, 1e-300)  # (2)
+
+    def shown(self, another: Mapping[str, float]) -> DetectionLimits:
+        """Compute the detection limit of each coefficient, at the shape that is detected best."""
+        shapes: dict[tuple[str, int], list[int]] = {}
+        for k in np.argsort(-self.powers, kind="stable").tolist():
+            probe = self.found.candidates[k]
+            if not probe.fixed:
+                shapes.setdefault((probe.effect, probe.place), []).append(k)
+        best = {key: places[0] for key, places in shapes.items()}
+        limits = dict.fromkeys(probe.effect for probe in self.found.candidates if probe.fixed)
+        reaches = {}
+        for (name, place), places in shapes.items():
+            # At that shape a richer law may be equivalent to a simpler one that it contains.
+            own = [k for k in places if not self._told_already(name, k, best)]
+            if name not in limits and own:
+                reaches[name, self._coefficient(name, place)] = self._proportional(own[0])
+        for name in limits:
+            reaches[name, self._coefficient(name, 0)] = self._limit(name)
+        return DetectionLimits(self.free, self.covariance, reaches, another)
+
+    def _coefficient(self, effect: str, place: int) -> str:
+        return self.world.available_effects[effect].on(self.world.simulator.system)[place].name
+
+    def _proportional(self, k: int) -> DetectionLimit:
+        power = self.powers[k]
+        size = Z95 / np.sqrt(power) if power > 0 else np.inf
+        parameter = self.world.parameters[self._place(self.found.candidates[k])]
+        low, high = parameter.bounds
+        # The interval exceeds all plausible values, so the data say nothing about the coefficient.
+        if 2.0 * size > MAX_INTERVAL_WIDTH * (high - low):
+            return DetectionLimit(float(size), confounded_with=self._mixed(k), vague=True)
+        return DetectionLimit(float(size), float(self.leaning[k]), confounded_with=self._mixed(k))
+
+    def _place(self, probe: CandidateDirection) -> int:
+        return self.world.get_coefficient_indices(probe.effect)[probe.place]
+
+    def _mixed(self, k: int) -> tuple[str, ...]:
+        """Return the parameters of the model that together have nearly the same influence."""
+        i = self.q + k
+        if self.powers[k] > (1.0 - CONFOUNDING_CORRELATION**2) * self.left[i, i]:
+            return ()
+        # Contributions are relative to the largest one.
+        parts = np.abs(self.along[k]) * np.sqrt(np.diagonal(self.left)[: self.q])
+        parts /= max(float(parts.max(initial=0.0)), 1e-300)
+        order = np.argsort(-parts).tolist()
+        return tuple(self.free[j] for j in order if parts[j] > MIN_CONFOUNDING_SHARE)
+
+    def _told_already(self, name: str, k: int, best: Mapping[tuple[str, int], int]) -> bool:
+        """Return whether a simpler effect that this effect contains has an equivalent coefficient.
+
+        The simpler effect may be in the model or not.
+        """
+        simpler = set(self.world.available_effects[name].contains)
+        others = [self.q + j for (other, _), j in best.items() if other in simpler]
+        for other in simpler & set(self.world.slots):
+            there = self.world.get_coefficient_indices(other)
+            others += [j for j, place in enumerate(self.places) if place in there]
+        i = self.q + k
+        for j in others:
+            scale = np.sqrt(self.left[i, i] * self.left[j, j])
+            if scale > 0 and abs(self.left[i, j]) / scale > SAME_COEFFICIENT_CORRELATION:
+                return True
+        return False
+
+    def _limit(self, name: str) -> DetectionLimit:
+        probes = [
+            (k, p) for k, p in enumerate(self.found.candidates) if p.effect == name and p.fixed
+        ]
+        sized = sorted((float(p.coefficients[0]), k) for k, p in probes)
+        sizes = [
+            size for size, k in sized if np.sqrt(self.powers[k]) >= MIN_DETECTABLE_LIMIT_SIGMAS
+        ]
+        # A limit has more influence the smaller it is, and backlash the larger it is.
+        least, most = (self.left[self.q + k, self.q + k] for _, k in (sized[0], sized[-1]))
+        below = bool(least > most)
+        if not sizes:
+            return DetectionLimit(np.inf, limit="below" if below else "above")
+        return (
+            DetectionLimit(max(sizes), limit="below")
+            if below
+            else DetectionLimit(min(sizes), limit="above")
+        )

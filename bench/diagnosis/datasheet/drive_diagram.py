@@ -1,0 +1,239 @@
+"""Drive and back-drive diagram: forces at which a drive at rest moves a load, holds it, or slips.
+
+U is the force of the motor, and P is the load that it works against, both along the joint. Dry
+friction holds the joint while the net force is below the total limit F of all friction laws at rest
+(M. Duclusaud et al., 2024, arXiv:2410.08650, section III). F may depend on U and P. f is the sum of
+all other forces at rest:
+
+    U - P + f >  F(U, P)    moves forward                                                       (1)
+    U - P + f < -F(U, P)    moves back: where P > 0 the load drives the motor                   (2)
+
+In between, the joint holds. The laws are those of the registered effects, evaluated at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.diagnosis.datasheet.subject import SheetSubject
+from sims import effects as library
+from sims.core.simulator import Array
+from sims.core.system import (
+    Effect,
+    Force,
+    Friction,
+    HiddenStateEffect,
+    StateSnapshot,
+    System,
+    SystemKind,
+)
+from sims.extended_simulator import ExtendedSimulator
+
+LOAD_POINT_COUNT = 201
+"""Number of loads on the diagram."""
+BISECTION_STEPS = 80
+"""Number of bisection steps for each boundary."""
+MAX_FORCE_FACTOR = 1e3
+"""Range in which boundary forces are searched, as a multiple of the diagram's range."""
+ROUNDING_SHARE = 1e-12
+"""Share of the search range below which a force counts as zero."""
+DEFAULT_LOAD_FACTOR = 4.0
+"""Range of the diagram for a drive without a force limit, as a multiple of the friction without
+load.
+"""
+
+
+class _StaticJoint(System):
+    """Joint at rest with given drive force and load, at which effects are evaluated."""
+
+    name = "bench"
+    says = "a joint between a drive and a load"
+    kind: ClassVar[SystemKind] = "rotary"
+    parameters = ()
+    channels = ()
+    coordinates = ("q",)
+    rates = ("qd",)
+    states: ClassVar[Mapping[str, float]] = {}
+    sensed = ()
+
+    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """Raise an error, because the joint does not move."""
+        raise NotImplementedError
+
+    def weight(self, moment: StateSnapshot) -> Array:
+        """Return the load as a force that acts against the drive."""
+        return -self.passive(moment)
+
+    def drive(self, moment: StateSnapshot) -> Array:
+        """Return the given drive force."""
+        return moment.inputs["drive"]
+
+    def passive(self, moment: StateSnapshot) -> Array:
+        """Return the given load."""
+        return moment.inputs["load"]
+
+    def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
+        """Raise an error, because the joint has no channels."""
+        raise NotImplementedError
+
+
+class _Slide(_StaticJoint):
+    """Prismatic joint at rest with given drive force and load."""
+
+    kind: ClassVar[SystemKind] = "linear"
+
+
+@dataclass(frozen=True)
+class DriveDiagram:
+    """Drive and back-drive diagram.
+
+    Attributes:
+        unit: Unit of all forces.
+        load: (N,) loads that the drive works against.
+        forward: (N,) drive forces above which the joint moves forward; infinite if it locks itself.
+        back: (N,) drive forces below which the joint moves back.
+        breakaway: Drive force that moves the joint without a load.
+        backdrive: Load that moves the joint without drive force; infinite if no load does.
+        laws: Names of the effects that are included.
+        reach: Range of the axes.
+        without: Names of effects at the joint that have a hidden state, so no law at rest.
+    """
+
+    unit: str
+    load: Array
+    forward: Array
+    back: Array
+    breakaway: float
+    backdrive: float
+    laws: tuple[str, ...]
+    reach: float
+    without: tuple[str, ...] = ()
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the diagram with the names of its laws as TOML data."""
+        return {
+            "unit": self.unit,
+            "laws": list(self.laws),
+            "breakaway": self.breakaway,
+            "backdrive": self.backdrive,
+            "load": self.load[:: LOAD_POINT_COUNT // 10].tolist(),
+            "forward": self.forward[:: LOAD_POINT_COUNT // 10].tolist(),
+            "back": self.back[:: LOAD_POINT_COUNT // 10].tolist(),
+        }
+
+
+def compute_drive_diagram(
+    subject: SheetSubject, extended: ExtendedSimulator, strongest: float | None
+) -> DriveDiagram:
+    """Compute the diagram of a joint.
+
+    Args:
+        subject: Joint or system.
+        extended: Extended simulator.
+        strongest: Force limit of the drive; None if it has none.
+    """
+    found = _Joint(subject, extended)
+    zero = np.zeros(1)
+    alone = float(found.friction(zero, zero)[0])
+    reach = strongest or DEFAULT_LOAD_FACTOR * alone or 1.0
+    load = np.linspace(-reach, reach, LOAD_POINT_COUNT)
+    far = MAX_FORCE_FACTOR * reach
+
+    def ahead(u: Array, p: Array) -> Array:
+        return u - p + found.pull(u, p) - found.friction(u, p)  # (1)
+
+    def behind(u: Array, p: Array) -> Array:
+        return u - p + found.pull(u, p) + found.friction(u, p)  # (2)
+
+    def unpowered(p: Array) -> Array:
+        return -behind(np.zeros_like(p), p)
+
+    return DriveDiagram(
+        "N" if found.system.kind == "linear" else "N*m",
+        load,
+        _root(lambda u: ahead(u, load), far, LOAD_POINT_COUNT),
+        _root(lambda u: behind(u, load), far, LOAD_POINT_COUNT),
+        float(_root(lambda u: ahead(u, zero), far, 1)[0]),
+        float(_root(unpowered, far, 1)[0]),
+        found.names,
+        reach,
+        found.without,
+    )
+
+
+def _root(growing: Callable[[Array], Array], far: float, count: int) -> Array:
+    """Find zeros (N,) of increasing functions by bisection; infinite outside the range."""
+    low, high = np.full(count, -far), np.full(count, far)
+    never, always = growing(high) <= 0, growing(low) > 0
+    for _ in range(BISECTION_STEPS):
+        middle = 0.5 * (low + high)
+        above = growing(middle) > 0
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    # A zero is only found up to the rounding error of the bisection.
+    middle = np.where(np.abs(high) < ROUNDING_SHARE * far, 0.0, 0.5 * (low + high))
+    root: Array = np.where(never, np.inf, np.where(always, -np.inf, middle))
+    return root
+
+
+class _Joint:
+    """Friction and force laws of a joint, evaluated at rest."""
+
+    def __init__(self, subject: SheetSubject, extended: ExtendedSimulator) -> None:
+        self.system = _Slide() if subject.is_prismatic else _StaticJoint()
+        self.laws: list[tuple[Effect, Array]] = []
+        self.without: tuple[str, ...] = ()
+        by_effect: dict[str, dict[str, float]] = {}
+        for name, numbers in extended.effects.items():
+            for effect, coefficient, number in subject.localise_effect(name, numbers):
+                by_effect.setdefault(effect, {})[coefficient] = number.value
+        for name, values in by_effect.items():
+            law = library.get_effect(name.partition("@")[0])
+            # The law of a drive acts before the drive force, which is given here.
+            if issubclass(law, HiddenStateEffect):
+                self.without = (*self.without, law.name)
+            elif law.at == "joint" and issubclass(law, Friction | Force):
+                c = np.array([values.get(one.name, 0.0) for one in law.coefficients])
+                self.laws.append((law(), c[:, None, None]))
+        stated = (
+            subject.get_model_file_value(f"friction.coulomb@{subject.joint}")
+            if subject.joint
+            else None
+        )
+        self.stated = 0.0 if stated is None else stated.value
+        self.names = tuple(law.name for law, _ in self.laws)
+
+    def friction(self, drive: Array, load: Array) -> Array:
+        """Compute the maximum holding force (N,)."""
+        moment = self._moment(drive, load)
+        limits = [np.full(len(drive), self.stated)]
+        for law, c in self.laws:
+            if isinstance(law, Friction):
+                limits.append(law.limit(_each(c, drive), moment)[:, 0])
+        held: Array = np.maximum(np.sum(limits, axis=0), 0.0)
+        return held
+
+    def pull(self, drive: Array, load: Array) -> Array:
+        """Compute the sum of the other forces at rest (N,)."""
+        moment = self._moment(drive, load)
+        forces = [np.zeros(len(drive))]
+        for law, c in self.laws:
+            if isinstance(law, Force):
+                forces.append(law.force(_each(c, drive), moment)[:, 0])
+        pull: Array = np.sum(forces, axis=0)
+        return pull
+
+    def _moment(self, drive: Array, load: Array) -> StateSnapshot:
+        nothing = np.zeros((len(drive), 1))
+        given = {"drive": drive[:, None], "load": load[:, None]}
+        return StateSnapshot(
+            self.system, np.zeros((len(drive), 0)), {}, nothing, nothing, nothing, given
+        )
+
+
+def _each(c: Array, drive: Array) -> Array:
+    """Expand coefficients (K, 1, 1) to (K, N, 1), one for each force."""
+    return np.broadcast_to(c, (len(c), len(drive), 1))

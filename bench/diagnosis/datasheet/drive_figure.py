@@ -1,0 +1,273 @@
+"""Drive and back-drive diagram as a figure, and the data sheet as one printed page."""
+
+from __future__ import annotations
+
+import textwrap
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.diagnosis.datasheet.drive_diagram import DriveDiagram
+from bench.diagnosis.datasheet.sheet_content import SheetContent
+from bench.diagnosis.datasheet.wording import (
+    format_confounding,
+    format_detection_limit,
+    format_evidence,
+    format_name,
+    format_prediction_interval,
+    format_short_name,
+    title,
+)
+from bench.diagnosis.report.wording import (
+    append_unit,
+    format_fitted_value,
+    format_number,
+    format_sentence,
+    format_unit,
+    sanitise,
+)
+from bench.figures import style
+from bench.figures.figure_files import is_pdf_wanted
+from bench.figures.text_layout import POINTS, text_width
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+A4_INCHES = (8.27, 11.69)
+"""Width and height of an A4 page in inches."""
+_MARGIN = 0.06
+"""Margin, as a share of the page width."""
+_LINE = 0.0118
+"""Height of a line of the table, as a share of the page height."""
+_SMALL = 0.0083
+"""Height of a line of effects not shown, at font size `_SMALL_SIZE`, as a share of the page height.
+"""
+_SMALL_SIZE = 5.6
+"""Font size of the effects not shown, in points."""
+_NAME_LETTERS = 40
+"""Maximum number of characters of a name in the list of effects not shown."""
+_LETTER = 0.63
+"""Mean width of a character, as a share of the font size."""
+_TABLE_SIZE, _LEAST_SIZE = 7.5, 5.0
+"""Maximum and minimum font size of the table, in points."""
+_MAX_DIAGRAM_HEIGHT = 0.36
+"""Maximum height of the diagram, as a share of the page height."""
+_LETTERS = 110
+"""Maximum number of characters of a line across the page."""
+_STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8,
+    "text.usetex": False,
+    # Names come from files, where a dollar sign must not start mathematics.
+    "text.parse_math": False,
+    "pdf.fonttype": 42,
+}
+
+
+def render_diagram(diagram: DriveDiagram) -> tuple[bytes, bytes | None]:
+    """Render the diagram as SVG for the page, and as PDF if requested."""
+    with _styled():
+        figure, axes = style.make_panel_grid(1, 1, (5.4, 4.6))
+        draw_diagram(axes[0, 0], diagram)
+        return style.render_svg(figure), style.render_pdf(figure) if is_pdf_wanted() else None
+
+
+def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
+    """Draw the diagram: where the joint moves, holds and slips, by load and motor force.
+
+    Args:
+        axes: Axes to draw on.
+        diagram: Diagram to draw.
+    """
+    reach, unit = diagram.reach, format_unit(diagram.unit)
+    load = diagram.load
+    ahead, back = (np.clip(side, -2 * reach, 2 * reach) for side in (diagram.forward, diagram.back))
+    axes.fill_between(load, ahead, 2 * reach, color=style.PALE_BLUE, linewidth=0)
+    axes.fill_between(load, back, ahead, color=style.HELD_OUT_GREY, linewidth=0)
+    axes.fill_between(load, -2 * reach, back, color=style.PALE_RUST, linewidth=0)
+    axes.plot(load, ahead, color=style.BLUE, linewidth=1.5)
+    axes.plot(load, back, color=style.VERMILION, linewidth=1.5, linestyle=(0, (5, 2)))
+    axes.plot(load, load, color=style.CONNECTOR_GREY, linewidth=0.8, linestyle=":")
+    axes.axhline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
+    axes.axvline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
+    for force, at, marker in (
+        (diagram.breakaway, (0.0, diagram.breakaway), "o"),
+        (diagram.backdrive, (diagram.backdrive, 0.0), "s"),
+    ):
+        if 0 < force <= reach:
+            axes.plot(*at, marker=marker, color=style.NEUTRAL_MARK, markersize=5, linestyle="none")
+            text = f" {format_number(force)} {unit}"
+            axes.annotate(text, at, xytext=(4, 4), textcoords="offset points")
+    said: dict[str, Any] = {"ha": "center", "va": "center", "color": style.CAPTION_GREY}
+    axes.text(-0.55 * reach, 0.75 * reach, "moves forward", **said)
+    axes.text(0.55 * reach, -0.75 * reach, "moves back", **said)
+    axes.text(0.72 * reach, 0.25 * reach, "back-driven:\nthe load slips", **said)
+    middle = 0.62 * reach
+    if np.interp(middle, load, ahead - back) > 0.15 * reach:
+        axes.text(middle, middle, "holds", **said)
+    axes.set(
+        xlim=(-reach, reach),
+        ylim=(-reach, reach),
+        xlabel=f"what it works against [{unit}]",
+        ylabel=f"force of the motor [{unit}]",
+    )
+    axes.set_title("Drive and back-drive, at rest", fontsize=9, loc="left")
+
+
+def render_pdf(facts: SheetContent) -> bytes:
+    """Render the sheet as a PDF of one page."""
+    with _styled():
+        return style.render_pdf(draw_sheet(facts))
+
+
+def draw_sheet(facts: SheetContent) -> Figure:
+    """Draw the sheet as a figure of one page."""
+    from bench.figures.notebook_figure import NotebookFigure
+
+    figure = NotebookFigure(figsize=A4_INCHES, layout=None)
+    top = _heading(figure, facts)
+    top = _shown(figure, facts, top)
+    diagram = facts.diagram
+    if diagram is None:
+        said = "\n".join(textwrap.wrap(facts.without_drive(), _LETTERS))
+        figure.text(_MARGIN, top - 0.01, said, va="top", linespacing=1.4)
+        # Without a diagram there is space for a table with a larger font.
+        _not_shown(figure, facts, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
+        return figure
+    below = _not_shown(figure, facts, size=_SMALL_SIZE)
+    height = min(_MAX_DIAGRAM_HEIGHT, top - below - 0.09)
+    if height > 0.1:
+        width = height * A4_INCHES[1] / A4_INCHES[0]
+        draw_diagram(figure.add_axes((_MARGIN + 0.09, top - height - 0.03, width, height)), diagram)
+        _beside(figure, diagram, _MARGIN + 0.13 + width, top - 0.05)
+    return figure
+
+
+def _heading(figure: Figure, facts: SheetContent) -> float:
+    """Draw name, title and verdict; return the height of the space below, as a share."""
+    figure.text(_MARGIN, 0.965, sanitise(facts.name, 60), fontsize=17, weight="bold", va="top")
+    title = facts.recording.title or facts.recording.path.stem
+    said = f"Data sheet from {sanitise(title, 90)}. {format_sentence(facts.verdict.meaning)}"
+    lines = textwrap.wrap(sanitise(said, 300), _LETTERS)[:3]
+    figure.text(
+        _MARGIN, 0.938, "\n".join(lines), color=style.CAPTION_GREY, va="top", linespacing=1.3
+    )
+    return 0.938 - 0.014 * len(lines) - 0.012
+
+
+def _shown(figure: Figure, facts: SheetContent, top: float) -> float:
+    """Draw the table of identified numbers; return the height of the space below, as a share."""
+    heads = ("", "quantity", "value (95 %)", "another run", "evidence")
+    rows = [
+        (
+            title(row, facts.is_driven),
+            sanitise(format_name(row), 60),
+            sanitise(format_fitted_value(row.number), 70),
+            format_prediction_interval(row),
+            sanitise(format_evidence(row, short=True), 60),
+        )
+        for row in facts.rows
+        if row.number is not None
+    ]
+    found = [row.state == "found" for row in facts.rows if row.number is not None]
+    size, columns = _columns([heads, *rows])
+    for x, text in zip(columns, heads, strict=True):
+        figure.text(x, top, text, weight="bold", va="top", fontsize=size)
+    for cells, is_found in zip(rows, found, strict=True):
+        top -= _LINE * 1.25
+        for i, (x, text) in enumerate(zip(columns, cells, strict=True)):
+            weight = "bold" if is_found and i == 1 else "normal"
+            figure.text(x, top, text, va="top", weight=weight, fontsize=size)
+    return top - _LINE * 1.5
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
+    """Choose the font size of a table, and the left edges of its columns as shares of the width."""
+    size = _TABLE_SIZE
+    while True:
+        widths = [text_width(column, size, "bold") for column in zip(*rows, strict=True)]
+        gap = 0.14 * size / _TABLE_SIZE
+        if (
+            sum(widths) + gap * (len(widths) - 1) <= A4_INCHES[0] * (1 - 2 * _MARGIN)
+            or size < _LEAST_SIZE
+        ):
+            break
+        size -= 0.25
+    begins = np.concatenate([[0.0], np.cumsum(widths[:-1]) + gap * np.arange(1, len(widths))])
+    return size, (_MARGIN + begins / A4_INCHES[0]).tolist()
+
+
+def _not_shown(figure: Figure, facts: SheetContent, size: float, begins: float = 0.0) -> float:
+    """Draw the effects that are not shown in two columns.
+
+    Args:
+        figure: Page to draw on.
+        facts: Content of the data sheet.
+        size: Font size in points.
+        begins: Height of the first line, as a share of the page; 0 for a table that ends at the
+            foot of the page.
+
+    Returns:
+        Height of the top of the table, as a share of the page.
+    """
+    rows = []
+    names = [format_short_name(row) for row in facts.rows if row.number is None]
+    longest = min(max(map(len, names), default=0), _NAME_LETTERS)
+    # A character of the monospaced font is 0.602 of its size wide.
+    beside_name = (0.602 * size / POINTS * longest + 0.12) / A4_INCHES[0]
+    letters = int((0.45 - beside_name) * A4_INCHES[0] * POINTS / (_LETTER * size))
+    for row in facts.rows:
+        if row.number is None:
+            mixed = format_confounding(row)
+            said = format_detection_limit(row) + (
+                f" (mixed up with {mixed})" if mixed and row.detection_limit else ""
+            )
+            lines = textwrap.wrap(said, letters)
+            rows.append((format_short_name(row), lines))
+    line = _SMALL * 1.2 * size / _SMALL_SIZE
+    heights = [len(lines) for _, lines in rows]
+    half = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
+    tallest = line * max(sum(heights[:half]), sum(heights[half:]))
+    # A long table must not overlap the foot of the page.
+    begins = max(begins, 0.045 + tallest)
+    for column, part in enumerate((rows[:half], rows[half:])):
+        x, y = _MARGIN + 0.45 * column, begins
+        for name, lines in part:
+            figure.text(x, y, sanitise(name, longest), va="top", fontsize=size, family="monospace")
+            said = "\n".join(lines)
+            figure.text(x + beside_name, y, said, va="top", fontsize=size, linespacing=1.25)
+            y -= line * len(lines)
+    heading = "Not shown by these data, and how small a number they would have shown (95 %)"
+    figure.text(_MARGIN, begins + 0.018, heading, weight="bold", va="top")
+    text = "Limits and gaps show from the size given on. Made by simgap datasheet."
+    figure.text(_MARGIN, 0.028, text, fontsize=6, color=style.CAPTION_GREY, va="top")
+    return begins + 0.02
+
+
+def _beside(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
+    """Draw the description of the diagram next to it."""
+    unit = diagram.unit
+    lines = [f"starts without a load at {append_unit(format_number(diagram.breakaway), unit)}"]
+    load = append_unit(format_number(diagram.backdrive), unit)
+    turned = np.isfinite(diagram.backdrive)
+    lines.append(f"without power a load of {load} turns it" if turned else "locks itself")
+    laws = sanitise(", ".join(diagram.laws), 100)
+    lines.append(f"laws: {laws or 'none, no friction at rest'}")
+    if diagram.without:
+        lines.append(f"not in it, with a state of its own: {', '.join(diagram.without)}")
+    text = "\n".join(part for line in lines for part in textwrap.wrap(line, 34))
+    figure.text(x, y, text, va="top", linespacing=1.4, fontsize=7.5)
+
+
+@contextmanager
+def _styled() -> Iterator[None]:
+    from matplotlib import rc_context
+
+    with rc_context(_STYLE), warnings.catch_warnings():
+        # A title may be in any script; characters that the font lacks are drawn as boxes.
+        warnings.filterwarnings("ignore", message="Glyph")
+        yield

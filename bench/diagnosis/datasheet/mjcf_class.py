@@ -1,0 +1,291 @@
+"""Data sheet as an MJCF default class, and a model that uses it and can be scored.
+
+Comments state what MuJoCo cannot express. For a system, whose state is known at every sample, a dry
+friction law that MuJoCo lacks is replaced by its mean over the runs, which is the best
+approximation in MJCF.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os.path import relpath
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.datasheet.sheet_content import SheetContent
+from bench.diagnosis.extended_robot_files import collect_causes
+from sims import effects as library
+from sims.core.simulator import Array
+from sims.core.system import Friction, RenderedModelFile, StateSnapshot
+from sims.core.toml_validation import read_toml
+from sims.extended_simulator import FittedValue
+from sims.recording.recording import Run
+from sims.recording.recording_description import get_description_path
+
+CLASS_FILE = "class.xml"
+"""File name of the classes."""
+MOTOR_ON_THRESHOLD = 0.5
+"""Value of a switching input above which the motor is on."""
+
+
+class MjcfFiles(NamedTuple):
+    """MJCF files by name, and notes on what they cannot express."""
+
+    contents: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+class _Class(NamedTuple):
+    """Default class, notes on what it cannot express, and a model that uses it, if there is one."""
+
+    text: str
+    said: Sequence[str]
+    model: str = ""
+
+
+def build_mjcf(facts: SheetContent, folder: Path) -> MjcfFiles:
+    """Build the class and the models that use it.
+
+    Args:
+        facts: Content of the data sheet.
+        folder: Folder of the files; the path of the log is relative to it.
+    """
+    from sims.robot.mujoco_messages import capture_mujoco_warnings
+
+    with capture_mujoco_warnings():
+        if facts.subject.kind.has_model:
+            return _of_robot(facts)
+        return _of_system(facts, folder)
+
+
+def _of_robot(facts: SheetContent) -> MjcfFiles:
+    kind: Any = facts.subject.kind
+    causes = collect_causes(facts.extended)
+    actuator = next(iter(facts.subject.actuators), None)
+    made = _class(
+        kind.robot, causes, facts.subject.joint, actuator, make_class_name(facts.name), facts
+    )
+    files = {CLASS_FILE: _file(facts, [made])}
+    if made.model:
+        files["model.xml"] = made.model
+    return MjcfFiles(files, tuple(made.said))
+
+
+def _of_system(facts: SheetContent, folder: Path) -> MjcfFiles:
+    """Build a class, a model and a log description for each group of runs with equal constants."""
+    from sims.robot.parsing.read_model_file import read_robot
+
+    made: list[_Class] = []
+    files: dict[str, str] = {}
+    for setting in group_runs_by_constants(facts):
+        model = _model_file(facts, setting)
+        if model is None:
+            return MjcfFiles({}, (f"{facts.subject.kind.name} has no form in MJCF",))
+        name = make_class_name("_".join([facts.name, setting.name]) if setting.name else facts.name)
+        with tempfile.TemporaryDirectory() as place:
+            path = Path(place) / f"{facts.subject.kind.name}.xml"
+            path.write_text(model.text)
+            robot = read_robot(path)
+        causes, said = _placed(facts, setting, model)
+        one = _class(robot, causes, model.joint, model.actuator, name, facts, (*model.said, *said))
+        made.append(one)
+        stem = f"model_{setting.name}" if setting.name else "model"
+        if one.model:
+            files[f"{stem}.xml"] = one.model
+            files |= _described(facts, setting, model, stem, folder)
+    lines = dict.fromkeys(line for one in made for line in one.said)
+    return MjcfFiles({CLASS_FILE: _file(facts, made), **files}, tuple(lines))
+
+
+def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
+    try:
+        return facts.subject.kind.system.render_model_file(setting.numbers)
+    except ZeroDivisionError:
+        # The file may contain a value that was edited by hand.
+        return None
+
+
+def _class(
+    robot: Any,
+    causes: Mapping[str, Mapping[str, FittedValue]],
+    joint: str,
+    actuator: str | None,
+    name: str,
+    facts: SheetContent,
+    notes: Sequence[str] = (),
+) -> _Class:
+    """Build the class of a robot's joint."""
+    from sims.robot.export.apply_causes import apply_causes
+    from sims.robot.export.default_class import render_default_class, render_model_using_class
+    from sims.robot.export.xml_editing import NotEditableError
+
+    applied = apply_causes(robot, causes, facts.extended.title)
+    own = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
+    said = [*notes, *applied.notes]
+    text = render_default_class(applied, *own, name, said)
+    try:
+        return _Class(text, said, render_model_using_class(robot, applied, *own, name, text))
+    except NotEditableError as unfit:
+        return _Class(text, [*said, f"no model that uses the class is written: {unfit}"])
+
+
+def make_class_name(name: str) -> str:
+    """Convert a name to one that is valid as a class name in XML and MuJoCo."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_")
+    return plain or "drive"
+
+
+def _file(facts: SheetContent, made: Sequence[_Class]) -> str:
+    """Format the classes as a file that MuJoCo loads and that others can include."""
+    title = facts.recording.title or facts.recording.path.stem
+    heading = f"{make_class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
+    safe = re.sub(r"-(?=-)", "- ", heading)
+    inner = "\n".join(one.text for one in made).replace("\n", "\n    ")
+    return f"<mujoco>\n  <!-- {safe} -->\n  <default>\n    {inner}\n  </default>\n</mujoco>\n"
+
+
+@dataclass(frozen=True)
+class ConstantsGroup:
+    """Runs of a recording with equal constants.
+
+    Attributes:
+        name: Short name from the constants; empty if there are none.
+        numbers: Parameters and constants.
+        runs: Runs of the recording.
+    """
+
+    name: str
+    numbers: Mapping[str, float]
+    runs: tuple[Run, ...]
+
+
+def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
+    """Group the runs by their constants, in the order of the recording."""
+    by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
+    for run in facts.recording.runs:
+        by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
+    usual = {c.name: c.value for c in facts.subject.kind.constants}
+    usual |= {p.name: p.nominal for p in facts.subject.kind.parameters}
+    fitted = {name: number.value for name, number in facts.extended.parameters.items()}
+    known = {**usual, **facts.recording.constants, **facts.extended.constants, **fitted}
+    return [
+        ConstantsGroup(
+            "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
+            {**known, **dict(constants)},
+            tuple(runs),
+        )
+        for constants, runs in by_constants.items()
+    ]
+
+
+def _placed(
+    facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile
+) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
+    """Map the fitted effects to their places in the model file, with notes on approximations."""
+    from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+
+    places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}
+    causes: dict[str, Mapping[str, FittedValue]] = {}
+    dry, said = 0.0, []
+    for name, numbers in facts.extended.effects.items():
+        effect = library.get_effect(name)
+        if issubclass(effect, Friction) and name not in MODEL_FIELD_EFFECTS:
+            held = _held(facts, setting, effect, numbers)
+            dry += held
+            said.append(
+                f"{name}: MuJoCo has no such law; frictionloss holds its mean over these runs, "
+                f"{held:.4g} N m"
+            )
+            continue
+        place = places.get(effect.at, "")
+        off = FittedValue(0.0, "1", None, None)
+        whole = {c.name: numbers.get(c.name, off) for c in effect.on(facts.subject.kind.system)}
+        causes[f"{name}@{place}" if place else name] = whole
+    if dry:
+        key = f"friction.coulomb@{model.joint}"
+        own = causes.get(key, {}).get("coefficient")
+        total = dry + (own.value if own else 0.0)
+        causes[key] = {"coefficient": FittedValue(total, "N*m", None, None)}
+    return causes, said
+
+
+def _held(
+    facts: SheetContent,
+    setting: ConstantsGroup,
+    effect: type[Friction],
+    numbers: Mapping[str, FittedValue],
+) -> float:
+    """Compute the mean limit of a friction law over the samples of some runs."""
+    limits = [_limits(facts, setting, run, effect, numbers) for run in setting.runs]
+    seen = np.concatenate(limits)
+    return float(seen[np.isfinite(seen)].mean())
+
+
+def _limits(
+    facts: SheetContent,
+    setting: ConstantsGroup,
+    run: Run,
+    effect: type[Friction],
+    numbers: Mapping[str, FittedValue],
+) -> Array:
+    """Compute the limit (T,) of a friction law at each sample of a run, as one batch."""
+    kind = facts.subject.kind
+    system = kind.system()
+    (coordinate,) = system.coordinates
+    position = run.channels[coordinate]
+    rate = np.gradient(position, run.times)
+    each = (len(position), 1)
+    theta = np.array([[setting.numbers[p.name] for p in kind.parameters]])
+    there = effect.on(system)
+    coefficients = [numbers[c.name].value if c.name in numbers else 0.0 for c in there]
+    moment = StateSnapshot(
+        system,
+        np.repeat(theta, len(position), axis=0),
+        {c.name: np.full(each, setting.numbers[c.name]) for c in kind.constants},
+        (run.times - run.times[0])[:, None],
+        position[:, None],
+        rate[:, None],
+        {name: values[:, None] for name, values in run.inputs.items()},
+    )
+    c = np.array(coefficients)[:, None, None]
+    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *each)), moment)[:, 0]
+    return limit
+
+
+def _described(
+    facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile, stem: str, folder: Path
+) -> Iterator[tuple[str, str]]:
+    """Yield a description of the log for the model, in which its runs are marked held out.
+
+    Nothing is yielded for a log of several files.
+    """
+    import tomli_w
+
+    path = facts.recording.path
+    if path.suffix != ".csv" or any(run.log for run in facts.recording.runs):
+        return
+    stated = read_toml(get_description_path(path))
+    file = relpath(path.resolve(), folder.resolve())
+    document: dict[str, Any] = {
+        "model": f"{stem}.xml",
+        "title": f"{facts.name} as {stem}.xml",
+        "channels": {},
+        "inputs": {},
+        "runs": {run.name: {"held_out": True} for run in setting.runs if _driven(run, model)},
+    }
+    for kind in ("channels", "inputs"):
+        for name, own in stated.get(kind, {}).items():
+            if name in model.signals:
+                document[kind][model.signals[name]] = {"file": file, "column": name, **own}
+    yield f"{stem}.toml", tomli_w.dumps(document)
+
+
+def _driven(run: Run, model: RenderedModelFile) -> bool:
+    """Return whether the inputs that switch the motor are on all the time."""
+    switches = [values for name, values in run.inputs.items() if name not in model.signals]
+    return all(bool((values > MOTOR_ON_THRESHOLD).all()) for values in switches)

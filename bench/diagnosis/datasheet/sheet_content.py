@@ -1,0 +1,127 @@
+"""Content of a data sheet, for any output format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from bench.diagnosis.datasheet.drive_diagram import DriveDiagram, compute_drive_diagram
+from bench.diagnosis.datasheet.sheet_rows import SheetRow
+from bench.diagnosis.datasheet.subject import SheetSubject
+from bench.diagnosis.report.wording import (
+    append_unit,
+    format_fitted_value,
+    format_number,
+    joined,
+    sanitise,
+)
+from bench.diagnosis.verdict import Verdict
+from sims.extended_simulator import ExtendedSimulator
+from sims.recording.recording import Recording
+
+FORMAT_VERSION = 1
+"""Format version of sheet.toml."""
+
+NAMES_IN_TERMINAL = 5
+"""Maximum number of effects that the terminal names as not shown by the data."""
+
+
+@dataclass(frozen=True)
+class SheetContent:
+    """Content of a data sheet.
+
+    Attributes:
+        name: Name on the sheet.
+        subject: Joint or system that it describes.
+        recording: Logs.
+        verdict: Verdict of the diagnosis.
+        extended: Extended simulator.
+        rows: Numbers of the sheet.
+    """
+
+    name: str
+    subject: SheetSubject
+    recording: Recording
+    verdict: Verdict
+    extended: ExtendedSimulator
+    rows: tuple[SheetRow, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of sheet.toml."""
+        named = {row.name: row.to_document() for row in self.rows}
+        joint = {"joint": self.subject.joint} if self.subject.joint else {}
+        return {
+            "format": FORMAT_VERSION,
+            "name": self.name,
+            "system": self.subject.kind.name,
+            **joint,
+            "recording": self.recording.title or self.recording.path.stem,
+            "runs": [run.name for run in self.recording.training()],
+            "verdict": self.verdict.verdict,
+            "elsewhere": list(self.elsewhere()),
+            "quantities": named,
+            **self._at_rest(),
+        }
+
+    def _at_rest(self) -> dict[str, Any]:
+        """Return the diagram of a drive; without a drive, the dry friction that holds the joint."""
+        if self.diagram is not None:
+            return {"diagram": self.diagram.to_document()}
+        rest = self.rest
+        return {"rest": {"unit": rest.unit, "laws": list(rest.laws), "breakaway": rest.breakaway}}
+
+    @cached_property
+    def is_driven(self) -> bool:
+        """Return whether a drive acts here; without one there is no diagram."""
+        return self.subject.is_driven(self.recording)
+
+    @property
+    def diagram(self) -> DriveDiagram | None:
+        """Diagram of where the joint moves, holds and slips; None without a drive."""
+        return self.rest if self.is_driven else None
+
+    def without_drive(self) -> str:
+        """Return why there is no diagram, and what is known of the joint at rest instead."""
+        why = "the log has no input"
+        if self.subject.joint:
+            why = (
+                f"joint {self.subject.joint} has no actuator in the model, and no force in the log"
+            )
+        rest = self.rest
+        if rest.laws and rest.breakaway > 0:
+            force = append_unit(format_number(rest.breakaway), rest.unit)
+            held = f"At rest, dry friction holds against up to {force} ({joined(rest.laws)})"
+        else:
+            held = "No law of friction was found that holds it at rest"
+        return (
+            f"There is no drive: {why}. So this sheet has no drive and back-drive diagram, and no "
+            f"numbers of a drive; the table shows what else acts on the joint. {held}."
+        )
+
+    @cached_property
+    def rest(self) -> DriveDiagram:
+        """Diagram of where the joint moves, holds and slips, also without a drive."""
+        strongest = [row.number.value for row in self.rows if row.strongest and row.number]
+        return compute_drive_diagram(self.subject, self.extended, next(iter(strongest), None))
+
+    def elsewhere(self) -> Iterator[str]:
+        """Yield causes of the model that act at other places, or in the world."""
+        for name, numbers in self.extended.effects.items():
+            if not any(True for _ in self.subject.localise_effect(name, numbers)):
+                yield name
+
+    def lines(self) -> list[str]:
+        """Format the sheet as text: numbers first, then the effects that are not shown."""
+        lines = [f"{sanitise(self.name, 80)}: {self.verdict.verdict}"]
+        shown = [row for row in self.rows if row.number is not None]
+        lines += [
+            f"  {sanitise(r.name, 60)} = {format_fitted_value(r.number)}" for r in shown if r.number
+        ]
+        rest = [row.name for row in self.rows if row.number is None]
+        few, more = rest[:NAMES_IN_TERMINAL], len(rest) - NAMES_IN_TERMINAL
+        if more > 0:
+            few = [*few, f"{more} more (the sheet says how small each could be)"]
+        lines.append(f"not shown by these data: {sanitise(joined(few), 2000) or 'nothing'}")
+        return lines

@@ -1,0 +1,293 @@
+"""Rows of a data sheet: numbers of a joint or actuator that are found, fitted or not shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from bench.diagnosis.datasheet.detection_limits import DetectionLimit, DetectionLimits
+from bench.diagnosis.datasheet.subject import ModelFileValue, SheetSubject
+from bench.diagnosis.report.wording import format_effect_name
+from bench.diagnosis.validation.gain_and_intervals import Z95
+from bench.diagnosis.verdict import Cause, Verdict
+from sims import effects as library
+from sims.core.system import ALL_PLACES
+from sims.extended_simulator import ExtendedSimulator, FittedValue
+
+QuantityState = Literal["found", "fitted", "derived", "not shown"]
+DERIVATIVE_STEP_SHARE = 1e-6
+"""Relative step of a parameter for the derivatives of derived quantities."""
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    """Row of the sheet: one number.
+
+    Attributes:
+        name: Name of the effect here, with its coefficient if it has several; or of the parameter.
+        says: Name in words.
+        part: ``joint``, ``actuator``, ``channel``, or ``system`` for a parameter of a system.
+        state: ``found`` for a cause, ``fitted`` for a parameter, ``get_central_jacobian`` for a
+            number that follows from others, or ``not shown``.
+        unit: Unit of the number.
+        number: Value with its 95 % interval; None if it is not shown.
+        stated: Value in the model file; None if the file has none.
+        detection_limit: Detection limit of an effect that is not shown.
+        p_value: Probability of a gain like that of the cause if it were absent.
+        share: Share of the held-out gap that the cause closes alone; None if not measured.
+        alternatives: Effects that explain the data as well.
+        prediction_half_width: Half the 95 % interval for a log, or a run, that is not yet recorded;
+            None if unknown.
+        strongest: Whether it is the force limit of the drive, at rest.
+    """
+
+    name: str
+    says: str
+    part: str
+    state: QuantityState
+    unit: str
+    number: FittedValue | None = None
+    stated: float | None = None
+    detection_limit: DetectionLimit | None = None
+    p_value: float | None = None
+    share: float | None = None
+    alternatives: tuple[str, ...] = ()
+    prediction_half_width: float | None = None
+    strongest: bool = False
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the row as TOML data, which has no null."""
+        row: dict[str, Any] = {"state": self.state, "says": self.says, "unit": self.unit}
+        row["part"] = self.part
+        if self.number is not None:
+            row |= self.number.to_table()
+        if self.prediction_half_width is not None:
+            row["another"] = self.prediction_half_width
+        if self.stated is not None:
+            row["stated"] = self.stated
+        if self.detection_limit is not None:
+            row |= _reached(self.detection_limit)
+        if self.p_value is not None:
+            row["p_value"] = self.p_value
+        if self.share is not None:
+            row["heldout_gain"] = self.share
+        if self.alternatives:
+            row["alternatives"] = list(self.alternatives)
+        return row
+
+
+def _reached(reach: DetectionLimit) -> dict[str, Any]:
+    row: dict[str, Any] = {}
+    if np.isfinite(reach.size):
+        row[{"": "resolved", "above": "none_above", "below": "none_below"}[reach.limit]] = (
+            reach.size
+        )
+        if reach.vague:
+            row["vague"] = True
+        if reach.is_nonzero_if_fitted:
+            row["leans_to"] = reach.estimate_if_fitted
+    if reach.confounded_with:
+        row["mixed_with"] = list(reach.confounded_with)
+    return row
+
+
+def build_sheet_rows(
+    subject: SheetSubject, extended: ExtendedSimulator, verdict: Verdict, shown: DetectionLimits
+) -> tuple[SheetRow, ...]:
+    """Build the rows of a sheet.
+
+    Args:
+        subject: Joint or system.
+        extended: Extended simulator.
+        verdict: Verdict with the evidence.
+        shown: Covariance and detection limits.
+
+    Returns:
+        Derived quantities, parameters, causes, then effects that are not shown.
+    """
+    rows = _Rows(subject, extended, verdict, shown)
+    return (*rows.derived(), *rows.parameters(), *rows.causes(), *rows.absent())
+
+
+@dataclass(frozen=True)
+class _Rows:
+    subject: SheetSubject
+    extended: ExtendedSimulator
+    verdict: Verdict
+    shown: DetectionLimits
+
+    def derived(self) -> Iterator[SheetRow]:
+        """Yield quantities derived from the system's parameters, by error propagation."""
+        parameters = self.extended.parameters
+        values = {name: number.value for name, number in parameters.items()}
+        known = {**self.extended.constants, **values}
+        free = [name for name in self.shown.free if name in values]
+        places = [self.shown.free.index(name) for name in free]
+        covariance = self.shown.covariance[np.ix_(places, places)]
+        for derived in self.subject.kind.system.derived:
+            try:
+                value = derived.of(known)
+            except (KeyError, ZeroDivisionError):
+                # A constant that differs between runs has no single value.
+                continue
+            slopes = []
+            for name in free:
+                step = DERIVATIVE_STEP_SHARE * (abs(known[name]) or 1.0)
+                slopes.append((derived.of({**known, name: known[name] + step}) - value) / step)
+            spread = np.array(slopes)
+            half = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
+            number = FittedValue(value, derived.unit, value - half, value + half)
+            row = SheetRow(derived.name, derived.says, "system", "derived", derived.unit, number)
+            yield replace(row, strongest=derived.strongest)
+
+    def parameters(self) -> Iterator[SheetRow]:
+        """Yield the parameters of the system, or the free numbers of the robot's file here."""
+        if not self.subject.joint:
+            for parameter in self.subject.kind.parameters:
+                nominal = FittedValue(parameter.nominal, parameter.unit, None, None)
+                # A parameter that is not in the file has its nominal value.
+                number = self.extended.parameters.get(parameter.name, nominal)
+                says = parameter.says or parameter.name
+                row = _row(parameter.name, says, "system", "fitted", number, None)
+                yield replace(
+                    row, prediction_half_width=self.shown.prediction_half_widths.get(parameter.name)
+                )
+            return
+        for name, number in self.extended.parameters.items():
+            # The coefficient of an effect with several has its name after a point.
+            effect, _, place = name.partition("@")
+            there = next(
+                (p for p in self.subject.places if place in (p, f"{p}.{_tail(place)}")), ""
+            )
+            if there:
+                row = self._of_effect(f"{effect}@{there}", name, number, "fitted")
+                yield self._apart(row, f"{effect}@{there}", name)
+
+    def causes(self) -> Iterator[SheetRow]:
+        """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
+        for name, numbers in self.extended.effects.items():
+            own = list(self.subject.localise_effect(name, numbers))
+            for effect, coefficient, number in own:
+                if number.value == 0:
+                    # A coefficient of zero means that the effect is absent; its detection limit is
+                    # computed.
+                    continue
+                several = sum(other == effect for other, _, _ in own) > 1
+                label = f"{effect} {coefficient}" if several else effect
+                row = self._of_effect(effect, label, number, "found", self._cause(name))
+                if _is_nothing(number):
+                    yield self._nothing(row, effect, number)
+                    continue
+                place = (
+                    "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
+                )
+                alone = name if len(numbers) == 1 else f"{name}.{coefficient}{place}"
+                yield self._apart(row, effect, alone)
+
+    def _apart(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
+        """Add the prediction interval from the consistency of the runs."""
+        half, stated = (
+            self.shown.prediction_half_widths.get(parameter),
+            self.subject.get_model_file_value(effect),
+        )
+        if half is None or stated is None:
+            return replace(row, prediction_half_width=half)
+        return replace(row, prediction_half_width=stated.compute_half_width(half))
+
+    def _nothing(self, row: SheetRow, effect: str, number: FittedValue) -> SheetRow:
+        """Build the row of a cause at other places that is not shown here."""
+        reach = _of_number(number, self.subject.get_model_file_value(effect))
+        return SheetRow(
+            row.name,
+            row.says,
+            row.part,
+            "not shown",
+            row.unit,
+            stated=row.stated,
+            detection_limit=reach,
+        )
+
+    def absent(self) -> Iterator[SheetRow]:
+        """Yield the effects that are not in the model, with their detection limits."""
+        for (effect, coefficient), reach in self.shown.reaches.items():
+            several = len({c for e, c in self.shown.reaches if e == effect}) > 1
+            label = f"{effect} {coefficient}" if several else effect
+            placed = library.find_effect(effect, self.subject.kind.system)
+            c = next(c for c in placed.coefficients if c.name == coefficient)
+            unit = c.unit_on(self.subject.kind.system, self.extended.observe) or "1"
+            yield self._absent(effect, label, unit, reach)
+
+    def _absent(self, effect: str, label: str, unit: str, reach: DetectionLimit) -> SheetRow:
+        stated = self.subject.get_model_file_value(effect)
+        value = None
+        if stated is not None:
+            unit, value = stated.unit, stated.value
+            reach = replace(
+                reach,
+                size=stated.compute_half_width(reach.size),
+                estimate_if_fitted=stated.compute_half_width(reach.estimate_if_fitted),
+            )
+        instead = tuple(c.effect for c in self.verdict.causes if effect in c.alternatives)
+        says = format_effect_name(effect.partition("@")[0])
+        part = library.find_effect(effect, self.subject.kind.system).at
+        return SheetRow(
+            label,
+            says,
+            part,
+            "not shown",
+            unit,
+            stated=value,
+            detection_limit=reach,
+            alternatives=instead,
+        )
+
+    def _of_effect(
+        self,
+        effect: str,
+        label: str,
+        number: FittedValue,
+        state: QuantityState,
+        cause: Cause | None = None,
+    ) -> SheetRow:
+        placed = library.find_effect(effect, self.subject.kind.system)
+        stated = self.subject.get_model_file_value(effect)
+        if stated is not None:
+            number = stated.compute_total(number)
+        row = _row(
+            label, format_effect_name(effect.partition("@")[0]), placed.at, state, number, stated
+        )
+        if cause is None:
+            return row
+        gains = [c.heldout_gain for c in self.verdict.candidates if c.effect == cause.effect]
+        share = next(iter(gains), None)
+        return replace(row, p_value=cause.p_value, share=share, alternatives=cause.alternatives)
+
+    def _cause(self, name: str) -> Cause | None:
+        return next((c for c in self.verdict.causes if c.effect == name), None)
+
+
+def _row(
+    name: str, says: str, part: str, state: QuantityState, number: FittedValue, stated: Any
+) -> SheetRow:
+    value = None if stated is None else stated.value
+    return SheetRow(name, says, part, state, number.unit, number, value)
+
+
+def _tail(place: str) -> str:
+    return place.rpartition(".")[2]
+
+
+def _is_nothing(number: FittedValue) -> bool:
+    """Return whether the coefficient of a cause at other places may be zero here."""
+    if number.low is None or number.high is None:
+        return False
+    return number.low <= 0 <= number.high
+
+
+def _of_number(number: FittedValue, stated: ModelFileValue | None) -> DetectionLimit:
+    low, high = number.low or 0.0, number.high or 0.0
+    size = max(abs(low), abs(high))
+    return DetectionLimit(size if stated is None else stated.compute_half_width(size))

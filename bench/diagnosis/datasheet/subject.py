@@ -1,0 +1,178 @@
+"""Subject of a data sheet: a joint of a robot with its actuators and sensors, or a system."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from sims import effects as library
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.system import ALL_PLACES, Effect
+from sims.extended_simulator import FittedValue
+from sims.recording.recording import Recording
+from sims.system_simulator import SystemSimulator
+
+PLACE_KIND_TITLES = {"joint": "Joint", "actuator": "Actuator", "channel": "Sensor"}
+"""Titles of the kinds of places that belong to a joint, in the order of the sheet."""
+_SHARES = {"actuator.stiffness": "{force}/{length}", "actuator.damping": "{force}*s/{length}"}
+"""Units of numbers of the model file, for effects that are relative changes of these numbers."""
+
+
+class ModelFileValue(NamedTuple):
+    """Value that a model file specifies for a number.
+
+    Attributes:
+        value: Value in the model file.
+        unit: Unit of the value.
+        share: Whether the effect is a relative change of the value, not a difference from it.
+    """
+
+    value: float
+    unit: str
+    share: bool
+
+    def compute_total(self, number: FittedValue) -> FittedValue:
+        """Return the value of the model file with an effect's coefficient applied."""
+        low, high = number.low, number.high
+        if low is None or high is None:
+            return FittedValue(self._with(number.value), self.unit, None, None)
+        return FittedValue(self._with(number.value), self.unit, self._with(low), self._with(high))
+
+    def compute_half_width(self, half: float) -> float:
+        """Convert half an interval of the coefficient to half an interval of the total."""
+        return half * self.value if self.share else half
+
+    def _with(self, c: float) -> float:
+        return self.value * (1.0 + c) if self.share else self.value + c
+
+
+@dataclass(frozen=True)
+class SheetSubject:
+    """Joint or system that a data sheet describes.
+
+    Attributes:
+        kind: Simulator class of the system.
+        joint: Joint of a robot; empty for a system with a single place.
+        places: Names of the joint, its actuators and its channels.
+    """
+
+    kind: type[SystemSimulator]
+    joint: str
+    places: frozenset[str]
+
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the actuators that drive the joint."""
+        return tuple(spot.name for spot in self._spots().get("actuator", ()) if self._on(spot))
+
+    @property
+    def is_prismatic(self) -> bool:
+        """Return whether the joint is prismatic, not rotary."""
+        if not self.joint:
+            return self.kind.system.kind != "rotary"
+        (joint,) = (s for s in self._spots()["joint"] if s.name == self.joint)
+        return bool(joint.kind == "slide")
+
+    def is_driven(self, recording: Recording) -> bool:
+        """Return whether a drive acts here.
+
+        A drive is an actuator of the robot's file, or an input of the recording that is not always
+        zero.
+        """
+        inputs = {
+            name for run in recording.runs for name, signal in run.inputs.items() if signal.any()
+        }
+        if not self.joint:
+            return bool(inputs)
+        return bool(self.actuators) or f"force.{self.joint}" in inputs
+
+    def acts_here(self, effect: Effect | type[Effect]) -> bool:
+        """Return whether an effect acts here and at one place only."""
+        if effect.at not in PLACE_KIND_TITLES or effect.place == ALL_PLACES:
+            return False
+        return effect.place in self.places if self.joint else True
+
+    def list_effects(self) -> Iterator[type[Effect]]:
+        """Yield every registered effect that can act here."""
+        for effect in library.list_effects_for(self.kind.system).values():
+            if self.acts_here(effect):
+                yield effect
+
+    def localise_effect(
+        self, name: str, numbers: Mapping[str, FittedValue]
+    ) -> Iterator[tuple[str, str, FittedValue]]:
+        """Yield the coefficients that a fitted effect has here.
+
+        Args:
+            name: Name of the effect, possibly of a family.
+            numbers: Fitted coefficients.
+
+        Yields:
+            Name of the effect at this place, name of the coefficient, and its value.
+        """
+        base, _, place = name.partition("@")
+        if place != ALL_PLACES:
+            if self.acts_here(library.find_effect(name, self.kind.system)):
+                yield from ((name, key, number) for key, number in numbers.items())
+            return
+        there = [one.place for one in self.list_effects() if one.of == base]
+        for key, number in numbers.items():
+            coefficient, _, at = key.partition("@")
+            # A family with one coefficient for all places, such as a delay, has the same value
+            # here.
+            for one in [at] if at else there:
+                if one in self.places:
+                    yield f"{base}@{one}", coefficient, number
+
+    def get_model_file_value(self, effect: str) -> ModelFileValue | None:
+        """Return the value in the model file that an effect changes; None if there is none."""
+        base, _, place = effect.partition("@")
+        for kind in ("joint", "actuator"):
+            for spot in self._spots().get(kind, ()):
+                if spot.name == place and base in spot.stated:
+                    return self._stated(base, spot)
+        return None
+
+    def _stated(self, base: str, spot: Any) -> ModelFileValue:
+        length, force = ("m", "N") if spot.kind == "slide" else ("rad", "N*m")
+        share = base in _SHARES
+        effect = library.find_effect(f"{base}@{spot.name}", self.kind.system)
+        unit = _SHARES[base] if share else effect.coefficients[0].units[0] or "1"
+        # A servo has a negative bias, but its gain is positive.
+        value = abs(spot.stated[base])
+        return ModelFileValue(value, unit.format(force=force, length=length), share)
+
+    def _spots(self) -> Mapping[str, Any]:
+        spots: Mapping[str, Any] = getattr(self.kind.system, "spots", {})
+        return spots
+
+    def _on(self, spot: Any) -> bool:
+        (joint,) = (s for s in self._spots()["joint"] if s.name == self.joint)
+        return bool(spot.coordinate == joint.coordinate)
+
+
+def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject:
+    """Make the subject of a data sheet.
+
+    Args:
+        kind: Simulator class of the system.
+        joint: Joint of a robot; None for the only joint.
+
+    Raises:
+        InputError: The joint does not exist, or there are several and none is given.
+    """
+    if not kind.has_model:
+        if joint is not None:
+            raise InputError(f"--joint: expected none, as {kind.name} is no robot; found {joint}")
+        return SheetSubject(kind, "", frozenset())
+    spots: Mapping[str, Any] = vars(kind.system)["spots"]
+    joints = [spot.name for spot in spots["joint"]]
+    if joint is None and len(joints) > 1:
+        raise InputError(f"robot {kind.name}: expected --joint, one of {', '.join(joints)}")
+    joint = joints[0] if joint is None else joint
+    if joint not in joints:
+        raise make_unknown_name_error(f"joint of robot {kind.name}", joint, joints)
+    bare = SheetSubject(kind, joint, frozenset())
+    channels = {f"{kind_of}.{joint}" for kind_of in ("q", "qd", "tau")}
+    return SheetSubject(kind, joint, frozenset({joint, *bare.actuators, *channels}))

@@ -1,0 +1,108 @@
+"""Text of a data sheet's rows, on the page and in print."""
+
+from __future__ import annotations
+
+import re
+
+from bench.diagnosis.datasheet.sheet_rows import SheetRow
+from bench.diagnosis.datasheet.subject import PLACE_KIND_TITLES
+from bench.diagnosis.report.wording import (
+    append_unit,
+    format_number,
+    format_p_value,
+    format_percent,
+    joined,
+)
+
+UNJUDGED_P_VALUE = 0.05
+"""P-value above which a cause is on the sheet only because the search ended before it was judged.
+"""
+
+
+def title(row: SheetRow, is_driven: bool) -> str:
+    """Return the title of the part of the table that a row belongs to.
+
+    Args:
+        row: Row of the sheet.
+        is_driven: Whether a drive acts on the joint or system.
+    """
+    if row.part == "system":
+        return "Motor" if is_driven else "System"
+    return PLACE_KIND_TITLES[row.part]
+
+
+def format_prediction_interval(row: SheetRow) -> str:
+    """Format half the prediction interval for a run or log that is not yet recorded."""
+    return (
+        ""
+        if row.prediction_half_width is None
+        else f"± {format_number(row.prediction_half_width, 2)}"
+    )
+
+
+def format_name(row: SheetRow) -> str:
+    """Return the name of the row in words."""
+    if row.part == "system":
+        return row.name.replace("_", " ")
+    # The sheet shows the value itself, not its difference from the model file.
+    return row.says if row.stated is None else re.sub("^(wrong|misplaced) ", "", row.says)
+
+
+def format_short_name(row: SheetRow) -> str:
+    """Return the name of the row without the joint or actuator that the whole sheet describes."""
+    effect, _, rest = row.name.partition("@")
+    if not rest:
+        return row.name
+    place, _, coefficient = rest.partition(" ")
+    channel = place.partition(".")[0] if row.part == "channel" else ""
+    return " ".join(part for part in (effect, coefficient, channel) if part)
+
+
+def format_evidence(row: SheetRow, short: bool = False) -> str:
+    """Format the evidence for a number on the sheet.
+
+    Args:
+        row: Row of the sheet.
+        short: Whether to use the short form for print.
+    """
+    if row.state == "derived":
+        return "follows from those below"
+    if row.state == "fitted":
+        return "fitted" if row.number and row.number.low is not None else "not fixed by these data"
+    judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
+    cut = "not judged" if short else "the search ended before it was judged"
+    said = [format_p_value(row.p_value) if judged else cut]
+    if row.share is not None:
+        closed = format_percent(row.share)
+        said.append(
+            f"{closed} held out" if short else f"alone it closes {closed} of the held-out gap"
+        )
+    if row.alternatives:
+        said.append(f"{joined(row.alternatives, 'or')} would do as well")
+    return "; ".join(said)
+
+
+def format_detection_limit(row: SheetRow) -> str:
+    """Format the smallest value of an absent effect that these data would have revealed."""
+    reach = row.detection_limit
+    if reach is None or reach.size == float("inf"):
+        return "nothing: not touched"
+    size = format_number(reach.size, 2)
+    if reach.vague:
+        return append_unit(f"nothing plausible, ± {size}", row.unit)
+    if reach.limit:
+        return append_unit(f"none {reach.limit} {size}", row.unit)
+    if reach.is_nonzero_if_fitted:
+        return (
+            append_unit(f"{format_number(reach.estimate_if_fitted, 2)} ± {size}", row.unit)
+            + ", not named"
+        )
+    return append_unit(f"0 ± {size}", row.unit)
+
+
+def format_confounding(row: SheetRow) -> str:
+    """Format confounded parameters, and causes that the effect might replace."""
+    said = list(row.detection_limit.confounded_with) if row.detection_limit else []
+    if row.alternatives:
+        said.append(f"may be there instead of {joined(row.alternatives, 'or')}")
+    return ", ".join(said)

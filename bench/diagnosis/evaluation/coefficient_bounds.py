@@ -1,0 +1,147 @@
+"""Ranges of effect coefficients: where they are plausible, and where a fit may move them.
+
+Times and frequencies follow the time scale of the recording (`evaluation.time_scale`).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.time_scale import is_instant
+from sims.core.simulator import Array, Parameter
+from sims.core.system import Coefficient, Effect, Friction
+
+MAX_RANGE_FACTOR = 20.0
+"""Ratio of the fit bounds to the plausible range, for coefficients of equation-based systems."""
+BEYOND_MODEL = 1000.0
+"""Ratio of the fit bounds to the plausible range, for quantities that a robot model file specifies.
+
+The total of such a quantity has physical limits (`least` and `most` of the coefficient), and its
+plausible range is a guess from the weight of the robot: damping of 60 N m s on a link of 1 N m is
+unusual, but possible.
+"""
+MAX_RANGE_FACTOR_DRY_FRICTION = 4.0
+"""Ratio of the fit bounds to the plausible range, for dry friction.
+
+Stronger friction only sticks, and sticking divides the steps of the engine.
+"""
+INVERSE_FORCE_UNITS = ("1/N", "1/(N")
+"""Units of coefficients of terms that grow faster than linearly with a force."""
+MIN_CYCLES_PER_RUN = 1.0
+"""Minimum number of cycles of a periodic effect within the longest run.
+
+With fewer cycles, any slow change would be called periodic.
+"""
+AT_BOUND = 1e-6
+"""Maximum distance of a value at a bound from this bound, as a share of the range.
+
+A bound of zero is reached exactly or not at all, because ranges are wide compared with small
+coefficients.
+"""
+NEAR = 1e-3
+"""Maximum distance of a value at a bound from this bound, as a share of the bound itself.
+
+It applies in addition to `AT_BOUND`.
+"""
+
+Bound = Literal["low", "high"]
+"""End of a range that a value lies at."""
+
+
+def compute_coefficient_bounds(world: RunEvaluator, name: str) -> list[tuple[float, float]]:
+    """Return the range in which a fit may move each coefficient of an effect.
+
+    A plausible range ranks causes, and values outside it are reported, but it does not override the
+    data. A fit is limited by physics (`Coefficient.least` and `most`: totals of friction, damping,
+    inertia and mass are not negative), or far outside the plausible range. A coefficient that is
+    nonnegative by definition stays so, and a shape parameter stays in its range.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+    """
+    effect = world.available_effects[name]
+    pairs = zip(world.parameters[world.slots[name]], effect.coefficients, strict=False)
+    return [
+        _within(_bounds(parameter, coefficient, effect, world), coefficient)
+        for parameter, coefficient in pairs
+    ]
+
+
+def clip_coefficients(world: RunEvaluator, name: str, c: Array) -> Array:
+    """Clip the coefficients (k,) of an effect to the range in which a fit may move them.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) its coefficients.
+    """
+    limited: Array = np.clip(c, *np.array(compute_coefficient_bounds(world, name)).T)
+    return limited
+
+
+def is_unusual(value: float, low: float, high: float) -> bool:
+    """Return whether a value lies outside its plausible range by more than rounding.
+
+    Args:
+        value: the value.
+        low: lower end of the range.
+        high: upper end of the range.
+    """
+    near = AT_BOUND * (high - low)
+    return not low - near <= value <= high + near
+
+
+def bound_of(value: float, low: float, high: float) -> Bound | None:
+    """Return the end of its range that a value lies at; None if it lies inside.
+
+    Args:
+        value: the value.
+        low: lower end of the range.
+        high: upper end of the range.
+    """
+    near = AT_BOUND * (high - low)
+    # A range may be a thousand times as wide as the distance of its bound from zero.
+    if value <= low + min(near, NEAR * abs(low)):
+        return "low"
+    return "high" if value >= high - min(near, NEAR * abs(high)) else None
+
+
+def _within(bounds: tuple[float, float], coefficient: Coefficient) -> tuple[float, float]:
+    """Return a range restricted to the physical limits of a coefficient."""
+    low, high = bounds
+    if coefficient.least is not None:
+        low = max(low, coefficient.least)
+    if coefficient.most is not None:
+        high = min(high, coefficient.most)
+    return low, high
+
+
+def _bounds(
+    parameter: Parameter, coefficient: Coefficient, effect: Effect, world: RunEvaluator
+) -> tuple[float, float]:
+    """Return the range of one coefficient without its physical limits."""
+    low, high = parameter.bounds
+    longest = world.longest
+    if is_instant(parameter):
+        return world.clock
+    if parameter.unit == "Hz":
+        # The lower bound is at most half of the upper bound, so that the range is not empty.
+        low = min(max(low, MIN_CYCLES_PER_RUN / longest), high / 2.0)
+    # A positive lower bound marks a shape parameter, such as a frequency, a rate or a sharpness.
+    if low > 0:
+        return low, high
+    if parameter.unit == "s":
+        # Delays longer than a run look constant within it.
+        return max(MAX_RANGE_FACTOR * low, -longest), min(MAX_RANGE_FACTOR * high, longest)
+    # A term that grows with the square of a force does not cause sticking by itself.
+    dry = isinstance(effect, Friction) and not parameter.unit.startswith(INVERSE_FORCE_UNITS)
+    beyond = MAX_RANGE_FACTOR_DRY_FRICTION if dry else MAX_RANGE_FACTOR
+    # The limits of a robot coefficient refer to the total with the value of the model file.
+    if world.kind.has_model and coefficient.least is not None:
+        beyond = BEYOND_MODEL
+    # A coefficient whose sign is part of the definition of its effect has a lower bound of zero.
+    return beyond * low, beyond * high

@@ -1,0 +1,177 @@
+"""Discretisation error of a robot's time step, and finer steps and integrators that remove it.
+
+A model file specifies a time step and an integrator, and both affect the motion: with a coarse step
+the motion is early by about half a step, or a stiff servo becomes unstable. With the motion q(h) at
+step size h, a scheme is accepted as the reference if halving its step hardly changes the motion. If
+no scheme qualifies, the first-order error of an implicit scheme is extrapolated (L. F. Richardson,
+1911, doi:10.1098/rsta.1911.0009):
+
+    q = 2 q(h / 2) - q(h)                                                                      (1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from sims.core.simulator import Array
+from sims.robot.integrator_settings import IntegratorSettings
+from sims.robot.robot_simulator import RobotSimulator
+
+MIN_DISCRETISATION_ERROR = 0.2
+"""Minimum RMS discretisation error, in units of the noise, at which finer steps are considered."""
+MAX_CORRECTED_ERROR = 0.1
+"""Maximum RMS error, in units of the noise, of a setting that corrects the discretisation error."""
+MAX_CORRECTED_ERROR_FAR_FIT = 0.7
+"""Maximum RMS error of a setting, in units of the noise, if the residual is much larger.
+
+The rest of the error is corrected after the fit (`bench.diagnosis.fitting.linearised_runs`).
+"""
+MIN_ERROR_REDUCTION = 4.0
+"""Minimum factor by which a setting with an error above `MAX_CORRECTED_ERROR` must reduce the error.
+
+The reference is the error of the step of the model file.
+"""
+MAX_ERROR_TO_RESIDUAL_RATIO = 0.05
+"""Maximum error of a setting above `MAX_CORRECTED_ERROR`, as a share of the residual of the model."""
+CONVERGENCE_TOLERANCE = 0.03
+"""Maximum RMS change by halving the step, in units of the noise, of a reference scheme."""
+MAX_STEP_DIVISIONS = 10
+"""Maximum number of divisions of the step of the model file."""
+STIFF_INTEGRATOR = "implicitfast"
+"""Integrator that remains stable with stiff servos."""
+CHECKED_RUN_COUNT = 2
+"""Number of runs that are checked; a step that is too coarse is so in all runs."""
+
+
+class StepRefinement(NamedTuple):
+    """A finer step or better integrator for a robot.
+
+    Attributes:
+        kind: its simulator with these settings.
+        own: step and integrator of the model file.
+        numerics: step and integrator that correct the error.
+        error: RMS discretisation error of `own`, in units of the noise.
+        corrected_error: RMS discretisation error of `numerics`, in units of the noise.
+    """
+
+    kind: type[RobotSimulator]
+    own: IntegratorSettings
+    numerics: IntegratorSettings
+    error: float
+    corrected_error: float
+
+    def is_accurate_enough(self, left: float) -> bool:
+        """Return whether the step is fine enough for a model with the given residual.
+
+        Args:
+            left: RMS residual of the model, in units of the noise.
+        """
+        return self.corrected_error < max(MAX_CORRECTED_ERROR, MAX_ERROR_TO_RESIDUAL_RATIO * left)
+
+
+def find_step_refinements(world: RunEvaluator, noise: NoiseModel) -> Iterator[StepRefinement]:
+    """Yield settings that reproduce the converged motion of the robot, the cheapest first.
+
+    Nothing is generated if the settings of the model file are accurate, or if no reference
+    converges.
+
+    Args:
+        world: the runs of a robot.
+        noise: noise of each channel.
+    """
+    kind = world.kind
+    assert issubclass(kind, RobotSimulator)
+    motions = _ReferenceMotions(world, noise, kind)
+    own = kind.numerics
+    reference = motions.reference(own)
+    if reference is None:
+        return
+    error = motions.apart(motions.of(own), reference)
+    if not error > MIN_DISCRETISATION_ERROR:
+        return
+    for numerics in _settings(own):
+        rest = motions.apart(motions.of(numerics), reference)
+        if rest < max(
+            MAX_CORRECTED_ERROR, min(MAX_CORRECTED_ERROR_FAR_FIT, error / MIN_ERROR_REDUCTION)
+        ):
+            yield StepRefinement(
+                kind.with_integrator_settings(numerics), own, numerics, error, rest
+            )
+
+
+def _settings(own: IntegratorSettings) -> Iterator[IntegratorSettings]:
+    """Yield steps and integrators in the order of their computational cost."""
+    step, integrator = own
+    cost = {"RK4": 3.3}
+    tried = []
+    for parts in (1, 2, 5, MAX_STEP_DIVISIONS):
+        for name in dict.fromkeys((integrator, STIFF_INTEGRATOR, "RK4")):
+            if (parts, name) != (1, integrator):
+                tried.append((parts * cost.get(name, 1.0), parts, name))
+    for _, parts, name in sorted(tried, key=lambda entry: entry[0]):
+        yield IntegratorSettings(step / parts, name)
+
+
+class _ReferenceMotions:
+    """Motions of the first runs with any step and integrator, each simulated once."""
+
+    def __init__(self, world: RunEvaluator, noise: NoiseModel, kind: type[RobotSimulator]) -> None:
+        self._world, self._kind, self._noise = world, kind, noise
+        self._tracks = world.tracks[:CHECKED_RUN_COUNT]
+        self._seen: dict[IntegratorSettings, Array] = {}
+
+    def of(self, numerics: IntegratorSettings) -> Array:
+        """Return the motion (R, T, C), NaN after the end of a shorter run."""
+        if numerics not in self._seen:
+            self._seen[numerics] = self._simulated(numerics)
+        return self._seen[numerics]
+
+    def _simulated(self, numerics: IntegratorSettings) -> Array:
+        """Simulate the runs without effects at nominal parameters."""
+        world = self._world
+        kind = self._kind.with_integrator_settings(numerics)
+        simulator = kind(world.recording.constants, world.channels)
+        count = len(self._tracks)
+        theta = np.tile(world.get_nominal_theta()[: world.own], (count, 1))
+        states = dict(zip(world.states, world.guess[:count].T, strict=True))
+        scenarios = [track.scenario for track in self._tracks]
+        world.simulations += count
+        return simulator.simulate_batch(theta, scenarios, states)
+
+    def reference(self, own: IntegratorSettings) -> Array | None:
+        """Return the converged motion of the robot; None if no scheme converges."""
+        for parts in (1, 2, 5):
+            coarse, fine = (
+                self.of(IntegratorSettings(own.timestep / n, "RK4")) for n in (parts, 2 * parts)
+            )
+            if self.apart(coarse, fine) < CONVERGENCE_TOLERANCE:
+                return fine
+        for parts in (2, 5):
+            pairs = []
+            for n in (parts, 2 * parts):
+                coarse, fine = (
+                    self.of(IntegratorSettings(own.timestep / k, STIFF_INTEGRATOR))
+                    for k in (n, 2 * n)
+                )
+                pairs.append(2.0 * fine - coarse)  # (1)
+            if self.apart(*pairs) < CONVERGENCE_TOLERANCE:
+                return pairs[1]
+        return None
+
+    def apart(self, one: Array, other: Array) -> float:
+        """Return the RMS difference in units of the noise; infinite if a simulation fails.
+
+        Only available samples of the recording are compared.
+        """
+        there = [np.isfinite(track.observed) for track in self._tracks]
+        squares = []
+        for run, seen in enumerate(there):
+            apart = (one[run, : len(seen)] - other[run, : len(seen)]) / self._noise.sigma
+            squares.append(np.square(apart[seen]))
+        size = float(np.sqrt(np.concatenate(squares).mean()))
+        return size if np.isfinite(size) else float("inf")

@@ -1,0 +1,100 @@
+"""Noise floor: the error that a perfect model would have, due to sensor noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.logs.quality.noise_estimation import estimate_noise
+from sims.core.simulator import Array
+from sims.recording.recording import Recording
+
+INTEGRATION_ERROR_SHARE = 1e-4
+"""Minimum noise floor as a share of the range of a channel.
+
+Smaller differences are errors of the integrator.
+"""
+RANGE_QUANTILES = (0.02, 0.98)
+"""Quantiles between which the range of a channel is measured, so that outliers do not widen it."""
+DEFAULT_FLOOR_SHARE = 1e-3
+"""Noise floor as a share of the typical size of a channel, if the samples give no estimate."""
+MIN_SIGMA = 1e-12
+"""Minimum noise floor in SI units, because residuals are divided by it."""
+MEDIAN_SIGMA_ERROR_FACTOR = 1.2
+"""Relative standard error of a noise estimate, times √n for n samples.
+
+The estimate is the median of n independent magnitudes. For the standard deviation, which is
+efficient, the factor is 0.71; the median has an efficiency of 37 %.
+"""
+MIN_SAMPLES = 4
+"""Minimum number of samples assumed for the uncertainty of an estimate."""
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Noise floor of each channel.
+
+    Attributes:
+        sigma: (C,) standard deviation.
+        is_stated: (C,) whether it is specified by the recording, and not estimated.
+        quantisation_step: (C,) quantisation step; 0 if the channel is not quantised.
+        uncertainty: (C,) relative standard error of the sigma.
+    """
+
+    sigma: Array
+    is_stated: NDArray[np.bool_]
+    quantisation_step: Array
+    uncertainty: Array
+    """Relative standard error (C,) of an estimated sigma; 0 if it is specified."""
+
+
+def compute_noise_floor(world: RunEvaluator, recording: Recording) -> NoiseFloor:
+    """Return the specified noise of each channel, or estimate it from all runs.
+
+    Held-out runs are included, because they also show the sensor noise.
+
+    Args:
+        world: the runs for fitting; its simulator defines the channels.
+        recording: the recording with all its runs.
+    """
+    sigmas, stated, steps, doubts = [], [], [], []
+    for channel in world.simulator.channels:
+        signals = [(run.times, run.channels[channel.name]) for run in recording.runs]
+        samples = [y[np.isfinite(y)] for _, y in signals]
+        values = np.concatenate(samples)
+        # Estimate also if the noise is specified, because the step shows whether the channel is
+        # quantised.
+        estimate = estimate_noise(signals)
+        known = recording.noise.get(channel.name, 0.0) > 0
+        sigma = recording.noise[channel.name] if known else estimate.sigma
+
+        # No simulation is accurate enough for a noise floor of zero.
+        least = max(INTEGRATION_ERROR_SHARE * range_of(values), MIN_SIGMA)
+        # There may be too few samples; a channel that never changes does not show its noise.
+        if not np.isfinite(sigma) or (not known and is_constant(values)):
+            sigma = DEFAULT_FLOOR_SHARE * channel.scale
+        sigmas.append(max(sigma, least))
+        stated.append(known)
+        steps.append(estimate.step)
+        doubts.append(
+            0.0 if known else MEDIAN_SIGMA_ERROR_FACTOR / max(values.size, MIN_SAMPLES) ** 0.5
+        )
+    return NoiseFloor(
+        sigma=np.array(sigmas),
+        is_stated=np.array(stated),
+        quantisation_step=np.array(steps),
+        uncertainty=np.array(doubts),
+    )
+
+
+def is_constant(values: Array) -> bool:
+    """Return whether samples (n,) exist and are all equal."""
+    return bool(values.size) and not np.ptp(values)
+
+
+def range_of(values: Array) -> float:
+    """Return the range of values (n,) without outliers; 0 if there are no values."""
+    return float(np.ptp(np.quantile(values, RANGE_QUANTILES))) if values.size else 0.0

@@ -1,0 +1,75 @@
+"""Add white noise to recordings without sensor noise, such as simulated ones.
+
+Two exact simulations of one system differ by their integration errors, 10^-9 to 10^-4 of the range
+of a channel. Without noise, every test would find this difference significant, and a search would
+explain the integrator. White noise of 10^-4 of the range (`floor.PRECISION`) covers the difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bench.core.random_streams import make_rng
+from bench.diagnosis.evaluation.noise_floor import INTEGRATION_ERROR_SHARE, MIN_SIGMA, range_of
+from bench.logs.quality.noise_estimation import differences_sigma
+from sims.core.simulator import Array
+from sims.recording.recording import Recording, Run
+
+ORDER = 8
+"""Order of the differences that remove the motion from a smooth signal.
+
+At ten samples per period, 2 % of a sine remains; at a hundred samples, 10^-10.
+"""
+FREE = 0.02
+"""Maximum remainder of a channel without noise, as a share of the noise that would be added.
+
+The remainder due to rounding to six digits is smaller.
+"""
+
+
+def add_least_noise(recording: Recording, channels: Sequence[str]) -> tuple[Recording, list[str]]:
+    """Add white noise of `INTEGRATION_ERROR_SHARE` of a channel's range to each channel without noise.
+
+    Channels that never change are not modified.
+
+    Args:
+        recording: the recording.
+        channels: names of the channels to check.
+
+    Returns:
+        The recording, and the names of the channels that were changed.
+    """
+    changed = {name: size for name in channels if (size := _missing(recording, name)) > 0.0}
+    if not changed:
+        return recording, []
+    runs = tuple(_noisy(run, changed) for run in recording.runs)
+    return replace(recording, runs=runs), list(changed)
+
+
+def _missing(recording: Recording, name: str) -> float:
+    """Return the standard deviation of the noise to add; 0 for noisy or constant channels."""
+    signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
+    values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
+    least = INTEGRATION_ERROR_SHARE * range_of(values)
+    if least < MIN_SIGMA:
+        return 0.0
+    # The estimate is not finite if all runs are too short for the differences.
+    return least if differences_sigma(signals, ORDER) < FREE * least else 0.0
+
+
+def _noisy(run: Run, sizes: dict[str, float]) -> Run:
+    """Return the run with white noise in some channels, reproducible for each run and channel."""
+
+    def noise(name: str, values: Array) -> Array:
+        return sizes[name] * make_rng("least noise", run.log, run.name, name).normal(
+            size=values.shape
+        )
+
+    channels = {
+        name: values + noise(name, values) if name in sizes else values
+        for name, values in run.channels.items()
+    }
+    return replace(run, channels=channels)

@@ -1,0 +1,251 @@
+"""AR(1) sensor noise: likelihood, whitening and portmanteau test.
+
+The noise e of a channel has variance σ² and correlation φ between neighbouring samples (G. E. P.
+Box, G. M. Jenkins, Time Series Analysis, chapter 3). The innovations u are independent:
+
+    e_t = φ e_{t-1} + u_t,   var u = (1 - φ²) σ²                                                 (1)
+
+Whitening (S. J. Prais, C. B. Winsten 1954; W. H. Greene, Econometric Analysis, chapter 20)
+transforms it into independent numbers of variance one, so that ordinary least squares becomes
+generalised least squares. A sample without a predecessor, at the start of a run or after a missing
+sample, starts a new sequence:
+
+    w_t = (e_t - φ e_{t-1}) / (σ √(1 - φ²)),   w_t = e_t / σ without a predecessor               (2)
+
+For n samples, of which m have a predecessor, twice the log-likelihood is, up to a constant,
+
+    2 log L = - n log σ² - m log(1 - φ²) - Σ w_t²                                                (3)
+
+Its maximum over σ² is at the mean square v of (2) for σ = 1:
+
+    2 log L = - n log v - m log(1 - φ²) - n                                                      (4)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.benchmark.statistics.chi_squared import chi_squared_tail
+from sims.core.simulator import Array
+
+Mask = NDArray[np.bool_]
+
+PHI_GRID = (0.0, 0.3, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98)
+"""Correlations over which a likelihood is maximised."""
+PHI_OFFSETS = (-0.1, -0.05, -0.02, 0.0, 0.01, 0.02, 0.05, 0.1)
+"""Offsets from the sample correlation of a residual that are tried."""
+MIN_PHI = -0.5
+"""Minimum correlation that is tried; negative for errors with alternating sign."""
+MAX_PHI = 0.995
+"""Maximum correlation that is tried; at 1 the noise is not stationary, and (2) divides by zero."""
+MIN_EFFECTIVE_SAMPLE_SHARE = 0.1
+"""Minimum share of the samples that remain as degrees of freedom after a fit."""
+PORTMANTEAU_LAGS = 20
+"""Number of autocorrelations in the portmanteau test."""
+
+MIN_VARIANCE = 1e-300
+"""Minimum variance, because zero has no logarithm and no reciprocal."""
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Noise of each channel.
+
+    Attributes:
+        sigma: (C,) standard deviation, in the unit of the channel.
+        phi: (C,) AR(1) correlation.
+    """
+
+    sigma: Array
+    phi: Array
+
+    def with_correlation(self, phi: Array | float) -> NoiseModel:
+        """Return the noise with other correlations."""
+        correlations = np.asarray(phi, dtype=np.float64)
+        spread = np.broadcast_to(correlations, self.sigma.shape)
+        return NoiseModel(self.sigma, spread.copy())
+
+
+def _unit(phi: float) -> NoiseModel:
+    """Return the noise of one channel with the given correlation and variance one."""
+    return NoiseModel(np.ones(1), np.array([phi]))
+
+
+def _has_predecessor(seen: Mask) -> Mask:
+    """Return whether each sample but the first has a direct predecessor (R, T - 1, C)."""
+    follows: Mask = seen[:, 1:] & seen[:, :-1]
+    return follows
+
+
+def whiten(values: Array, seen: Mask, noise: NoiseModel) -> Array:
+    """Whiten values by (2).
+
+    Args:
+        values: (R, T, C, ...) noise, or derivatives of noisy signals, because (2) is linear.
+        seen: (R, T, C) mask of available samples; the others become zero.
+        noise: noise of each channel.
+
+    Returns:
+        Values of the same shape; whitened noise is independent with variance one.
+    """
+    extra = (1,) * (values.ndim - 3)
+    # Derivatives have further axes after that of the channels.
+    phi = noise.phi.reshape(-1, *extra)
+    sigma = noise.sigma.reshape(-1, *extra)
+    # A Jacobian is large, and multiplication is faster than division.
+    result: Array = values * (1.0 / sigma)
+
+    # A second pass over all samples, which white noise does not need.
+    if phi.any():
+        pairs = _has_predecessor(seen)
+        follows = pairs.reshape(*pairs.shape, *extra)
+        # Values of missing samples are arbitrary, even NaN, and must not affect the next sample.
+        before = np.where(follows, result[:, :-1], 0.0)
+        latter = result[:, 1:]
+        innovations = (latter - phi * before) / np.sqrt(1.0 - phi * phi)
+        result[:, 1:] = np.where(follows, innovations, latter)
+
+    if not seen.all():
+        result = np.where(seen.reshape(*seen.shape, *extra), result, 0.0)
+    return result
+
+
+def compute_log_determinant(seen: Mask, phi: Array | float) -> float:
+    """Return half the log-determinant of whitening at unit variance, -m/2 log(1 - φ²) of (3)."""
+    follows = _has_predecessor(seen).sum(axis=(0, 1))
+    logarithms = np.log1p(-np.square(phi))
+    return float(-0.5 * (follows * logarithms).sum())
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Twice the log-likelihood of a residual, maximised over phi and sigma of each channel.
+
+    Attributes:
+        value: (4) summed over the channels, without its last term, which is the same for all
+            models.
+        sigma: (C,) standard deviation of the noise of each channel; NaN for a channel without
+            samples.
+        phi: (C,) AR(1) correlation of each channel.
+    """
+
+    value: float
+    sigma: Array
+    phi: Array
+
+
+def maximise_likelihood(residual: Array, seen: Mask, lost: float = 0.0) -> Likelihood:
+    """Maximise the likelihood of a residual over the noise of each channel.
+
+    Args:
+        residual: (R, T, C) residual of a model.
+        seen: (R, T, C) mask of available samples.
+        lost: degrees of freedom used by the fit, subtracted from the samples when sigma is
+            estimated.
+    """
+    total = 0.0
+    sigmas: list[float] = []
+    phis: list[float] = []
+    # The degrees of freedom of the fit are distributed over the channels by their samples.
+    samples = max(int(seen.sum()), 1)
+    share = max(1.0 - lost / samples, MIN_EFFECTIVE_SAMPLE_SHARE)
+    for c in range(residual.shape[2]):
+        channel = slice(c, c + 1)
+        here = seen[:, :, channel]
+        # A channel without samples has no likelihood and no noise.
+        if not here.any():
+            sigmas.append(np.nan)
+            phis.append(0.0)
+            continue
+        value, phi, variance = _maximise_channel_likelihood(residual[:, :, channel], here, share)
+        total += value
+        sigmas.append(variance**0.5)
+        phis.append(phi)
+    return Likelihood(total, np.array(sigmas), np.array(phis))
+
+
+def _maximise_channel_likelihood(
+    residual: Array,
+    seen: Mask,
+    share: float,
+) -> tuple[float, float, float]:
+    """Return the maximum of (4) for one channel (R, T, 1), with its correlation and variance.
+
+    The variance is estimated with the remaining degrees of freedom. The likelihood counts all
+    samples, because Schwarz's criterion has a separate penalty for fitted parameters.
+
+    Args:
+        residual: (R, T, 1) residual.
+        seen: (R, T, 1) mask of available samples.
+        share: share of the samples that remain as degrees of freedom.
+    """
+    count = int(seen.sum())
+    best = (-np.inf, 0.0, 0.0)
+    for phi in _list_nearby_phis(residual, seen):
+        w = whiten(residual, seen, _unit(phi))
+        power = float((w * w).sum())
+        variance = max(power / count, MIN_VARIANCE)
+        # Equation (4) with the determinant of whitening.
+        determinant = 2.0 * compute_log_determinant(seen, phi)
+        value = -count * np.log(variance) + determinant
+        hypothesis = (value, phi, variance / share)
+        best = max(best, hypothesis)
+    return best
+
+
+def _list_nearby_phis(residual: Array, seen: Mask) -> Array:
+    """Return correlations to try, near the sample correlation of the residual."""
+    follows = _has_predecessor(seen)
+    former = residual[:, :-1][follows]
+    latter = residual[:, 1:][follows]
+    power = float(former @ former)
+    # The correlation of zeros is not defined.
+    own = float(former @ latter) / power if power > 0 else 0.0
+    tried = own + np.array(PHI_OFFSETS)
+    around = np.clip(tried, MIN_PHI, MAX_PHI)
+    # White noise is always one of the hypotheses.
+    correlations: Array = np.unique(np.append(around, 0.0))
+    return correlations
+
+
+def compute_portmanteau_p_value(residual: Array, seen: Mask, found: Likelihood) -> float:
+    """Return the p-value of the hypothesis that a residual is AR(1) noise.
+
+    Portmanteau test of the whitened residual: if its autocorrelations r_k at h lags are those of
+    independent numbers, Q has a chi-squared distribution with h - 1 degrees of freedom; φ has used
+    one (G. M. Ljung, G. E. P. Box, Biometrika 65(2), 297, 1978, doi:10.1093/biomet/65.2.297).
+
+        Q = n (n + 2) Σ r_k² / (n - k)                                                           (5)
+
+    With several channels, the smallest p-value is multiplied by their number (Bonferroni).
+
+    Args:
+        residual: (R, T, C) residual of a model.
+        seen: (R, T, C) mask of available samples.
+        found: likelihood of the residual, which contains the fitted correlations.
+    """
+    least = 1.0
+    for c, phi in enumerate(found.phi.tolist()):
+        channel = slice(c, c + 1)
+        here = seen[:, :, channel]
+        white = whiten(residual[:, :, channel], here, _unit(phi))
+        count = max(int(here.sum()), 2)
+        statistic = count * (count + 2.0) * _correlated(white[:, :, 0], count)  # (5)
+        least = min(least, chi_squared_tail(PORTMANTEAU_LAGS - 1, statistic))
+    return min(1.0, least * len(found.phi))
+
+
+def _correlated(w: Array, count: int) -> float:
+    """Return the sum in (5) for whitened values (R, T) with `count` samples."""
+    runs, length = w.shape
+    power = max(float((w * w).sum()), MIN_VARIANCE)
+    total = 0.0
+    for lag in range(1, min(PORTMANTEAU_LAGS, length - 1) + 1):
+        products = w[:, lag:] * w[:, :-lag]
+        correlation = float(products.sum()) / power
+        # Each run starts separately, so `lag` pairs are lost in every run.
+        total += correlation**2 / max(count - lag * runs, 1)
+    return total

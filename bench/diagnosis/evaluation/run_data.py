@@ -1,0 +1,172 @@
+"""A recorded run prepared for fitting: scenario, observations and a guess of the initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask
+from sims.core.simulator import Array, Scenario
+from sims.recording.recording import Recording, Run
+from sims.system_simulator import SystemSimulator
+
+INITIAL_GUESS_SAMPLES = 8
+"""Number of samples at the start of a run from which its initial state is guessed."""
+MIN_SAMPLES_FOR_PARABOLA = 5
+"""Minimum number of samples to fit a parabola; with fewer samples a line is fitted."""
+MIN_SAMPLES_FOR_SLOPE = 3
+"""Minimum number of samples to estimate a slope; with fewer samples it would be mostly noise."""
+DEFAULT_START_HEIGHT = 10.0
+"""Start height in metres of a ball without a recorded height.
+
+It is added to the height that the ball needs so that it does not land during its run.
+"""
+MAX_UNKNOWN_FALL_SPEED = 100.0
+"""Maximum assumed fall speed in m/s of a ball whose height and speed are not recorded."""
+
+
+@dataclass(frozen=True)
+class RunData:
+    """One recorded run.
+
+    Attributes:
+        name: name of the run.
+        scenario: input of the simulator.
+        observed: (T, C) observations in SI units, NaN where missing.
+        initial_state_guess: (s,) initial states, specified or guessed from the first samples.
+        known_state_mask: (s,) whether a state is not estimated, because it is specified or because
+            no recorded channel depends on its coordinate.
+    """
+
+    name: str
+    scenario: Scenario
+    observed: Array
+    initial_state_guess: Array
+    known_state_mask: Mask
+
+    @property
+    def duration(self) -> float:
+        """Duration of the run in seconds."""
+        times = self.scenario.times
+        return float(times[-1] - times[0])
+
+
+def prepare_run(
+    run: Run,
+    recording: Recording,
+    simulator: SystemSimulator,
+    states: Sequence[str],
+) -> RunData:
+    """Prepare a run of a recording for a simulator.
+
+    Args:
+        run: the run.
+        recording: the recording that contains the run.
+        simulator: simulator that observes the recorded channels.
+        states: names of the initial states.
+    """
+    columns = [run.channels[c.name] for c in simulator.channels]
+    # Constants of a run are valid only in this run.
+    constants = {**recording.constants, **run.constants}
+    guesses = _guessed(run, simulator)
+    fixed = {*run.initial, *_find_unobserved_states(simulator)}
+    # Initial values that are not states of the system, such as the pose of a floating base, are not
+    # part of a batch element.
+    begun = {name: value for name, value in run.initial.items() if name not in states}
+    return RunData(
+        name=run.name,
+        scenario=Scenario(
+            run.times, begun, run.inputs, constants, run.linear, run.offset, run.before, run.off
+        ),
+        observed=np.stack(columns, axis=1),
+        initial_state_guess=np.array([guesses[name] for name in states]),
+        known_state_mask=np.array([name in fixed for name in states]),
+    )
+
+
+def _guessed(run: Run, simulator: SystemSimulator) -> dict[str, float]:
+    """Return initial states by name: specified, guessed from the first samples, or default."""
+    system = simulator.system
+    values = dict(simulator.states)
+    # Not strict, because a user-defined system may have states in addition to coordinates and
+    # rates.
+    for coordinate, rate in zip(system.coordinates, system.rates, strict=False):
+        if coordinate in run.channels:
+            values[coordinate], values[rate] = estimate_initial_value_and_slope(
+                run.times, run.channels[coordinate]
+            )
+    # A recorded rate is more accurate than a slope.
+    for rate in system.rates:
+        if rate in run.channels:
+            values[rate] = estimate_initial_value_and_slope(run.times, run.channels[rate])[0]
+    if system.bounces and system.coordinates[-1] not in run.channels:
+        values[system.coordinates[-1]] = _estimate_start_height(run, simulator)
+    # Specified values override every guess.
+    values.update(run.initial)
+    return values
+
+
+def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
+    """Return a start height in metres from which the ball does not land during the run.
+
+    If the height is not recorded, impacts cannot be identified.
+    """
+    constant = simulator.constant_values.get("gravity", 9.81)
+    gravity = float(run.constants.get("gravity", constant))
+    seconds = float(run.times[-1] - run.times[0])
+    # Allow for twice the fall due to gravity and for a fast downward throw.
+    return DEFAULT_START_HEIGHT + MAX_UNKNOWN_FALL_SPEED * seconds + gravity * seconds**2
+
+
+def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
+    """Return the states of coordinates that no recorded channel shows; they keep their defaults."""
+    system, shown = simulator.system, {c.name for c in simulator.channels}
+    hidden = set()
+    pairs = zip(system.coordinates, system.rates, strict=False)
+    for axis, (coordinate, rate) in enumerate(pairs):
+        about = {coordinate, rate, f"accel_{coordinate}"}
+        # Biases and springs act on the primary coordinate, so its states are always estimated.
+        if axis != system.primary and not about & shown:
+            hidden |= {coordinate, rate}
+    return hidden
+
+
+def take_first_samples(scenario: Scenario, samples: int) -> Scenario:
+    """Return a scenario cut to its first samples.
+
+    Args:
+        scenario: the scenario.
+        samples: number of samples to keep.
+    """
+    if samples >= scenario.times.size:
+        return scenario
+    inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
+    off = {name: mask[:samples] for name, mask in scenario.off.items()}
+    return replace(scenario, times=scenario.times[:samples], inputs=inputs, off=off)
+
+
+def estimate_initial_value_and_slope(times: Array, values: Array) -> tuple[float, float]:
+    """Estimate value and slope at the first time from a parabola through the first samples.
+
+    Args:
+        times: (T,) times, s.
+        values: (T,) samples, NaN where missing.
+
+    Returns:
+        The value and the slope; 0 where there are too few samples.
+    """
+    seen = np.isfinite(values)
+    t = times[seen][:INITIAL_GUESS_SAMPLES] - times[0]
+    y = values[seen][:INITIAL_GUESS_SAMPLES]
+    if t.size == 0:
+        return 0.0, 0.0
+    if t.size < MIN_SAMPLES_FOR_SLOPE:
+        return float(y[0]), 0.0
+    # Scaling time to [0, 1] keeps its powers well conditioned at any sample rate.
+    scale = float(t[-1]) or 1.0
+    degree = 1 if t.size < MIN_SAMPLES_FOR_PARABOLA else 2
+    coefficients = np.polynomial.polynomial.polyfit(t / scale, y, degree)
+    value, slope = coefficients[:2]
+    return float(value), float(slope / scale)

@@ -1,0 +1,662 @@
+"""Simulate recorded runs with any parameters, effects and initial states, as one large batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis.evaluation.noise_model import Mask
+from bench.diagnosis.evaluation.run_data import RunData, prepare_run, take_first_samples
+from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.evaluation.simulation_cache import LaneCache
+from bench.diagnosis.evaluation.time_scale import on_time_scale
+from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
+from sims import effects as library
+from sims.core.simulator import Array, InputError, Parameter, Scenario, make_unknown_name_error
+from sims.core.system import Effect, Input, Sensor, members_of
+from sims.engines import HIDDEN_STATE_ENGINES
+from sims.recording.recording import Recording, Run
+from sims.system_simulator import SystemSimulator
+
+Indices = NDArray[np.intp]
+
+MAX_BATCH_SAMPLES = 400_000
+"""Maximum number of samples simulated in one engine call.
+
+Larger calls need more memory and are not faster.
+"""
+MIN_BATCH_SIZE = 64
+"""Minimum batch size of an engine call, however long the runs; the engine steps it in parallel."""
+MAX_CHUNK_SAMPLES = 80_000
+"""Maximum number of samples per chunk if compiled steps are distributed over several cores."""
+MIN_CHUNK_SIZE = 32
+"""Minimum number of batch elements per chunk if work is distributed over several cores."""
+MAX_TIME_STEP = 0.01
+"""Maximum time step of the batch engine, in seconds.
+
+The engine uses shorter steps where the motion or the forces require it.
+"""
+MAX_TIME_STEP_FILTERED = 0.0025
+"""Maximum time step of the batch engine, in seconds, if a sensor filters its signal.
+
+A filter treats its input as linear over each step, which an impact is not.
+"""
+MAX_PHASE_PER_STEP = 0.14
+"""Maximum phase of an oscillation per step of the batch engine, in radians; relative error 3e-6."""
+MAX_STEP_COUNT_FACTOR = 4.0
+"""Maximum ratio of actual to planned steps before a batch element is abandoned.
+
+All elements of a call wait for the slowest one.
+"""
+FREED_CONSTANT_RANGE_FACTOR = 5.0
+"""Range factor of a constant that is estimated: from value / 5 to value * 5."""
+
+
+class RunEvaluator:
+    """Simulates the runs of a recording for given parameters, effects and initial states.
+
+    The simulator contains every available effect; an effect is off unless its coefficients are
+    nonzero. A vector theta (P,) holds the base parameters of the system, the constants to estimate,
+    and then the coefficients of all effects. A model is therefore a sparse vector, and models, runs
+    and finite differences are simulated together as elements of one batch.
+
+    Attributes:
+        kind: class of the simulator, as given.
+        recording: the recording, as given.
+        runs: its runs that are used, as given.
+        engine: name of the engine, as given.
+        extra: effects in addition to the library, as given.
+        library: names of the available effects, without the extra ones.
+        simulator: simulator with all available effects; its channels are the recorded ones.
+        own: number of base parameters of the system.
+        freed: constants that are treated as parameters.
+        parameters: (P,) description of each element of theta.
+        base: (b,) indices in theta of the base parameters and the estimated constants.
+        slots: slice of theta with the coefficients of each effect.
+        states: names of the initial states.
+        tracks: the runs, prepared for fitting.
+        lengths: (R,) number of samples of each run.
+        observed: (R, T, C) observations in SI units; NaN where missing, or after the end of a run.
+        known: (R, s) whether an initial state is known, and so is not estimated.
+        guess: (R, s) initial states, specified or guessed.
+        longest: duration of the longest run, in seconds.
+        clock: first and last time stamp of all runs, in seconds.
+        simulations: number of batch elements simulated so far.
+        watch: search control that stops fits early; by default it never does.
+        correction: (R, T, C) correction added to all simulations, or None
+            (`bench.diagnosis.fitting.linearised_runs`).
+        derivatives: (R, T, C, s) derivatives by the initial states if they come from a
+            linearisation, else None.
+        neighbourhoods: linearised robot runs that were used most recently
+            (`bench.diagnosis.fitting.linearised_runs`).
+        simulated: responses to effects that have no linearisation, by name and coefficients.
+        followed: the runs of a robot as followed by a state filter, or None
+            (`bench.diagnosis.kalman.candidate_responses`).
+        identified: (b,) base parameters of a robot identified by prediction errors; None if there
+            are none.
+        state_prior: (s,) standard deviations of the initial states about their guesses, if a filter
+            follows the runs of a robot; else None.
+        measured: for runs of a robot, states estimated from readings alone
+            (`bench.diagnosis.kalman.measured_states`).
+        crew: worker pool for simulations and fits; by default only this process.
+
+    Args:
+        kind: class of the simulator.
+        recording: the recording.
+        runs: the runs of the recording to use; they are padded to equal length.
+        engine: name of the engine.
+        extra: effects in addition to the registered library.
+        free: names of constants to treat as parameters.
+        candidates: names of the available library effects; None for all that are applicable.
+
+    Raises:
+        InputError: the simulator is not a system that accepts effects, a constant does not exist,
+            or none of its channels is recorded.
+    """
+
+    def __init__(
+        self,
+        kind: type[SystemSimulator],
+        recording: Recording,
+        runs: Sequence[Run],
+        engine: str | None = "batch",
+        extra: Sequence[type[Effect]] = (),
+        free: Sequence[str] = (),
+        candidates: Sequence[str] | None = None,
+    ) -> None:
+        self.kind = kind
+        self.recording = recording
+        self.engine = engine
+        self.runs = tuple(runs)
+        self.extra = tuple(extra)
+        usable = library.list_effects_for(kind.system)
+        recorded = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
+        # An effect on a channel that is not recorded is not observable.
+        shown = [
+            name
+            for name, effect in usable.items()
+            if _is_effect_observable(effect, recorded)
+            and (effect.hook != "hidden" or kind.has_model or engine in HIDDEN_STATE_ENGINES)
+        ]
+        self.library = shown if candidates is None else list(candidates)
+        self.simulator, self._fine = self._simulators()
+
+        # Theta has three parts: base parameters, freed constants, coefficients.
+        system = self.simulator.system
+        self.own = len(system.parameters)
+        self.freed = [_make_freed_parameter(name, self.simulator, recording) for name in free]
+        coefficients = self.simulator.parameters[self.own :]
+        self.parameters: tuple[Parameter, ...] = (*system.parameters, *self.freed, *coefficients)
+        self.base: Indices = np.arange(self.own + len(self.freed))
+        self.slots = _allocate_coefficients(self.simulator, self.base.size)
+        self._shifting, self._filtering = self._delaying()
+
+        # A system without coordinates provides the names of its states itself.
+        self.states = [*system.coordinates, *system.rates] or list(kind.states)
+        self.tracks: tuple[RunData, ...] = tuple(
+            prepare_run(run, recording, self.simulator, self.states) for run in runs
+        )
+        self.lengths: Indices = np.array([len(t.observed) for t in self.tracks])
+        self.observed = self._padded()
+        self.known: Mask = np.array([t.known_state_mask for t in self.tracks])
+        self.guess: Array = np.array([t.initial_state_guess for t in self.tracks])
+        self.longest = self._longest()
+        self.parameters = self._on_time_scale()
+        self.clock = self._clock()
+        self._travels: dict[str, float] = {}
+        self.derivatives: Array | None = None
+        self.correction: Array | None = None
+        self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
+        self.simulated: dict[tuple[str, bytes], Array] = {}
+        self.followed: Any = None
+        self.identified: Array | None = None
+        self.state_prior: Array | None = None
+        self.measured: dict[int, Mapping[int, Array]] = {}
+        self.simulations = 0
+        self._cache = LaneCache()
+        self.watch = SearchControl()
+        self.crew = ForkedWorkerPool()
+        self._parts: dict[float, list[Scenario]] = {}
+
+    def _simulators(self) -> tuple[SystemSimulator, SystemSimulator]:
+        """Create the simulator with all effects, and a copy with the fine step for filters."""
+        kind = self.kind
+        effects: list[str | type[Effect]] = list(self.library)
+        effects += [effect for effect in self.extra if effect.fits(kind.system)]
+        # Channels follow the order of the simulator, not that of the columns of the log.
+        recorded = self.runs[0].channels
+        observe = [c.name for c in kind.channels if c.name in recorded]
+        usual: dict[str, Any] = {}
+        fine: dict[str, Any] = {}
+        # The other engines choose their steps themselves.
+        if self.engine == "batch":
+            usual = {
+                "time_step": MAX_TIME_STEP,
+                "turn": MAX_PHASE_PER_STEP,
+                "patience": MAX_STEP_COUNT_FACTOR,
+            }
+            fine = {**usual, "time_step": MAX_TIME_STEP_FILTERED}
+
+        def made(settings: dict[str, Any]) -> SystemSimulator:
+            constants = self.recording.constants
+            return kind(constants, observe, engine=self.engine, effects=effects, **settings)
+
+        return made(usual), made(fine)
+
+    def _padded(self) -> Array:
+        """Return the observations (R, T, C) of all runs, NaN after the end of a shorter run."""
+        shape = len(self.tracks), self.lengths.max(), len(self.channels)
+        observed = np.full(shape, np.nan)
+        for row, track in zip(observed, self.tracks, strict=True):
+            row[: len(track.observed)] = track.observed
+        return observed
+
+    def _longest(self) -> float:
+        """Return the duration of the longest run, in seconds."""
+        # A duration of zero is replaced, because times are divided by it.
+        return max(track.duration for track in self.tracks) or 1.0
+
+    def _clock(self) -> tuple[float, float]:
+        """Return the first and the last time stamp of all runs."""
+        stamps = [track.scenario.times for track in self.tracks]
+        return min(float(t[0]) for t in stamps), max(float(t[-1]) for t in stamps)
+
+    @property
+    def sample_interval(self) -> float:
+        """Median sample interval of the run sampled most often, in seconds; 0 if unknown."""
+        gaps = [np.diff(track.scenario.times) for track in self.tracks]
+        return min((float(np.median(gap)) for gap in gaps if gap.size), default=0.0)
+
+    @property
+    def max_travel(self) -> float:
+        """Largest range of the primary coordinate within one run; 0 if it is not recorded."""
+        system = self.simulator.system
+        return self._range(system.coordinates[system.primary] if system.coordinates else "")
+
+    def get_effect_travel(self, effect: str) -> float:
+        """Return the largest range within one run of the coordinate that an effect acts on.
+
+        The range is 0 if the coordinate is not recorded.
+        """
+        return self._range(self._coordinate(effect))
+
+    def get_coordinate_range(self, effect: str) -> tuple[float, float]:
+        """Return the minimum and maximum, over all runs, of the coordinate that an effect acts on.
+
+        Both are 0 if the coordinate is not recorded.
+        """
+        name = self._coordinate(effect)
+        if name not in self.channels:
+            return 0.0, 0.0
+        values = self.observed[:, :, self.channels.index(name)]
+        return float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=-np.inf))
+
+    def _coordinate(self, effect: str) -> str:
+        """Return the coordinate that an effect acts on; empty if there are no coordinates."""
+        system = self.simulator.system
+        coordinate = self.available_effects[effect].coordinate
+        place = system.primary if coordinate is None else coordinate
+        return system.coordinates[place] if system.coordinates else ""
+
+    def _range(self, name: str) -> float:
+        """Return the largest range of a channel within one run, cached; 0 if not recorded."""
+        if name not in self._travels:
+            self._travels[name] = self._travel(name)
+        return self._travels[name]
+
+    def _travel(self, name: str) -> float:
+        if name not in self.channels:
+            return 0.0
+        values = self.observed[:, :, self.channels.index(name)]
+        # A run without samples of the channel has no range.
+        values = values[np.isfinite(values).any(axis=1)]
+        ranges = np.nanmax(values, axis=1) - np.nanmin(values, axis=1)
+        return float(ranges.max(initial=0.0))
+
+    def _delaying(self) -> tuple[Indices, Indices]:
+        """Return the indices of coefficients that shift sample times or need fine steps.
+
+        Batch elements with such coefficients are simulated separately.
+
+        Returns:
+            The indices in theta of coefficients that shift sample times, and of those that need
+            fine steps.
+        """
+        shifting: list[int] = []
+        filtering: list[int] = []
+        for effect in self.simulator.effects:
+            places = self.get_coefficient_indices(effect.name)
+            if _shifts_sample_times(effect):
+                shifting.extend(places)
+            if effect.sharp or (isinstance(effect, Sensor) and effect.filters):
+                filtering.extend(places)
+        # The type must be given, because an empty list would become an array of floats.
+        return np.array(shifting, dtype=np.intp), np.array(filtering, dtype=np.intp)
+
+    def _on_time_scale(self) -> tuple[Parameter, ...]:
+        """Return the parameters with coefficient ranges for the time scale of the runs."""
+        first, spacing = self.base.size, self.sample_interval
+        coefficients = self.parameters[first:]
+        scaled = [on_time_scale(p, self.longest, spacing) for p in coefficients]
+        return (*self.parameters[:first], *scaled)
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the recorded channels, in the order of the observations."""
+        return [c.name for c in self.simulator.channels]
+
+    @cached_property
+    def available_effects(self) -> dict[str, Effect]:
+        """Available effects by name."""
+        return {effect.name: effect for effect in self.simulator.effects}
+
+    @property
+    def has_linearisation(self) -> bool:
+        """Whether the simulator provides linearised responses to small changes."""
+        return self.kind.has_model
+
+    def get_coefficient_indices(self, effect: str) -> range:
+        """Return the indices in theta of the coefficients of an effect."""
+        slot = self.slots[effect]
+        return range(slot.start, slot.stop)
+
+    def get_nominal_theta(self) -> Array:
+        """Return the parameters (P,) at their nominal values, with all effects off."""
+        values = np.array([p.nominal for p in self.parameters])
+        # An effect is off if its coefficients are zero, whatever their nominal values.
+        values[self.base.size :] = 0.0
+        return values
+
+    def get_sample_mask(self, share: float) -> Mask:
+        """Return the mask (R, T, C) of available samples within the first share of each run."""
+        numbers = np.arange(self.observed.shape[1])
+        ends = np.ceil(share * self.lengths)
+        first = numbers < ends[:, None]
+        counted: Mask = np.isfinite(self.observed) & first[:, :, None]
+        return counted
+
+    def simulate(
+        self,
+        theta: Array,
+        runs: Indices,
+        states: Array,
+        share: float = 1.0,
+    ) -> Array:
+        """Simulate a batch of runs.
+
+        Args:
+            theta: (L, P) parameters.
+            runs: (L,) index of the run of each batch element.
+            states: (L, s) initial states.
+            share: initial share of each run that is simulated.
+
+        Returns:
+            Observations (L, T, C); NaN after the simulated share and after the end of a shorter
+            run.
+        """
+        result = np.empty((len(theta), *self.observed.shape[1:]))
+        if self.has_linearisation:
+            lanes = zip(theta, runs.tolist(), states, strict=True)
+            keys = [
+                b"".join((repr((share, run)).encode(), own.tobytes(), begin.tobytes()))
+                for own, run, begin in lanes
+            ]
+            new = self._cache.missing(keys)
+            made = self._simulate(theta[new], runs[new], states[new], share)
+            self._cache.fill(keys, new, made, result)
+        else:
+            # Results are not cached here: the slowest element of a call sets the steps of all
+            # elements, so an element differs in its last digits from call to call.
+            result = self._simulate(theta, runs, states, share)
+        if self.correction is not None:
+            result += self.correction[runs]
+        return result
+
+    def _simulate(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
+        """Simulate a batch without correction; arguments and result as in `simulate`."""
+        self.simulations += len(theta)
+        _, length, channels = self.observed.shape
+        result = np.empty((len(theta), length, channels))
+        if not len(theta):
+            return result
+
+        # The slowest element of a call sets its steps, so elements that need many steps are
+        # simulated separately.
+        kinds = self.group_compatible(theta)
+        together = max(MIN_BATCH_SIZE, MAX_BATCH_SAMPLES // length)
+        if self.is_cheap_to_split:
+            together = min(together, max(MIN_CHUNK_SIZE, int(MAX_CHUNK_SAMPLES / (share * length))))
+        parts, calls = [], []
+        for kind in np.unique(kinds):
+            lanes = np.flatnonzero(kinds == kind)
+            for part in np.array_split(lanes, -(-lanes.size // together)):
+                parts.append(part)
+                calls.append((bool(kind >= 2), theta[part], runs[part], states[part], share))
+        for number, simulated in self.crew.map_unordered(self, _simulated, calls):
+            last = simulated.shape[1]
+            result[parts[number], :last] = simulated
+            result[parts[number], last:] = np.nan
+        return result
+
+    def with_runs(self, runs: Sequence[Run]) -> RunEvaluator:
+        """Return a `RunEvaluator` of other runs that were cut or thinned from these runs.
+
+        It shares the parameters, the grids of shape parameters, the search control and the worker
+        pool.
+        """
+        other = RunEvaluator(
+            self.kind,
+            self.recording,
+            runs,
+            engine=self.engine,
+            extra=self.extra,
+            free=[p.name for p in self.freed],
+            candidates=self.library,
+        )
+        # Periodic effects continue from segment to segment, and a value found in one segment holds
+        # in all of them.
+        other.longest = self.longest
+        other.parameters = self.parameters
+        other.clock = self.clock
+        # Ranges are computed now, because those of segments would differ.
+        for name in self.channels:
+            self._range(name)
+        other._travels = self._travels
+        other.watch = self.watch
+        other.crew = self.crew
+        return other
+
+    def with_kind(self, kind: type[SystemSimulator]) -> RunEvaluator:
+        """Return a `RunEvaluator` with the same runs and another simulator of the same system."""
+        other = RunEvaluator(
+            kind,
+            self.recording,
+            self.runs,
+            engine=self.engine,
+            extra=self.extra,
+            free=[p.name for p in self.freed],
+            candidates=self.library,
+        )
+        other.parameters = self.parameters
+        other.watch, other.crew = self.watch, self.crew
+        other.followed, other.guess = self.followed, self.guess
+        other.derivatives, other.identified = self.derivatives, self.identified
+        other.state_prior = self.state_prior
+        self.crew.register(other)
+        return other
+
+    def simulator_of(self, kind: type[SystemSimulator]) -> SystemSimulator:
+        """Return another simulator of the same system with the same effects and channels."""
+        effects: list[str | type[Effect]] = [*self.library, *self.extra]
+        return kind(self.recording.constants, self.channels, effects=effects)
+
+    def group_compatible(self, theta: Array) -> Indices:
+        """Return group numbers (L,); batch elements of one group can share an engine call.
+
+        Args:
+            theta: (L, P) parameters.
+        """
+        active = theta != 0
+        shifting = active[:, self._shifting].any(axis=1)
+        filtering = active[:, self._filtering].any(axis=1)
+        kinds: Indices = shifting + 2 * filtering
+        return kinds
+
+    @cached_property
+    def is_cheap_to_split(self) -> bool:
+        """Whether splitting a batch into several calls costs no time, as with compiled steps."""
+        if self.kind.has_model:
+            return True
+        if self.engine != "batch":
+            return False
+        # Loaded only when needed, because importing the compiler package takes time.
+        from sims.engines.compiled import kernel
+
+        return kernel.get_kernel() is not None
+
+    def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
+        """Return the scenarios of batch elements with their freed constants.
+
+        Args:
+            theta: (L, P) parameters, which contain the constants.
+            runs: (L,) index of the run of each batch element.
+            share: initial share of each run to which its scenario is cut.
+        """
+        if share not in self._parts:
+            self._parts[share] = [
+                take_first_samples(t.scenario, int(np.ceil(share * len(t.observed))))
+                for t in self.tracks
+            ]
+        # Elements of one run share its scenario object, so the simulator prepares it only once.
+        scenarios = [self._parts[share][run] for run in runs]
+        return [self._freed_in(one, own) for one, own in zip(scenarios, theta, strict=True)]
+
+    def simulate_batch(
+        self, fine: bool, theta: Array, runs: Indices, states: Array, share: float
+    ) -> Array:
+        """Simulate batch elements of one group in one engine call.
+
+        Args:
+            fine: whether to use the fine time step that filters need.
+            theta: (L, P) parameters.
+            runs: (L,) index of the run of each batch element.
+            states: (L, s) initial states.
+            share: initial share of each run that is simulated.
+
+        Returns:
+            Observations (L, T', C).
+        """
+        simulator = self._fine if fine else self.simulator
+        scenarios = self._scenarios(theta, runs, share)
+        # The simulator does not treat freed constants as parameters.
+        freed = np.arange(self.own, self.base.size)
+        lanes = np.delete(theta, freed, axis=1)
+        initial = dict(zip(self.states, states.T, strict=True))
+        return simulator.simulate_batch(lanes, scenarios, initial)
+
+    def simulate_scenarios(
+        self, theta: Array, scenarios: Sequence[Scenario], states: Array
+    ) -> Array:
+        """Simulate batch elements in arbitrary scenarios.
+
+        Args:
+            theta: (L, P) parameters.
+            scenarios: (L,) scenarios.
+            states: (L, s) initial states.
+
+        Returns:
+            Observations (L, T, C), NaN after the end of a shorter scenario.
+        """
+        self.simulations += len(theta)
+        length = max(scenario.times.size for scenario in scenarios)
+        result = np.full((len(theta), length, len(self.channels)), np.nan)
+        together = max(MIN_CHUNK_SIZE, MAX_BATCH_SAMPLES // length)
+        freed = np.arange(self.own, self.base.size)
+        kinds = self.group_compatible(theta)
+        for kind in np.unique(kinds):
+            simulator = self._fine if kind >= 2 else self.simulator
+            lanes = np.flatnonzero(kinds == kind)
+            for part in np.array_split(lanes, -(-lanes.size // together)):
+                own = [self._freed_in(scenarios[i], theta[i]) for i in part]
+                initial = dict(zip(self.states, states[part].T, strict=True))
+                seen = simulator.simulate_batch(np.delete(theta[part], freed, 1), own, initial)
+                result[part, : seen.shape[1]] = seen
+        return result
+
+    def _freed_in(self, scenario: Scenario, theta: Array) -> Scenario:
+        """Return a scenario with the freed constants set from parameters (P,)."""
+        if not self.freed:
+            return scenario
+        values = theta[self.own : self.base.size].tolist()
+        freed = {p.name: value for p, value in zip(self.freed, values, strict=True)}
+        return replace(scenario, constants={**scenario.constants, **freed})
+
+    def make_observing_simulator(
+        self, observe: Sequence[str], effects: Sequence[str]
+    ) -> SystemSimulator:
+        """Return a simulator with other channels and only the given effects.
+
+        The caller must close it.
+
+        Args:
+            observe: names of the channels.
+            effects: names of the effects.
+        """
+        own: list[str | type[Effect]] = [
+            next((e for e in self.extra if e.name == name), name) for name in effects
+        ]
+        settings: dict[str, Any] = {}
+        if self.engine == "batch":
+            settings = {
+                "time_step": MAX_TIME_STEP,
+                "turn": MAX_PHASE_PER_STEP,
+                "patience": MAX_STEP_COUNT_FACTOR,
+            }
+        constants = self.recording.constants
+        return self.kind(constants, list(observe), engine=self.engine, effects=own, **settings)
+
+    def follow(self, followed: Any) -> None:
+        """Use the results of a state filter for the runs of a robot.
+
+        The filter provides guesses, derivatives and prior standard deviations of the initial
+        states.
+
+        Args:
+            followed: filtered runs, a
+                `bench.diagnosis.kalman.candidate_responses.FollowedRuns`.
+        """
+        self.followed = followed
+        begun = followed.first_states()
+        fine = np.isfinite(begun).all()
+        self.guess = np.where(self.known | ~fine, self.guess, begun)
+        self.derivatives = followed.state_sensitivities()
+        self.state_prior = followed.state_prior()
+
+    def close(self) -> None:
+        """Release the resources of the engine."""
+        self.simulator.close()
+        self._fine.close()
+
+
+def _is_effect_observable(effect: type[Effect], recorded: set[str]) -> bool:
+    """Return whether all signals that an effect (or effect family) acts on are recorded."""
+    members = members_of(effect)
+    return all(not member.signal or member.signal in recorded for member in members)
+
+
+def _simulated(world: RunEvaluator, *call: Any) -> Array:
+    """Simulate one engine call; a module-level function, so that workers can run it."""
+    return world.simulate_batch(*call)
+
+
+def _make_freed_parameter(name: str, simulator: SystemSimulator, recording: Recording) -> Parameter:
+    """Return a constant as a parameter.
+
+    Args:
+        name: name of the constant.
+        simulator: simulator that has the constant.
+        recording: recording whose runs must not set the constant individually.
+
+    Raises:
+        InputError: the constant does not exist, is zero, or differs between runs.
+    """
+    constants = {c.name: c for c in simulator.constants}
+    if name not in constants:
+        raise make_unknown_name_error(
+            f"constant of system {simulator.name}", name, list(constants) or ["none"]
+        )
+    value = simulator.constant_values[name]
+    # The range is a multiple of the value, and a value set by a run would override the fitted
+    # value.
+    if value == 0 or any(name in run.constants for run in recording.runs):
+        raise InputError(
+            f"free constant {name}: expected one that is not zero and the same in every run"
+        )
+    # Sorted, because a constant may be negative.
+    low, high = sorted((value / FREED_CONSTANT_RANGE_FACTOR, value * FREED_CONSTANT_RANGE_FACTOR))
+    constant = constants[name]
+    return Parameter(name, constant.unit, value, (low, high), says=constant.says)
+
+
+def _allocate_coefficients(simulator: SystemSimulator, first: int) -> dict[str, slice]:
+    """Return the slice of theta of each effect, starting at index `first`."""
+    slots = {}
+    # Use the order of the simulator, which is the order of its parameters.
+    for effect in simulator.effects:
+        last = first + len(effect.on(simulator.system))
+        slots[effect.name] = slice(first, last)
+        first = last
+    return slots
+
+
+def _shifts_sample_times(effect: Effect) -> bool:
+    """Return whether an effect reads signals at other times than those of the scenario."""
+    for family in (Input, Sensor):
+        if isinstance(effect, family) and type(effect).times is not family.times:
+            return True
+    return False

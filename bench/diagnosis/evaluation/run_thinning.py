@@ -1,0 +1,88 @@
+"""Subsampling of long runs: keep every n-th sample, at most one longest engine step apart.
+
+If motion is sampled much faster than it changes, a search takes many steps and gains little
+information. The first of every n samples is kept, and an input is replaced by its mean over them,
+which transfers the same momentum as the original input.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import MAX_TIME_STEP, Indices, RunEvaluator
+from sims.core.simulator import Array
+from sims.recording.recording import Run
+
+MIN_SAMPLES_TO_THIN = 12_000
+"""Minimum total number of samples of all runs for which they are thinned."""
+MIN_THINNED_SAMPLES = 2_000
+"""Minimum total number of samples after thinning."""
+MIN_CHANNEL_SAMPLE_SHARE = 0.5
+"""Minimum number of samples of a channel after thinning, as a share of the expected number.
+
+A channel that is sampled rarely might otherwise lose all its samples.
+"""
+
+
+def thin_runs(world: RunEvaluator) -> RunEvaluator | None:
+    """Return a `RunEvaluator` with thinned runs and the same parameters.
+
+    Args:
+        world: the runs.
+
+    Returns:
+        The thinned runs, or None if there are few samples, if the sample interval is already as
+        long as an engine step, or if a channel would lose too many samples.
+    """
+    total = int(world.lengths.sum())
+    most = total // MIN_THINNED_SAMPLES
+    factors = [min(_factor(run), most) for run in world.runs]
+    if total < MIN_SAMPLES_TO_THIN or max(factors) < 2:
+        return None
+    runs = [_take_every_nth(run, factor) for run, factor in zip(world.runs, factors, strict=True)]
+    if not all(
+        _shown(few, run, factor) for few, run, factor in zip(runs, world.runs, factors, strict=True)
+    ):
+        return None
+    return world.with_runs(runs)
+
+
+def _factor(run: Run) -> int:
+    """Return the number of sample intervals within one engine step."""
+    intervals = np.diff(run.times)
+    if not intervals.size:
+        return 1
+    return max(int(MAX_TIME_STEP / float(np.median(intervals)) + 1e-6), 1)
+
+
+def _take_every_nth(run: Run, factor: int) -> Run:
+    """Return the run with every n-th sample; n is `factor`."""
+    first = np.arange(0, run.times.size, factor)
+    return replace(
+        run,
+        times=run.times[first],
+        channels={name: values[first] for name, values in run.channels.items()},
+        inputs={name: _means(run.times, values, first) for name, values in run.inputs.items()},
+        extra={},
+    )
+
+
+def _means(times: Array, values: Array, first: Indices) -> Array:
+    """Return the mean of an input between kept samples; the value itself after the last one."""
+    lasting = np.diff(times, append=times[-1])
+    # The last sample has no duration; a tiny one avoids 0 / 0 in its block.
+    lasting[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
+    means: Array = np.add.reduceat(values * lasting, first) / np.add.reduceat(lasting, first)
+    return means
+
+
+def _shown(few: Run, run: Run, factor: int) -> bool:
+    """Return whether every channel keeps about its expected number of samples."""
+    for name, values in run.channels.items():
+        before = int(np.isfinite(values).sum())
+        left = int(np.isfinite(few.channels[name]).sum())
+        if left < MIN_CHANNEL_SAMPLE_SHARE * before / factor:
+            return False
+    return True

@@ -1,0 +1,249 @@
+"""Deadline, interruption and progress of a search, and the questions that it has not answered.
+
+A search ends early in one of two ways. A fit stops after its present step and keeps the best point
+so far (`SearchControl.should_abandon_fit`). Between fits, an exception ends the search.
+`SearchControl.check_not_stopped` follows every
+computation that may have been stopped, so an incomplete fit is never evaluated.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from bench.diagnosis.evaluation.progress_events import ProgressListener, SilentListener
+
+StopReason = Literal["budget", "interrupt"]
+StopCallback = Callable[[], bool]
+ProgressCallback = Callable[[float, str], None]
+
+QUESTION_TEXTS: Mapping[str, str] = {
+    "base_fit": "the best fit of the simulator's own parameters",
+    "search": "the other effects of the library, and several together",
+    "rivals": "whether a rival does better once it is fitted to the end",
+    "held_out": "whether held-out runs bear it out",
+    "structure": "whether a force of any shape would help still",
+    "alternatives": "what would explain the same as well",
+}
+"""Questions of a search in their order, by their name in verdict.json."""
+
+STAGES: Mapping[str, str] = {
+    "base_fit": "fitting the base model",
+    "search": "testing effects",
+    "rivals": "comparing similar causes",
+    "held_out": "simulating held-out runs",
+    "structure": "testing the residual for structure",
+    "alternatives": "looking for alternative causes",
+}
+"""Name of the first stage of each question, as the progress display shows it."""
+
+QUESTION_SECONDS: Mapping[str, float] = {
+    "base_fit": 1.5,
+    "search": 4.0,
+    "rivals": 3.0,
+    "held_out": 1.0,
+    "structure": 0.5,
+    "alternatives": 0.5,
+}
+"""Time to answer each question, in seconds for a small recording; it scales the progress bar."""
+LARGER_MODEL_SECONDS = 6.0
+"""Time to search models with one more effect, in seconds for a small recording."""
+PROGRESS_STEP_SHARE = 0.4
+"""Share of the remaining progress of a question that each step is assumed to take."""
+
+
+@dataclass(frozen=True)
+class EarlyStop:
+    """Early end of a search.
+
+    Attributes:
+        reason: reason, ``budget`` or ``interrupt``.
+        during_question: the step that was running.
+        skipped_questions: questions without an answer: ``base_fit``, ``search``, ``rivals``,
+            ``held_out``, ``structure``, ``alternatives``.
+    """
+
+    reason: StopReason
+    during_question: str
+    skipped_questions: tuple[str, ...]
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the entry of verdict.json."""
+        return {
+            "by": self.reason,
+            "during": self.during_question,
+            "not_asked": list(self.skipped_questions),
+        }
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> EarlyStop:
+        """Create an instance from the entry of verdict.json."""
+        return cls(document["by"], document["during"], tuple(document["not_asked"]))
+
+
+class SearchStoppedError(Exception):
+    """Raised when the search has to end now."""
+
+
+class SearchControl:
+    """Deadline and progress of one search.
+
+    Attributes:
+        deadline: end of the search on the clock `time.monotonic`, which all processes share; None
+            for no limit.
+
+    Args:
+        budget: wall-clock time limit in seconds; None for no limit.
+        stop: callback that returns whether the user wants to stop; called between two steps.
+        progress: callback that receives the estimated finished share and the current step.
+        listener: receives the stages, steps and results of the search.
+    """
+
+    def __init__(
+        self,
+        budget: float | None = None,
+        stop: StopCallback = lambda: False,
+        progress: ProgressCallback | None = None,
+        listener: ProgressListener | None = None,
+    ) -> None:
+        self.deadline = None if budget is None else time.monotonic() + budget
+        self._stop = stop
+        self._progress = progress
+        self._listener = listener or SilentListener()
+        self._by: StopReason | None = None
+        self._left = False
+        self._what = ""
+        self._question = "base_fit"
+        # Weights of finished questions, of the present question, and of the later ones.
+        self._done, self._now = 0.0, QUESTION_SECONDS["base_fit"]
+        self._ahead = _list_later_weights("base_fit")
+        self._looks = -1
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Report the start of a stage.
+
+        Args:
+            name: description of the stage.
+            total: number of steps of the stage; None if unknown.
+        """
+        self._listener.stage(name, total)
+
+    def advance(self, count: int = 1) -> None:
+        """Report further finished steps of the stage."""
+        self._listener.advance(count)
+
+    def found(self, effects: Sequence[str], share: float) -> None:
+        """Report the best model so far.
+
+        Args:
+            effects: names of its effects.
+            share: share of the discrepancy that the model removes, 0 to 1.
+        """
+        self._listener.found(effects, share)
+
+    def should_stop(self) -> bool:
+        """Return whether the search has to end; once true, it stays true."""
+        if self._by is None and self._stop():
+            self._by = "interrupt"
+        if self._by is None and self.deadline is not None and time.monotonic() >= self.deadline:
+            self._by = "budget"
+        return self._by is not None
+
+    def begin_question(self, question: str) -> None:
+        """Begin a question of `QUESTION_TEXTS`.
+
+        Raises:
+            EndedError: the search has to end.
+        """
+        self._enter(QUESTION_SECONDS[question])
+        self._question = question
+        self._ahead = _list_later_weights(question)
+        self.stage(STAGES[question])
+        self.report_and_check(QUESTION_TEXTS[question])
+
+    def begin_larger_models(self) -> None:
+        """Begin the search of larger models, whose number cannot be predicted."""
+        self._enter(LARGER_MODEL_SECONDS)
+
+    def _enter(self, weight: float) -> None:
+        """Move the progress to a part of the search with the given weight."""
+        self._done += self._now
+        self._now = weight
+        self._looks = -1
+
+    def report_and_check(self, what: str) -> None:
+        """Report the next step, and check that the search may continue.
+
+        Raises:
+            EndedError: the search has to end.
+        """
+        self.check_not_stopped()
+        self.report(what)
+
+    def report(self, what: str) -> None:
+        """Report the next step without a check, where fits stop by themselves."""
+        self._what = what
+        self._looks += 1
+        self._advance(0.0)
+
+    def check_not_stopped(self) -> None:
+        """Raise an error if the last computation may have been stopped early.
+
+        Raises:
+            EndedError: the search has to end.
+        """
+        if self.should_stop():
+            raise SearchStoppedError
+
+    def should_abandon_fit(self, share: float) -> bool:
+        """Return whether a fit has to stop now.
+
+        Args:
+            share: share of the fit that is finished, 0 to 1.
+        """
+        self._advance(share)
+        self._left |= self.should_stop()
+        return self._left
+
+    def record_abandoned_fit(self, left: bool) -> None:
+        """Record whether a fit was stopped in another process."""
+        self._left |= left
+
+    def has_abandoned_fits(self) -> bool:
+        """Return whether any fit was stopped early."""
+        return self._left
+
+    def make_early_stop(self, held_out: bool) -> EarlyStop:
+        """Return the reason of the early end and the questions that were skipped.
+
+        Args:
+            held_out: whether there are held-out runs.
+        """
+        names = list(QUESTION_TEXTS)
+        open_ones = names[names.index(self._question) :]
+        if not held_out:
+            open_ones = [name for name in open_ones if name != "held_out"]
+        return EarlyStop(self._by or "interrupt", self._what, tuple(open_ones))
+
+    def _advance(self, share: float) -> None:
+        """Report the finished share of the search.
+
+        Args:
+            share: finished share of the present fit, 0 to 1.
+        """
+        remaining = (1.0 - PROGRESS_STEP_SHARE) ** self._looks
+        # Earlier steps have taken their shares; the fit is a part of the present step.
+        within = 1.0 - remaining * (1.0 - PROGRESS_STEP_SHARE * share)
+        total = self._done + self._now + self._ahead
+        done = (self._done + self._now * within) / total
+        self._listener.completed(done)
+        if self._progress is not None:
+            self._progress(done, self._what)
+
+
+def _list_later_weights(question: str) -> float:
+    """Return the total weight of the questions after the given one."""
+    names = list(QUESTION_TEXTS)
+    return sum(QUESTION_SECONDS[name] for name in names[names.index(question) + 1 :])

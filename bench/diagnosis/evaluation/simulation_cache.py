@@ -1,0 +1,53 @@
+"""Cache of simulated batch elements, so that none is simulated twice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sims.core.simulator import Array
+
+CACHE_BYTES = 64 << 20
+"""Maximum memory for the cached results of one `World`, in bytes; the oldest are dropped first."""
+
+
+class LaneCache:
+    """Observations (T, C) of batch elements, cached by their inputs, with a memory limit.
+
+    A fit simulates a trial, accepts it, and then needs it again as the centre of finite
+    differences; starts are compared before they are fitted. A third of the simulations of a robot
+    are such repetitions.
+
+    Args:
+        limit: maximum size of the cached results, in bytes.
+    """
+
+    def __init__(self, limit: int = CACHE_BYTES) -> None:
+        self._limit = limit
+        self._held: dict[bytes, Array] = {}
+        self._bytes = 0
+
+    def missing(self, keys: Sequence[bytes]) -> list[int]:
+        """Return the indices of elements that are not cached; of equal ones only the first."""
+        first = {key: place for place, key in reversed(list(enumerate(keys)))}
+        return sorted(place for key, place in first.items() if key not in self._held)
+
+    def fill(
+        self, keys: Sequence[bytes], places: Sequence[int], results: Array, out: Array
+    ) -> None:
+        """Store new results, and write the results of all elements to an output array.
+
+        Args:
+            keys: keys of all elements, as passed to `missing`.
+            places: indices of the elements that `missing` returned.
+            results: (N, T, C) results of these elements.
+            out: (L, T, C) output array for the results of all elements.
+        """
+        new = {keys[place]: row for place, row in zip(places, results, strict=True)}
+        for place, key in enumerate(keys):
+            out[place] = new[key] if key in new else self._held[key]
+        for key, row in new.items():
+            # Store a copy: a view would keep the results of a whole call in memory.
+            self._held[key] = row.copy()
+            self._bytes += row.nbytes
+        while self._bytes > self._limit:
+            self._bytes -= self._held.pop(next(iter(self._held))).nbytes

@@ -1,0 +1,238 @@
+"""Surrogate residuals: random noise with the spectrum of a residual (sieve bootstrap).
+
+Each channel is fitted by an autoregression, whose order is selected by Akaike's criterion, and
+simulated with its own resampled innovations (P. Buhlmann, Bernoulli 3(2), 123, 1997,
+doi:10.2307/3318584):
+
+    e_t = Σ_k a_k e_{t-k} + u_t                                                                  (1)
+
+In a short run, the fit absorbs the slow part of the noise. The residual then seems less correlated
+than the noise is, and scores that slow changes reach under the null hypothesis would seem too rare.
+This bias is estimated by applying the same fit to a first set of surrogates, and a second set is
+generated without it (bootstrap after bootstrap; L. Kilian, Rev. Econ. Stat. 80(2), 218, 1998,
+doi:10.1162/003465398557465). With a* the weights estimated from the residuals of the first set:
+
+    a ← a + s (a - a*),   s the largest share of 1 for which the process is stationary           (2)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import MIN_VARIANCE, Mask
+from sims.core.simulator import Array
+
+BURN_IN_SAMPLES = 200
+"""Number of initial samples of a surrogate that are discarded, to remove its zero initial state."""
+YULE_WALKER_RIDGE = 1e-9
+"""Share of the variance added to the Yule-Walker matrix, which a pure tone makes singular."""
+MAX_ROOT = 0.999
+"""Maximum modulus of the roots of an autoregression; from 1 on the process is not stationary."""
+MIN_AIC_GAIN = 1e-9
+"""Minimum decrease of Akaike's criterion by a higher order; smaller ones are due to rounding."""
+BIAS_CORRECTION_SHARES = tuple(share / 20.0 for share in range(20, 0, -1))
+"""Shares of the bias correction to try, largest first, until the process is stationary."""
+PILOT_COUNT_RANGE = (20, 100)
+"""Minimum and maximum number of surrogates of the first set, which estimates the bias."""
+PILOT_SAMPLE_COUNT = 20_000
+"""Target number of samples of the first set.
+
+A bias that is smaller than its error of estimation does not matter.
+"""
+MAX_CHUNK_SIZE = 500_000
+"""Maximum number of values that are simulated at once; more would not fit in the CPU cache."""
+MIN_CHUNK_WIDTH = 1_000
+"""Minimum number of series that are simulated in parallel, so that the cost per step is low."""
+MIN_INNOVATIONS = 10
+"""Minimum number of innovations to resample; with fewer, the samples themselves are resampled."""
+
+
+def draw_surrogates(
+    residual: Array,
+    seen: Mask,
+    count: int,
+    rng: np.random.Generator,
+    largest: int = 6,
+    left: Callable[[Array], Array] | None = None,
+) -> Array:
+    """Draw residuals (count, R, T, C) with the spectrum of a given residual.
+
+    Args:
+        residual: (R, T, C) residual of a model, zero where no sample exists.
+        seen: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
+        count: number of surrogates.
+        rng: random numbers for the innovations.
+        largest: maximum order of the autoregression.
+        left: callback that returns the residual of a fit to noise (count, R, T, C); without it the
+            bias is not corrected.
+    """
+    channels = residual.shape[2]
+    weights = [_autoregression(residual[..., c], seen[..., c], largest) for c in range(channels)]
+    # White noise has no correlation that a fit could reduce.
+    if left is not None and any(w.size for w in weights):
+        pilots = int(np.clip(PILOT_SAMPLE_COUNT // max(int(seen.sum()), 1), *PILOT_COUNT_RANGE))
+        leavings = left(_simulate_autoregression(residual, seen, weights, pilots, rng))
+        for c in range(channels):
+            weights[c] = _correct_bias(weights[c], leavings[..., c], seen[..., c])
+    return _simulate_autoregression(residual, seen, weights, count, rng)
+
+
+def _simulate_autoregression(
+    residual: Array, seen: Mask, weights: Sequence[Array], count: int, rng: np.random.Generator
+) -> Array:
+    """Simulate the autoregressions (1) with resampled innovations of a residual.
+
+    Args:
+        residual: (R, T, C) residual.
+        seen: (R, T, C) mask of available samples.
+        weights: weights (p,) of each channel.
+        count: number of surrogates.
+        rng: random numbers for the innovations.
+
+    Returns:
+        Surrogates (count, R, T, C).
+    """
+    runs, length, channels = residual.shape
+    result = np.zeros((count, runs, length, channels))
+    for c, own in enumerate(weights):
+        here = seen[:, :, c]
+        filled = np.where(here, residual[:, :, c], 0.0)
+        innovations = _centred(filled, here, own)
+        step = max(
+            MAX_CHUNK_SIZE // ((length + BURN_IN_SAMPLES) * runs), MIN_CHUNK_WIDTH // runs, 1
+        )
+        for first in range(0, count, step):
+            some = result[first : first + step, :, :, c]
+            drawn = rng.choice(innovations, size=(length + BURN_IN_SAMPLES, len(some), runs))
+            # Time is the first axis of the simulation, and the last axis here.
+            driven = np.moveaxis(_drive_autoregression(own, drawn)[BURN_IN_SAMPLES:], 0, 2)
+            some[...] = np.where(here, driven, 0.0)
+    return result
+
+
+def _correct_bias(weights: Array, leavings: Array, seen: Mask) -> Array:
+    """Correct weights (p,) for the bias of a fit, by (2).
+
+    Args:
+        weights: (p,) weights of an autoregression.
+        leavings: (count, R, T) residuals of the fit to noise with these weights.
+        seen: (R, T) mask of available samples.
+    """
+    order = weights.size
+    count, *shape = leavings.shape
+    covariances = _autocovariances(leavings.reshape(-1, shape[1]), np.tile(seen, (count, 1)), order)
+    found, _ = _yule_walker(covariances, order)
+    # If no autoregression of this order is found, the bias is unknown.
+    if found.size != order:
+        return weights
+    for share in BIAS_CORRECTION_SHARES:
+        corrected = weights + share * (weights - found)
+        if _max_root(corrected) <= MAX_ROOT:
+            return corrected
+    return weights
+
+
+def _drive_autoregression(weights: Array, innovations: Array) -> Array:
+    """Apply the autoregression (1) to innovations (T, ...), in place."""
+    order = weights.size
+    if not order:
+        return innovations
+    flat = innovations.reshape(len(innovations), -1)
+    # The weight of the oldest sample comes first, in the order of the samples.
+    backwards = weights[::-1]
+    # A sample depends only on earlier ones, which are complete by then.
+    for t in range(1, len(flat)):
+        before = flat[max(t - order, 0) : t]
+        flat[t] += backwards[order - len(before) :] @ before
+    return innovations
+
+
+def _autoregression(values: Array, seen: Mask, largest: int) -> Array:
+    """Fit an autoregression to values (R, T); no weights if it has too few innovations."""
+    filled = np.where(seen, values, 0.0)
+    covariances = _autocovariances(filled, seen, min(largest, seen.shape[1] - 1))
+    weights = _select_order_by_aic(covariances, int(seen.sum()))
+    return weights if _innovations(filled, seen, weights).size >= MIN_INNOVATIONS else np.zeros(0)
+
+
+def _centred(filled: Array, seen: Mask, weights: Array) -> Array:
+    """Return the innovations (n,) minus their mean; the samples themselves if there are too few."""
+    innovations = _innovations(filled, seen, weights)
+    if innovations.size < MIN_INNOVATIONS:
+        return filled[seen] if seen.any() else np.zeros(1)
+    # A nonzero mean would accumulate to an offset of the surrogates.
+    centred: Array = innovations - innovations.mean()
+    return centred
+
+
+def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
+    """Return the autocovariances (largest + 1,) of values (R, T), lag 0 first."""
+    length = seen.shape[1]
+    covariances = []
+    for lag in range(largest + 1):
+        former, latter = slice(0, length - lag), slice(lag, length)
+        # Missing samples add nothing to the sum, so their pairs are not counted either.
+        pairs = seen[:, latter] & seen[:, former]
+        products = filled[:, latter] * filled[:, former]
+        covariances.append(float(products.sum()) / max(int(pairs.sum()), 1))
+    return np.array(covariances)
+
+
+def _select_order_by_aic(covariances: Array, count: int) -> Array:
+    """Return weights (p,) of the order p with the lowest n log var u + 2 p (H. Akaike, 1974)."""
+    best = np.inf
+    weights = np.zeros(0)
+    for order in range(len(covariances)):
+        solved, variance = _yule_walker(covariances, order)
+        criterion = count * np.log(max(variance, MIN_VARIANCE)) + 2.0 * order
+        if criterion < best - MIN_AIC_GAIN:
+            best = criterion
+            weights = solved
+    return weights
+
+
+def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
+    """Return the innovations (n,) u of (1), where all samples that they need are available."""
+    order, length = weights.size, seen.shape[1]
+    predicted = np.zeros(1)
+    # A sample and all samples that predict it.
+    complete = seen[:, order:]
+    for k, weight in enumerate(weights, start=1):
+        earlier = slice(order - k, length - k)
+        predicted = predicted + weight * filled[:, earlier]
+        complete = complete & seen[:, earlier]
+    innovations: Array = (filled[:, order:] - predicted)[complete]
+    return innovations
+
+
+def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
+    """Solve the Yule-Walker equations for weights (p,) and the variance of the innovations.
+
+    With autocovariances γ (Box & Jenkins, chapter 3):
+
+        Σ_l γ_|k-l| a_l = γ_k,   var u = γ_0 - Σ_k a_k γ_k                                       (3)
+
+    The variance is infinite if (1) is not stationary, so that this order is not selected.
+    """
+    power = covariances[0]
+    # Order zero is white noise; without power there is no signal.
+    if order == 0 or power <= 0:
+        return np.zeros(0), float(power)
+    numbers = np.arange(order)
+    lags = np.abs(numbers[:, None] - numbers)
+    later = covariances[1 : order + 1]
+    # Left-hand matrix of (3), with a ridge.
+    matrix = covariances[lags] + YULE_WALKER_RIDGE * power * np.eye(order)
+    weights = np.linalg.solve(matrix, later)
+    variance = float(power - weights @ later)
+    if variance <= 0 or _max_root(weights) > MAX_ROOT:
+        return np.zeros(0), np.inf
+    return weights, variance
+
+
+def _max_root(weights: Array) -> float:
+    """Return the largest modulus of the roots; the response of (1) is a sum of their powers."""
+    roots = np.roots(np.concatenate([[1.0], -weights]))
+    return float(np.abs(roots).max(initial=0.0))

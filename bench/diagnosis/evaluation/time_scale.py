@@ -1,0 +1,54 @@
+"""Plausible ranges of times and frequencies, from the time scale of a recording.
+
+With T the duration of the longest run and h the shortest sample interval:
+
+* a delay or a lag is plausible up to T / 20, and a fit may move it up to T: longer ones look
+  constant within a run;
+* a decay time constant is at most `LASTING` T;
+* a frequency is at most 1 / (2 h), the Nyquist frequency.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sims.core.simulator import Parameter
+
+SHARE = 0.05
+"""Maximum plausible delay or lag, as a share of the duration of the longest run."""
+LASTING = 3.0
+"""Maximum decay time constant, as a multiple of the duration of the longest run."""
+DECADES = 100.0
+"""Ratio of the highest to the lowest plausible frequency if the sampling limits the highest one."""
+
+
+def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
+    """Return the coefficient with a plausible range for the time scale of a recording.
+
+    Args:
+        parameter: a coefficient, with the range that its effect specifies.
+        longest: duration of the longest run, s.
+        spacing: shortest sample interval, s; 0 if unknown.
+    """
+    low, high = parameter.bounds
+    if is_instant(parameter):
+        return parameter
+    if parameter.unit == "s":
+        if low > 0:
+            high = max(high, LASTING * longest)
+        else:
+            # A delay may have either sign, so both ends are scaled by the same factor.
+            times = max(1.0, SHARE * longest / high)
+            low, high = times * low, times * high
+    elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
+        high = 0.5 / spacing
+        low = min(low, high / DECADES)
+    if (low, high) == parameter.bounds:
+        return parameter
+    nominal = min(max(parameter.nominal, low), high)
+    return replace(parameter, nominal=nominal, bounds=(low, high), training=None)
+
+
+def is_instant(coefficient: Parameter) -> bool:
+    """Return whether a coefficient is a time on the clock of the recording."""
+    return coefficient.name.endswith(".instant")

@@ -1,0 +1,345 @@
+"""Pool of forked worker processes that share the independent tasks of one search.
+
+The result of a task does not depend on the process that runs it. The split into tasks does not
+depend on the number of workers either, so the results are bit-identical with one worker and with
+many. Workers are forked only after enough work has been done to justify their cost. They inherit
+the `World` objects as they were then and receive small messages. They end with the pool, or with
+their parent (by a kernel signal and by the end of their pipe). They ignore Ctrl-C, which only the
+parent handles.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import io
+import mmap
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import connection
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from bench.benchmark.isolation.linux_syscalls import PR_SET_PDEATHSIG, prctl
+from bench.diagnosis.evaluation.search_control import SearchControl
+from sims.core.simulator import Array
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+    from multiprocessing.process import BaseProcess
+
+PARALLEL_THRESHOLD_SECONDS = 0.4
+"""Seconds of work in parallelisable tasks after which workers are started."""
+POLL_INTERVAL_SECONDS = 0.05
+"""Interval in seconds at which the pool checks whether the search must end."""
+
+Result = TypeVar("Result")
+Task = Callable[..., Result]
+"""A module-level function: its first argument is the world, the others come from the message."""
+
+
+class SharedState(Protocol):
+    """Shared state that tasks work on, such as a `World`."""
+
+    simulations: int
+    watch: SearchControl
+    crew: ForkedWorkerPool
+
+
+class _Worker(NamedTuple):
+    process: BaseProcess
+    pipe: Connection
+
+
+class _Answer(NamedTuple):
+    """Reply of a worker: a result or an error with its traceback, and counts for the parent."""
+
+    result: Any
+    error: Exception | None
+    trace: str
+    simulations: int
+    left: bool
+
+
+class _WorkerTracebackError(Exception):
+    """Traceback of an error inside a worker, attached as the cause of the error."""
+
+    def __str__(self) -> str:
+        return f"in a worker:\n{self.args[0]}"
+
+
+class ForkedWorkerPool:
+    """Pool of up to a given number of worker processes.
+
+    Args:
+        jobs: maximum number of processes; 1 means only this process.
+    """
+
+    def __init__(self, jobs: int = 1) -> None:
+        self._jobs = jobs
+        self._spent = 0.0
+        # `_worlds` are all registered worlds, `_known` those that the present workers inherited.
+        self._worlds: list[SharedState] = []
+        self._known: list[SharedState] = []
+        self._team: list[_Worker] = []
+        self._ending: mmap.mmap | None = None
+
+    def map(
+        self, world: SharedState, task: Task[Result], items: Sequence[tuple[Any, ...]]
+    ) -> list[Result]:
+        """Run a task on each item, and return the results in the order of the items.
+
+        Args:
+            world: first argument of the task.
+            task: a module-level function.
+            items: further arguments of each call.
+
+        Returns:
+            One result per item.
+        """
+        results = dict(self.map_unordered(world, task, items))
+        return [results[number] for number in range(len(items))]
+
+    def map_unordered(
+        self, world: SharedState, task: Task[Result], items: Sequence[tuple[Any, ...]]
+    ) -> Iterator[tuple[int, Result]]:
+        """Run a task on each item, and yield item numbers and results as they arrive.
+
+        Args:
+            world: first argument of the task; workers have it as it was when they were started.
+            task: a module-level function.
+            items: further arguments of each call.
+
+        Yields:
+            The number of an item and its result.
+        """
+        several = self._jobs > 1 and len(items) > 1
+        if several and self._spent >= PARALLEL_THRESHOLD_SECONDS:
+            self._ready(world)
+        if several and self._team:
+            yield from self._shared(world, task, items)
+            return
+        for number, item in enumerate(items):
+            begun = time.perf_counter()
+            result = task(world, *item)
+            if several:
+                self._spent += time.perf_counter() - begun
+            yield number, result
+
+    def register(self, world: SharedState) -> None:
+        """Register a world for later work, so that workers inherit it when they start."""
+        self._worlds.append(world)
+
+    def forget(self, world: SharedState) -> None:
+        """Start new workers before the next work on a world, because it has changed."""
+        self._known = [known for known in self._known if known is not world]
+
+    def close(self) -> None:
+        """Kill all workers, and continue without them."""
+        for worker in list(self._team):
+            worker.process.kill()
+        for worker in list(self._team):
+            self._lose(worker.pipe)
+        self._jobs = 1
+
+    def _ready(self, world: SharedState) -> None:
+        """Ensure that the workers know a world; otherwise replace them by new workers."""
+        if _is_same_array(self._known, world):
+            return
+        for worker in list(self._team):
+            self._lose(worker.pipe)
+        if not _is_same_array(self._worlds, world):
+            self.register(world)
+        self._known = list(self._worlds)
+        # Checked at this moment, because threads may start and end.
+        if can_fork():
+            self._start()
+
+    def _start(self) -> None:
+        if self._ending is None:
+            self._ending = mmap.mmap(-1, 1)
+        context = multiprocessing.get_context("fork")
+        # Frozen objects stay in shared memory pages: garbage collection in a worker does not write
+        # to them.
+        gc.freeze()
+        for _ in range(self._jobs):
+            mine, theirs = context.Pipe()
+            # A worker that inherits ends of other pipes would keep the workers of these pipes
+            # alive.
+            others = [mine, *(worker.pipe for worker in self._team)]
+            told = (self._known, theirs, others, self._ending, os.getpid())
+            process = context.Process(target=_work, args=told, daemon=True, name="explain")
+            process.start()
+            theirs.close()
+            self._team.append(_Worker(process, mine))
+        gc.unfreeze()
+
+    def _shared(
+        self,
+        world: SharedState,
+        task: Task[Result],
+        items: Sequence[tuple[Any, ...]],
+    ) -> Iterator[tuple[int, Result]]:
+        errors: dict[int, tuple[Exception, str]] = {}
+        waiting = list(range(len(items)))[::-1]
+        busy: dict[Connection, int] = {}
+        free = [worker.pipe for worker in self._team]
+        place = next(i for i, known in enumerate(self._known) if known is world)
+        while waiting or busy:
+            while free and waiting:
+                pipe = free.pop()
+                number = waiting.pop()
+                if _sent(pipe, (place, task, items[number])):
+                    busy[pipe] = number
+                else:
+                    self._lose(pipe)
+                    waiting.append(number)
+            # All workers are gone, so the remaining items are processed here.
+            if not busy:
+                yield from ((number, task(world, *items[number])) for number in waiting)
+                break
+            for pipe in self._heard(list(busy), world):
+                number = busy.pop(pipe)
+                answer = _received(pipe)
+                if answer is None:
+                    # The worker died, perhaps for lack of memory, so its item is processed again.
+                    self._lose(pipe)
+                    waiting.append(number)
+                    continue
+                free.append(pipe)
+                world.simulations += answer.simulations
+                world.watch.record_abandoned_fit(answer.left)
+                if answer.error is not None:
+                    errors[number] = answer.error, answer.trace
+                else:
+                    yield number, answer.result
+        # Raise the error of the first item in order, whichever error arrived first.
+        for number in sorted(errors):
+            error, trace = errors[number]
+            raise error from _WorkerTracebackError(trace)
+
+    def _heard(self, pipes: list[Connection], world: SharedState) -> list[Any]:
+        """Wait for replies and return their pipes; tell workers to stop if the search must end."""
+        while True:
+            ready = connection.wait(pipes, POLL_INTERVAL_SECONDS)
+            if self._ending is not None and world.watch.should_stop():
+                self._ending[0] = 1
+            if ready:
+                return ready
+
+    def _lose(self, pipe: Connection) -> None:
+        """Kill a worker and remove it from the pool."""
+        for worker in list(self._team):
+            if worker.pipe is pipe:
+                self._team.remove(worker)
+                worker.process.kill()
+                worker.process.join()
+                pipe.close()
+
+
+def _is_same_array(worlds: Sequence[SharedState], world: SharedState) -> bool:
+    """Return whether a world is one of the given objects (by identity, not equality)."""
+    return any(one is world for one in worlds)
+
+
+def count_available_cores() -> int:
+    """Return the number of CPU cores that this process may use."""
+    # The CPU affinity is not available on all systems.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def can_fork() -> bool:
+    """Return whether workers can be forked from this process.
+
+    This requires Linux, no other threads (their locks would stay locked in the child), and a
+    process that may have children.
+    """
+    alone = threading.active_count() == 1
+    return sys.platform == "linux" and alone and not multiprocessing.current_process().daemon
+
+
+class _Pickler(pickle.Pickler):
+    """Pickler that keeps the memory order of arrays, because sums depend on it in the last bit."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        if type(thing) is not np.ndarray or thing.ndim < 2 or thing.flags.c_contiguous:
+            return NotImplemented
+        order = np.argsort([-abs(stride) for stride in thing.strides], kind="stable")
+        return _restore_axes, (np.ascontiguousarray(thing.transpose(order)), np.argsort(order))
+
+
+def _restore_axes(values: Array, order: Array) -> Array:
+    """Restore the order of axes that an array had before it was sent."""
+    return values.transpose(order)
+
+
+def serialise_message(message: Any) -> bytes:
+    """Serialise a message for a pipe."""
+    buffer = io.BytesIO()
+    _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL).dump(message)
+    return buffer.getvalue()
+
+
+def _sent(pipe: Connection, message: Any) -> bool:
+    try:
+        pipe.send_bytes(serialise_message(message))
+    except OSError:
+        return False
+    return True
+
+
+def _received(pipe: Connection) -> _Answer | None:
+    """Return the reply of a worker, or None if the worker is gone."""
+    try:
+        answer: _Answer = pickle.loads(pipe.recv_bytes())
+    except (EOFError, OSError):
+        return None
+    return answer
+
+
+def _work(
+    worlds: Sequence[SharedState],
+    pipe: Connection,
+    others: list[Connection],
+    ending: mmap.mmap,
+    parent: int,
+) -> None:
+    """Process the requests of the parent until the pipe ends; main loop of a worker."""
+    # Ctrl-C of a terminal reaches every process of the group; only the parent handles it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(OSError):
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    # The parent may have ended before the kernel signal was requested.
+    if os.getppid() != parent:
+        return
+    for other in others:
+        other.close()
+    for world in worlds:
+        world.crew = ForkedWorkerPool()
+    while True:
+        try:
+            place, task, item = pickle.loads(pipe.recv_bytes())
+        except (EOFError, OSError):
+            return
+        world, deadline = worlds[place], worlds[place].watch.deadline
+        world.watch = SearchControl(stop=lambda: ending[0] != 0)
+        world.watch.deadline = deadline
+        before = world.simulations
+        result, error, trace = None, None, ""
+        try:
+            result = task(world, *item)
+        except Exception as raised:
+            error, trace = raised, traceback.format_exc()
+        count = world.simulations - before
+        if not _sent(pipe, _Answer(result, error, trace, count, world.watch.left())):
+            return

@@ -1,0 +1,252 @@
+"""Candidate runs that could be recorded next, as plans in terms of the experimental setup.
+
+A plan sets the driven inputs, the form, size and offset of the command, the initial state, the
+constants (such as a load) and the sampling rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.core.input_signals import evaluate_signal
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, stated_limits
+from sims.core.simulator import Array, Scenario
+
+COMMAND_SIZE_FACTORS = (1.0, 2.0, 0.4)
+"""Command sizes that are tried, as factors of the largest command recorded."""
+INITIAL_STATE_FACTORS = (1.0, 1.4, 2.0, -1.0, 0.6, 0.3)
+"""Initial coordinates that are tried, as factors of the recorded initial coordinate."""
+COMMAND_OFFSET_FACTORS = (0.5, -0.5)
+"""Command offsets that are tried instead of the median, as factors of the largest command."""
+HOLD_FACTORS = (2, 4)
+"""Factors that are tried for a longer sampling interval; commands are held or interpolated over it.
+"""
+MIN_SAMPLES = 40
+"""Minimum number of samples of a run."""
+REST_RATE = 0.05
+"""Rate of a coordinate, in its unit per second, below which a run began at rest."""
+REST_STATE = 0.05
+"""Minimum magnitude of an initial coordinate to which the factors of `INITIAL_STATE_FACTORS` apply."""
+RELEASE_SHARE = 0.2
+"""Share of a run after which a pushed system is released."""
+HOLD_LEVEL_COUNT = 6
+"""Number of levels in a run of holds."""
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """Plan of a run.
+
+    Attributes:
+        driven_inputs: Driven inputs; empty if the system is only released.
+        form: Form of the command in words.
+        size: Size of the command, as a factor of the largest one recorded.
+        level: Offset of the command from its median, as a factor of the largest one recorded.
+        states: Initial states by name, where they differ from the first run's at rest.
+        constants: Constants by name, such as load, length or gain, with values from the recorded
+            runs.
+        hold_factor: Factor of the sampling interval.
+    """
+
+    driven_inputs: tuple[str, ...] = ()
+    form: str = ""
+    size: float = 1.0
+    level: float = 0.0
+    states: tuple[tuple[str, float], ...] = ()
+    constants: tuple[tuple[str, float], ...] = ()
+    hold_factor: int = 1
+
+
+@dataclass(frozen=True)
+class CandidateRun:
+    """Candidate run: a plan with its command signals and its initial state."""
+
+    plan: RunPlan
+    says: str
+    scenario: Scenario
+    states: Array
+
+
+class RigModel:
+    """Experimental setup, from which variants of the recorded runs are made.
+
+    Args:
+        world: Run evaluator of the recorded runs.
+        seconds: Duration of the next run in seconds.
+    """
+
+    def __init__(self, world: RunEvaluator, seconds: float) -> None:
+        self.world, self.seconds = world, seconds
+        self.old = world.tracks[0].scenario
+        self.step = float(np.median(np.diff(self.old.times)))
+        self.largest, self.rest = {}, {}
+        for name in self.old.inputs:
+            signals = [track.scenario.inputs[name] for track in world.tracks]
+            middle = float(np.median(np.concatenate(signals)))
+            self.largest[name] = max(float(np.abs(values - middle).max()) for values in signals)
+            self.rest[name] = middle
+        self.driven = tuple(name for name in self.old.inputs if self.largest[name] > 0)
+        self.limits = stated_limits(world)
+        self.begin = self._begin()
+
+    def _begin(self) -> Array:
+        """Return the initial state of the first run, at rest and within joint ranges.
+
+        A robot cannot be started in motion.
+        """
+        states = self.world.tracks[0].initial_state_guess.copy()
+        rates = set(self.world.simulator.system.rates)
+        for i, name in enumerate(self.world.states):
+            states[i] = 0.0 if name in rates else self._reachable(name, float(states[i]))
+        return states
+
+    def _reachable(self, name: str, value: float) -> float:
+        """Clip a state to the range of its joint."""
+        return float(np.clip(value, *self.limits.positions.get(name, UNLIMITED)))
+
+    # -- plans
+
+    def list_basic_plans(self) -> Iterator[RunPlan]:
+        """Yield plans of every form and size, for each input alone and for all together.
+
+        Plans that only release the system from other initial states are included.
+        """
+        for state in self._beginnings():
+            yield RunPlan(states=(state,))
+        groups = [(name,) for name in self.driven]
+        for driven in [*groups, self.driven] if len(groups) > 1 else groups:
+            for size in COMMAND_SIZE_FACTORS:
+                for form in COMMAND_FORMS:
+                    yield RunPlan(driven, form, size)
+
+    def list_variants(self, plan: RunPlan) -> Iterator[RunPlan]:
+        """Yield variants of a plan with one property changed."""
+        for name, value in self._beginnings():
+            yield replace(plan, states=tuple((dict(plan.states) | {name: value}).items()))
+        for name, values in self._knobs().items():
+            rest = tuple(pair for pair in plan.constants if pair[0] != name)
+            for value in values:
+                yield replace(plan, constants=(*rest, (name, value)))
+        if plan.driven_inputs:
+            for level in COMMAND_OFFSET_FACTORS:
+                yield replace(plan, level=level)
+            for size in COMMAND_SIZE_FACTORS:
+                yield replace(plan, size=size)
+        for coarser in HOLD_FACTORS:
+            if self.seconds / (self.step * coarser) >= MIN_SAMPLES:
+                yield replace(plan, hold_factor=coarser)
+
+    def _beginnings(self) -> Iterator[tuple[str, float]]:
+        """Yield larger initial coordinates, and the fastest initial rates recorded."""
+        system, world = self.world.simulator.system, self.world
+        unseen = {world.states[i] for i in np.flatnonzero(world.known.all(axis=0))}
+        for name in system.coordinates:
+            base = float(self.begin[world.states.index(name)])
+            values = [
+                share * base if abs(base) > REST_STATE else share for share in INITIAL_STATE_FACTORS
+            ]
+            # Outside its range a joint begins at the limit, which is tried only once.
+            reachable = dict.fromkeys(self._reachable(name, value) for value in values)
+            for value in reachable if name not in unseen else ():
+                yield name, value
+        if world.kind.has_model:
+            return
+        for name in system.rates:
+            fastest = float(np.abs(world.guess[:, world.states.index(name)]).max())
+            for value in (fastest, -fastest) if fastest > REST_RATE and name not in unseen else ():
+                yield name, value
+
+    def _knobs(self) -> dict[str, list[float]]:
+        """Return the constants that differ between runs, with their values, which are available."""
+        values: dict[str, set[float]] = {}
+        for run in self.world.runs:
+            for name, value in run.constants.items():
+                values.setdefault(name, set()).add(value)
+        return {name: sorted(own) for name, own in values.items() if len(own) > 1}
+
+    # -- runs
+
+    def make_run(self, plan: RunPlan) -> CandidateRun:
+        """Make the command signals and the initial state of a plan."""
+        times = np.arange(0.0, self.seconds, self.step * plan.hold_factor)
+        inputs = {
+            name: self._limited(name, np.full(times.size, self.rest[name]))
+            for name in self.old.inputs
+        }
+        states = self.begin.copy()
+        limited = []
+        for number, name in enumerate(plan.driven_inputs):
+            own = plan.size * _command(plan.form, times, self.step, np.random.default_rng(number))
+            wanted = self.rest[name] + self.largest[name] * (own + plan.level)
+            inputs[name] = self._limited(name, wanted)
+            limited += [name] if (inputs[name] != wanted).any() else []
+        for name, value in plan.states:
+            states[self.world.states.index(name)] = value
+        constants = {**self.old.constants, **dict(plan.constants)}
+        scenario = replace(self.old, times=times, inputs=inputs, constants=constants)
+        return CandidateRun(plan, self._says(plan, inputs, limited), scenario, states)
+
+    def _limited(self, name: str, values: Array) -> Array:
+        """Clip a command to the limits of its actuator and its joint."""
+        return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
+
+    def _says(self, plan: RunPlan, inputs: Mapping[str, Array], limited: Sequence[str]) -> str:
+        if plan.driven_inputs:
+            what = plan.driven_inputs[0] if len(plan.driven_inputs) == 1 else "all inputs"
+            text = f"{what}: {plan.form}, {plan.size:g} times as large as so far"
+        else:
+            text = "let it go"
+        if plan.level:
+            middles = [f"{name} = {np.median(inputs[name]):.3g}" for name in plan.driven_inputs]
+            text += f", about {', '.join(middles)}"
+        for name in limited:
+            low, high = self.limits.commands[name]
+            text += f", {name} limited to {low:.4g} to {high:.4g}"
+        begins = [f"{name} = {value:.3g}" for name, value in plan.states]
+        text += f", from {', '.join(begins)}" if begins else ""
+        if plan.constants:
+            text += ", with " + ", ".join(f"{name} = {value:.4g}" for name, value in plan.constants)
+        if plan.hold_factor > 1:
+            text += (
+                f", commands and samples {1.0 / (self.step * plan.hold_factor):.4g} times a second"
+            )
+        return text
+
+
+COMMAND_FORMS: Mapping[str, str] = {
+    "slow multisine": "multisine:1:{slow:g}:1",
+    "fast multisine": "multisine:1:{middle:g}:{fast:g}",
+    "chirp": "chirp:1:{slow:g}:{fast:g}",
+    "steps of 0.5 s": "steps:1:0.5",
+    "steps of 0.1 s": "steps:1:0.1",
+    "slow sine": "sine:1:{slow:g}",
+    "square wave of 1 Hz": "square:1:1",
+    "square wave of 4 Hz": "square:1:4",
+    "ramps up and down": "",
+    "holds": "",
+    "a push, then let go": "",
+}
+"""Signal specifications of unit size, by name of the form; an empty one is computed by `_command`.
+"""
+
+
+def _command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
+    """Compute a command (T,) of unit size."""
+    share = times / (times[-1] or 1.0)
+    if form == "ramps up and down":
+        return np.asarray(2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * share)))
+    if form == "holds":
+        # Levels alternate with a large change each time, so that friction becomes visible.
+        levels = np.array([0.0, 1.0, -1.0, 0.5, -0.5, 0.25])
+        return levels[np.minimum((share * HOLD_LEVEL_COUNT).astype(np.intp), HOLD_LEVEL_COUNT - 1)]
+    if form == "a push, then let go":
+        return np.where(share < RELEASE_SHARE, 1.0, 0.0)
+    seconds = float(times[-1])
+    slow = min(max(1.0 / max(seconds, step), 0.1), 0.5)
+    fast = max(min(8.0, 0.1 / step), 2.0 * slow)
+    text = COMMAND_FORMS[form].format(slow=slow, middle=min(1.0, 0.5 * fast), fast=fast)
+    return evaluate_signal(text, times, rng)

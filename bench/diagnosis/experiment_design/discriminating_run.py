@@ -1,0 +1,313 @@
+"""Propose a discriminating run: the run in which the predictions of two models differ most.
+
+It is a T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V.
+Fedorov, Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57), with the competing model's
+parameters fixed at their fit to the present data. On a run x with T samples of C channels the two
+models differ by
+
+    apart(x) = sqrt(mean over t, c of ((y_model - y_rival) / sigma_c)^2)                       (1)
+
+For a robot no run is proposed that exceeds a limit of the model file
+(`diagnosis.experiment_design`): commands
+and initial states are limited, and the motion is simulated with both models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.experiment_design.model_file_limits import (
+    UNLIMITED,
+    Interval,
+    StatedLimits,
+    stated_limits,
+)
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from sims.core.simulator import Array, Scenario
+
+MIN_DISCRIMINATION_SIGMAS = 2.0
+"""Minimum RMS difference of two models, in noise standard deviations, for which one more run would
+distinguish them.
+"""
+INITIAL_STATE_FACTORS = (0.3, 2.0, -1.0)
+"""Factors of an initial state that are tried."""
+REST_STATE = 0.05
+"""Minimum magnitude of an initial state to which the factors of `INITIAL_STATE_FACTORS` apply. A smaller state is
+replaced by the numbers in `INITIAL_STATE_FACTORS` themselves.
+"""
+MIN_DROP_HEIGHT = 1.0
+"""Minimum initial height in metres of a system that bounces."""
+INPUT_FACTORS = (0.3, 3.0)
+"""Factors of an input that are tried."""
+ROBOT_INPUTS = (0.3, 2.0)
+"""Factors of a robot's input that are tried: it may be driven at most twice as hard as before."""
+LARGER = 1.1
+"""Minimum factor by which an input must change, up or down, to be a different run."""
+
+
+@dataclass(frozen=True)
+class DiscriminatingRun:
+    """Proposed run or measurement.
+
+    Attributes:
+        says: Proposal as a sentence.
+        change: By name, the differences from the first fitted run: seconds, an initial state, or
+            the factor of an input; None if no run is proposed.
+        discrimination_sigmas: RMS difference of the two models in units of the noise; None if no
+            run is proposed.
+    """
+
+    says: str
+    change: Mapping[str, float] | None = None
+    discrimination_sigmas: float | None = None
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the proposal as in verdict.json."""
+        if self.change is None or self.discrimination_sigmas is None:
+            return {"says": self.says}
+        return {"says": self.says, "change": dict(self.change), "apart": self.discrimination_sigmas}
+
+
+class _Run(NamedTuple):
+    """Candidate run that could be recorded."""
+
+    says: str
+    change: dict[str, float]
+    scenario: Scenario
+    states: Array
+
+
+def propose_discriminating_run(
+    models: ModelSet, model: FittedModel, rival: FittedModel
+) -> DiscriminatingRun:
+    """Propose a run or measurement that distinguishes a model from a competing model.
+
+    Args:
+        models: Collection that contains both models.
+        model: Model of the present diagnosis.
+        rival: Competing model that explains the data as well.
+    """
+    world = models.world
+    says = ""
+    change: dict[str, float] = {}
+    largest = 0.0
+    apart = [
+        (_compute_discrimination(world, run, model, rival, models.noise.sigma), run)
+        for run in _runs(world)
+    ]
+    # A run that cannot be simulated with both models is not proposed.
+    apart = [(size, run) for size, run in apart if np.isfinite(size) and size > 0.0]
+    apart.sort(key=lambda entry: -entry[0])
+    is_limited = False
+    if found := _first_within_limits(world, (model, rival), apart):
+        largest, (says, change, _, _) = found
+        is_limited = largest < MIN_DISCRIMINATION_SIGMAS <= apart[0][0]
+    # Effects that both models have are not in question.
+    names = set(model.effects)
+    rivals = set(rival.effects)
+    mine = " and ".join(sorted(names - rivals))
+    other = " and ".join(sorted(rivals - names))
+    if largest < MIN_DISCRIMINATION_SIGMAS:
+        return DiscriminatingRun(_explain_no_run(world, mine, other, is_limited), {}, largest)
+    says = f"{says}: there {mine} and {other} differ by {largest:.3g} times the noise"
+    return DiscriminatingRun(says, change, largest)
+
+
+def _first_within_limits(
+    world: RunEvaluator, models: Sequence[FittedModel], runs: Sequence[tuple[float, _Run]]
+) -> tuple[float, _Run] | None:
+    """Return the first run that stays within the limits of a robot, whichever model is true.
+
+    For a system without a model file it is the first of all runs.
+
+    Args:
+        world: Run evaluator of the present runs.
+        models: Models that may be true.
+        runs: Candidate runs with the difference of the models (1), largest first.
+
+    Returns:
+        A run with its difference, which is 0 if no discriminating run is within the limits; None
+        without runs.
+    """
+    if not world.kind.has_model or not runs or runs[0][0] < MIN_DISCRIMINATION_SIGMAS:
+        return runs[0] if runs else None
+    # These imports are needed for robots only.
+    from bench.diagnosis.experiment_design.candidate_runs import CandidateRun as RigRun
+    from bench.diagnosis.experiment_design.candidate_runs import RunPlan
+    from bench.diagnosis.experiment_design.safety_limits import RigLimits
+
+    limits = RigLimits(world, models[0])
+    for apart, run in runs:
+        candidate = RigRun(RunPlan(), run.says, run.scenario, run.states)
+        if apart < MIN_DISCRIMINATION_SIGMAS or all(
+            limits(model, [candidate])[0] for model in models
+        ):
+            return apart, run
+    return 0.0, runs[0][1]
+
+
+def _explain_no_run(world: RunEvaluator, mine: str, other: str, is_limited: bool) -> str:
+    """Write what to do if no such run would discriminate, or none within the limits of a robot."""
+    channels = [channel.name for channel in world.kind.channels]
+    unseen = ", ".join(name for name in channels if name not in world.channels)
+    instead = "measure one of the causes directly"
+    # Another sensor may measure a difference where these sensors agree.
+    if unseen:
+        instead = f"record {unseen} besides"
+    if is_limited:
+        return (
+            f"No run of this kind within the limits of the model file would tell {mine} from "
+            f"{other}; {instead}, or let simgap design search for other commands"
+        )
+    return (
+        f"No run of this kind would tell {mine} from {other}: "
+        f"their predictions agree within the noise; {instead}"
+    )
+
+
+def _runs(world: RunEvaluator) -> Iterator[_Run]:
+    """Yield runs like the first one with one changed duration, initial state or input."""
+    limits = stated_limits(world)
+    first = _first(world, limits)
+    # If several runs discriminate equally well, the first one is proposed.
+    yield _longer(first)
+    yield from _elsewhere(world, first, limits)
+    yield from _driven(world, first, limits)
+
+
+def _first(world: RunEvaluator, limits: StatedLimits) -> _Run:
+    """Return the first fitted run, as the basis of the proposals.
+
+    A robot starts at rest, because it cannot be started in motion, and with commands and positions
+    within their limits.
+    """
+    track = world.tracks[0]
+    if not world.kind.has_model:
+        return _Run("", {}, track.scenario, track.initial_state_guess)
+    rates = set(world.simulator.system.rates)
+    states = [
+        0.0 if name in rates else _limited(value, limits.states.get(name))
+        for name, value in zip(world.states, track.initial_state_guess, strict=True)
+    ]
+    given = track.scenario.inputs
+    inputs = {name: _limited(values, limits.commands.get(name)) for name, values in given.items()}
+    is_limited = any((inputs[name] != values).any() for name, values in given.items())
+    says = ", with commands limited as the model file states" if is_limited else ""
+    return _Run(says, {}, replace(track.scenario, inputs=inputs), np.array(states))
+
+
+def _limited(values: Any, limits: Interval | None) -> Any:
+    """Clip a number or an array to an interval."""
+    return values if limits is None else np.clip(values, *limits)
+
+
+def _longer(first: _Run) -> _Run:
+    times = first.scenario.times
+    later = times[1:] - times[0]
+    twice = np.concatenate([times, times[-1] + later])
+    inputs = {}
+    for name, signal in first.scenario.inputs.items():
+        # The inputs are repeated from the beginning.
+        inputs[name] = np.concatenate([signal, signal[1:]])
+    scenario = replace(first.scenario, times=twice, inputs=inputs)
+    seconds = float(twice[-1] - twice[0])
+    change = {"seconds": seconds}
+    return _Run(f"Record twice as long{first.says}", change, scenario, first.states)
+
+
+def _elsewhere(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
+    """Yield runs with one changed initial state; a robot starts at rest."""
+    system = world.simulator.system
+    height = len(system.coordinates) - 1
+    named = zip(world.states, _units(world), strict=True)
+    for place, (name, unit) in enumerate(named):
+        above_ground = system.bounces and place == height
+        if world.kind.has_model and name not in system.coordinates:
+            continue
+        for share in INITIAL_STATE_FACTORS:
+            # A body cannot be released below the ground.
+            if above_ground and share < 0:
+                continue
+            states = first.states.copy()
+            value = float(states[place])
+            moving = abs(value) > REST_STATE
+            value = share * value if moving else share
+            if above_ground:
+                value = max(value, MIN_DROP_HEIGHT)
+            value = float(_limited(value, limits.states.get(name)))
+            states[place] = value
+            says = f"Start with {name} = {value:.3g} {unit}{first.says}"
+            yield _Run(says, {name: value}, first.scenario, states)
+
+
+def _driven(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
+    """Yield runs with one scaled input, within the limits of the commands."""
+    shares = ROBOT_INPUTS if world.kind.has_model else INPUT_FACTORS
+    for name, signal in first.scenario.inputs.items():
+        if not signal.any():
+            continue
+        low, high = limits.commands.get(name, UNLIMITED)
+        most = _largest_share(signal, (low, high))
+        for share in dict.fromkeys(min(share, most) for share in shares):
+            driven = share * signal
+            if 1.0 / LARGER < share < LARGER or driven.min() < low or driven.max() > high:
+                continue
+            inputs = {**first.scenario.inputs, name: driven}
+            size = "smaller" if share < 1 else "larger"
+            says = f"Make the input {name} {size}, {share:.3g} times what it was{first.says}"
+            scenario = replace(first.scenario, inputs=inputs)
+            yield _Run(says, {name: share}, scenario, first.states)
+
+
+def _largest_share(signal: Array, limits: Interval) -> float:
+    """Return the largest factor that keeps a signal within its limits, rounded down.
+
+    It is infinite if nothing limits the signal.
+    """
+    ends = zip((float(signal.min()), float(signal.max())), limits, strict=True)
+    # No factor reaches a limit of the opposite sign.
+    factors = [limit / end for end, limit in ends if np.isfinite(limit) and end * limit > 0]
+    return float(np.floor(1e3 * min(factors)) / 1e3) if factors else np.inf
+
+
+def _units(world: RunEvaluator) -> list[str]:
+    """List the units of the states: coordinates, their rates, and further states."""
+    system = world.simulator.system
+    units = {channel.name: channel.unit for channel in world.kind.channels}
+    lengths = [units.get(name, "m") for name in system.coordinates]
+    rates = [f"{unit}/s" for unit in lengths]
+    # A user-defined system may have further states after the rates, in any unit.
+    further = system.rates[len(lengths) :]
+    others = [units.get(name, "SI") for name in further]
+    return [*lengths, *rates, *others]
+
+
+def _compute_discrimination(
+    world: RunEvaluator, run: _Run, model: FittedModel, rival: FittedModel, sigma: Array
+) -> float:
+    """Compute the RMS difference (1) of two models on a run."""
+    both = [model.fit.theta, rival.fit.theta]
+    # Freed constants are fitted with the parameters, but passed to the simulator as constants.
+    places = world.base[world.own :]
+    theta = np.delete(np.stack(both), places, axis=1)
+    names = [parameter.name for parameter in world.freed]
+    scenarios = []
+    for fitted in both:
+        values = fitted[places].tolist()
+        freed = dict(zip(names, values, strict=True))
+        constants = {**run.scenario.constants, **freed}
+        scenarios.append(replace(run.scenario, constants=constants))
+
+    # Each model is one batch element of the call, both with the same initial states.
+    initial = {}
+    for name, value in zip(world.states, run.states.tolist(), strict=True):
+        initial[name] = np.full(2, value)
+    mine, other = world.simulator.simulate_batch(theta, scenarios, initial)
+    world.simulations += 2
+    apart = (mine - other) / sigma
+    return float(np.sqrt(np.square(apart).mean()))  # (1)

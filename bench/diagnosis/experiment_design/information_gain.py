@@ -1,0 +1,303 @@
+"""Value of candidate runs: expected discrimination of models, or information about parameters.
+
+If two models explain the present data, the value of a run x is the residual of the competing model
+on that run after it is refitted to both the data and the run. C is the covariance of its parameters
+from the present data, and d is the difference of the two models on the run (T-optimality; A. C.
+Atkinson, V. V. Fedorov, Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57):
+
+    T(x) = min over δ, z of  |d - J δ - B z|^2 + δ' C^-1 δ                                      (1)
+
+All terms are whitened by the noise of the present data. J and B are the derivatives of the
+competing model by its parameters and by the free initial state of the run. Either model may be
+true, so each is fitted to the prediction of the other, and the smaller value counts. If no models
+compete but parameters are uncertain, the value of a run is the decrease of that uncertainty
+(D-optimality; V. V. Fedorov, Theory of Optimal Experiments, 1972),
+
+    D(x) = 1/2 log det(I + C J' (I - B B^+) J)                                                  (2)
+
+Because of the noise of the run, twice the difference of the log-likelihoods of the two models has
+the mean T and the variance 4 T.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel, whiten
+from bench.diagnosis.experiment_design.candidate_runs import CandidateRun
+from bench.diagnosis.experiment_design.safety_limits import RigLimits
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.validation.gain_and_intervals import compute_covariance, compute_fisher_blocks
+from sims.core.simulator import Array
+
+DISCRIMINATION_THRESHOLD = 25.0
+"""Minimum discrimination (1) for which a run distinguishes two models: despite its noise, odds of
+at least 33 to 1 result in 19 of 20 cases.
+"""
+MAX_USEFUL_DISCRIMINATION = 4.0 * DISCRIMINATION_THRESHOLD
+"""Discrimination (1) above which a run gains no further value."""
+MAX_EVALUATED_RUNS = 12
+"""Maximum number of runs of a robot for which (1) is computed: those with the largest difference of
+the models before a refit.
+"""
+MANY, FEWER = 12, 4
+"""Maximum number of exact evaluations of (1) in a row, for a system and for a robot, which is
+slower to simulate.
+"""
+STATE_STEP_SHARE = 1e-3
+"""Step of an initial state for a derivative, in units of the state."""
+MAX_STATE_STEP_GROWTH = 100.0
+"""Maximum growth factor of such a step during a run, relative to the channel scales."""
+MAX_FIT_ITERATIONS = 12
+"""Maximum number of iterations of a fit of a competing model to a candidate run."""
+MAX_DAMPING = 1e8
+"""Damping (D. W. Marquardt 1963) above which a fit of a competing model to a candidate run stops.
+"""
+
+
+class _Known(NamedTuple):
+    """Information of the present runs on a model's parameters.
+
+    Each parameter is in units of `spread`: its standard error, but at most a tenth of its bounds.
+    """
+
+    model: FittedModel
+    spread: Array
+    inverse: Array
+    """Inverse of the covariance matrix of the parameters, in units of `spread`."""
+
+
+class _LinearisedRun(NamedTuple):
+    """Linearisation of a run with a model, whitened.
+
+    Attributes:
+        centre: (n,) prediction.
+        numbers: (n, q) derivatives by the parameters, each in units of its spread.
+        states: (n, s) derivatives by the initial state.
+    """
+
+    centre: Array
+    numbers: Array
+    states: Array
+
+
+class RunValue(NamedTuple):
+    """Value of a candidate run.
+
+    Attributes:
+        run: Candidate run.
+        values: (1) of each ordered pair of models, or (2) alone.
+        value: Value of the run over all pairs.
+        is_exact: Whether (1) is computed exactly, not only to first order.
+    """
+
+    run: CandidateRun
+    values: Array
+    value: float
+    is_exact: bool = False
+
+
+def get_sort_key(entry: RunValue) -> tuple[float, str]:
+    """Return a sort key that puts the best run first."""
+    return -entry.value, entry.run.says
+
+
+class RunRanker:
+    """Ranker of candidate runs for some models, the first of which is the present diagnosis."""
+
+    def __init__(self, models: ModelSet, rivals: Sequence[FittedModel]) -> None:
+        self.models, self.world = models, models.world
+        self.known = [_known(models, one) for one in rivals]
+        self.noise: NoiseModel = compute_fisher_blocks(models, rivals[0]).noise
+        self.limits = RigLimits(self.world, rivals[0])
+        count = len(rivals)
+        self.pairs = list(permutations(range(count), 2))
+        self.most = MAX_USEFUL_DISCRIMINATION * len(self.pairs) / 2 if self.pairs else np.inf
+        self.patience = FEWER if self.world.kind.has_model else MANY
+        self.free = ~self.world.known.all(axis=0)
+
+    # -- runs
+
+    def rank_runs(self, runs: Sequence[CandidateRun]) -> list[RunValue]:
+        """Return the runs within the limits, the best first, by (1) to first order or by (2)."""
+        stands = self.known[0].model
+        able = [run for run, may in zip(runs, self.limits(stands, runs), strict=True) if may]
+        if self.world.kind.has_model:
+            able = self._plainest(able)
+        entries = []
+        for run in able:
+            slopes = [self._slopes(run, one, one.model.fit.theta) for one in self.known]
+            if all(one is not None for one in slopes):
+                entries.append(self._entry(run, [one for one in slopes if one is not None]))
+        return sorted(entries, key=get_sort_key)
+
+    def _entry(self, run: CandidateRun, slopes: Sequence[_LinearisedRun]) -> RunValue:
+        if not self.pairs:
+            value = _compute_information_gain(slopes[0], self.known[0])
+            return RunValue(run, np.array([value]), value)
+        values = np.zeros((len(slopes), len(slopes)))
+        for true, rival in self.pairs:
+            gap = slopes[true].centre - slopes[rival].centre
+            values[true, rival] = _left(gap, slopes[rival], self.known[rival])[0]
+        return RunValue(run, values, _worth(values))
+
+    def evaluate_exactly(self, entry: RunValue) -> RunValue:
+        """Compute (1) exactly, because the competing model may be far from linear on the run."""
+        if not self.pairs:
+            return entry._replace(is_exact=True)
+        values = entry.values.copy()
+        for true, rival in self.pairs:
+            values[true, rival] = self._told(entry.run, self.known[true], self.known[rival])
+        # The run must be within the limits, whichever model is true.
+        for one in self.known[1:]:
+            if not self.limits(one.model, [entry.run])[0]:
+                values[:] = 0.0
+        return RunValue(entry.run, values, _worth(values), is_exact=True)
+
+    def _plainest(self, runs: Sequence[CandidateRun]) -> list[CandidateRun]:
+        """Select the runs of a robot with the largest difference of the models before any refit.
+
+        The exact evaluation of a robot's run is slow.
+        """
+        sizes = []
+        for run in runs:
+            thetas = [one.model.fit.theta for one in self.known]
+            seen = self._whitened(self._simulated(run, thetas, [run.states] * len(thetas)))
+            gaps = [seen[b] - seen[a] for a, b in combinations(range(len(seen)), 2)]
+            gaps = gaps or [seen[0] - seen[0].mean()]
+            size = float(sum(np.log1p(np.square(gap).sum()) for gap in gaps))
+            sizes.append(size if np.isfinite(size) else -np.inf)
+        order = np.argsort(-np.array(sizes), kind="stable")
+        return [runs[place] for place in order[:MAX_EVALUATED_RUNS].tolist()]
+
+    # -- one run
+
+    def _simulated(
+        self, run: CandidateRun, thetas: Sequence[Array], states: Sequence[Array]
+    ) -> Array:
+        """Simulate the run (L, T, C) with each parameter vector and initial state."""
+        scenarios = [run.scenario] * len(thetas)
+        return self.world.simulate_scenarios(np.array(thetas), scenarios, np.array(states))
+
+    def _whitened(self, values: Array) -> Array:
+        """Whiten observations, or differences of them, to (L, n)."""
+        seen = np.ones((1, *values.shape[1:]), dtype=np.bool_)
+        lanes = np.moveaxis(values, 0, -1)[None]
+        result: Array = np.moveaxis(whiten(lanes, seen, self.noise)[0], -1, 0)
+        return result.reshape(len(values), -1)
+
+    def _slopes(
+        self, run: CandidateRun, known: _Known, at: Array, states: Array | None = None
+    ) -> _LinearisedRun | None:
+        """Linearise a run at a parameter vector and an initial state.
+
+        Returns:
+            The linearisation; None if the simulation fails, or if the run amplifies differences of
+            the initial state so much that its result could not be interpreted.
+        """
+        begin = run.states if states is None else states
+        free = known.model.fit.free.tolist()
+        thetas = [at] * (1 + len(free) + int(self.free.sum()))
+        for row, place in enumerate(free):
+            moved = at.copy()
+            moved[place] += known.spread[row]
+            thetas[1 + row] = moved
+        shifts = STATE_STEP_SHARE * np.eye(begin.size)[self.free]
+        begins = [begin] * (1 + len(free)) + [begin + shift for shift in shifts]
+        seen = self._simulated(run, thetas, begins)
+        if not np.isfinite(seen).all():
+            return None
+        apart = np.abs(seen[1 + len(free) :] - seen[0])
+        sizes = np.array([channel.scale for channel in self.world.simulator.channels])
+        if apart.size and (apart / sizes).max() > MAX_STATE_STEP_GROWTH * STATE_STEP_SHARE:
+            return None
+        lanes = self._whitened(np.concatenate([seen[:1], seen[1:] - seen[0]]))
+        numbers, initial = lanes[1 : 1 + len(free)], lanes[1 + len(free) :]
+        return _LinearisedRun(lanes[0], numbers.T, initial.T / STATE_STEP_SHARE)
+
+    def _told(self, run: CandidateRun, true: _Known, rival: _Known) -> float:
+        """Compute (1) by Levenberg-Marquardt."""
+        fit = rival.model.fit
+        shown = self._simulated(run, [true.model.fit.theta], [run.states])
+        aim = self._whitened(shown)[0]
+        at, states, gone = fit.theta.copy(), run.states.copy(), np.zeros(fit.free.size)
+        slopes, damping = self._slopes(run, rival, at), 1e-6
+        if slopes is None or not np.isfinite(aim).all():
+            return 0.0
+        least = float(np.square(aim - slopes.centre).sum())
+        for _ in range(MAX_FIT_ITERATIONS):
+            if damping > MAX_DAMPING:
+                break
+            _, step, moved = _left(aim - slopes.centre, slopes, rival, gone, damping)
+            tried, begin = at.copy(), states.copy()
+            tried[fit.free] += step * rival.spread
+            begin[self.free] += moved
+            after = self._slopes(run, rival, tried, begin)
+            own = np.inf if after is None else float(np.square(aim - after.centre).sum())
+            cost = own + float((gone + step) @ rival.inverse @ (gone + step))
+            if after is None or not cost < least:
+                damping *= 100.0
+                continue
+            done = least - cost < 1e-3 * least
+            at, states, gone, slopes, least = tried, begin, gone + step, after, cost
+            damping /= 10.0
+            if done:
+                break
+        return least
+
+
+def _known(models: ModelSet, model: FittedModel) -> _Known:
+    own = compute_covariance(models, model)
+    bounds = np.array([models.world.parameters[i].bounds for i in model.fit.free]).reshape(-1, 2)
+    widest = 0.1 * (bounds[:, 1] - bounds[:, 0])
+    spread = np.minimum(np.sqrt(np.maximum(np.diagonal(own), 1e-300)), widest)
+    inverse = np.asarray(np.linalg.pinv(own / np.outer(spread, spread), hermitian=True))
+    return _Known(model, np.asarray(spread), inverse)
+
+
+def _worth(values: Array) -> float:
+    """Sum the discrimination over all pairs; each pair counts up to `MAX_USEFUL_DISCRIMINATION`."""
+    least = np.minimum(values, values.T)
+    return float(np.minimum(least[np.triu_indices(len(least), 1)], MAX_USEFUL_DISCRIMINATION).sum())
+
+
+def _left(
+    gap: Array,
+    slopes: _LinearisedRun,
+    known: _Known,
+    gone: Array | None = None,
+    damping: float = 1e-9,
+) -> tuple[float, Array, Array]:
+    """Compute (1) to first order, and the steps of parameters and states at its minimum.
+
+    Args:
+        gap: (n,) residual of the competing model.
+        slopes: Linearisation of the competing model.
+        known: Information of the present runs on the competing model.
+        gone: (q,) difference of its parameters from their present estimates, in units of spread.
+        damping: Levenberg-Marquardt damping of the step.
+    """
+    q = len(known.spread)
+    gone = np.zeros(q) if gone is None else gone
+    columns = np.concatenate([slopes.numbers, slopes.states], axis=1)
+    normal, pull = columns.T @ columns, columns.T @ gap
+    normal[:q, :q] += known.inverse
+    pull[:q] -= known.inverse @ gone
+    damped = normal + damping * np.diag(np.diagonal(normal)) + 1e-18 * np.eye(len(normal))
+    step = np.linalg.solve(damped, pull)
+    begun = float(gap @ gap + gone @ known.inverse @ gone)
+    least = begun - 2.0 * float(pull @ step) + float(step @ normal @ step)
+    return max(least, 0.0), step[:q], step[q:]
+
+
+def _compute_information_gain(slopes: _LinearisedRun, known: _Known) -> float:
+    """Compute (2), the logarithm of the decrease of the uncertainty."""
+    basis, _ = np.linalg.qr(slopes.states)
+    own = slopes.numbers - basis @ (basis.T @ slopes.numbers)
+    scaled = np.linalg.pinv(known.inverse, hermitian=True)
+    _, value = np.linalg.slogdet(np.eye(len(scaled)) + scaled @ (own.T @ own))
+    return float(0.5 * value)

@@ -1,0 +1,216 @@
+"""Design of the next recording: commands that decide what the present recording leaves open.
+
+Runs that an experimenter could make (`rig.plans`), within the limits of the rig (`rig.limits`), are
+simulated and ranked by their value (`rig.worth`). The best plans are then varied, one property at a
+time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from bench.diagnosis.experiment_design.candidate_runs import RigModel
+from bench.diagnosis.experiment_design.information_gain import (
+    DISCRIMINATION_THRESHOLD,
+    RunRanker,
+    RunValue,
+    get_sort_key,
+)
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from sims.core.simulator import Array
+
+MAX_VARIATION_ROUNDS = 2
+"""Maximum number of rounds in which the best plans are varied."""
+PLANS_VARIED_PER_ROUND = 2
+"""Number of plans that are varied in each round."""
+PLANS_TESTED_FOR_LENGTH = 8
+"""Maximum number of plans that are also tested with a longer run."""
+
+
+@dataclass(frozen=True)
+class NextRunDesign:
+    """Design of the next recording.
+
+    Attributes:
+        says: Commands in words.
+        by: Criterion: ``T`` if the run distinguishes models, ``D`` if it narrows parameters.
+        gain: For ``D``, (2) of `rig.worth`, the logarithm of the factor by which the volume of the
+            confidence region shrinks; for ``T``, the smallest value of `discrimination_by_effect`.
+        effect: Effect of the present model that is to be distinguished; empty for ``D``.
+        discrimination_by_effect: Discrimination, (1) of `rig.worth`, from each alternative effect;
+            empty for ``D``.
+        times: (T,) sample times in seconds.
+        inputs: (T,) values by input, each held until the next sample.
+        initial: Initial states by name.
+        constants: Constants of the run that differ from those of the first run, by name.
+        groups: Effects grouped by those that the run would still not distinguish.
+    """
+
+    says: str
+    by: Literal["T", "D"]
+    gain: float
+    effect: str
+    discrimination_by_effect: Mapping[str, float]
+    times: Array
+    inputs: Mapping[str, Array]
+    initial: Mapping[str, float]
+    constants: Mapping[str, float]
+    groups: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def distinguished_effects(self) -> tuple[str, ...]:
+        """Alternative effects that the run would distinguish from the present effect."""
+        return tuple(
+            name
+            for name, value in self.discrimination_by_effect.items()
+            if value > DISCRIMINATION_THRESHOLD
+        )
+
+    @property
+    def settles_all(self) -> bool:
+        """Return whether the run would distinguish all effects, whichever is true."""
+        return len(self.groups) == len(self.discrimination_by_effect) + 1
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the design as JSON data; the command signals are written as a table instead."""
+        return {
+            "says": self.says,
+            "by": self.by,
+            "gain": self.gain,
+            "effect": self.effect,
+            "told": dict(self.discrimination_by_effect),
+            "split": self.distinguished_effects,
+            "settles": self.settles_all,
+            "seconds": float(self.times[-1]),
+            "inputs": list(self.inputs),
+            "initial": dict(self.initial),
+            "constants": dict(self.constants),
+            "groups": self.groups,
+        }
+
+
+def design_next_run(
+    models: ModelSet,
+    model: FittedModel,
+    rivals: Sequence[FittedModel],
+    seconds: float,
+    longest: float,
+) -> NextRunDesign | None:
+    """Design the best run that could be recorded next.
+
+    Args:
+        models: Collection that contains all of the models.
+        model: Model of the present diagnosis.
+        rivals: Competing models that explain the data as well; empty if there are none.
+        seconds: Duration of the run in seconds.
+        longest: Maximum duration in seconds, if a run of `seconds` does not decide.
+
+    Returns:
+        The design; None if no run can be simulated.
+    """
+    rig = RigModel(models.world, seconds)
+    judge = RunRanker(models, [model, *rivals])
+    found = judge.rank_runs([rig.make_run(plan) for plan in rig.list_basic_plans()])
+    asked = {entry.run.plan for entry in found}
+    for _ in range(MAX_VARIATION_ROUNDS):
+        found = _evaluate_fully(judge, found)
+        if not found or found[0].value >= judge.most or models.world.watch.has_abandoned_fits():
+            break
+        plans = [
+            plan
+            for entry in found[:PLANS_VARIED_PER_ROUND]
+            for plan in rig.list_variants(entry.run.plan)
+        ]
+        new = [plan for plan in dict.fromkeys(plans) if plan not in asked]
+        asked.update(new)
+        found = [*found, *judge.rank_runs([rig.make_run(plan) for plan in new])]
+    found = _evaluate_fully(judge, found)
+    if found and _would_longer_run_help(found[0], longest / seconds):
+        longer = RigModel(models.world, longest)
+        long = judge.rank_runs(
+            [longer.make_run(entry.run.plan) for entry in found[:PLANS_TESTED_FOR_LENGTH]]
+        )
+        found = sorted([found[0], *_evaluate_fully(judge, long)[:1]], key=get_sort_key)
+    return _made(models, [model, *rivals], rig, found[0]) if found else None
+
+
+def _would_longer_run_help(best: RunValue, times: float) -> bool:
+    """Return whether a longer run may distinguish models that the best run does not."""
+    least = np.minimum(best.values, best.values.T)
+    untold = least[(least > 0) & (least <= DISCRIMINATION_THRESHOLD)]
+    return (
+        times > 1.0
+        and best.values.ndim == 2
+        and bool((untold * 2.0 * times > DISCRIMINATION_THRESHOLD).any())
+    )
+
+
+def _evaluate_fully(judge: RunRanker, found: Sequence[RunValue]) -> list[RunValue]:
+    """Sort runs by value, after exact evaluation of the first ones.
+
+    Linearised values tend to be too high.
+    """
+    ranked = sorted(found, key=get_sort_key)
+    for _ in range(judge.patience):
+        first = next(
+            (k for k, entry in enumerate(ranked[:PLANS_VARIED_PER_ROUND]) if not entry.is_exact),
+            None,
+        )
+        if first is None or (ranked[0].is_exact and ranked[0].value >= judge.most):
+            break
+        ranked[first] = judge.evaluate_exactly(ranked[first])
+        ranked.sort(key=get_sort_key)
+    # Runs that are evaluated exactly come before those that are only linearised.
+    return sorted(ranked, key=lambda entry: (not entry.is_exact, *get_sort_key(entry)))
+
+
+def _made(
+    models: ModelSet, among: Sequence[FittedModel], rig: RigModel, entry: RunValue
+) -> NextRunDesign:
+    """Build the design from the best run."""
+    run, rivals = entry.run, among[1:]
+    told: dict[str, float] = {}
+    groups: tuple[tuple[str, ...], ...] = ()
+    effect, gain = "", float(entry.values[0]) if not rivals else 0.0
+    if rivals:
+        least = np.minimum(entry.values, entry.values.T)
+        stands = among[0]
+        names = [_other(one, stands) for one in rivals]
+        effect = _other(stands, rivals[0])
+        told = {name: float(value) for name, value in zip(names, least[0, 1:], strict=True)}
+        groups = tuple(_connected_groups([effect, *names], least))
+        gain = min(told.values())
+    constants = dict(run.plan.constants)
+    return NextRunDesign(
+        says=run.says,
+        by="T" if rivals else "D",
+        gain=gain,
+        effect=effect,
+        discrimination_by_effect=told,
+        times=run.scenario.times,
+        inputs=dict(run.scenario.inputs),
+        initial=dict(zip(models.world.states, run.states.tolist(), strict=True)),
+        constants={k: v for k, v in constants.items() if rig.old.constants.get(k) != v},
+        groups=groups,
+    )
+
+
+def _other(model: FittedModel, than: FittedModel) -> str:
+    """Return the effects that one model has and the other does not have."""
+    return " and ".join(name for name in model.effects if name not in than.effects)
+
+
+def _connected_groups(names: Sequence[str], least: Array) -> Iterator[tuple[str, ...]]:
+    """Yield connected groups of names that are linked by pairs that are not distinguished."""
+    left = list(range(len(names)))
+    while left:
+        group, new = [], [left[0]]
+        while new:
+            group += new
+            left = [place for place in left if place not in new]
+            new = [b for b in left if any(least[a, b] <= DISCRIMINATION_THRESHOLD for a in new)]
+        yield tuple(names[place] for place in sorted(group))

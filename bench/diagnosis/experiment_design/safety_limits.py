@@ -1,0 +1,169 @@
+"""Limits of an experimental setup: reject runs that exceed limits of position, speed or force.
+
+Runs are also rejected if bodies touch that did not touch before. The runs are simulated, and all
+moving channels are monitored, whether they are recorded or not.
+
+A limit of the model file (`experiment_design.model_file_limits`) holds whatever the present runs
+did. Where the file specifies no limit, it follows from the values in the present runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.experiment_design.candidate_runs import CandidateRun
+from bench.diagnosis.experiment_design.model_file_limits import Interval, stated_limits
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.logs.quality.pose_check import find_contacts
+from sims.core.simulator import Array, Scenario
+
+TRAVEL_FACTOR = 3.0
+"""Distance by which a channel without a specified limit may leave its present range, as a multiple
+of that range.
+"""
+SPEED_AND_FORCE_FACTOR = 2.0
+"""Maximum speed and force of a robot's joint without a specified limit, as a multiple of the
+present maximum.
+"""
+STOP = 0.01
+"""Share of its range by which a joint may press into its stop if it did so in the present runs:
+stops are soft in MuJoCo.
+"""
+IDLE_JOINT_SHARE = 0.1
+"""Minimum value used as the present maximum speed and force of a joint that was at rest, as a share
+of the maximum over all joints.
+"""
+
+
+class RigLimits:
+    """Check of which runs an experimental setup can execute.
+
+    Args:
+        world: Run evaluator of the present runs.
+        model: Model fitted to them.
+    """
+
+    def __init__(self, world: RunEvaluator, model: FittedModel) -> None:
+        self.world = world
+        self.past = self._seen(
+            model,
+            [track.scenario for track in world.tracks],
+            np.where(np.isfinite(model.fit.states), model.fit.states, world.guess),
+        )
+        self.bounds = self._bounds()
+
+    def __call__(self, model: FittedModel, runs: Sequence[CandidateRun]) -> list[bool]:
+        """Return for each run whether it stays within the limits if a model is true.
+
+        Args:
+            model: Model with which the runs are simulated.
+            runs: Candidate runs.
+        """
+        if not runs:
+            return []
+        states = np.array([run.states for run in runs])
+        seen = self._seen(model, [run.scenario for run in runs], states)
+        return [self._within(channels) for channels in seen]
+
+    # -- monitored channels
+
+    @cached_property
+    def monitored_channels(self) -> list[str]:
+        """Names of the monitored channels."""
+        kind = self.world.kind
+        if not kind.has_model:
+            moving = {*kind.system.coordinates, *kind.system.rates, *self.world.channels}
+            return [c.name for c in kind.channels if c.name in moving]
+        names = {f"{what}.{joint.name}" for joint in self._joints for what in ("q", "qd", "tau")}
+        return [c.name for c in kind.channels if c.name in names]
+
+    @property
+    def _joints(self) -> list[Any]:
+        robot: Any = self.world.kind
+        return [joint for joint in robot.robot.joints if joint.single]
+
+    def _seen(
+        self, model: FittedModel, scenarios: Sequence[Scenario], states: Array
+    ) -> list[Mapping[str, Array]]:
+        """Simulate the monitored channels of each run, by name; each run to its own end."""
+        world = self.world
+        values = {p.name: float(v) for p, v in zip(world.parameters, model.fit.theta, strict=True)}
+        simulator = world.make_observing_simulator(self.monitored_channels, model.effects)
+        try:
+            theta = np.array([[values.get(p.name, 0.0) for p in simulator.parameters]])
+            freed = {p.name: values[p.name] for p in world.freed}
+            own = [replace(s, constants={**s.constants, **freed}) for s in scenarios]
+            initial = dict(zip(world.states, states.T, strict=True))
+            result = simulator.simulate_batch(np.repeat(theta, len(own), 0), own, initial)
+        finally:
+            simulator.close()
+        world.simulations += len(own)
+        names = [channel.name for channel in simulator.channels]
+        return [
+            dict(zip(names, lane[: scenario.times.size].T, strict=True))
+            for lane, scenario in zip(result, own, strict=True)
+        ]
+
+    # -- limits
+
+    def _bounds(self) -> dict[str, tuple[float, float]]:
+        """Determine the minimum and maximum of each monitored channel."""
+        ends = {}
+        for name in self.monitored_channels:
+            values = np.concatenate([run[name] for run in self.past])
+            values = values[np.isfinite(values)]
+            ends[name] = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+        scales = {channel.name: channel.scale for channel in self.world.kind.channels}
+        if not self.world.kind.has_model:
+            return {name: _wider(*ends[name], scales[name]) for name in ends}
+        stated = stated_limits(self.world).channels
+        bounds = {}
+        for name, (low, high) in ends.items():
+            if name in stated:
+                bounds[name] = _with_stop(stated[name], (low, high), name.startswith("q."))
+            elif name.startswith("q."):
+                bounds[name] = _wider(low, high, scales[name])
+            else:
+                kind = name.partition(".")[0]
+                most = max(max(map(abs, own)) for key, own in ends.items() if key.startswith(kind))
+                own = SPEED_AND_FORCE_FACTOR * max(abs(low), abs(high), IDLE_JOINT_SHARE * most)
+                bounds[name] = -own, own
+        return bounds
+
+    def _within(self, channels: Mapping[str, Array]) -> bool:
+        for name, values in channels.items():
+            low, high = self.bounds[name]
+            slack = 1e-9 * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0
+            if not np.isfinite(values).all():
+                return False
+            if values.min() < low - slack or values.max() > high + slack:
+                return False
+        return (
+            not self.world.kind.has_model
+            or find_contacts(self.world.kind, channels) <= self._touched
+        )
+
+    @cached_property
+    def _touched(self) -> frozenset[tuple[int, int]]:
+        """Pairs of bodies that touched in the present runs."""
+        return frozenset().union(*(find_contacts(self.world.kind, run) for run in self.past))
+
+
+def _with_stop(stated: Interval, past: Interval, is_position: bool) -> Interval:
+    """Return the specified limits; a position range is widened a little if stops were pressed."""
+    low, high = stated
+    if not is_position:
+        return stated
+    slack = STOP * (high - low)
+    return max(min(low, past[0]), low - slack), min(max(high, past[1]), high + slack)
+
+
+def _wider(low: float, high: float, scale: float) -> tuple[float, float]:
+    slack = TRAVEL_FACTOR * max(high - low, scale)
+    return low - slack, high + slack

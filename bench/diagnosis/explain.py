@@ -1,0 +1,943 @@
+"""Run a diagnosis (`simgap explain`): from a recording to verdict, simulator and report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from bench.benchmark.runner.thread_limit import limit_to_one_thread
+from bench.core.random_streams import make_rng
+from bench.diagnosis.conventions.unit_check import Subject, recognised, wrong_units
+from bench.diagnosis.evaluation.noise_floor import (
+    INTEGRATION_ERROR_SHARE,
+    NoiseFloor,
+    compute_noise_floor,
+)
+from bench.diagnosis.evaluation.noise_free_runs import add_least_noise
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.search_control import STAGES, SearchControl
+from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
+from bench.diagnosis.experiment_design.next_run import NextRunDesign, design_next_run
+from bench.diagnosis.explanation import Explanation
+from bench.diagnosis.fitting.base_fit import (
+    FINAL_ITERATIONS,
+    BaseFit,
+    correct_discretisation,
+    fit_base_model,
+)
+from bench.diagnosis.fitting.bound_widening import Bounds, fit_wider, outside, use_bounds
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import MAX_ITERATIONS
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.friction_form_verdict import has_dry_friction, is_likelier_soft, soft_kind
+from bench.diagnosis.numerics_cause import (
+    CoarseStepFinding,
+    Reusable,
+    add_numerics_cause,
+    is_finer_model_better,
+    is_finer_step_better,
+)
+from bench.diagnosis.parameter_freezing import freeze_unidentified_parameters
+from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
+from bench.diagnosis.search.diagnose import DiagnosisResult, answer, diagnose
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit, list_hat_effects
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from bench.diagnosis.validation.cross_validation import CrossValidation
+from bench.diagnosis.validation.held_out_runs import HeldOutRuns, Validation
+from bench.diagnosis.verdict import RecordingFault
+from bench.diagnosis.verdict_builder import VerdictBuilder
+from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.importing.sample_thinning import thin
+from bench.logs.joined_recordings import load_joined
+from bench.logs.quality.timestamp_check import check_recording_plausible
+from bench.logs.segmentation import segment_recording
+from bench.logs.size_limits import check_recording_size
+from bench.pages.text_format import joined
+from sims import extended_simulator as extend
+from sims.core.simulator import Array, InputError, Simulator
+from sims.extended_simulator import ExtendedSimulator
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_description import read_meta
+from sims.system_simulator import SystemSimulator
+
+SOFT_FRICTION = (
+    "dry friction has MuJoCo's soft form (solreffriction and solimpfriction of the model file): "
+    "it fits better than stiff friction"
+)
+"""Message to the user when dry friction changes to the soft form."""
+STIFF_FRICTION = "soft dry friction leaves a gap all the same: stiff friction is used"
+"""Message to the user when dry friction changes back to the stiff form."""
+if TYPE_CHECKING:
+    from bench.diagnosis.evaluation.integrator_check import StepRefinement
+    from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+
+MIN_SAMPLES_PER_UNKNOWN = 2.0
+"""Minimum number of samples for fitting per unknown."""
+MIN_EXTRA_SAMPLES = 4
+"""Minimum number of samples for fitting in addition to `MIN_SAMPLES_PER_UNKNOWN` per unknown."""
+MAX_CHANNEL_SIZE_FACTOR = 1e9
+"""Recorded values of at least this multiple of a channel's typical size are refused."""
+EXPLAINED = ("adequate", "named", "ambiguous")
+"""Verdicts for which the model explains the data down to the noise."""
+PrintLine = Callable[[str], None]
+RecordingSource: TypeAlias = str | Path | Recording
+
+
+def explain(
+    recording: RecordingSource | Sequence[RecordingSource],
+    system: str | None = None,
+    engine: str = "batch",
+    seed: int = 0,
+    free: Sequence[str] = (),
+    tuner: str | None = None,
+    say: PrintLine = lambda _: None,
+    force: bool = False,
+    watch: SearchControl | None = None,
+    jobs: int = 1,
+    model: str | Path | None = None,
+    whole: bool = False,
+    pieces: float | None = None,
+    thorough: bool = False,
+) -> Explanation:
+    """Explain a recording.
+
+    Args:
+        recording: Path of the table, or a recording in memory; the runs of several recordings are
+            explained together.
+        system: Name of the system to use instead of the one in the description.
+        engine: pybullet, mujoco or batch; a simulator with its own integrator uses that.
+        seed: Random seed of the surrogates and the bootstrap.
+        free: Constants of a system, or numbers of a robot's model file, to estimate with the
+            parameters.
+        tuner: Registered tuner that finds the starting values for the fit of the base parameters.
+        say: Callback for messages to the user about the recording and the base model.
+        force: Explain recordings that are otherwise refused.
+        watch: Search control with the time limit and the progress; by default without limit.
+        jobs: Number of worker processes; the result does not depend on it.
+        model: Model file of a robot to use instead of the one in the description.
+        whole: Use all of a long recording of a robot, not segments of it.
+        pieces: Duration in seconds of the segments that runs are cut into; None for an automatic
+            choice.
+        thorough: Continue the search while causes may be missing, and let held-out runs decide.
+
+    Returns:
+        Verdict, report data and extended simulator.
+
+    Raises:
+        InputError: The recording cannot be read or is too short, its simulator takes no effects, or
+            the search was stopped before anything could be simulated.
+    """
+    with closing(ForkedWorkerPool(jobs)) as crew:
+        sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
+        subject = _ExplainInput(sources, system, model, whole, pieces)
+        given = engine, seed, tuple(free), tuner, say, force
+        explainer = _ExplainRun(subject, *given, watch or SearchControl(), crew, thorough)
+        with closing(explainer):
+            return explainer.run()
+
+
+def _added_noise(channels: Sequence[str]) -> str:
+    """Return the message about channels to which noise was added; empty if there are none."""
+    if not channels:
+        return ""
+    return (
+        f"no noise is found in {joined(channels)}: white noise of {INTEGRATION_ERROR_SHARE:g} of the range is "
+        "added, the accuracy of a simulation; smaller differences are not explained"
+    )
+
+
+class ExplanationAndDesign(NamedTuple):
+    """Explanation, and the recording to make next; None if no run would add information."""
+
+    explanation: Explanation
+    design: NextRunDesign | None
+
+
+def explain_and_design(
+    recording: RecordingSource | Sequence[RecordingSource],
+    seconds: float,
+    longest: float,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    say: PrintLine = lambda _: None,
+    watch: SearchControl | None = None,
+    jobs: int = 1,
+) -> ExplanationAndDesign:
+    """Explain recordings, and design the next recording.
+
+    Args:
+        recording: See `explain`.
+        seconds: Duration in seconds of the next recording.
+        longest: Maximum duration in seconds, if `seconds` do not suffice.
+        system: See `explain`.
+        model: See `explain`.
+        free: See `explain`.
+        say: See `explain`.
+        watch: See `explain`.
+        jobs: See `explain`.
+    """
+    with closing(ForkedWorkerPool(jobs)) as crew:
+        sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
+        subject = _ExplainInput(sources, system, model, whole=False, pieces=None)
+        given = "batch", 0, tuple(free), None, say, False
+        with closing(_ExplainRun(subject, *given, watch or SearchControl(), crew)) as explainer:
+            explanation = explainer.run()
+            explainer.watch.stage("designing the next recording")
+            return ExplanationAndDesign(explanation, explainer.design(seconds, longest))
+
+
+def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
+    """Switch off or leave out the samples of a robot in which its drives have no effect."""
+    if not kind.has_model:
+        return recording
+    # This import is needed for robots only.
+    from bench.diagnosis.prediction_error.inactive_drives import without_inactive_drives
+
+    return without_inactive_drives(recording, kind)
+
+
+class _ExplainInput(NamedTuple):
+    """Recordings to explain, what to use instead of their descriptions, and their segmentation."""
+
+    sources: Sequence[RecordingSource]
+    system: str | None
+    model: str | Path | None
+    whole: bool
+    pieces: float | None
+
+
+class _Worlds(NamedTuple):
+    """Simulator with one time step, and its run evaluators for fitting and validation."""
+
+    kind: type[SystemSimulator]
+    fitting: RunEvaluator
+    validation: Validation | None
+
+
+class _Found(NamedTuple):
+    """Search result: base model, search, finding and random generator."""
+
+    base: BaseFit
+    search: EffectSearch
+    finding: DiagnosisResult
+    rng: np.random.Generator
+
+
+class _ExplainRun:
+    def __init__(
+        self,
+        subject: _ExplainInput,
+        engine: str,
+        seed: int,
+        free: tuple[str, ...],
+        tuner: str | None,
+        say: PrintLine,
+        force: bool,
+        watch: SearchControl,
+        crew: ForkedWorkerPool,
+        thorough: bool = False,
+    ) -> None:
+        self.started = time.perf_counter()
+        self.seed = seed
+        self.tuner = tuner
+        self.say = say
+        self.recording, kind = load_joined(
+            subject.sources, subject.system, subject.model, free, _without_inactive_drives
+        )
+        self.path = self.recording.path
+        if not issubclass(kind, SystemSimulator):
+            raise self._takes_no_effects()
+        # Effects that are part of the simulator already could not be chosen again.
+        extend.check_not_extended(kind)
+        # A simulator with its own integrator has no choice of engine.
+        usual = kind.default_engine if kind.has_model else None
+        self.engine = usual if kind.own_engine else engine
+        # A free number of a robot is a number of its model file, and so a parameter of its
+        # simulator.
+        free = () if kind.has_model else free
+        # This check precedes the run evaluators, which plan every step of every run.
+        for odd in check_recording_plausible(self.recording, kind, force):
+            say(f"{self.path}: {odd}")
+        self.recording, thinned = thin(self.recording, kind)
+        self.recording, settled = leave_out_settling(self.recording, kind)
+        self.recording, note = segment_recording(
+            self.recording, kind, subject.pieces, subject.whole
+        )
+        recorded = self.recording.runs[0].channels
+        names = [channel.name for channel in kind.channels if channel.name in recorded]
+        self.recording, quiet = add_least_noise(self.recording, names)
+        said = thinned, settled, note, _added_noise(quiet)
+        self.notes = tuple(text for text in said if text)
+        for note in self.notes:
+            say(note)
+        check_recording_size(self.recording, kind(engine=self.engine), force)
+        self.watch = watch
+        self.force = force
+        self.crew = crew
+        self.thorough = thorough
+        self.free = tuple(free)
+        # By name, the declared range of a base parameter and the wider range that replaced it.
+        self.wider: dict[str, tuple[Bounds, Bounds]] = {}
+        # Base parameters of a robot, identified by prediction errors; starting values of the fit.
+        self.identified: Array | None = None
+        self._enter(kind)
+        left_out = [
+            f"{effect} is not tested: {why}" for effect, why in kind.system.left_out.items()
+        ]
+        for line in left_out:
+            say(line)
+        self.notes = (*self.notes, *left_out)
+        self.coarse: CoarseStepFinding | None = None
+        # Finer steps than the file's, and the run evaluators with the file's step if one is used.
+        self.finer: Reusable[StepRefinement] | None = None
+        self.file = _Worlds(self.kind, self.fitting, self.validation)
+        self.found: tuple[EffectSearch, DiagnosisResult] | None = None
+        self.faults: tuple[RecordingFault, ...] = ()
+        self._check()
+
+    def _enter(self, kind: type[SystemSimulator]) -> None:
+        """Set up run evaluators, noise floor and validation for a simulator class."""
+        before = self._followed()
+        self.fitting = self._world(kind, self.recording.training())
+        self.floor: NoiseFloor = compute_noise_floor(self.fitting, self.recording)
+        # The noise is white at first: each likelihood estimates its autocorrelation.
+        self.noise = NoiseModel(self.floor.sigma, np.zeros(len(self.floor.sigma)))
+        self.kind = kind
+        self.validation = self._validation(kind)
+        self.assessor = self._assessor()
+        for known, world in zip(before, self._worlds(), strict=False):
+            # The initial states of the runs depend little on the time step.
+            world.follow(known)
+
+    def _worlds(self) -> list[RunEvaluator]:
+        """Return the run evaluators of the runs for fitting and of the held-out runs."""
+        validation = self.validation
+        held_out = validation.world if isinstance(validation, HeldOutRuns) else None
+        return [self.fitting] if held_out is None else [self.fitting, held_out]
+
+    def _followed(self) -> list[FollowedRuns]:
+        """Return the filtered runs of a robot, if there are any."""
+        if not hasattr(self, "fitting"):
+            return []
+        return [w.followed for w in self._worlds() if w.followed is not None]
+
+    def _validation(self, kind: type[SystemSimulator]) -> Validation | None:
+        """Prepare the validation: on held-out runs, or by cross-validation of few runs."""
+        if held_out := self.recording.held_out():
+            # The same effects at the same indices give a parameter vector the same meaning here.
+            return HeldOutRuns(self._world(kind, held_out), self.noise)
+        if len(self.recording.folds()) > 1:
+            return CrossValidation(self.fitting, self.noise)
+        return None
+
+    def _assessor(self) -> VerdictBuilder:
+        given = self.recording, self.fitting, self.validation, self.floor, self.engine
+        return VerdictBuilder(*given)
+
+    def _world(self, kind: type[SystemSimulator], runs: Sequence[Run]) -> RunEvaluator:
+        world = RunEvaluator(
+            kind, self.recording, runs, self.engine, list_hat_effects(kind), self.free
+        )
+        world.watch = self.watch
+        world.crew = self.crew
+        self.crew.register(world)
+        use_bounds(world, {name: bounds for name, (_, bounds) in self.wider.items()})
+        world.identified = self.identified
+        return world
+
+    def _takes_no_effects(self) -> InputError:
+        return InputError(
+            f"{self.path}: simulator {self.recording.system} takes no effects, "
+            "so nothing can be missing from it"
+        )
+
+    def _check(self) -> None:
+        world = self.fitting
+        # With fewer samples than unknowns every model fits exactly, and no gap would be visible.
+        samples = int(np.isfinite(world.observed).sum())
+        unknowns = world.base.size + int((~world.known).sum())
+        if samples < MIN_SAMPLES_PER_UNKNOWN * unknowns + MIN_EXTRA_SAMPLES:
+            least = int(MIN_SAMPLES_PER_UNKNOWN * unknowns) + MIN_EXTRA_SAMPLES
+            raise InputError(
+                f"{self.path}: too short: {samples} samples for fitting, "
+                f"expected at least {least} for {unknowns} parameters and initial states"
+            )
+        # Values that are too large by orders of magnitude have a wrong unit; no fit could follow
+        # them.
+        measuring = self.assessor.held_out_evaluator
+        parts = [part.observed for part in (world, measuring) if part is not None]
+        for c, channel in enumerate(world.simulator.channels):
+            largest = max(float(np.nanmax(np.abs(part[..., c]), initial=0.0)) for part in parts)
+            if largest >= MAX_CHANNEL_SIZE_FACTOR * channel.scale:
+                raise InputError(
+                    f"{self.path}: column {channel.name}: expected values of about "
+                    f"{channel.scale:g} {channel.unit}, found {largest:.3g}; is the unit right?"
+                )
+
+    # With a thread per core, small matrix products take five times as long on a busy machine.
+    @limit_to_one_thread()
+    def run(self) -> Explanation:
+        self._refuse_broken_conventions()
+        self.watch.stage(STAGES["base_fit"])
+        base = self._base()
+        if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
+            raise self._fails()
+        found = self._searched(base)
+        found = self._with_better_step(found.search, found.finding) or found
+        base, search, finding, rng = found
+        self.watch.stage("measuring the gain")
+        verdict = self.assessor.build_verdict(search, finding, rng, self.started)
+        verdict = replace(
+            verdict, recording_faults=self.faults, recording_notes=self.recording.notes
+        )
+        if self.coarse is not None:
+            verdict = add_numerics_cause(verdict, self.coarse)
+        self.found = search, finding
+        notes = (*outside(self.fitting, finding.model.fit.theta, self.wider), *self.notes)
+        story = DiagnosisReportDataBuilder(
+            self.assessor, search, base, finding, notes
+        ).build_report_data(verdict)
+        return Explanation(verdict, story, self._extended(search, finding))
+
+    def _searched(self, base: BaseFit) -> _Found:
+        """Search and judge; repeat with MuJoCo's soft dry friction if the data support it."""
+        # Surrogates and bootstrap share one random stream, so that a seed gives the same result.
+        rng = self._rng()
+        search = self._search(base, rng)
+        if not self.kind.has_model:
+            return _Found(base, search, self._finding(search), rng)
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.dry_friction import SoftFrictionError
+
+        stiff = _Worlds(self.kind, self.fitting, self.validation)
+        try:
+            found = _Found(base, search, self._finding(search), rng)
+            # A search does not select dry friction that is a free number.
+            is_free = has_dry_friction(self.fitting, ())
+            done = self.watch.has_abandoned_fits() or bool(self.faults) or not is_free
+            if done or not is_likelier_soft(
+                search, found.finding.model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+            ):
+                return found
+            return self._searched_soft(base, search)
+        except SoftFrictionError as error:
+            soft = self._searched_soft(base, search, error.start)
+            if (
+                not error.is_preliminary
+                or self._is_explained(soft)
+                or self.watch.has_abandoned_fits()
+            ):
+                return soft
+        self.say(STIFF_FRICTION)
+        before = self.assessor.before
+        self._return(stiff, before)
+        again = self._search(base, rng, is_form_given=True)
+        try:
+            return _Found(base, again, self._finding(again), rng)
+        except SoftFrictionError as error:
+            return self._searched_soft(base, search, error.start)
+
+    def _refuse_broken_conventions(self) -> None:
+        """Refuse a robot's recording whose conventions differ from those of its model file.
+
+        Raises:
+            InputError: The conventions differ; the message names the change to make.
+        """
+        if not self.kind.has_model or self.force:
+            return
+        # These imports are needed for robots only.
+        from bench.diagnosis.conventions.convention_comparison import ConventionComparison
+        from bench.diagnosis.conventions.corrected_description import lines_of
+
+        self.watch.stage("comparing conventions of log and model")
+        differences = ConventionComparison(self._units).differences()
+        if not differences:
+            return
+        remedy = "correct these signals"
+        if self.recording.path.with_suffix(".toml").exists():
+            _, meta = read_meta(self.recording.path)
+            lines = "; ".join(lines_of(meta, self.kind, differences))
+            remedy = (
+                f"set {lines} in {self._units.file}, or write a corrected description: "
+                f"simgap inspect {self.path.name} --fix NAME.toml"
+            )
+        what = "; ".join(one.description for one in differences)
+        raise InputError(
+            f"{self.path}: {what}; expected the conventions of the model file: {remedy} "
+            "(--force explains the log as it is)"
+        )
+
+    @staticmethod
+    def _is_explained(found: _Found) -> bool:
+        """Return whether a result explains the data down to the noise."""
+        return found.finding.verdict in EXPLAINED
+
+    def _searched_soft(
+        self, base: BaseFit, before: EffectSearch, likely: FitStart | None = None
+    ) -> _Found:
+        """Search and judge with MuJoCo's soft dry friction.
+
+        Args:
+            base: Base model.
+            before: Search with stiff friction.
+            likely: Model that may explain the runs.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
+
+        self.say(SOFT_FRICTION)
+        held_out = self.assessor.before
+        self._enter(soft_kind(self.kind))
+        self.assessor = replace(self.assessor, before=held_out)
+        fitter = TrajectoryFitter(self.fitting, self.noise, base.fixed_parameters)
+        start = replace(base.fit.make_start(), states=self.fitting.guess)
+        (fit,) = fitter.fit_models([start], FINAL_ITERATIONS)
+        base = self._without_step(replace(base, fit=fit))
+        rng = self._rng()
+        search = self._search(base, rng)
+        if isinstance(search, PredictionErrorSearch) and isinstance(before, PredictionErrorSearch):
+            search.likely = likely
+            robot: Any = self.kind
+            if not robot.robot.compiled.dof_frictionloss.any():
+                search.take_over(before)
+        return _Found(base, search, self._finding(search), rng)
+
+    def _answered(self, base: BaseFit) -> _Found:
+        """Freeze and correct a base model that was fitted with another step, and search again."""
+        return self._searched(self._settled(base))
+
+    def _finding(self, search: EffectSearch) -> DiagnosisResult:
+        """Return the finding; without causes if the recording has a wrong unit or sign.
+
+        Every cause would only imitate the wrong unit or sign.
+        """
+        base = search.base_model
+        if not self.faults:
+            finding = self.assessor.judged(search, self._named(search))
+            self.faults = self._imitated(search, finding) or self._unexplained(search, finding)
+            if not self.faults:
+                return finding
+        return DiagnosisResult("unknown", base, base, (), assess_lack_of_fit(search, base))
+
+    def _named(self, search: EffectSearch) -> DiagnosisResult:
+        """Diagnose the causes; for a robot by prediction errors."""
+        if self.fitting.followed is None:
+            return diagnose(search, self.validation)
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.simulation_confirmation import Confirmation
+
+        return answer(Confirmation(search, self.validation))
+
+    def _unexplained(
+        self, search: EffectSearch, finding: DiagnosisResult
+    ) -> tuple[RecordingFault, ...]:
+        """Return wrong units and signs of a robot's recording that no effect explains."""
+        explained = finding.verdict in EXPLAINED
+        if not self._asks_units_late or explained or self.watch.has_abandoned_fits():
+            return ()
+        base = BaseFit(search.base_model.fit, frozenset(search.frozen))
+        fault = wrong_units(self._units, self.fitting, self.noise, base)
+        return () if fault is None else (fault,)
+
+    def _imitated(
+        self, search: EffectSearch, finding: DiagnosisResult
+    ) -> tuple[RecordingFault, ...]:
+        """Return wrong units and signs that the diagnosed causes imitate."""
+        found = [
+            recognised(self._units, self.fitting, cause, search.base_model.fit)
+            for cause in self.assessor.causes(search, finding)
+        ]
+        return tuple(fault for fault in found if fault is not None)
+
+    @property
+    def _units(self) -> Subject:
+        """Input of the unit check."""
+        return Subject(self.kind, self.recording, self.engine, self.free)
+
+    def close(self) -> None:
+        """Close the simulators; proposals of experiments need them until then."""
+        self.fitting.close()
+        if self.validation is not None:
+            self.validation.close()
+
+    def design(self, seconds: float, longest: float) -> NextRunDesign | None:
+        """Design the next recording; call it after `run`.
+
+        The run distinguishes the first cause that has alternatives. If there is none, it narrows
+        the parameters of the present model.
+
+        Args:
+            seconds: Duration of the run in seconds.
+            longest: Maximum duration in seconds, if `seconds` do not suffice.
+        """
+        if self.found is None:
+            return None
+        search, finding = self.found
+        for cause in finding.causes:
+            rest = {name for name in finding.model.effects if name != cause.effect}
+            keys = [frozenset({*rest, other}) for other in cause.alternatives]
+            rivals = [search.models[key] for key in keys if key in search.models]
+            if rivals:
+                return design_next_run(search, finding.model, rivals, seconds, longest)
+        return design_next_run(search, finding.model, (), seconds, longest)
+
+    def _search(self, base: BaseFit, rng: np.random.Generator, **attributes: Any) -> EffectSearch:
+        """Begin a search; by prediction errors where the simulator can be linearised."""
+        kind = EffectSearch
+        if self.fitting.followed is not None:
+            # This import is needed for robots only.
+            from bench.diagnosis.prediction_error.prediction_error_search import (
+                PredictionErrorSearch,
+            )
+
+            kind = PredictionErrorSearch
+        given = self.fitting, self.noise, base.fixed_parameters, rng, self.floor.is_stated
+        search = kind(*given, thorough=self.thorough, **attributes)
+        search.add_fit(base.fit)
+        return search
+
+    def _base(self) -> BaseFit:
+        """Fit the base model; for a robot with the time step that the data support.
+
+        This is the step of the model file or a finer one.
+        """
+        if self.kind.has_model:
+            self._follow()
+        base = fit_base_model(self.fitting, self.noise, self._given())
+        if self._asks_units_late:
+            return self._prepared(base)
+        if not self.watch.has_abandoned_fits():
+            fault = wrong_units(self._units, self.fitting, self.noise, base)
+            self.faults = (fault,) if fault is not None else ()
+        if self.faults:
+            return base
+        return self._prepared(base) if self.kind.has_model else self._within_range(base)
+
+    @property
+    def _asks_units_late(self) -> bool:
+        """Return whether units are checked only after no effect has explained the gap.
+
+        This is so for a robot's recording, unless its free numbers could not be identified.
+        """
+        lost = self.free_numbers and self.identified is None and self.fitting.followed is not None
+        return self.kind.has_model and not lost
+
+    @property
+    def free_numbers(self) -> bool:
+        """Return whether the base model has parameters."""
+        return bool(self.fitting.base.size)
+
+    def _follow(self) -> None:
+        """Estimate the initial states of a robot's runs by a filter with the present model."""
+        # This import is needed for robots only.
+        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+
+        self.watch.stage("following the runs with the model")
+        world, *held_out = self._worlds()
+        followed = FollowedRuns.follow(world, world.get_nominal_theta(), self.noise)
+        # Where the linear model diverges, causes are searched by simulation.
+        if not followed.is_sound:
+            return
+        if self.free_numbers and self.tuner is None:
+            followed = self._identified(followed)
+        world.follow(followed)
+        for world in held_out:
+            # Held-out runs are only simulated; without a filter they begin at their measured
+            # values.
+            found = FollowedRuns.follow(world, world.get_nominal_theta(), self.noise)
+            if found.is_sound:
+                world.follow(found)
+
+    def _identified(self, followed: FollowedRuns) -> FollowedRuns:
+        """Return the runs, filtered with base parameters from a prediction-error fit."""
+        # This import is needed for robots only.
+        from bench.diagnosis.kalman.likelihood_fit import identify_base
+
+        world = self.fitting
+        declared = {p.name: p.bounds for p in world.parameters}
+        found, wider = identify_base(world, self.noise, followed)
+        if found is not followed:
+            self.identified = world.identified = found.theta[world.base]
+        self._widen(wider, declared)
+        return found
+
+    def _widen(self, found: Mapping[str, Bounds], declared: Mapping[str, Bounds]) -> None:
+        """Report the wider ranges of base parameters, and use them for all runs."""
+        for world in self._worlds()[1:]:
+            use_bounds(world, found)
+        for parameter, (low, high) in found.items():
+            self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
+        self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
+
+    def _prepared(self, base: BaseFit) -> BaseFit:
+        """Return the base model of a robot with the step that the data support.
+
+        Free numbers that the data cannot identify are frozen.
+        """
+        if self._shows_steps(base):
+            base = self._stepped(base)
+        return self._settled(base)
+
+    def _shows_steps(self, base: BaseFit) -> bool:
+        """Return whether the recording shows the discretisation error of the engine's steps."""
+        lost = self.fitting.followed is None or not np.isfinite(base.fit.cost)
+        if self.watch.has_abandoned_fits() or lost:
+            return True
+        # These imports are needed for robots only.
+        from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+        from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
+
+        return shows_step_errors(FollowedRuns.of_model(self.fitting, base.fit.theta, self.noise))
+
+    def _without_step(self, base: BaseFit) -> BaseFit:
+        """Return the base model without the discretisation error of the engine's steps.
+
+        The error is corrected if the recording shows it, or if no filter could decide.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.prediction_error.effect_selection import shows_step_errors
+
+        followed = self.fitting.followed
+        if followed is not None and not shows_step_errors(followed):
+            return base
+        return correct_discretisation(self.fitting, self.noise, base)
+
+    def _settled(self, base: BaseFit) -> BaseFit:
+        """Widen ranges, freeze unidentified numbers and correct the step error of a base model."""
+        base = self._frozen(self._within_range(base))
+        # The choice of the step precedes this correction, which hides the discretisation error.
+        return self._without_step(base)
+
+    def _within_range(self, base: BaseFit) -> BaseFit:
+        """Widen the ranges of base parameters that the fit leaves at a bound."""
+        declared = {p.name: p.bounds for p in self.fitting.parameters}
+        declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
+        base, found = fit_wider(self.fitting, self.noise, base)
+        self._widen(found, declared)
+        return base
+
+    def _frozen(self, base: BaseFit) -> BaseFit:
+        """Freeze free numbers of a robot that the data cannot identify.
+
+        A system has few parameters, and would have no result without them; there the verdict
+        reports it.
+        """
+        if self.watch.has_abandoned_fits() or not np.isfinite(base.fit.cost):
+            return base
+        kept = freeze_unidentified_parameters(
+            self.fitting, self.noise, base, lambda base: self._search(base, self._rng())
+        )
+        if kept.unidentified_parameters:
+            names = ", ".join(
+                self.fitting.parameters[i].name for i in sorted(kept.unidentified_parameters)
+            )
+            self.say(f"frozen, as the recording cannot fix it beside the others: {names}")
+        return kept
+
+    def _stepped(self, base: BaseFit) -> BaseFit:
+        """Choose the step of the base model: the file's own, or a finer one.
+
+        A finer step is used if it alone closes a large part of the gap. The run evaluators of the
+        chosen step are then those of the explainer.
+        """
+        # This import is needed for robots only.
+        from bench.diagnosis.evaluation.integrator_check import find_step_refinements
+
+        self.finer = Reusable(find_step_refinements(self.fitting, self.noise))
+        file = _Worlds(self.kind, self.fitting, self.validation)
+        value, left = self._judged(base)
+        gap = left - 1.0
+        for fine in self.finer:
+            # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
+            if not fine.is_accurate_enough(left):
+                continue
+            self._enter(fine.kind)
+            if self.fitting.followed is None:
+                # A model that diverges with the file's step may be filtered with a finer one.
+                self._follow()
+            other = fit_base_model(self.fitting, self.noise, self._nearby(base))
+            reached, left = self._judged(other)
+            if not is_finer_step_better(reached - value, gap, left - 1.0):
+                # Another missing effect may affect both models: they are compared again with it.
+                if fine.is_accurate_enough(0.0):
+                    break
+                left = 0.0
+            elif fine.is_accurate_enough(left):
+                self._use_finer(fine, reached - value, base, file)
+                return other
+        self._return(file)
+        return base
+
+    def _use_finer(self, fine: StepRefinement, gain: float, base: BaseFit, file: _Worlds) -> None:
+        """Record that the file's own step is too coarse; the finer step is in use already."""
+        numerics = fine.numerics
+        self.say(f"stepped more finely: {numerics.integrator}, {numerics.timestep:g} s")
+        self.coarse, self.file = CoarseStepFinding(fine, gain), file
+        self.assessor = replace(self.assessor, before=self._before(base, file.validation))
+
+    def _with_better_step(self, search: EffectSearch, finding: DiagnosisResult) -> _Found | None:
+        """Return the result with another step, if that explains the data better; otherwise None.
+
+        The other step is compared with the effects of this result or some of them.
+
+        A missing effect can make either step look better, and effects can imitate a step, so the
+        first choice is preliminary. Models are compared by penalised log-likelihood and residual,
+        and a finer step must be clearly better: data that MuJoCo made with the file's own step must
+        not be explained by another.
+        """
+        if (
+            self.finer is None
+            or self.faults
+            or finding.early_stop is not None
+            or self.watch.has_abandoned_fits()
+        ):
+            return None
+        if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
+            return None
+        found = finding.model.penalised_log_likelihood, search.compute_excess(finding.model)
+        here = _Worlds(self.kind, self.fitting, self.validation)
+        if self.coarse is not None:
+            before = self.assessor.before
+            self._return(self.file)
+            if not is_finer_model_better(self._best(search, finding), found):
+                self.say("the model file's own step explains the data as well: it is used")
+                self.coarse = None
+                base = BaseFit(search.base_model.fit, search.frozen)
+                return self._answered(fit_base_model(self.fitting, self.noise, self._nearby(base)))
+            self._return(here, before)
+            return None
+        fine = next((one for one in self.finer or () if one.is_accurate_enough(0.0)), None)
+        if fine is None:
+            return None
+        self._enter(fine.kind)
+        best = self._best(search, finding)
+        if not is_finer_model_better(found, best):
+            self._return(here)
+            return None
+        base = BaseFit(search.base_model.fit, search.frozen)
+        other = fit_base_model(self.fitting, self.noise, self._nearby(base))
+        self._use_finer(fine, best[0] - found[0], base, here)
+        return self._answered(other)
+
+    def _best(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[float, float]:
+        """Fit all subsets of a finding's effects with the present step, and rate the best model.
+
+        Returns:
+            Penalised log-likelihood and excess RMS residual of the best model.
+        """
+        names, fit = finding.model.effects, finding.model.fit
+        slots = self.fitting.slots
+        starts = []
+        for count in range(len(names) + 1):
+            for some in combinations(names, count):
+                theta = fit.theta.copy()
+                for left_out in set(names) - set(some):
+                    theta[slots[left_out]] = self.fitting.get_nominal_theta()[slots[left_out]]
+                starts.append(FitStart(some, theta, fit.states))
+        fits = TrajectoryFitter(self.fitting, self.noise, search.frozen).fit_models(
+            starts, MAX_ITERATIONS
+        )
+        models = self._search(BaseFit(search.base_model.fit, search.frozen), self._rng())
+        best = max(
+            (models.add_fit(one) for one in fits), key=lambda model: model.penalised_log_likelihood
+        )
+        return best.penalised_log_likelihood, models.compute_excess(best)
+
+    def _nearby(self, base: BaseFit) -> Array | None:
+        """Return starting values for a fit with another step; None for the default starts.
+
+        A different step changes the best parameters only a little, so the fit needs no other
+        starts, unless the fit with the previous step failed.
+        """
+        if not np.isfinite(base.fit.cost) or self.identified is not None:
+            return self._given()
+        nearby: Array = base.fit.theta[self.fitting.base]
+        return nearby
+
+    def _before(self, base: BaseFit, validation: Validation | None) -> Array | None:
+        """Predict the held-out runs with the file's own step; None without validation."""
+        if validation is None:
+            return None
+        return validation.validate([base.fit])[0].simulated
+
+    def _return(self, worlds: _Worlds, before: Array | None = None) -> None:
+        """Return to run evaluators that were in use before."""
+        self.kind, self.fitting, self.validation = worlds
+        self.assessor = replace(self._assessor(), before=before)
+
+    def _judged(self, base: BaseFit) -> tuple[float, float]:
+        """Return twice the log-likelihood and the RMS residual, in noise units, of a base model."""
+        found = self._search(base, self._rng())
+        return float(found.base_model.likelihood.value), 1.0 + found.compute_excess(
+            found.base_model
+        )
+
+    def _rng(self) -> np.random.Generator:
+        return make_rng("explain", self.recording.system, self.seed)
+
+    def _fails(self) -> InputError:
+        """Return the error that explains why nothing could be simulated."""
+        if self.faults:
+            return InputError(f"{self.path}: {self.faults[0].says}")
+        if self.watch.has_abandoned_fits():
+            return InputError(
+                f"{self.path}: the search was ended before a fit could follow the recording"
+            )
+        return InputError(
+            f"{self.path}: the simulation fails wherever a fit begins; "
+            "check constants, units, inputs and initial states"
+        )
+
+    def _given(self) -> Array | None:
+        """Return starting values of the base parameters; None for the default starts.
+
+        They come from a registered tuner, or are those identified by prediction errors.
+        """
+        if self.tuner is None:
+            return self.identified
+        # Few users request a tuner, and the code that drives one is slow to import.
+        from bench.diagnosis.fitting.tuner_initialisation import run_tuner
+
+        return run_tuner(self.tuner, self.fitting, self.noise, self.seed)
+
+    def _extended(self, search: EffectSearch, finding: DiagnosisResult) -> ExtendedSimulator:
+        world, numbers = (
+            self.fitting,
+            self.assessor.collect_parameter_estimates(search, finding.model),
+        )
+        own = {p.name: numbers[i] for i, p in enumerate(world.parameters[: world.own])}
+        # A freed constant becomes a constant of the extended simulator, with its fitted value.
+        freed = {p.name: numbers[world.own + i].value for i, p in enumerate(world.freed)}
+        added = {}
+        # The simulator's order keeps the file independent of the order of the search.
+        for effect, slot in world.slots.items():
+            if effect not in finding.model.effects:
+                continue
+            coefficients = world.available_effects[effect].on(world.simulator.system)
+            places = range(*slot.indices(len(world.parameters)))
+            added[effect] = {
+                coefficient.name: numbers[place]
+                for coefficient, place in zip(coefficients, places, strict=True)
+            }
+        return ExtendedSimulator(
+            extend.make_extended_name(self.recording.system),
+            self.recording.system,
+            self.engine,
+            self.recording.title,
+            own,
+            added,
+            {**self.recording.constants, **freed},
+            world.channels,
+            self.kind,
+            extend.get_robot_reference(self.kind),
+        )

@@ -1,0 +1,132 @@
+"""Extended model files of a robot: extended.xml, and extended.urdf for a robot from a URDF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sims.core.freed_memory import release_free_memory
+from sims.extended_simulator import ExtendedSimulator, FittedValue
+
+if TYPE_CHECKING:
+    from sims.robot.export.write_model_file import WrittenModelFiles
+
+
+class ExtendedRobotFiles(NamedTuple):
+    """Extended model files of a robot.
+
+    Attributes:
+        contents: Content by file name.
+        notes: Notes on the files and on what they cannot express, one line each.
+        before, after: Text of the user's file, and of the extended file in the same format.
+    """
+
+    contents: Mapping[str, str]
+    notes: tuple[str, ...] = ()
+    before: str = ""
+    after: str = ""
+
+
+def build_robot_files(extended: ExtendedSimulator) -> ExtendedRobotFiles:
+    """Build the extended model files of a robot; none for a system that is not a robot.
+
+    The files are loaded again and compared with the intended model; on a mismatch no file is
+    returned.
+    """
+    kind: Any = extended.kind
+    if kind is None or not kind.has_model:
+        return ExtendedRobotFiles({})
+    from sims.robot.export.round_trip_check import check_written_files
+    from sims.robot.export.write_model_file import write_model_files
+    from sims.robot.export.xml_editing import strip_heading
+
+    # Models with all meshes are compiled several times, which needs the memory of the search.
+    release_free_memory()
+    causes, left_out = written_causes(collect_causes(extended))
+    done = write_model_files(kind.robot, causes, extended.title)
+    try:
+        check_written_files(kind.robot, causes, done)
+    except RuntimeError as error:
+        # An error here must not discard the result of minutes of search.
+        return ExtendedRobotFiles({}, (f"no model file is written, by a fault of simgap: {error}",))
+    try:
+        before = kind.robot.path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        # The file was deleted after it was read; changes are then shown without the old text.
+        before = ""
+    after = done.xml if done.urdf is None else done.urdf
+    return ExtendedRobotFiles(
+        _named(done), (*left_out, *done.notes), before, strip_heading(after or "")
+    )
+
+
+def written_causes(
+    causes: Mapping[str, Mapping[str, FittedValue]],
+) -> tuple[dict[str, Mapping[str, FittedValue]], tuple[str, ...]]:
+    """Select the causes that a model file may contain.
+
+    Numbers at a bound of their range, or without an interval, are not results and are left out.
+
+    Args:
+        causes: Coefficients by effect.
+
+    Returns:
+        The selected causes, and a line for each number that is left out.
+    """
+    kept: dict[str, Mapping[str, FittedValue]] = {}
+    left_out = []
+    for effect, numbers in causes.items():
+        if effect.startswith("numerics."):
+            kept[effect] = numbers
+            continue
+        # Each place of a family is handled alone; coefficients of one place belong together.
+        bad = {key.partition("@")[2]: n for key, n in numbers.items() if not n.is_result}
+        own = {key: n for key, n in numbers.items() if key.partition("@")[2] not in bad}
+        if own:
+            kept[effect] = own
+        for place, one in bad.items():
+            # A number that was never fitted has the value of the model file.
+            if one.at_bound is None and not one.value:
+                continue
+            end = {"low": "lower", "high": "upper", None: ""}[one.at_bound]
+            why = f"lies at the {end} bound of its range" if end else "has no finite interval"
+            name = effect if not place else f"{effect.partition('@')[0]}@{place}"
+            left_out.append(
+                f"{name} is not written to the model file: its value, {one.value:.3g} {one.unit}, "
+                f"{why} and is not a result"
+            )
+    return kept, tuple(left_out)
+
+
+def _named(done: WrittenModelFiles) -> dict[str, str]:
+    contents = {"extended.xml": done.xml, "extended.urdf": done.urdf}
+    return {name: content for name, content in contents.items() if content is not None}
+
+
+def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, FittedValue]]:
+    """Collect the fitted changes of a robot as coefficients by effect.
+
+    They are freed numbers of its model file, diagnosed effects, and the step and integrator if they
+    differ from those of the file.
+    """
+    kind: Any = extended.kind
+    causes: dict[str, Mapping[str, FittedValue]] = {}
+    for effect in kind.system.freed_effects:
+        names = {c.name: f"{effect.name}.{c.name}" for c in effect.coefficients}
+        if len(names) == 1:
+            names = dict.fromkeys(names, effect.name)
+        causes[effect.name] = {c: extended.parameters[name] for c, name in names.items()}
+    return {**causes, **extended.effects, **_numerics(kind)}
+
+
+def _numerics(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
+    from sims.robot.integrator_settings import INTEGRATOR_IDS, read_integrator_settings
+
+    own, numerics = read_integrator_settings(kind.robot), kind.numerics
+    changed: dict[str, Mapping[str, FittedValue]] = {}
+    if numerics.timestep != own.timestep:
+        changed["numerics.step"] = {"step": FittedValue(numerics.timestep, "s", None, None)}
+    if numerics.integrator != own.integrator:
+        number = INTEGRATOR_IDS[numerics.integrator]
+        changed["numerics.integrator"] = {"integrator": FittedValue(number, "1", None, None)}
+    return changed

@@ -1,0 +1,232 @@
+"""Multi-start fit of the base model: base parameters and initial states, within all bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.benchmark.runner.standalone_tuning import spread_start_points
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from sims.core.simulator import Array, Parameter
+
+GRID_STARTS = 15
+"""Number of starts over the bounds, in addition to the nominal start."""
+FITTED_STARTS = 3
+"""Number of starts that are fitted: those with the lowest cost."""
+FINAL_ITERATIONS = 10
+"""Maximum number of steps of a final fit, after parameters or settings have changed."""
+MIN_SENSITIVITY_SIGMAS = 1.0
+"""Minimum change of the observations, in sigmas, of a parameter that influences the data.
+
+The change is that of all samples together (root of the sum of squares) when the parameter moves
+across its bounds.
+"""
+LOG_SCALE_RATIO = 5.0
+"""Minimum ratio of the bounds of a parameter for which starts are spaced logarithmically."""
+FAILED_SAMPLE_RESIDUAL = 1e3
+"""Residual of a sample that a start could not simulate, in the unit of the channel."""
+
+
+class Horizon(NamedTuple):
+    """A fit horizon.
+
+    Attributes:
+        share: initial share of each run that is fitted.
+        iterations: number of steps of the fit.
+    """
+
+    share: float
+    iterations: int
+
+
+FOLLOWED = (Horizon(1.0, 6),)
+"""Fit horizons of a robot whose runs start near their best states, due to a state filter."""
+FIT_HORIZONS = (Horizon(0.2, 6), Horizon(0.45, 6), Horizon(1.0, 20))
+"""Fit horizons, used one after another.
+
+The end of a run depends on its beginning so strongly that only a nearly fitted model can follow it.
+"""
+
+
+@dataclass(frozen=True)
+class BaseFit:
+    """The fitted base model.
+
+    Attributes:
+        fit: the fit.
+        insensitive_parameters: indices of parameters that stay nominal because they do not
+            influence the data.
+        unidentified_parameters: indices of parameters that stay nominal because the data do not
+            determine them together with the others.
+    """
+
+    fit: TrajectoryFit
+    insensitive_parameters: frozenset[int]
+    unidentified_parameters: frozenset[int] = frozenset()
+
+    @property
+    def fixed_parameters(self) -> frozenset[int]:
+        """Indices of all parameters that stay nominal."""
+        return self.insensitive_parameters | self.unidentified_parameters
+
+
+def fit_base_model(world: RunEvaluator, noise: NoiseModel, given: Array | None = None) -> BaseFit:
+    """Fit base parameters and initial states.
+
+    Args:
+        world: the runs.
+        noise: noise that weights the channels.
+        given: (b,) base parameters to start from, for example from a tuner; None for a multi-start
+            over the bounds.
+
+    Returns:
+        The best fit, with insensitive parameters at their nominal values.
+    """
+    thetas = _starts(world, given)
+    starts = [FitStart((), theta, world.guess) for theta in thetas]
+    # Simulating a start costs far less than fitting it, so the starts are reduced first.
+    world.watch.report(f"base fit from {len(starts)} starts")
+    if len(starts) > FITTED_STARTS:
+        order = np.argsort(costs_of_starts(world, noise, starts), kind="stable")
+        starts = [starts[i] for i in order[:FITTED_STARTS]]
+
+    fits: list[TrajectoryFit] = []
+    for horizon in FIT_HORIZONS if world.followed is None else FOLLOWED:
+        world.watch.report(f"base fit, first {horizon.share:.0%} of the runs")
+        fits = TrajectoryFitter(world, noise, share=horizon.share).fit_models(
+            starts, horizon.iterations
+        )
+        starts = [fit.make_start() for fit in fits]
+    best = min(fits, key=lambda fit: fit.cost)
+    if world.has_linearisation and world.followed is None:
+        # Derivatives about the first start are replaced by those about the fitted model for all
+        # later fits. The import is local, because only robots need it.
+        from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+
+        compute_state_jacobian(world, best.theta, best.states, anew=True)
+        best = TrajectoryFitter(world, noise).fit_models([best.make_start()], FINAL_ITERATIONS)[0]
+
+    # An insensitive parameter is set to nominal, because the value that the search reached means
+    # nothing.
+    places = world.base.tolist()
+    untouched = frozenset(i for i in places if not _is_sensitive(world, best, i, noise))
+    if untouched:
+        kept = list(untouched)
+        theta = best.theta.copy()
+        theta[kept] = world.get_nominal_theta()[kept]
+        start = replace(best.make_start(), theta=theta)
+        best = TrajectoryFitter(world, noise, untouched).fit_models([start], FINAL_ITERATIONS)[0]
+    return BaseFit(best, untouched)
+
+
+def correct_discretisation(world: RunEvaluator, noise: NoiseModel, base: BaseFit) -> BaseFit:
+    """Return the base model of a robot, corrected for the discretisation error and fitted again.
+
+    Args:
+        world: the runs of a robot; the correction is stored in it.
+        noise: noise of each channel.
+        base: the fitted base model.
+    """
+    # Imported here, because only robots need it.
+    from bench.diagnosis.fitting.linearised_runs import correct_discretisation
+
+    correct_discretisation(world, noise, base.fit.theta, base.fit.states)
+    if world.correction is None:
+        return base
+    fit = TrajectoryFitter(world, noise, base.fixed_parameters).fit_models(
+        [base.fit.make_start()], FINAL_ITERATIONS
+    )[0]
+    return replace(base, fit=fit)
+
+
+def _starts(world: RunEvaluator, given: Array | None) -> list[Array]:
+    """Return start parameters (P,): the given ones, or the nominal ones and a regular grid."""
+    nominal = world.get_nominal_theta()
+    if given is not None:
+        nominal[world.base] = given
+        return [nominal]
+    parameters = [world.parameters[i] for i in world.base]
+    starts = [nominal]
+    # A simulator may have no parameters; its base fit only fits initial states.
+    if not parameters:
+        return starts
+    for shares in spread_start_points(GRID_STARTS, len(parameters)):
+        theta = nominal.copy()
+        for place, parameter, share in zip(world.base, parameters, shares, strict=True):
+            theta[place] = _between(parameter, share)
+        starts.append(theta)
+    return starts
+
+
+def _between(parameter: Parameter, share: float) -> float:
+    """Return the value at a share of the bounds of a parameter."""
+    low, high = parameter.bounds
+    if low > 0 and high / low > LOG_SCALE_RATIO:
+        return float(low * (high / low) ** share)
+    return float(low + (high - low) * share)
+
+
+def misfit_of_starts(world: RunEvaluator, noise: NoiseModel, share: float) -> float:
+    """Return the lowest cost of the starts of a base fit, before any fit.
+
+    Args:
+        world: the runs.
+        noise: noise that weights the channels.
+        share: initial share of each run that counts.
+
+    Returns:
+        The sum of squares; infinite if no start can be simulated.
+    """
+    starts = [FitStart((), theta, world.guess) for theta in _starts(world, None)]
+    return float(costs_of_starts(world, noise, starts, share, np.inf).min())
+
+
+def costs_of_starts(
+    world: RunEvaluator,
+    noise: NoiseModel,
+    starts: Sequence[FitStart],
+    share: float = FIT_HORIZONS[0].share,
+    lost: float = FAILED_SAMPLE_RESIDUAL,
+) -> Array:
+    """Return the sum of squares of each start over the first samples of the runs.
+
+    Args:
+        world: the runs.
+        noise: noise that weights the channels.
+        starts: parameters and initial states.
+        share: initial share of each run that counts.
+        lost: residual of a sample that could not be simulated.
+    """
+    count, runs = len(starts), len(world.tracks)
+    thetas = [s.theta for s in starts]
+    theta = np.repeat(thetas, runs, axis=0)
+    states = np.concatenate([s.states for s in starts])
+    lanes = np.tile(np.arange(runs), count)
+    simulated = world.simulate(theta, lanes, states, share)
+    simulated = simulated.reshape(count, runs, *simulated.shape[1:])
+
+    # An abandoned start has no samples, and must not seem to fit them.
+    left = np.nan_to_num(world.observed - simulated, nan=lost)
+    residuals = np.where(world.get_sample_mask(share), left, 0.0) / noise.sigma
+    costs: Array = np.square(residuals).sum(axis=(1, 2, 3))
+    return costs
+
+
+def _is_sensitive(world: RunEvaluator, fit: TrajectoryFit, place: int, noise: NoiseModel) -> bool:
+    """Return whether a parameter influences the data."""
+    # A fixed parameter has no column.
+    columns = np.flatnonzero(fit.free == place)
+    if not columns.size:
+        return False
+    low, high = world.parameters[place].bounds
+    change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
+    # Count only available samples.
+    shown = change[np.isfinite(world.observed)]
+    sigmas = np.sqrt(np.square(shown).sum())
+    return float(sigmas) > MIN_SENSITIVITY_SIGMAS

@@ -1,0 +1,188 @@
+"""Wider ranges for base parameters that a fit leaves at a bound of their range.
+
+A declared range is a guess of usual values. If the best value lies outside it, the base model is
+wrong, and an effect of the library would be fitted to the difference. Therefore the range is
+widened as far as physics allows, and the base model is fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import BEYOND_MODEL, bound_of
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import FINAL_ITERATIONS, BaseFit
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from sims.core.simulator import Array, Parameter
+
+Bounds = tuple[float, float]
+
+FACTOR = 4.0
+"""Factor by which a range is widened in one round."""
+ROUNDS = 5
+"""Maximum number of rounds: the range is then a thousand times as wide."""
+
+
+def at_bounds(world: RunEvaluator, base: BaseFit) -> list[int]:
+    """Return the indices of fitted base parameters at a bound that physics allows to exceed."""
+    places = []
+    for i in world.base.tolist():
+        if i in base.fixed_parameters:
+            continue
+        low, high = world.parameters[i].bounds
+        end = bound_of(float(base.fit.theta[i]), low, high)
+        lower, upper = widened(world.parameters[i], limits_of(world, i))
+        if (end == "low" and lower < low) or (end == "high" and upper > high):
+            places.append(i)
+    return places
+
+
+def fit_wider(
+    world: RunEvaluator, noise: NoiseModel, base: BaseFit
+) -> tuple[BaseFit, dict[str, Bounds]]:
+    """Widen the ranges of parameters at a bound, and fit the base model again.
+
+    Args:
+        world: the runs for fitting; the ranges of its parameters are replaced.
+        noise: noise of each channel.
+        base: the fitted base model.
+
+    Returns:
+        The base model, and the new ranges by name; empty if no parameter is at a bound.
+    """
+    found: dict[str, Bounds] = {}
+    for _ in range(ROUNDS):
+        places = at_bounds(world, base)
+        if not places or world.watch.has_abandoned_fits():
+            break
+        for i in places:
+            parameter = world.parameters[i]
+            found[parameter.name] = widened(parameter, limits_of(world, i))
+        use_bounds(world, found)
+        fit = TrajectoryFitter(world, noise, base.fixed_parameters).fit_models(
+            [base.fit.make_start()], FINAL_ITERATIONS
+        )[0]
+        base = replace(base, fit=fit)
+    return base, found
+
+
+def range_around(world: RunEvaluator, place: int, value: float | None = None) -> Bounds:
+    """Return the range of a base parameter, widened until it contains a value.
+
+    It is widened at most `ROUNDS` times.
+
+    Args:
+        world: the runs for fitting.
+        place: index of the parameter.
+        value: value that the range must contain; None for the widest range.
+    """
+    parameter = world.parameters[place]
+    limits = limits_of(world, place)
+    for _ in range(ROUNDS):
+        low, high = parameter.bounds
+        if value is not None and low <= value <= high:
+            break
+        parameter = replace(parameter, bounds=widened(parameter, limits), training=None)
+    return parameter.bounds
+
+
+def use_bounds(world: RunEvaluator, found: Mapping[str, Bounds]) -> None:
+    """Replace the ranges of parameters of a world.
+
+    Args:
+        world: the runs for fitting; its parameters are replaced.
+        found: new range of each parameter, by name.
+    """
+    if not found:
+        return
+    world.parameters = tuple(
+        replace(p, bounds=found[p.name], training=None) if p.name in found else p
+        for p in world.parameters
+    )
+    # Workers that were forked before still have the narrow ranges.
+    world.crew.forget(world)
+
+
+def limits_of(world: RunEvaluator, place: int) -> Bounds:
+    """Return the physical limits of a base parameter; for a robot, those of its total value.
+
+    Args:
+        world: the runs for fitting.
+        place: index of the parameter.
+    """
+    parameter = world.parameters[place]
+    if world.kind.has_model:
+        coefficient = _coefficient(world.kind, parameter.name)
+        if coefficient is not None:
+            least, most = coefficient.least, coefficient.most
+            return (
+                -np.inf if least is None else least,
+                BEYOND_MODEL * coefficient.plausible[0][1] if most is None else most,
+            )
+    return _limits(parameter)
+
+
+def _coefficient(kind: Any, name: str) -> Any:
+    """Return the effect coefficient of a robot that a freed parameter stands for, or None."""
+    for effect in kind.system.freed_effects:
+        for c in effect.coefficients:
+            if name in (effect.name, f"{effect.name}.{c.name}"):
+                return c
+    return None
+
+
+def _limits(parameter: Parameter) -> Bounds:
+    """Return the limits of a declared parameter from its unit and its range.
+
+    A parameter with a nonnegative range stays nonnegative, and a share is at most 1.
+    """
+    low, high = parameter.bounds
+    share = parameter.unit == "1" and low >= 0.0 and high <= 1.0
+    return 0.0 if low >= 0.0 else -np.inf, 1.0 if share else np.inf
+
+
+def widened(parameter: Parameter, limits: Bounds) -> Bounds:
+    """Return the next wider range of a parameter.
+
+    Args:
+        parameter: the parameter with its present range.
+        limits: its physical limits.
+    """
+    low, high = parameter.bounds
+    width = high - low
+    # A positive parameter stays positive, so its range grows by a factor on both sides.
+    lower = low / FACTOR if low > 0.0 else low - (FACTOR - 1.0) * width * (low < 0.0)
+    upper = high * FACTOR if low >= 0.0 else high + (FACTOR - 1.0) * width
+    return max(lower, min(limits[0], low)), min(upper, max(limits[1], high))
+
+
+def outside(
+    world: RunEvaluator, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds]]
+) -> list[str]:
+    """Return a sentence for each fitted parameter that lies outside its declared range.
+
+    Args:
+        world: the runs for fitting.
+        theta: (P,) the fitted parameters.
+        wider: by parameter name, the declared range and the wider range that was used.
+    """
+    sentences = []
+    for i in world.base.tolist():
+        parameter, value = world.parameters[i], float(theta[i])
+        if parameter.name not in wider:
+            continue
+        (low, high), (wide_low, wide_high) = wider[parameter.name]
+        if low <= value <= high:
+            continue
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        sentences.append(
+            f"{parameter.name} = {value:.4g}{unit} lies outside its usual range, {low:g} to "
+            f"{high:g}{unit}; the range was widened to {wide_low:g} to {wide_high:g}{unit}. "
+            "Check the units and constants of the recording"
+        )
+    return sentences

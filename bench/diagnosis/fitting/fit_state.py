@@ -1,0 +1,346 @@
+"""State of one Levenberg-Marquardt fit: point, Jacobian, damping and convergence.
+
+For a step with predicted decrease p that changed the cost from F to F', the gain ratio is
+
+    ρ = (F - F') / p                                                                             (1)
+
+The damping λ follows ρ by Nielsen's rule (H. B. Nielsen, Damping parameter in Marquardt's method,
+IMM-REP-1999-05), but it changes faster in both directions: the original minimum factor is 1/3, the
+original growth is ν λ.
+
+    λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        if F' < F, and the step is accepted            (2)
+    λ ← 2ν λ,                        ν ← 2ν       otherwise                                      (3)
+
+Expensive derivatives J may be used for several steps. They are updated with the unpredicted part of
+the change by a step δ, along the step only; D are the scales of the unknowns (C. G. Broyden, Math.
+Comp. 19, 577, 1965, doi:10.1090/S0025-5718-1965-0198670-6; for this method: K. Madsen, H. B.
+Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, section 3.3):
+
+    J ← J + (y(x + δ) - y(x) - J δ) δᵀ D⁻² / (δᵀ D⁻² δ)                                          (4)
+
+They are recomputed when predictions become poor: when ρ is far from 1, or F has increased.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask
+from bench.diagnosis.evaluation.run_evaluator import Indices
+from sims.core.simulator import Array
+
+CONVERGENCE_TOLERANCE = 0.02
+"""Convergence threshold: minimum decrease of the sum of squares by a step, in units of the noise.
+
+A share of the sum of squares, `RELATIVE_CONVERGENCE_TOLERANCE` or `COARSE_SHARE`, is added to it.
+"""
+RELATIVE_CONVERGENCE_TOLERANCE = 1e-4
+"""Convergence threshold as a share of the sum of squares, added to `CONVERGENCE_TOLERANCE`."""
+FINAL_CONVERGENCE_TOLERANCE = 0.002
+"""Convergence threshold of fits whose parameters are reported, in units of the noise.
+
+Parameters are then within a twentieth of a standard error of the optimum.
+"""
+
+# The cost of a robot fit is not smooth: a joint that sticks one integration step later changes it
+# by more than the fit can still gain. These constants end such fits.
+COARSE_SHARE = 1e-3
+"""Convergence threshold as a share of the sum of squares, if the model is far from the data."""
+FAR = 2.0
+"""Mean squared residual, in units of the noise, above which a model is far from the data."""
+STAGNANT_RATIO = 0.3
+"""Maximum gain ratio (1) of a step that ends a fit far from the data."""
+STAGNANT_SHARE = 5e-3
+"""Maximum gain of a step that ends a fit far from the data, as a share of the sum of squares."""
+ROUGHNESS = 3.0
+"""Maximum predicted decrease, in units of the noise, at which a rejected step ends a rough fit.
+
+It applies to steps with derivatives of the present point.
+"""
+EXACT_ROUGHNESS = 1.0
+"""Value that replaces `ROUGHNESS` in fits whose parameters are reported."""
+
+INITIAL_DAMPING = 1e-3
+"""Initial damping λ of (2)."""
+MIN_DAMPING = 1e-10
+"""Minimum damping λ; a damping of zero could not grow again."""
+MAX_DAMPING = 1e8
+"""Maximum damping λ; above it no step decreases the cost, however short."""
+INITIAL_DAMPING_GROWTH = 2.0
+"""Initial growth factor ν of (3), and the factor by which ν itself grows."""
+MIN_DAMPING_FACTOR = 0.1
+"""Minimum factor of (2) by which the damping changes after an accepted step."""
+JACOBIAN_REUSE_TOLERANCE = 0.5
+"""Maximum deviation of ρ from 1 at which derivatives are used for another step."""
+
+
+SHARED_RENEWALS = 2
+"""Number of recomputed Jacobians after which a fit gets its own derivatives by initial states.
+
+It applies to models near the data; other models share these derivatives.
+"""
+
+
+class KnownJacobian(NamedTuple):
+    """Known derivatives of the runs by some of the parameters, about a nearby point.
+
+    Attributes:
+        free: (q,) indices of these parameters in theta.
+        jacobian: (R, T, C, q) derivatives.
+    """
+
+    free: Indices
+    jacobian: Array
+
+    def drop_parameters(self, places: Collection[int]) -> KnownJacobian:
+        """Return the derivatives without those by some parameters."""
+        kept = [j for j, place in enumerate(self.free.tolist()) if place not in places]
+        return KnownJacobian(self.free[kept], self.jacobian[..., kept])
+
+    def add_parameters(self, places: Sequence[int], jacobian: Array) -> KnownJacobian:
+        """Return the derivatives together with those by further parameters.
+
+        Args:
+            places: (k,) indices of the further parameters in theta.
+            jacobian: (R, T, C, k) derivatives by them.
+        """
+        free = np.concatenate([self.free, np.array(places, dtype=np.intp)])
+        return KnownJacobian(free, np.concatenate([self.jacobian, jacobian], axis=3))
+
+
+@dataclass(frozen=True)
+class FitStart:
+    """Start of a fit.
+
+    Attributes:
+        effects: names of the active effects.
+        theta: (P,) parameters.
+        states: (R, s) initial states.
+        known: derivatives that are known near the start, if any.
+    """
+
+    effects: tuple[str, ...]
+    theta: Array
+    states: Array
+    known: KnownJacobian | None = None
+
+
+@dataclass(frozen=True)
+class TrajectoryFit:
+    """A fitted model.
+
+    Attributes:
+        effects: names of the active effects.
+        theta: (P,) parameters and coefficients.
+        states: (R, s) initial states.
+        free: (q,) indices of the fitted elements of theta.
+        simulated: (R, T, C) simulated observations.
+        jacobian: (R, T, C, q + s) derivatives of `simulated`, initial states last.
+        cost: sum of squares of the whitened residual.
+        is_own_jacobian: whether the derivatives were computed at exactly this point.
+    """
+
+    effects: tuple[str, ...]
+    theta: Array
+    states: Array
+    free: Indices
+    simulated: Array
+    jacobian: Array
+    cost: float
+    is_own_jacobian: bool = True
+
+    def get_known_jacobian(self) -> KnownJacobian:
+        """Return the derivatives by the parameters, for use in fits that start nearby."""
+        return KnownJacobian(self.free, self.jacobian[..., : self.free.size])
+
+    def make_start(self) -> FitStart:
+        """Return a start that continues from this fit."""
+        return FitStart(self.effects, self.theta, self.states)
+
+
+@dataclass(frozen=True)
+class FitPoint:
+    """A point of a fit and its simulation; attributes as those of `TrajectoryFit`."""
+
+    start: FitStart
+    simulated: Array
+    jacobian: Array
+    cost: float
+
+
+@dataclass
+class FitState:
+    """State of the fit of one model.
+
+    Attributes:
+        point: best point so far.
+        free: (q,) indices of the fitted elements of theta.
+        low: (q,) lower bounds of the fitted parameters.
+        high: (q,) upper bounds of the fitted parameters.
+        widths: (q,) widths of the plausible ranges of the parameters.
+        steps: (q + s,) step sizes of finite differences.
+        damping: λ.
+        growth: ν.
+        predicted_decrease: predicted decrease of the cost by the last step.
+        is_finished: whether the fit has converged or was eliminated.
+        has_own_jacobian: whether the derivatives were computed at the present point, and not at
+            another one.
+        is_jacobian_stale: whether the derivatives must be recomputed before the next step.
+        is_waiting: whether recomputing can wait until the fit is known not to be far behind others.
+        is_final_fit: whether the fit continues to the threshold `FINAL_CONVERGENCE_TOLERANCE`.
+        rough: whether the cost is not smooth at the scale of the noise.
+        samples: number of samples that count.
+        renewals: number of times the derivatives were recomputed.
+        by_states: (R, T, C, s) derivatives by initial states about this model; None to use those
+            that all models share.
+    """
+
+    point: FitPoint
+    free: Indices
+    low: Array
+    high: Array
+    widths: Array
+    steps: Array
+    damping: float = INITIAL_DAMPING
+    growth: float = INITIAL_DAMPING_GROWTH
+    predicted_decrease: float = np.inf
+    is_finished: bool = False
+    has_own_jacobian: bool = True
+    is_jacobian_stale: bool = False
+    is_waiting: bool = False
+    is_final_fit: bool = False
+    rough: bool = False
+    samples: int = 0
+    renewals: int = 0
+    by_states: Array | None = None
+
+    @property
+    def needs_own_states(self) -> bool:
+        """Whether the derivatives by initial states that all models share are not good enough.
+
+        This is the case if the model is near the data, but its derivatives by parameters had to be
+        recomputed several times.
+        """
+        slow = self.rough and self.by_states is None and self.renewals >= SHARED_RENEWALS
+        return slow and not self._is_far(self.point.cost)
+
+    def get_tolerance(self, cost: float) -> float:
+        """Return the convergence threshold: minimum decrease of the cost by a step."""
+        if self.is_final_fit:
+            return FINAL_CONVERGENCE_TOLERANCE
+        return (
+            CONVERGENCE_TOLERANCE
+            + (COARSE_SHARE if self._is_far(cost) else RELATIVE_CONVERGENCE_TOLERANCE) * cost
+        )
+
+    def _is_far(self, cost: float) -> bool:
+        """Return whether a fit with a rough cost is far from the data."""
+        return self.rough and cost > FAR * self.samples
+
+    def make_fit(self) -> TrajectoryFit:
+        """Return the present result of the fit."""
+        at = self.point
+        return TrajectoryFit(
+            at.start.effects,
+            at.start.theta,
+            at.start.states,
+            self.free,
+            at.simulated,
+            at.jacobian,
+            at.cost,
+            self.has_own_jacobian,
+        )
+
+    def compute_inward_steps(self, theta: Array) -> Array:
+        """Return signed difference steps (q + s,) from parameters (P,).
+
+        The step of a parameter at its upper bound points inward.
+        """
+        steps = self.steps.copy()
+        own = steps[: self.free.size]
+        own[theta[self.free] + own > self.high] *= -1.0
+        return steps
+
+    def update_jacobian(self, reached: FitPoint) -> Array:
+        """Return derivatives (R, T, C, q + s) at a new point by Broyden's update (4), run by run.
+
+        Args:
+            reached: the point that the step has reached.
+        """
+        at = self.point
+        # Samples after the end of a shorter run are NaN, and count as unchanged.
+        shown = np.nan_to_num(reached.simulated - at.simulated)
+        shared = (reached.start.theta - at.start.theta)[self.free]
+        own = reached.start.states - at.start.states
+        moved = np.concatenate([np.broadcast_to(shared, (len(own), shared.size)), own], axis=1)
+        weighed = moved / np.square(self.steps)
+        length = np.sum(weighed * moved, axis=1)
+        # A run in which nothing was moved gives no information.
+        along = weighed / np.where(length > 0, length, np.inf)[:, None]
+        missed = shown - np.einsum("rtcq,rq->rtc", at.jacobian, moved)
+        learnt: Array = at.jacobian + missed[..., None] * along[:, None, None, :]  # (4)
+        return learnt
+
+    def mark_converged(self) -> None:
+        """Mark the fit as converged if its derivatives belong to the present point.
+
+        Otherwise the derivatives must be recomputed first.
+        """
+        if self.has_own_jacobian:
+            self.is_finished = True
+        else:
+            self.is_jacobian_stale = self.is_waiting = True
+
+    def accept_step(self, gained: float, cost: float, own: bool) -> None:
+        """Update the damping and the convergence state after an accepted step.
+
+        Args:
+            gained: decrease of the cost.
+            cost: new cost.
+            own: whether the derivatives were computed at the point where the step began.
+        """
+        ratio = gained / max(self.predicted_decrease, 1e-300)  # (1)
+        self.is_jacobian_stale = (
+            not self.has_own_jacobian and abs(ratio - 1.0) > JACOBIAN_REUSE_TOLERANCE
+        )
+        factor = max(MIN_DAMPING_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
+        self.damping = max(self.damping * factor, MIN_DAMPING)  # (2)
+        self.growth = INITIAL_DAMPING_GROWTH
+        stagnant = ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
+        if own and not self.is_final_fit and stagnant and self._is_far(cost):
+            self.is_finished = True
+        # With derivatives of the present point the fit has converged; with others it may have.
+        if gained < self.get_tolerance(cost):
+            self.mark_converged()
+
+    def reject_step(self) -> None:
+        """Increase the damping (3) after a rejected step, unless outdated derivatives caused it."""
+        if not self.has_own_jacobian:
+            self.is_jacobian_stale = True
+            return
+        if self.rough and self.predicted_decrease < (
+            EXACT_ROUGHNESS if self.is_final_fit else ROUGHNESS
+        ):
+            self.is_finished = True
+            return
+        self.damping = self.damping * INITIAL_DAMPING_GROWTH * self.growth
+        self.growth = INITIAL_DAMPING_GROWTH * self.growth
+
+    def find_blocked_parameters(self, residual: Array, jacobian: Array) -> Mask:
+        """Return the mask (q,) of parameters at a bound that the data push against.
+
+        Args:
+            residual: (R, T, C) whitened residual.
+            jacobian: (R, T, C, q + s) whitened derivatives.
+        """
+        # Direction of steepest descent of the cost.
+        pushed = np.einsum("rtc,rtcq->q", residual, jacobian[..., : self.free.size])
+        here = self.point.start.theta[self.free]
+        below = (here <= self.low) & (pushed < 0)
+        above = (here >= self.high) & (pushed > 0)
+        stuck: Mask = below | above
+        return stuck

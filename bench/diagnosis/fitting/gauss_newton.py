@@ -1,0 +1,226 @@
+"""Damped Gauss-Newton step for parameters that all runs share and initial states of each run.
+
+Run i has the residual r_i. The shared parameters x change it by A_i, and the initial state z_i of
+the run changes it by B_i. The prior of z_i has mean g_i and standard deviation π. The cost is
+
+    F = Σ_i |r_i|² + Σ_i |d_i|²,   d_i = (z_i - g_i) / π                                         (1)
+
+A Gauss-Newton step linearises r. The initial state of a run does not influence other runs, so the
+normal equations have arrowhead structure (B. Triggs et al., Bundle adjustment, 2000,
+doi:10.1007/3-540-44480-7_21, section 6), here with U = Σ A_iᵀ A_i, W_i = A_iᵀ B_i and V_i = B_iᵀ
+B_i + π⁻²:
+
+    U δx + Σ_i W_i δz_i = a,          a = Σ A_iᵀ r_i                                             (2)
+    W_iᵀ δx + V_i δz_i = b_i,         b_i = B_iᵀ r_i - d_i / π                                   (3)
+
+Levenberg-Marquardt damping adds λ times their own diagonals to U and V_i (J. Nocedal, S. J. Wright,
+Numerical Optimization, 2nd ed., section 10.3). Initial states are eliminated run by run. This
+leaves the Schur complement for the shared parameters, from which the initial states follow:
+
+    (U - Σ W_i V_i⁻¹ W_iᵀ) δx = a - Σ W_i V_i⁻¹ b_i                                              (4)
+    δz_i = V_i⁻¹ b_i - V_i⁻¹ W_iᵀ δx                                                             (5)
+
+The work therefore grows linearly with the number of runs. If r were linear, (1) would decrease by
+
+    Σ |r_i|² - |r_i - A_i δx - B_i δz_i|² + Σ |d_i|² - |d_i + δz_i / π|²                         (6)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask
+from sims.core.simulator import Array
+
+MIN_DIAGONAL = 1e-12
+"""Minimum diagonal element of U, so that unknowns without any response are damped."""
+RIDGE_SHARE = 1e-9
+"""Share of its diagonal that is always added to U.
+
+Without it, parameters with the same response would make U singular if there is no damping.
+"""
+
+
+@dataclass(frozen=True)
+class GaussNewtonStep:
+    """A step to try.
+
+    Attributes:
+        parameter_step: (q,) step of the shared parameters.
+        state_steps: (R, s) step of the initial states.
+        predicted_decrease: predicted decrease of the cost.
+    """
+
+    parameter_step: Array
+    state_steps: Array
+    predicted_decrease: float
+
+
+@dataclass(frozen=True)
+class _ArrowheadEquations:
+    """The normal equations (2) and (3) of R runs, q shared parameters and s initial states.
+
+    Attributes:
+        shared: (q, q) U.
+        cross: (R, q, s) all W_i.
+        inner: (R, s, s) all V_i.
+        gradient: (q,) a.
+        pull: (R, s) all b_i.
+    """
+
+    shared: Array
+    cross: Array
+    inner: Array
+    gradient: Array
+    pull: Array
+
+    def solved(self, stuck: Mask) -> tuple[Array, Array]:
+        """Solve (4) and (5) for the steps (q,) and (R, s); stuck parameters (q,) do not move."""
+        schur, inverse_cross = compute_schur_complement(self.shared, self.cross, self.inner)
+        # V⁻¹ b of all runs.
+        columns = self.pull[:, :, None]
+        inverse_pull = np.linalg.solve(self.inner, columns)[:, :, 0]
+
+        # Right-hand side of (4).
+        right = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
+
+        shared = np.zeros(len(right))
+        moves = ~stuck
+        if moves.any():
+            free = schur[np.ix_(moves, moves)]
+            # Scale the parameters: curvatures of an outlet of 1e-6 m^2 and of a lag of seconds
+            # differ by more than double precision resolves, and the smaller one would be treated as
+            # zero.
+            scale = np.sqrt(np.maximum(np.diagonal(self.shared)[moves], MIN_DIAGONAL))
+            scaled = free / np.outer(scale, scale)
+            if not np.isfinite(scaled).all():
+                # Derivatives of an unstable motion give no usable step.
+                return np.full(len(right), np.nan), np.full(self.pull.shape, np.nan)
+            # Least squares takes the shortest step if parameters have the same response.
+            solution = np.linalg.lstsq(scaled, right[moves] / scale, rcond=None)
+            shared[moves] = solution[0] / scale
+
+        own = inverse_pull - np.einsum("rsq,q->rs", inverse_cross, shared)  # (5)
+        return shared, own
+
+
+def compute_schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
+    """Eliminate the initial states of every run from the normal equations.
+
+    Args:
+        shared: (q, q) U.
+        cross: (R, q, s) all W_i.
+        inner: (R, s, s) all V_i.
+
+    Returns:
+        The matrix (q, q) of (4), and all V_i⁻¹ W_iᵀ (R, s, q).
+    """
+    transposed = cross.transpose(0, 2, 1)
+    solved = np.linalg.solve(inner, transposed)
+    inverse_cross = np.asarray(solved, dtype=np.float64)
+    products = np.matmul(cross, inverse_cross)
+    schur: Array = shared - products.sum(axis=0)  # (4), its left side
+    return schur, inverse_cross
+
+
+def hold_known_states(inner: Array, cross: Array, known: Mask) -> tuple[Array, Array]:
+    """Fix known initial states in the normal equations.
+
+    Args:
+        inner: (R, s, s) all V_i.
+        cross: (R, q, s) all W_i.
+        known: (R, s) mask of known initial states.
+
+    Returns:
+        V_i and W_i, in which no parameter and no other state is coupled to a known state.
+    """
+    # The equation of a known state becomes: its step is zero.
+    touched = known[:, :, None] | known[:, None, :]
+    alone = np.where(touched, np.eye(inner.shape[1]), inner)
+    return alone, np.where(known[:, None, :], 0.0, cross)
+
+
+def compute_gauss_newton_step(
+    residual: Array,
+    jacobian: Array,
+    q: int,
+    drift: Array,
+    prior: Array,
+    known: Mask,
+    damping: float,
+    stuck: Mask,
+) -> GaussNewtonStep:
+    """Compute one damped Gauss-Newton step.
+
+    Args:
+        residual: (R, T, C) whitened residual, observed minus simulated.
+        jacobian: (R, T, C, q + s) whitened derivatives of the simulation; initial states last.
+        q: number of shared parameters.
+        drift: (R, s) the d of (1): deviations of initial states from their guesses, in sigmas.
+        prior: (s,) the π of (1).
+        known: (R, s) initial states that do not move.
+        damping: Levenberg-Marquardt damping λ.
+        stuck: (q,) parameters that do not move.
+    """
+    runs, size = len(residual), jacobian.shape[3]
+    j = jacobian.reshape(runs, -1, size)
+    r = residual.reshape(runs, -1)
+    arrow = _apply_damping(_assemble_normal_equations(j, r, q, drift, prior), damping, known)
+    shared, own = arrow.solved(stuck)
+    return GaussNewtonStep(shared, own, _predict_decrease(j, r, drift, prior, shared, own))
+
+
+def _assemble_normal_equations(
+    j: Array,
+    r: Array,
+    q: int,
+    drift: Array,
+    prior: Array,
+) -> _ArrowheadEquations:
+    """Build equations (2) and (3) from residuals (R, n) and derivatives (R, n, q + s)."""
+    own = slice(q, j.shape[2])
+    # One product contains all AᵀA, AᵀB and BᵀB, another one all Aᵀr and Bᵀr.
+    transposed = j.transpose(0, 2, 1)
+    normal = np.matmul(transposed, j)
+    residuals = r[:, :, None]
+    right = np.matmul(transposed, residuals)[:, :, 0]
+    return _ArrowheadEquations(
+        shared=normal[:, :q, :q].sum(axis=0),  # U
+        cross=normal[:, :q, own].copy(),  # W
+        inner=normal[:, own, own] + np.diag(1.0 / prior**2),  # V
+        gradient=right[:, :q].sum(axis=0),  # a
+        pull=right[:, own] - drift / prior,  # b
+    )
+
+
+def _apply_damping(arrow: _ArrowheadEquations, damping: float, known: Mask) -> _ArrowheadEquations:
+    """Return the damped equations, in which known initial states do not move."""
+    diagonal = np.einsum("rii->ri", arrow.inner)
+    inner = arrow.inner + damping * diagonal[:, :, None] * np.eye(arrow.inner.shape[1])
+    inner, cross = hold_known_states(inner, arrow.cross, known)
+    pull = np.where(known, 0.0, arrow.pull)
+
+    scale = np.maximum(np.diagonal(arrow.shared), MIN_DIAGONAL)
+    shared = arrow.shared + np.diag(damping * scale + RIDGE_SHARE * scale + MIN_DIAGONAL)
+    return _ArrowheadEquations(shared, cross, inner, arrow.gradient, pull)
+
+
+def _predict_decrease(
+    j: Array,
+    r: Array,
+    drift: Array,
+    prior: Array,
+    shared: Array,
+    own: Array,
+) -> float:
+    """Return the decrease (6) of the cost if the residual were linear."""
+    repeated = np.tile(shared, (len(r), 1))
+    steps = np.concatenate([repeated, own], axis=1)
+    changes = np.matmul(j, steps[:, :, None])[:, :, 0]
+    left = r - changes
+    after = drift + own / prior
+    promised = float((r * r).sum() - (left * left).sum())
+    promised += float((drift**2).sum() - (after**2).sum())
+    return promised

@@ -1,0 +1,167 @@
+"""Linearised robot runs: responses to effects and initial states, and discretisation correction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.finite_differences import is_finite_response
+from sims.core.simulator import Array
+from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.dynamics.series_joints import is_series_effect
+from sims.robot.robot_simulator import RobotSimulator
+
+MAX_CORRECTABLE_ERROR = 1.0
+"""Maximum RMS discretisation error that is corrected, in units of the noise."""
+
+
+def compute_effect_responses(
+    world: RunEvaluator, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+) -> Array:
+    """Compute the first-order responses of the runs to one additional effect each.
+
+    The result has single precision, because it is by far the largest array of an explanation and
+    only a derivative.
+
+    Args:
+        world: the runs of a robot.
+        theta: (P,) parameters, without the added effects.
+        states: (R, s) initial states.
+        added: K effects with their coefficients.
+
+    Returns:
+        Changes of the runs (K, R, T, C); NaN where they are not finite.
+    """
+    runs, length, channels = world.observed.shape
+    result: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
+    kept = world.simulated
+    keys = [(name, c.tobytes()) for name, c in added]
+    asked = [i for i, key in enumerate(keys) if key not in kept]
+    calls = [(run, theta, states[run], [added[i] for i in asked]) for run in range(runs)]
+    for run, (values, looks) in world.crew.map_unordered(world, _responses, calls):
+        # Values that overflow single precision become infinite here.
+        with np.errstate(over="ignore"):
+            result[asked, run, : values.shape[1]] = values
+        world.simulations += looks
+    result[~is_finite_response(result)] = np.nan
+    for i, key in enumerate(keys):
+        if key in kept:
+            result[i] = kept[key]
+        elif is_series_effect(world.available_effects[key[0]]):
+            # Responses without a linearisation are simulated, and are similar in all models near
+            # the data.
+            kept[key] = result[i].copy()
+    return result
+
+
+def _responses(
+    world: RunEvaluator, run: int, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
+) -> tuple[Array, int]:
+    """Compute the responses of one run (K, T, C), and the number of simulations used."""
+    about = _get_linearisation(world, run, theta, states)
+    return about.compute_effect_responses([(world.available_effects[name], c) for name, c in added])
+
+
+def compute_state_jacobian(
+    world: RunEvaluator, theta: Array, states: Array, anew: bool = False
+) -> Array:
+    """Return derivatives (R, T, C, s) of the runs by their initial states.
+
+    They are those about the first requested model, or about this one if `anew` is set. Initial
+    states act similarly in all models near the data, and a fit with derivatives of another such
+    model converges to the same result.
+
+    Args:
+        world: the runs of a robot.
+        theta: (P,) parameters.
+        states: (R, s) initial states.
+        anew: whether to recompute the derivatives about this model and store them.
+    """
+    if world.derivatives is None or anew:
+        world.derivatives = begun_about(world, theta, states)
+    return world.derivatives
+
+
+def begun_about(world: RunEvaluator, theta: Array, states: Array) -> Array:
+    """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
+
+    Args:
+        world: the runs of a robot.
+        theta: (P,) parameters of the model.
+        states: (R, s) initial states of the model.
+    """
+    runs, length, channels = world.observed.shape
+    result = np.zeros((runs, length, channels, len(world.states)))
+    calls = [(run, theta, states[run]) for run in range(runs)]
+    for run, values in world.crew.map_unordered(world, _begun, calls):
+        result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
+    result[~is_finite_response(result)] = 0.0
+    return result
+
+
+def _begun(world: RunEvaluator, run: int, theta: Array, states: Array) -> Array:
+    """Compute the derivatives (s, T, C) of one run by its initial states."""
+    return _get_linearisation(world, run, theta, states).compute_initial_state_responses()
+
+
+def _get_linearisation(
+    world: RunEvaluator, run: int, theta: Array, states: Array
+) -> RunLinearisation:
+    """Return the linearisation of one run, cached because most are used more than once."""
+    key = run, theta.tobytes(), states.tobytes()
+    kept = world.neighbourhoods
+    about: RunLinearisation | None = kept.pop(key, None)
+    if about is None:
+        half = len(world.states) // 2
+        scenario = world.tracks[run].scenario
+        about = RunLinearisation(world.simulator, theta, scenario, states[:half], states[half:])
+    kept[key] = about
+    # Drop the linearisations that were not used for the longest time.
+    for old in list(kept)[: -len(world.tracks)]:
+        del kept[old]
+    return about
+
+
+def correct_discretisation(
+    world: RunEvaluator, noise: NoiseModel, theta: Array, states: Array
+) -> None:
+    """Correct all later simulations for the discretisation error of a model's motion.
+
+    With the motion q(h) at step size h, the discretisation error is
+
+        2 q(h / 4) - q(h / 2) - q(h)                                                           (1)
+
+    to first order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for
+    any higher order. An error below `MAX_CORRECTABLE_ERROR` is not reported as a cause, but could
+    be mistaken for
+    one: for example dry friction that stops within a step and not at its end, or a servo that is
+    nearly too fast for the step.
+
+    Args:
+        world: the runs of a robot.
+        noise: noise of each channel.
+        theta: (P,) parameters of a model near the data.
+        states: (R, s) initial states of the model.
+    """
+    if not world.has_linearisation:
+        return
+    assert issubclass(world.kind, RobotSimulator)
+    effects = [*world.library, *world.extra]
+    runs = len(world.tracks)
+    scenarios = [track.scenario for track in world.tracks]
+    lanes = np.tile(theta, (runs, 1))
+    begun = dict(zip(world.states, states.T, strict=True))
+    half = world.kind.with_half_step()
+    seen = [world.simulator.simulate_batch(lanes, scenarios, begun)]
+    for kind in (half, half.with_half_step()):
+        finer = kind(world.recording.constants, world.channels, effects=effects)
+        seen.append(finer.simulate_batch(lanes, scenarios, begun))
+    world.simulations += 7 * runs
+    left = 2.0 * seen[2] - seen[1] - seen[0]  # (1)
+    sizes = np.square(left / noise.sigma)[np.isfinite(world.observed)]
+    # A large error cannot be removed by this correction.
+    if float(np.sqrt(sizes.mean())) < MAX_CORRECTABLE_ERROR:
+        world.correction = np.nan_to_num(left)

@@ -1,0 +1,378 @@
+"""Fitted models of a recording: effects, fit, likelihood and penalised log-likelihood.
+
+For a model with log-likelihood L and k parameters determined by n samples, the penalised
+log-likelihood (merit) is
+
+    M = 2 log L - k log n - Σ_e max(c_e - k_e log n, 0)                                          (1)
+
+Without the last term, this is the criterion of G. Schwarz (Ann. Stat. 6(2), 461, 1978,
+doi:10.1214/aos/1176344136) with reversed sign, so that higher is better. The last term is for
+effects e with many candidate shapes: c_e is the gain of the best shape under the null hypothesis,
+of which the k_e coefficients already pay k_e log n.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from bench.core.random_streams import make_rng
+from bench.diagnosis.evaluation.noise_model import Likelihood, Mask, NoiseModel, maximise_likelihood
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter, compute_state_prior
+from sims.core.simulator import Array
+
+EffectNames = tuple[str, ...]
+
+MODELS_KEPT_PER_HORIZON = (12, 8)
+"""Numbers of models that continue after each fit horizon but the last, in patient fits."""
+MAX_ITERATIONS = 24
+"""Maximum number of steps of each fit."""
+MIN_SIGMA_SHARE = 1e-3
+"""Minimum standard deviation of a channel in generalised fits, as a share of its noise."""
+MAX_REWEIGHTED_FITS = 4
+"""Maximum number of fits of the reported model, each weighted by the previous residual."""
+MIN_GAIN_FOR_REWEIGHTING = 3.0
+"""Minimum gain in merit of such a fit for which another one is made."""
+MAX_REWEIGHTED_SQUARES_RATIO = 1.2
+"""Maximum growth factor of the sum of squares in a fit that assumes AR(1) noise.
+
+A fit that grows more was distorted by structure that is not noise.
+"""
+MAX_SEED = 2**62
+"""Upper limit of the integer that identifies the random number streams of a search."""
+_SIZES = {
+    0: ("the base model", "the base model"),
+    1: ("one effect", "single effects"),
+    2: ("one pair of effects", "pairs of effects"),
+    3: ("one set of three effects", "sets of three effects"),
+}
+"""Singular and plural description of models by number of effects, for the progress display."""
+MIN_EFFECTIVE_SAMPLES = 2
+"""Minimum number of samples assumed for the price of a parameter, because log 1 is zero."""
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A fitted model and its merit.
+
+    Attributes:
+        fit: the fit.
+        likelihood: likelihood of the residual of the fit.
+        penalised_log_likelihood: penalised log-likelihood (1); it counts parameters, coefficients,
+            and the initial states that the data determine.
+    """
+
+    fit: TrajectoryFit
+    likelihood: Likelihood
+    penalised_log_likelihood: float
+
+    @property
+    def effects(self) -> EffectNames:
+        """Names of the effects of the model."""
+        return self.fit.effects
+
+
+@dataclass
+class ModelSet:
+    """Fitted models of one recording, by their effects.
+
+    Attributes:
+        world: the runs for fitting.
+        noise: sensor noise.
+        frozen: indices of parameters that do not influence the data.
+        rng: source of all random numbers.
+        stated: (C,) whether the recording specifies the noise of each channel.
+        models: the best fit for each set of effects.
+        null_gains: gain of each effect under the null hypothesis, about the base model.
+        derived: fits whose derivatives were recomputed with central differences, each with its
+            original fit.
+    """
+
+    world: RunEvaluator
+    noise: NoiseModel
+    frozen: frozenset[int]
+    rng: np.random.Generator
+    stated: Mask
+    models: dict[frozenset[str], FittedModel] = field(default_factory=dict)
+    null_gains: dict[str, float] = field(default_factory=dict)
+    derived: dict[int, tuple[TrajectoryFit, TrajectoryFit]] = field(default_factory=dict)
+    _drawn: int = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._drawn = int(self.rng.integers(MAX_SEED))
+
+    def make_rng(self, question: str, names: Iterable[str] = ()) -> np.random.Generator:
+        """Return the random generator of a question about a model with the given effects.
+
+        It does not depend on earlier questions, so the answer does not either.
+
+        Args:
+            question: name of the question.
+            names: effects of the model.
+        """
+        return make_rng(self._drawn, question, *sorted(names))
+
+    @property
+    def observed_mask(self) -> Mask:
+        """Mask (R, T, C) of available samples."""
+        return np.isfinite(self.world.observed)
+
+    def compute_residual(self, fit: TrajectoryFit) -> Array:
+        """Return observed minus simulated (R, T, C), zero where no sample exists."""
+        left = self.world.observed - fit.simulated
+        residual: Array = np.where(self.observed_mask, left, 0.0)
+        return residual
+
+    def add_fit(self, fit: TrajectoryFit) -> FittedModel:
+        """Store a fit, unless a better fit of the same effects is known; return the better one."""
+        return self._entered(self._of(fit))
+
+    def _entered(self, model: FittedModel) -> FittedModel:
+        """Return the better one of a model and the stored model of the same effects."""
+        # The key does not depend on the order in which effects were added.
+        key = frozenset(model.effects)
+        if (
+            key not in self.models
+            or model.penalised_log_likelihood > self.models[key].penalised_log_likelihood
+        ):
+            self.models[key] = model
+            self.on_replaced(key)
+        return self.models[key]
+
+    def _of(self, fit: TrajectoryFit) -> FittedModel:
+        """Return a fit with its likelihood and merit."""
+        free = fit.free.size + count_identified_states(self.world, fit, self.noise)
+        # A model that could not be simulated is stored, too, so that it is not tried again.
+        found = _LOST
+        if np.isfinite(fit.cost):
+            found = maximise_likelihood(self.compute_residual(fit), self.observed_mask, free)
+        chance = sum(self.get_effect_penalty(name) for name in fit.effects)
+        merit = found.value - free * self.parameter_penalty - chance  # (1)
+        return FittedModel(fit, found, merit)
+
+    def with_sensitivities(self, start: FitStart) -> FitStart:
+        """Return a start with the derivatives that are known near it."""
+        return start
+
+    def force_of_any_shape(self, model: FittedModel) -> tuple[float, str] | None:  # noqa: ARG002
+        """Return the p-value of the best additional force and the signal that the force depends on.
+
+        Here always None: the test for unmodelled forces uses simulations.
+        """
+        return None
+
+    def on_replaced(self, key: frozenset[str]) -> None:
+        """Called after a model has replaced another one; does nothing here."""
+
+    @property
+    def parameter_penalty(self) -> float:
+        """Penalty log n of (1) for each parameter that the data determine."""
+        count = int(self.observed_mask.sum())
+        return float(np.log(max(count, MIN_EFFECTIVE_SAMPLES)))
+
+    def get_effect_penalty(self, name: str) -> float:
+        """Return the additional penalty of an effect, its part of the last term of (1)."""
+        slot = self.world.slots[name]
+        # If there are few shapes, the coefficients alone pay for the gain under the null
+        # hypothesis.
+        paid = (slot.stop - slot.start) * self.parameter_penalty
+        return float(max(self.null_gains.get(name, 0.0) - paid, 0.0))
+
+    def refit_models(
+        self,
+        starts: Sequence[FitStart],
+        noise: NoiseModel | None = None,
+        patient: bool = False,
+        race: bool = True,
+    ) -> None:
+        """Fit models from their starts and store them.
+
+        Args:
+            starts: starts of the fits.
+            noise: noise that weights the samples; None for `self.noise`.
+            patient: whether to fit the beginnings of the runs first, as in the base fit, and
+                continue with the best models.
+            race: whether to stop fits that fall far behind.
+        """
+        watch = self.world.watch
+        watch.report_and_check(f"refit of {_format_starts(starts)}")
+        noise = noise or self.noise
+        starts = [self.with_sensitivities(start) for start in starts]
+        if patient:
+            starts = self._sifted(starts, noise)
+        # Sums of squares with different weights are not comparable.
+        racing = race and noise is self.noise
+        reached = self._reached(starts) if racing else np.inf
+        fitter = TrajectoryFitter(self.world, noise, self.frozen)
+        watch.stage(_fitting(starts), len(starts))
+        for fit in fitter.fit_models(
+            starts, MAX_ITERATIONS, race=race, reached=reached, finished=watch.advance
+        ):
+            self.add_fit(fit)
+        # A fit that was stopped early is stored, but not evaluated.
+        watch.check_not_stopped()
+        self._report_best()
+
+    def fit_all(self, starts: Sequence[FitStart]) -> list[FittedModel]:
+        """Fit models from their starts together, and return the best fits of their effects."""
+        self.refit_models(starts, race=False)
+        return [self.models[frozenset(start.effects)] for start in starts]
+
+    def fit_one(self, start: FitStart) -> FittedModel:
+        """Fit a model from a start, and return the best fit of its effects."""
+        return self.fit_all([start])[0]
+
+    def _report_best(self) -> None:
+        """Report the model with the highest merit and the share of the discrepancy it removes."""
+        base = self.models.get(frozenset())
+        best = max(
+            self.models.values(), key=lambda model: model.penalised_log_likelihood, default=base
+        )
+        if base is None or best is None or not best.effects:
+            return
+        gap = self.compute_excess(base)
+        if gap > 0 and np.isfinite(gap):
+            share = 1.0 - max(self.compute_excess(best), 0.0) / gap
+            self.world.watch.found(best.effects, max(share, 0.0))
+
+    def refine_jacobian(self, model: FittedModel) -> FittedModel:
+        """Return the model with derivatives at its own parameters, computed at most once.
+
+        This is needed if the fit ended with derivatives from a nearby point.
+        """
+        if model.fit.is_own_jacobian or not np.isfinite(model.fit.cost):
+            return model
+        known = self.models.get(frozenset(model.effects))
+        if known is not None and known.fit.is_own_jacobian and known.fit.theta is model.fit.theta:
+            return known
+        fitter = TrajectoryFitter(self.world, self.noise, self.frozen)
+        (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
+        result = replace(model, fit=replace(model.fit, jacobian=fit.jacobian, is_own_jacobian=True))
+        if known is model:
+            self.models[frozenset(model.effects)] = result
+        return result
+
+    def fit_to_convergence(self, model: FittedModel) -> FittedModel:
+        """Return the model fitted to final convergence, weighted by the noise of its own residual.
+
+        With AR(1) noise, confidence intervals require generalised least squares. Far from the data,
+        the different weights also lead out of local minima, so the fit is repeated until it changes
+        nothing. A fit that leaves clearly larger residuals is rejected: with structured residuals,
+        this method prefers smooth residuals to small ones.
+        """
+        self.world.watch.stage("refining the model")
+        squares = TrajectoryFitter(self.world, self.noise).compute_cost
+        for _ in range(MAX_REWEIGHTED_FITS):
+            left = model.likelihood
+            if not np.isfinite(model.fit.cost):
+                break
+            # A channel without samples has no noise, and a channel without noise would have
+            # infinite weight.
+            sigma = np.where(np.isfinite(left.sigma), left.sigma, self.noise.sigma)
+            noise = NoiseModel(np.maximum(sigma, MIN_SIGMA_SHARE * self.noise.sigma), left.phi)
+            fitter = TrajectoryFitter(self.world, noise, self.frozen, exact=True)
+            (fit,) = fitter.fit_models([model.fit.make_start()], MAX_ITERATIONS)
+            if self.world.watch.has_abandoned_fits():
+                break
+            other = self._of(replace(fit, cost=squares(fit)))
+            if other.fit.cost > MAX_REWEIGHTED_SQUARES_RATIO * squares(model.fit):
+                break
+            gain = other.penalised_log_likelihood - model.penalised_log_likelihood
+            if gain < MIN_GAIN_FOR_REWEIGHTING:
+                if gain > 0:
+                    # The fits are so close that scores about the old one remain valid.
+                    model = self.models[frozenset(other.effects)] = other
+                break
+            model = self._entered(other)
+        return model
+
+    def _sifted(self, starts: Sequence[FitStart], noise: NoiseModel) -> list[FitStart]:
+        """Return the starts of the best models after all fit horizons but the last (whole runs)."""
+        begun = list(starts)
+        # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.
+        for horizon, count in zip(FIT_HORIZONS[:-1], MODELS_KEPT_PER_HORIZON, strict=True):
+            fitter = TrajectoryFitter(self.world, noise, self.frozen, horizon.share)
+            fits = fitter.fit_models(begun, horizon.iterations)
+            fits.sort(key=lambda fit: fit.cost)
+            begun = [fit.make_start() for fit in fits[:count]]
+        return begun
+
+    def _reached(self, starts: Sequence[FitStart]) -> float:
+        """Return the lowest cost of known models with at most as many effects as the starts."""
+        most = max(len(start.effects) for start in starts)
+        known = self.models.values()
+        costs = [m.fit.cost for m in known if 0 < len(m.effects) <= most]
+        return min(costs, default=np.inf)
+
+    def get_best(self, size: int) -> FittedModel | None:
+        """Return the model with the highest merit among those with `size` effects."""
+        known = self.models.values()
+        models = [m for m in known if len(m.effects) == size]
+        return max(models, key=lambda m: m.penalised_log_likelihood) if models else None
+
+    def compute_excess(self, model: FittedModel) -> float:
+        """Return the RMS residual of a model in units of the noise floor, minus one."""
+        scaled = self.compute_residual(model.fit) / self.noise.sigma
+        squares = np.square(scaled[self.observed_mask])
+        return float(np.sqrt(squares.mean())) - 1.0
+
+    def compute_channel_weights(self, model: FittedModel) -> NoiseModel:
+        """Return noise that is raised to the residual of a model where that is larger."""
+        sigma = model.likelihood.sigma
+        # A channel without samples has no sigma, and its weight has no influence.
+        left = np.where(np.isfinite(sigma), sigma, 0.0)
+        return NoiseModel(np.maximum(self.noise.sigma, left), self.noise.phi)
+
+
+def _format_starts(starts: Sequence[FitStart]) -> str:
+    """Return a short description of the models that start there."""
+    names = list(dict.fromkeys(" + ".join(start.effects) or "the base model" for start in starts))
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"{names[0]}{more}" if names else "nothing"
+
+
+def _fitting(starts: Sequence[FitStart]) -> str:
+    """Return the name of the stage that fits these models, by their number of effects."""
+    size = max((len(start.effects) for start in starts), default=0)
+    one, several = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
+    return f"fitting {one if len(starts) == 1 else several}"
+
+
+def count_identified_states(world: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel) -> float:
+    """Return the number of initial states that the data determine, summed over all runs.
+
+    These are the effective degrees of freedom of ridge regression (T. Hastie, R. Tibshirani, J.
+    Friedman, The Elements of Statistical Learning, 2nd ed., section 3.4.1); a state without
+    influence does not count. With the derivatives B_i of run i by its initial state in units of the
+    noise, the prior π, and the eigenvalues λ_ij of π B_iᵀ B_i π:
+
+        f = Σ_ij λ_ij / (1 + λ_ij)                                                               (2)
+
+    Args:
+        world: the runs.
+        fit: the fitted model.
+        noise: noise of each channel.
+    """
+    seen = np.isfinite(world.observed)
+    states = fit.jacobian[..., fit.free.size :]
+    counted = np.where(seen[..., None], states, 0.0)
+    scaled = counted / noise.sigma[:, None]
+    # The shape is written out, because -1 is ambiguous if there are no states.
+    runs, length, channels, size = scaled.shape
+    columns = scaled.reshape(runs, length * channels, size) * compute_state_prior(world)
+    # A known state is not a degree of freedom.
+    columns = np.where(world.known[:, None, :], 0.0, columns)
+    normal = np.matmul(columns.transpose(0, 2, 1), columns)
+    eigenvalues = np.linalg.eigvalsh(normal)
+    # Rounding may make an eigenvalue slightly negative.
+    fixed = eigenvalues / (1.0 + np.maximum(eigenvalues, 0.0))  # (2)
+    return float(fixed.clip(0.0, 1.0).sum())
+
+
+_LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
+"""Likelihood of a model that could not be simulated."""

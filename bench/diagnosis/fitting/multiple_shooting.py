@@ -1,0 +1,114 @@
+"""Multiple shooting: fit short segments of the runs first, to start long fits near the minimum.
+
+Over a long run, a small change of a period, a limit or a delay moves the trajectory far from the
+data, so the sum of squares has many local minima. It has few over short segments, because every
+segment starts at the data (multiple shooting; H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7).
+With the observation y, the simulated observation h at time t, and the state z_k of segment k at its
+start time τ_k, the segments are fitted by
+
+    min over θ, z_1 ... z_K of  Σ_k Σ_{τ_k ≤ t < τ_{k+1}} |y(t) - h(t; z_k, θ)|² / σ²            (1)
+
+Bock also requires that segment k ends where segment k + 1 begins. This constraint is omitted here:
+the segment fit only gives a start for the fit of whole runs, which enforces continuity, and decides
+nothing itself.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from sims.core.simulator import Array
+from sims.recording.recording import Run
+
+SEGMENTS_PER_RUN = 4
+"""Maximum number of segments per run; a run gets fewer if the segments would be too short."""
+MIN_MEAN_SEGMENT_SAMPLES = 20
+"""Minimum number of samples per segment, on average over the segments of a run."""
+MAX_MISSING_FACTOR = 2
+"""Factor by which a single segment may have fewer samples than `MIN_MEAN_SEGMENT_SAMPLES`, due to missing samples."""
+RUN_END_SHARE = 0.1
+"""Share of a run, at its end, in which the influence of the initial state is measured."""
+MAX_STATE_INFLUENCE = 0.1
+"""Maximum influence of the initial state on the end of a run if the run forgets its initial state.
+
+The influence is a share of the largest influence within the run.
+"""
+
+
+def make_segment_evaluator(world: RunEvaluator) -> RunEvaluator | None:
+    """Return a `RunEvaluator` of the segments with the same parameters.
+
+    A floating base is excluded, because its pose at the start of a segment is not known. A system
+    that bounces is excluded, too: for a segment that starts near an impact, the side of the impact
+    is ambiguous, and for a ball that comes to rest the fit searches among hundreds of small bounces
+    (this takes minutes in the updraft cases of the exam).
+
+    Args:
+        world: the whole runs.
+
+    Returns:
+        The segments as runs, or None if every run is too short for two segments, or if the system
+        has a floating base or bounces.
+    """
+    if world.simulator.system.bounces or world.simulator.system.afloat:
+        return None
+    runs = [piece for run in world.runs for piece in _split_run(run)]
+    if len(runs) == len(world.runs):
+        return None
+    return world.with_runs(runs)
+
+
+def _split_run(run: Run) -> list[Run]:
+    """Return the segments of a run, or the run itself if it is too short."""
+    # A time counts as sampled if any channel has a sample.
+    values = np.stack(list(run.channels.values()))
+    seen: Mask = np.any(np.isfinite(values), axis=0)
+    count = int(np.clip(seen.sum() // MIN_MEAN_SEGMENT_SAMPLES, 1, SEGMENTS_PER_RUN))
+    edges = np.linspace(0, run.times.size, count + 1).astype(int)
+    parts = [slice(a, b) for a, b in pairwise(edges)]
+    # Segments have equal length, but one of them may have too many missing samples.
+    if any(seen[part].sum() < MIN_MEAN_SEGMENT_SAMPLES // MAX_MISSING_FACTOR for part in parts):
+        return [run]
+    return [run.part(part, f"{run.name}.{n}") for n, part in enumerate(parts)]
+
+
+def join_segment_fits(world: RunEvaluator, found: TrajectoryFit) -> FitStart:
+    """Return the start of a fit of the whole runs from a fit of their segments.
+
+    Args:
+        world: the whole runs.
+        found: fit of the segments of `world`.
+
+    Returns:
+        The fitted parameters, with the initial states of the first segment of each run.
+    """
+    counts = [len(_split_run(run)) for run in world.runs]
+    # The initial state of a run is that of its first segment.
+    first = np.cumsum([0, *counts])[:-1]
+    return FitStart(found.effects, found.theta, found.states[first])
+
+
+def forgets_initial_state(world: RunEvaluator, noise: NoiseModel, derivatives: Array) -> bool:
+    """Return whether initial states hardly influence the last samples of each run.
+
+    In that case a fit of whole runs has no more local minima than a fit of their segments.
+
+    Args:
+        world: the runs.
+        noise: noise of each channel.
+        derivatives: (R, T, C, s) derivatives of the simulated runs by their initial states; zero
+            for known states.
+    """
+    seen = np.isfinite(world.observed)[..., None]
+    sizes = np.abs(np.where(seen, derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
+    for run, length in zip(sizes, world.lengths, strict=True):
+        last = run[int((1.0 - RUN_END_SHARE) * length) : int(length)]
+        # If all initial states of a run are known, the decay of their influence cannot be measured.
+        if not run.any() or (last.max(axis=0) > MAX_STATE_INFLUENCE * run.max(axis=0)).any():
+            return False
+    return True

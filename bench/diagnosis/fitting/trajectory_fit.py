@@ -1,0 +1,471 @@
+"""Least-squares fit of trajectories with shared parameters and initial states of each run.
+
+Levenberg-Marquardt for many models at once, so that one engine call serves all of them. A single
+step of one model is in `arrow`. AR(1) noise is whitened first (`noise`), so the fit is a
+generalised least-squares fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, whiten
+from bench.diagnosis.evaluation.run_evaluator import MIN_CHUNK_SIZE, Indices, RunEvaluator
+from bench.diagnosis.fitting.finite_differences import (
+    INITIAL_PARAMETER_STEP,
+    INITIAL_STATE_STEP,
+    build_displaced_inputs,
+    compute_difference_steps,
+    is_finite_response,
+)
+from bench.diagnosis.fitting.fit_state import (
+    MAX_DAMPING,
+    FitPoint,
+    FitStart,
+    FitState,
+    TrajectoryFit,
+)
+from bench.diagnosis.fitting.gauss_newton import compute_gauss_newton_step
+from bench.diagnosis.fitting.racing import (
+    MIN_ITERATIONS_BEFORE_ELIMINATION,
+    RacingRound,
+    eliminate_losing_fits,
+    iterate_rounds,
+)
+from sims.core.simulator import Array
+
+UNOBSERVED_STATE_PRIOR_SIGMA = 3.0
+"""Prior standard deviation of an initial state that no sample shows, SI units."""
+OBSERVED_STATE_PRIOR_SIGMA = 100.0
+"""Prior standard deviation of an initial state that samples show, SI units.
+
+It is so wide that the samples alone decide.
+"""
+
+GROUP_COST_SAMPLES = 60_000
+"""Approximate cost of one step of a group of models, in simulated samples."""
+ALGEBRA_COST_SAMPLES = 8_000
+"""Cost of solving the equations of one model, in simulated samples."""
+
+_TrialStep = tuple[FitState, FitStart]
+"""A model, and the point that its next step proposes."""
+
+
+@dataclass(frozen=True)
+class TrajectoryFitter:
+    """Fits models to the runs of a `RunEvaluator`.
+
+    Attributes:
+        world: the runs.
+        noise: noise of each channel.
+        frozen: indices of parameters that are not fitted, because the data do not show them.
+        share: only this initial share of each run counts.
+        parameters: False to fit only initial states.
+        exact: whether fits are refined to final convergence, as needed for reported parameters.
+    """
+
+    world: RunEvaluator
+    noise: NoiseModel
+    frozen: frozenset[int] = frozenset()
+    share: float = 1.0
+    parameters: bool = True
+    exact: bool = False
+
+    def fit_models(
+        self,
+        starts: Sequence[FitStart],
+        iterations: int = 12,
+        race: bool = False,
+        reached: float = np.inf,
+        finished: Callable[[], None] = lambda: None,
+    ) -> list[TrajectoryFit]:
+        """Fit each model from its start.
+
+        Args:
+            starts: starts of the fits; one or more.
+            iterations: maximum number of steps of each fit.
+            race: whether to stop fits that are far behind the best fit or behind `reached`.
+            reached: lowest cost of other models.
+            finished: called once for each model whose fit has ended.
+
+        Returns:
+            The fits in the order of their starts.
+        """
+        problems = [self._problem(start) for start in starts]
+        for leg in iterate_rounds(iterations, race):
+            # Unfinished fits continue in groups, which exchange nothing within a round.
+            going = [i for i, problem in enumerate(problems) if not problem.is_finished]
+            if not going or (
+                leg.first and self.world.watch.should_abandon_fit(leg.first / iterations)
+            ):
+                break
+            best = min(reached, *(problem.point.cost for problem in problems))
+            groups = self._groups(problems, going)
+            calls = [(self._terms(), [problems[i] for i in g], leg, race, best) for g in groups]
+            for number, members in self.world.crew.map_unordered(self.world, _advance_group, calls):
+                for i, problem in zip(groups[number], members, strict=True):
+                    problems[i] = problem
+                    if problem.is_finished or leg.last >= iterations:
+                        finished()
+        return [p.make_fit() for p in problems]
+
+    def _terms(self) -> tuple[Any, ...]:
+        """Return all fields except the world, as sent to workers."""
+        return self.noise, self.frozen, self.share, self.parameters, self.exact
+
+    def _groups(self, problems: Sequence[FitState], going: Sequence[int]) -> list[list[int]]:
+        """Split unfinished fits into groups of about `GROUP_COST_SAMPLES` simulated samples.
+
+        Each group has models of one kind as far as possible. There is only one group if large
+        engine calls cost less per batch element.
+        """
+        world = self.world
+        if not world.is_cheap_to_split:
+            return [list(going)]
+        runs, length, _ = world.observed.shape
+        unknown = self._moved_states().size
+        lanes = sum(1 + problems[i].free.size + unknown for i in going) * runs
+        cost = lanes * length * self.share + ALGEBRA_COST_SAMPLES * len(going)
+        # Compiled batch elements are stepped in parallel, however long they are.
+        count = int(np.ceil(min(cost / GROUP_COST_SAMPLES, lanes / MIN_CHUNK_SIZE)))
+        kinds = world.group_compatible(np.stack([problems[i].point.start.theta for i in going]))
+        order = [going[i] for i in np.argsort(kinds, kind="stable")]
+        parts = np.array_split(order, min(count, len(order)))
+        return [part.tolist() for part in parts]
+
+    def advance_round(
+        self, problems: Sequence[FitState], leg: RacingRound, race: bool, reached: float
+    ) -> list[FitState]:
+        """Advance fits by one racing round.
+
+        Args:
+            problems: states of the fits.
+            leg: the steps to make.
+            race: whether to stop fits that are far behind the best fit or behind `reached`.
+            reached: lowest cost of other models, including those of other groups.
+
+        Returns:
+            The fits after the round.
+        """
+        # Mask of the samples that count, (R, T, C).
+        seen = self.world.get_sample_mask(self.share)
+        if not leg.first:
+            self._begin(problems, seen)
+        for iteration in range(leg.first, leg.last):
+            # In the first steps even the correct model may be far behind.
+            if race and iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION:
+                eliminate_losing_fits(problems, reached)
+            self._renew(
+                problems, seen, waiting=not race or iteration >= MIN_ITERATIONS_BEFORE_ELIMINATION
+            )
+            trials = list(self._trials(problems, seen))
+            if not trials and any(p.is_waiting and not p.is_finished for p in problems):
+                continue
+            # The caller checks whether the fit was stopped early here.
+            if not trials or self.world.watch.should_abandon_fit(iteration / leg.all):
+                break
+            made = self._plain_points if self.world.has_linearisation else self._points
+            for (problem, _), point in zip(trials, made(trials, seen), strict=True):
+                self._judge(problem, point)
+        return list(problems)
+
+    def _begin(self, problems: Sequence[FitState], seen: Mask) -> None:
+        """Simulate the starts, and compute derivatives or reuse known ones from nearby."""
+        nearby = [p for p in problems if self._knows(p)]
+        others = [p for p in problems if not self._knows(p)]
+        if others:
+            begun = self._points([(p, p.point.start) for p in others], seen)
+            for problem, point in zip(others, begun, strict=True):
+                self._take(problem, point)
+        if nearby:
+            begun = self._plain_points([(p, p.point.start) for p in nearby], seen)
+            for problem, point in zip(nearby, begun, strict=True):
+                assert point.start.known is not None
+                own = self._begun(problem, point.start, point.simulated.shape[1])
+                known = point.start.known.jacobian[:, : point.simulated.shape[1]]
+                self._take(problem, replace(point, jacobian=np.concatenate([known, own], axis=3)))
+                problem.has_own_jacobian = False
+
+    def _knows(self, problem: FitState) -> bool:
+        """Return whether derivatives by all fitted parameters are known near the start."""
+        known = problem.point.start.known
+        return (
+            self.world.has_linearisation
+            and known is not None
+            and np.array_equal(known.free, problem.free)
+        )
+
+    def _renew(self, problems: Sequence[FitState], seen: Mask, waiting: bool) -> None:
+        """Recompute the derivatives of fits whose present ones are not good enough.
+
+        Fits that can wait are included only if `waiting` is true.
+        """
+        stale = [
+            p
+            for p in problems
+            if p.is_jacobian_stale and not p.is_finished and (waiting or not p.is_waiting)
+        ]
+        if not stale:
+            return
+        for problem in stale:
+            problem.renewals += 1
+            if problem.needs_own_states:
+                # Imported here, because only robots need it.
+                from bench.diagnosis.fitting.linearised_runs import begun_about
+
+                at = problem.point.start
+                problem.by_states = begun_about(self.world, at.theta, at.states)
+        points = self._points([(p, p.point.start) for p in stale], seen)
+        for problem, point in zip(stale, points, strict=True):
+            self._take(problem, point)
+
+    def _problem(self, start: FitStart) -> FitState:
+        """Create the state of a fit: the fitted parameters, their bounds and step sizes."""
+        world = self.world
+        free: list[int] = []
+        bounds: list[tuple[float, float]] = []
+        if self.parameters:
+            free += [i for i in world.base.tolist() if i not in self.frozen]
+            bounds += [world.parameters[i].bounds for i in free]
+            for name in start.effects:
+                free += world.get_coefficient_indices(name)
+                bounds += compute_coefficient_bounds(world, name)
+        # The shape has two columns even if nothing is fitted.
+        table = np.array(bounds, dtype=np.float64).reshape(-1, 2)
+        low, high = table.T
+
+        # Plausible ranges scale the finite differences; a fit may go far beyond them.
+        plausible = [world.parameters[i].bounds for i in free]
+        widths = np.array([b - a for a, b in plausible], dtype=np.float64)
+        state_steps = np.full(len(world.states), INITIAL_STATE_STEP)
+
+        # A start may have a size from a score test, or come from wider bounds.
+        theta = start.theta.copy()
+        theta[free] = np.clip(theta[free], low, high)
+        begun = FitStart(start.effects, theta, start.states.copy(), start.known)
+        return FitState(
+            point=FitPoint(begun, np.empty(0), np.empty(0), np.inf),
+            free=np.array(free, dtype=np.intp),
+            low=low,
+            high=high,
+            widths=widths,
+            steps=np.concatenate([INITIAL_PARAMETER_STEP * widths, state_steps]),
+            is_final_fit=self.exact,
+            rough=world.has_linearisation,
+            samples=int(world.get_sample_mask(self.share).sum()),
+        )
+
+    def _points(self, trials: Sequence[_TrialStep], seen: Mask) -> list[FitPoint]:
+        """Simulate trial points together with their derivatives and cost.
+
+        One engine call contains every run of every model with every unknown displaced, so it
+        integrates over time only once. An initial state that is known in every run is not an
+        unknown.
+        """
+        runs, size = self.world.guess.shape
+        unknown = self._moved_states()
+        steps = [problem.compute_inward_steps(start.theta) for problem, start in trials]
+        moved = [
+            build_displaced_inputs(start, problem.free, step, unknown)
+            for (problem, start), step in zip(trials, steps, strict=True)
+        ]
+        # Batch elements are ordered by model, then by unknown, then by run.
+        thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in moved])
+        states = np.concatenate([begin.reshape(-1, size) for _, begin in moved])
+        lanes = np.tile(np.arange(runs), len(thetas) // runs)
+        simulated = self.world.simulate(thetas, lanes, states, self.share)
+        simulated = simulated.reshape(-1, runs, *simulated.shape[1:])
+
+        points = []
+        first = 0
+        for (problem, start), step in zip(trials, steps, strict=True):
+            # The first element is not displaced; each other one has one unknown displaced.
+            last = first + 1 + problem.free.size + unknown.size
+            part = simulated[first:last]
+            first = last
+            jacobian = self._derivatives(part, step, unknown)
+            if self.world.has_linearisation:
+                jacobian[..., problem.free.size :] = self._begun(problem, start, part.shape[2])
+            cost = self._cost(part[0], start.states, seen)
+            points.append(FitPoint(start, part[0], jacobian, cost))
+        return points
+
+    def _plain_points(self, trials: Sequence[_TrialStep], seen: Mask) -> list[FitPoint]:
+        """Simulate trial points, and keep the derivatives of the present point of each fit."""
+        runs = len(self.world.guess)
+        simulated = self.world.simulate(
+            np.concatenate([np.tile(start.theta, (runs, 1)) for _, start in trials]),
+            np.tile(np.arange(runs), len(trials)),
+            np.concatenate([start.states for _, start in trials]),
+            self.share,
+        ).reshape(len(trials), runs, *self.world.observed.shape[1:])
+        return [
+            FitPoint(start, part, problem.point.jacobian, self._cost(part, start.states, seen))
+            for (problem, start), part in zip(trials, simulated, strict=True)
+        ]
+
+    def _moved_states(self) -> Indices:
+        """Return the indices (n,) of initial states that finite differences displace.
+
+        There are none if the derivatives come from a linearisation.
+        """
+        if self.world.has_linearisation:
+            return np.array([], dtype=np.intp)
+        return np.flatnonzero(~self.world.known.all(axis=0))
+
+    def _begun(self, problem: FitState, start: FitStart, samples: int) -> Array:
+        """Return derivatives (R, T, C, s) by initial states, zero where a state is known.
+
+        They are those of the fit itself, if it has any, or those that all models share.
+        """
+        world = self.world
+        # Imported here, because only robots need it.
+        from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+
+        shared = problem.by_states
+        if shared is None:
+            shared = compute_state_jacobian(world, start.theta, start.states)
+        derivatives = shared[:, :samples]
+        kept: Array = derivatives * ~world.known[:, None, None, :]
+        return kept
+
+    def _derivatives(self, part: Array, steps: Array, unknown: Indices) -> Array:
+        """Compute finite-difference derivatives (R, T, C, q + s).
+
+        They are zero for known initial states, which therefore absorb nothing of the residual.
+
+        Args:
+            part: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
+            steps: (q + s,) displacements.
+            unknown: (n,) indices of the initial states that are displaced.
+        """
+        known = self.world.known
+        q = steps.size - known.shape[1]
+        columns = np.concatenate([np.arange(q), q + unknown])
+        # An abandoned batch element is NaN, so the effect of its unknown is not known.
+        with np.errstate(all="ignore"):
+            quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
+        jacobian: Array = np.where(is_finite_response(quotients), quotients, 0.0)
+        if columns.size == steps.size:
+            return jacobian
+        quotients, jacobian = jacobian, np.zeros((*part.shape[1:], steps.size))
+        jacobian[..., columns] = quotients
+        jacobian[..., q:] *= ~known[:, None, None, :]
+        return jacobian
+
+    def _take(self, problem: FitState, point: FitPoint) -> None:
+        """Move a fit to a point, and adapt its difference steps to the responses there."""
+        problem.point = point
+        problem.has_own_jacobian, problem.is_jacobian_stale, problem.is_waiting = True, False, False
+        problem.steps = compute_difference_steps(point.jacobian, self.noise, problem.widths)
+
+    def _residual(self, simulated: Array, seen: Mask) -> Array:
+        """Return observed minus simulated (R, T, C), zero where no sample counts."""
+        residual: Array = np.where(seen, self.world.observed - simulated, 0.0)
+        return residual
+
+    def _drift(self, states: Array) -> Array:
+        """Return the deviations (R, s) of initial states from their guesses, in prior sigmas."""
+        drift: Array = (states - self.world.guess) / compute_state_prior(self.world)
+        return drift
+
+    def compute_cost(self, fit: TrajectoryFit) -> float:
+        """Return the cost of a fit for the noise of this fitter."""
+        return self._cost(fit.simulated, fit.states, self.world.get_sample_mask(self.share))
+
+    def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
+        """Return the cost, eq. (1) of `arrow`; infinite if the simulation was abandoned."""
+        residual = self._residual(simulated, seen)
+        # An abandoned batch element is NaN, which cannot be compared.
+        if not np.isfinite(residual).all():
+            return np.inf
+        w = whiten(residual, seen, self.noise)
+        drift = self._drift(states)
+        return float((w * w).sum() + (drift * drift).sum())
+
+    def _trials(self, problems: Sequence[FitState], seen: Mask) -> Iterator[_TrialStep]:
+        """Yield the next trial of each unfinished fit; a fit without a useful step is finished."""
+        for problem in problems:
+            if problem.is_finished or problem.is_waiting:
+                continue
+            trial = self._trial(problem, seen)
+            if trial is not None:
+                yield problem, trial
+
+    def _trial(self, problem: FitState, seen: Mask) -> FitStart | None:
+        """Return the next parameters and initial states to try.
+
+        If no decrease is predicted, mark the fit as finished or waiting, and return None.
+        """
+        at = problem.point
+        # There is no descent direction from a point that could not be simulated.
+        if not np.isfinite(at.cost):
+            problem.is_finished = True
+            return None
+
+        left = self._residual(at.simulated, seen)
+        derivatives = np.where(seen[..., None], at.jacobian, 0.0)
+        residual = whiten(left, seen, self.noise)
+        jacobian = whiten(derivatives, seen, self.noise)
+        step = compute_gauss_newton_step(
+            residual,
+            jacobian,
+            problem.free.size,
+            self._drift(at.start.states),
+            compute_state_prior(self.world),
+            self.world.known,
+            problem.damping,
+            problem.find_blocked_parameters(
+                residual, jacobian
+            ),  # clipping them afterwards would distort the step
+        )
+        problem.predicted_decrease = step.predicted_decrease
+        # The fit has converged, no step is short enough, or numbers overflow.
+        if (
+            not np.isfinite(step.predicted_decrease)
+            or step.predicted_decrease < problem.get_tolerance(at.cost)
+            or problem.damping > MAX_DAMPING
+        ):
+            problem.mark_converged()
+            return None
+
+        # Copy the parameters, because the old point is still needed if the trial is rejected.
+        theta = at.start.theta.copy()
+        moved = theta[problem.free] + step.parameter_step
+        theta[problem.free] = np.clip(moved, problem.low, problem.high)
+        return replace(at.start, theta=theta, states=at.start.states + step.state_steps)
+
+    def _judge(self, problem: FitState, point: FitPoint) -> None:
+        """Accept a trial point if its cost is lower, and update the damping."""
+        gained = problem.point.cost - point.cost
+        own = problem.has_own_jacobian
+        if point.cost < problem.point.cost:
+            if self.world.has_linearisation:
+                problem.point = replace(point, jacobian=problem.update_jacobian(point))
+                problem.has_own_jacobian = not problem.free.size
+            else:
+                self._take(problem, point)
+            problem.accept_step(gained, point.cost, own)
+        else:
+            problem.reject_step()
+
+
+def _advance_group(world: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> list[FitState]:
+    """Advance one group of fits by one racing round; runs in this process or in a worker."""
+    return TrajectoryFitter(world, *terms).advance_round(*call)
+
+
+def compute_state_prior(world: RunEvaluator) -> Array:
+    """Return the prior standard deviations (s,) of the initial states."""
+    if world.state_prior is not None:
+        return world.state_prior
+    system, shown = world.simulator.system, set(world.channels)
+    # Samples of a coordinate also show its rate; a user-defined system may have further states.
+    pairs = dict(zip(system.rates, system.coordinates, strict=False))
+    measured = [name in shown or pairs.get(name) in shown for name in world.states]
+    return np.where(measured, OBSERVED_STATE_PRIOR_SIGMA, UNOBSERVED_STATE_PRIOR_SIGMA)

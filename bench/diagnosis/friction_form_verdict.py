@@ -1,0 +1,195 @@
+"""Form of a robot's dry friction: stiff or soft.
+
+Stiff is Coulomb friction. Soft is the friction that MuJoCo computes from `frictionloss` with the
+solver parameters of the model file.
+
+A simulator adds all dry friction in one form. A form is therefore compared by fitting the same
+effects with a run evaluator of the other form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from bench.core.random_streams import make_rng
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from sims.core.simulator import Array
+from sims.core.system import Effect, Friction, members_of
+from sims.system_simulator import SystemSimulator
+
+_HOLDS = ", and holds still what pulls less"
+"""Part of the description of Coulomb friction that does not hold for the soft form, which creeps.
+"""
+
+
+def soft_kind(kind: type[SystemSimulator]) -> type[SystemSimulator]:
+    """Return the simulator class of a robot with dry friction in MuJoCo's soft form."""
+    robot: Any = kind
+    soft: type[SystemSimulator] = robot.with_friction_form("soft")
+    return soft
+
+
+def has_dry_friction(world: RunEvaluator, names: Iterable[str]) -> bool:
+    """Return whether effects or freed numbers of a robot contain dry friction.
+
+    Only then the form of dry friction matters.
+
+    Args:
+        world: Run evaluator; its simulator may be a robot.
+        names: Names of effects.
+    """
+    robot: Any = world.kind
+    if not robot.has_model:
+        return False
+    freed: list[type[Effect]] = list(robot.system.freed_effects)
+    plain = [plain_friction(world, name) for name in names]
+    effects = [*(type(world.available_effects[name]) for name in plain), *freed]
+    return any(_is_dry_friction(effect) for effect in effects)
+
+
+def has_soft_form(world: RunEvaluator) -> bool:
+    """Return whether the effects of a robot add dry friction in MuJoCo's soft form."""
+    robot: Any = world.kind
+    return bool(robot.has_model and robot.robot.friction_form == "soft")
+
+
+def form_of(world: RunEvaluator, name: str) -> str | None:
+    """Return ``soft`` for dry friction in MuJoCo's soft form, and None for other effects.
+
+    Args:
+        world: Run evaluator with the effect.
+        name: Name of the effect.
+    """
+    is_soft = has_soft_form(world) and _is_dry_friction(type(world.available_effects[name]))
+    return "soft" if is_soft else None
+
+
+def with_solver_parameters(world: RunEvaluator, name: str, says: str) -> str:
+    """Add the soft form to the description of an effect, before the place in brackets at its end.
+
+    For example ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
+
+    Args:
+        world: Run evaluator with the effect.
+        name: Name of the effect.
+        says: Description of the effect.
+    """
+    robot: Any = world.kind
+    effect = type(world.available_effects[name])
+    members = members_of(effect)
+    joints = [joint for joint in robot.robot.joints if joint.single]
+    places = [member.coordinate for member in members if member.coordinate is not None]
+    dofs = [joints[place].velocity for place in places]
+    parameters = {tuple(robot.robot.compiled.dof_solref[dof].tolist()) for dof in dofs}
+    text = " or ".join(" ".join(f"{value:g}" for value in pair) for pair in sorted(parameters))
+    sentence, bracket, place = says.partition(" (at ")
+    sentence = sentence.removesuffix(_HOLDS)
+    return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
+
+
+def is_likelier_soft(models: ModelSet, model: FittedModel, margin: float) -> bool:
+    """Return whether a robot model with dry friction is likelier with MuJoCo's soft form.
+
+    The dry friction may be an effect or a free number.
+
+    Args:
+        models: Models with stiff friction, with their noise and frozen parameters.
+        model: One of these models, fitted.
+        margin: Minimum gain in twice the log-likelihood.
+    """
+    if not has_dry_friction(models.world, model.effects) or has_soft_form(models.world):
+        return False
+    other = models.world.with_kind(soft_kind(models.world.kind))
+    try:
+        return choose_friction_form(models, model, other, margin) is not None
+    finally:
+        other.close()
+
+
+def choose_friction_form(
+    models: ModelSet, model: FittedModel, other: RunEvaluator, margin: float
+) -> FittedModel | None:
+    """Refit a model with the other form of dry friction, and return it if it is likelier.
+
+    Effects with a state that contain dry friction, such as hysteresis, do not act through
+    `frictionloss`. They are replaced by the dry friction that they contain, because they may only
+    imitate the other form.
+
+    Args:
+        models: Models of the present form, with their noise and frozen parameters.
+        model: One of these models, for which `has_dry_friction` is true.
+        other: Run evaluator of the same runs and parameters, with a simulator of the other form.
+        margin: Minimum gain in twice the log-likelihood.
+
+    Returns:
+        The model in the other form; None if the present form is kept.
+    """
+    fitted = _refit_in(other, models, model)
+    gain = fitted.likelihood.value - model.likelihood.value
+    return fitted if gain >= margin else None
+
+
+def _refit_in(world: RunEvaluator, models: ModelSet, model: FittedModel) -> FittedModel:
+    """Fit the effects of a model with a run evaluator of the other form."""
+    names, theta = with_plain_friction(models.world, model.effects, model.fit.theta)
+    # The random numbers of these models do not affect the result.
+    others = ModelSet(world, models.noise, models.frozen, make_rng("friction form"), models.stated)
+    fitted = others.fit_one(FitStart(names, theta, model.fit.states))
+    if models.world.correction is None:
+        return fitted
+    # Both forms are compared without the discretisation error of the integrator.
+    from bench.diagnosis.fitting.linearised_runs import correct_discretisation
+
+    correct_discretisation(world, models.noise, fitted.fit.theta, fitted.fit.states)
+    others.models.clear()
+    return others.fit_one(fitted.fit.make_start())
+
+
+def _is_dry_friction(effect: type[Effect]) -> bool:
+    """Return whether an effect, or a member of a family, acts through `frictionloss`."""
+    members = getattr(effect, "members", ())
+    return issubclass(effect, Friction) or any(isinstance(one, Friction) for one in members)
+
+
+def plain_friction(world: RunEvaluator, name: str) -> str:
+    """Return the dry friction that an effect with a state contains, or else the effect itself.
+
+    Args:
+        world: Run evaluator with the effect.
+        name: Name of the effect.
+    """
+    effect = world.available_effects[name]
+    if effect.hook != "hidden":
+        return name
+    contained = [n for n in effect.contains if n in world.available_effects]
+    friction = [n for n in contained if _is_dry_friction(type(world.available_effects[n]))]
+    return friction[0] if friction else name
+
+
+def with_plain_friction(
+    world: RunEvaluator, names: Iterable[str], theta: Array
+) -> tuple[tuple[str, ...], Array]:
+    """Replace effects with a state by the dry friction that they contain.
+
+    Args:
+        world: Run evaluator of the runs.
+        names: Names of the effects of a model.
+        theta: (P,) parameters of the model.
+
+    Returns:
+        Names of the effects and parameters of the model without these states.
+    """
+    theta, plain = theta.copy(), dict[str, None]()
+    for name in names:
+        friction = plain_friction(world, name)
+        plain[friction] = None
+        if friction != name:
+            # The first coefficient of both effects is the limit of the friction force.
+            theta[world.get_coefficient_indices(friction)[0]] += theta[
+                world.get_coefficient_indices(name)[0]
+            ]
+            theta[world.get_coefficient_indices(name)] = 0.0
+    return tuple(plain), theta

@@ -1,0 +1,305 @@
+"""Identifiability of each parameter and cause: identifiable, weak or not, and what it confounds.
+
+D are the derivatives of all recorded samples by the parameters, in units of the noise and projected
+onto the complement of the derivatives by the initial states of each run. The covariance of a fit is
+then the inverse of the Fisher information
+
+    F = D'D,    cov = F^-1                                                                     (1)
+
+(E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data, 1997, chapter
+4; C. Brun, P. Reichert, H. R. Kuensch, Water Resources Research 37(4), 1015, 2001, for weak and
+collinear parameters). Free parameters are assessed together. Each cause is assessed alone, in
+addition to the free parameters, because causes are tested one at a time. Two causes are confounded
+if their derivatives are nearly parallel,
+
+    corr = |d_i'd_j| / (|d_i| |d_j|)                                                           (2)
+
+White noise is assumed, and the derivatives are those of the model that fits the recording now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
+from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
+from bench.diagnosis.validation.gain_and_intervals import Z95
+from sims.core.simulator import Array
+from sims.core.system import ALL_PLACES
+
+IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
+
+NARROW, WIDE = 0.1, 1.0
+"""Maximum width of a 95 % interval, as a fraction of a parameter's range, for identifiable and for
+weak parameters.
+"""
+MIN_DETECTABLE_LIMIT_SIGMAS = 5.0
+"""Minimum norm of the change of all samples by a limit or backlash, in noise standard deviations,
+for it to be detectable.
+"""
+CONFOUNDING_CORRELATION = 0.95
+"""Minimum correlation of two parameters that are reported as confounded."""
+MAX_NAMED_CONFOUNDERS = 4
+"""Maximum number of confounded parameters that are reported for one parameter."""
+
+
+@dataclass(frozen=True)
+class ParameterIdentifiability:
+    """Identifiability of one parameter or coefficient of a cause.
+
+    Attributes:
+        name: Name of the parameter, or of the cause with its coefficient.
+        free: Whether it is a free parameter of the fit; False for a cause.
+        unit: Unit of the value.
+        half: Half the width of the 95 % interval; infinite if the recording is insensitive to it,
+            NaN for a limit or backlash, which is either detectable or not.
+        low, high: Plausible range.
+        word: Identifiability level.
+        mixed: Names of confounded parameters with their correlation.
+    """
+
+    name: str
+    free: bool
+    unit: str
+    half: float
+    low: float
+    high: float
+    word: IdentifiabilityLevel
+    mixed: tuple[tuple[str, float], ...]
+
+
+def assess_identifiability(
+    world: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit, found: DirectionSet | None = None
+) -> tuple[ParameterIdentifiability, ...]:
+    """Assess the identifiability of every free parameter and of every cause.
+
+    Args:
+        world: Run evaluator of the runs.
+        noise: Noise of each channel.
+        fit: Fit with its derivatives; the linearisation point.
+        found: Sensitivity directions of the causes at this point, if they are known.
+
+    Returns:
+        Free parameters first, then causes, those with the narrowest intervals first.
+    """
+    if found is None:
+        names = [
+            name for name in world.library if world.available_effects[name].place != ALL_PLACES
+        ]
+        found = compute_directions(world, fit, names)
+    return _Identified(world, noise, fit, found).numbers()
+
+
+class _Identified:
+    def __init__(
+        self, world: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit, found: DirectionSet
+    ) -> None:
+        self.world, self.noise, self.fit, self.found = world, noise, fit, found
+        self.seen = np.isfinite(world.observed)
+        q = fit.free.size
+        jacobian = np.where(self.seen[..., None], fit.jacobian, 0.0)
+        jacobian /= noise.sigma[:, None]
+        runs = len(jacobian)
+        flat = jacobian.reshape(runs, -1, jacobian.shape[3])
+        # A known initial state is not fitted, so nothing is projected out for it.
+        self.states = flat[..., q:] * ~world.known[:, None, :]
+        self.parameters = self._without_states(flat[..., :q])
+
+    def numbers(self) -> tuple[ParameterIdentifiability, ...]:
+        free = self._free()
+        causes = sorted(self._causes(), key=_share_of_range)
+        return (*free, *causes)
+
+    def _without_states(self, columns: Array) -> Array:
+        """Project the initial states of each run out of columns (R, n, k); return (N, k)."""
+        b = self.states
+        precision = np.diag(compute_state_prior(self.world) ** -2.0)
+        normal = np.matmul(b.transpose(0, 2, 1), b) + precision
+        inner = np.linalg.solve(normal, np.matmul(b.transpose(0, 2, 1), columns))
+        left: Array = columns - np.matmul(b, inner)
+        runs, samples, count = left.shape
+        return left.reshape(runs * samples, count)
+
+    def _free(self) -> list[ParameterIdentifiability]:
+        """Assess the free parameters jointly by (1)."""
+        own = self.parameters
+        scale = np.sqrt(np.einsum("nk,nk->k", own, own))
+        touched = scale > 0
+        covariance = np.full((scale.size, scale.size), np.inf)
+        unit = own[:, touched] / scale[touched]
+        inverse = np.linalg.pinv(unit.T @ unit, rcond=1e-13, hermitian=True)
+        values, vectors = np.linalg.eigh(unit.T @ unit)
+        lost = vectors[:, values < 1e-12]
+        inverse = inverse + 1e12 * lost @ lost.T
+        places = np.ix_(touched, touched)
+        covariance[places] = inverse / np.outer(scale[touched], scale[touched])
+        numbers = []
+        for i, place in enumerate(self.fit.free.tolist()):
+            parameter = self.world.parameters[place]
+            sd = np.sqrt(max(float(covariance[i, i]), 0.0))
+            mixed = []
+            for j, other in enumerate(self.fit.free.tolist()):
+                if i != j and np.isfinite(covariance[i, j]) and touched[i] and touched[j]:
+                    corr = covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j])
+                    mixed.append((self.world.parameters[other].name, float(abs(corr))))
+            low, high = parameter.bounds
+            numbers.append(
+                _number(parameter.name, True, parameter.unit, Z95 * sd, (low, high), mixed)
+            )
+        # The fit has frozen parameters to which the runs are insensitive.
+        for place in sorted(set(self.world.base.tolist()) - set(self.fit.free.tolist())):
+            parameter = self.world.parameters[place]
+            numbers.append(
+                _number(parameter.name, True, parameter.unit, np.inf, parameter.bounds, ())
+            )
+        return numbers
+
+    def _causes(self) -> list[ParameterIdentifiability]:
+        """Assess every cause alone next to the free parameters; families by their members."""
+        world = self.world
+        probes = [
+            p
+            for p in self.found.candidates
+            if world.available_effects[p.effect].place != ALL_PLACES
+        ]
+        mine = [
+            world.available_effects[p.effect].place != ALL_PLACES for p in self.found.candidates
+        ]
+        values = self.found.responses[..., mine]
+        shown = np.where(self.seen[..., None], values, 0.0)
+        shown /= self.noise.sigma[:, None]
+        runs, _, _, count = shown.shape
+        columns = self._without_states(shown.reshape(runs, -1, count))
+        if self.parameters.shape[1]:
+            basis, _ = np.linalg.qr(self.parameters)
+            columns -= basis @ (basis.T @ columns)
+        powers = np.sqrt(np.einsum("nk,nk->k", columns, columns))
+        # A coefficient with several shapes is represented by the most sensitive one.
+        best: dict[tuple[str, int], int] = {}
+        limits = {probe.effect for probe in probes if probe.fixed}
+        for k, probe in enumerate(probes):
+            if probe.effect in limits and not probe.fixed:
+                continue
+            key = probe.effect, probe.place
+            if key not in best or powers[k] > powers[best[key]]:
+                best[key] = k
+        chosen = list(best.values())
+        units = columns[:, chosen] / np.maximum(powers[chosen], 1e-300)
+        alike = np.abs(units.T @ units)
+        numbers = []
+        for row, ((name, place), k) in zip(alike, best.items(), strict=True):
+            parameter = world.parameters[world.get_coefficient_indices(name)[place]]
+            probe = probes[k]
+            half = Z95 / powers[k] if powers[k] > 0 else np.inf
+            mixed = [
+                (other, float(likeness))
+                for (other, _), j, likeness in zip(best, chosen, row, strict=True)
+                if other != name and powers[j] > 0
+            ]
+            single = sum(1 for own, _ in best if own == name) == 1
+            label = name if single else f"{name} {parameter.name.rpartition('.')[2]}"
+            if probe.fixed:
+                # The effect of a limit or backlash is not proportional to it; it shows if it is
+                # reached.
+                own = _number(label, False, parameter.unit, 0.0, parameter.bounds, mixed)
+                numbers.append(replace(own, half=np.nan, word=_shown(float(powers[k]))))
+                continue
+            numbers.append(_number(label, False, parameter.unit, half, parameter.bounds, mixed))
+        return numbers
+
+
+def _shown(noises: float) -> IdentifiabilityLevel:
+    """Return the level of a limit or backlash that changes the samples by this norm."""
+    if noises < MIN_DETECTABLE_LIMIT_SIGMAS:
+        return "not identifiable"
+    return "weak" if noises < MIN_DETECTABLE_LIMIT_SIGMAS / NARROW else "identifiable"
+
+
+def _number(
+    name: str,
+    free: bool,
+    unit: str,
+    half: float,
+    bounds: tuple[float, float],
+    mixed: Sequence[tuple[str, float]],
+) -> ParameterIdentifiability:
+    low, high = bounds
+    share = 2.0 * half / max(high - low, 1e-300)
+    word: IdentifiabilityLevel = "not identifiable"
+    if share <= WIDE:
+        word = "identifiable" if share <= NARROW else "weak"
+    near = sorted((m for m in mixed if m[1] > CONFOUNDING_CORRELATION), key=lambda m: -m[1])
+    others = tuple(dict(near[::-1]).items())[::-1][:MAX_NAMED_CONFOUNDERS]
+    return ParameterIdentifiability(name, free, unit, float(half), low, high, word, others)
+
+
+def format_identifiability(numbers: Sequence[ParameterIdentifiability], most: int = 8) -> list[str]:
+    """Format the free parameters and the best identifiable causes as lines for the terminal.
+
+    Args:
+        numbers: Result of `assess_identifiability`.
+        most: Maximum number of causes with their own line, and of names in a list.
+    """
+    lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
+    lines += [f"  {_line(number)}" for number in numbers if number.free]
+    causes = {word: [n for n in numbers if not n.free and n.word == word] for word in _WORDS}
+    counts = [f"{len(those)} {word}" for word, those in causes.items()]
+    lines.append(f"causes, each by itself, surest first: {', '.join(counts)}")
+    # A limit has no interval, and follows the causes that have one.
+    sure = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
+    lines += [f"  {_line(number)}" for number in sure[:most]]
+    for word, those in (("identifiable too", sure[most:]), *list(causes.items())[1:]):
+        if those:
+            lines.append(f"  {word}: {listed(_effects(those), most)}")
+    if any(len(those) > most for those in causes.values()):
+        lines.append("  every cause with its number: the same command with --json")
+    return lines
+
+
+def _line(number: ParameterIdentifiability) -> str:
+    """Format one parameter with its level, interval, range and confounded parameters."""
+    half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
+    if np.isnan(number.half):
+        half = "a limit within reach"
+    other = listed([f"{name} ({corr:.3f})" for name, corr in number.mixed], 2)
+    mixed = f"; mixed up with {other}" if other else ""
+    span = f"{number.low:.3g} to {number.high:.3g}"
+    return f"{number.word:16s} {number.name}: {half} of {span}{mixed}"
+
+
+def _effects(numbers: Sequence[ParameterIdentifiability]) -> list[str]:
+    """List the effects of causes once each, with the number of their places."""
+    places: dict[str, set[str]] = {}
+    for number in numbers:
+        effect, _, place = number.name.partition(" ")[0].partition("@")
+        places.setdefault(effect, set()).add(place)
+    several = {name: len(at) for name, at in places.items()}
+    return [f"{name} ({n} places)" if n > 1 else name for name, n in several.items()]
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Join the first names, and count the remaining ones.
+
+    Args:
+        names: Names.
+        most: Maximum number of names to write.
+    """
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+_WORDS: tuple[IdentifiabilityLevel, ...] = ("identifiable", "weak", "not identifiable")
+
+
+def _share_of_range(number: ParameterIdentifiability) -> float:
+    """Return half the width of an interval as a fraction of the plausible range."""
+    width = number.high - number.low
+    with np.errstate(over="ignore"):
+        return float(np.nan_to_num(number.half) / width) if width > 0 else 0.0

@@ -1,0 +1,600 @@
+"""Responses of the innovations to every candidate effect, carried through the filter's recursion.
+
+With gain K and whitener W of the filter (`bench.diagnosis.kalman.filter_and_smoother`), a unit of
+candidate k, which adds b to states and ψ to readings (`dynamics.measured_linearisation`, eqs. (3)
+and (4)), changes the predicted state by s and the whitened innovations by -w:
+
+    u_i = ψ_i + H_i s_i,    w_i = W_i u_i,    s_{i+1} = A_i (s_i - K_i u_i) + b_i               (1)
+
+so that the innovations are e = Σ_k c_k w_k + white noise, linear in the coefficients however large
+they are, since the motion about which the model is linear is the measured one (L. Ljung, System
+Identification, 2nd ed., 1999, chapter 3; K. J. Åström, Automatica 16, 551, 1980,
+doi:10.1016/0005-1098(80)90078-3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.kalman.filter_and_smoother import (
+    LARGEST,
+    SMALLEST_FORCE,
+    Filtered,
+    LinearRuns,
+    Mask,
+    Places,
+    Smoothed,
+    filter_runs,
+    fit_process_noise,
+    with_coloured_noise,
+)
+from bench.diagnosis.kalman.measured_states import measured_states
+from bench.diagnosis.search.candidate_directions import CandidateDirection
+from sims.core.simulator import Array
+from sims.core.system import Effect
+from sims.robot.dynamics.measured_linearisation import MeasuredLinear, SingleArray, Trajectory
+from sims.robot.places.typical_forces import compute_floating_forces, compute_joint_scales
+from sims.robot.robot_simulator import RobotSimulator
+
+POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 0.3
+"""Standard deviations of the first states about the measured motion.
+
+That of positions is in rad or m, because an encoder may have an offset; that of velocities is a
+share of the largest velocity.
+"""
+LEAST_PRIOR = 1e-4
+"""Minimum prior standard deviation of a velocity, rad/s or m/s."""
+LARGEST_PRIOR = 1e3
+"""Maximum prior standard deviation of a velocity, rad/s or m/s."""
+UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
+"""Prior standard deviations of unrecorded joints: position in rad or m, velocity per second."""
+FIRST_FORCE = 0.1
+"""Initial missing force of the process noise fit, as a share of a typical force."""
+MAX_LINEARISATIONS = 4
+"""Maximum number of times the model is linearised about a motion that is smoothed with it."""
+LINEARISED_GAIN = 10.0
+"""Minimum gain in log-likelihood by a linearisation for which another one is made."""
+
+CORRELATIONS = (0.4, 0.6, 0.75, 0.85, 0.92, 0.96)
+"""Correlations of AR(1) sensor noise, tried in this order while the likelihood increases."""
+COLOURED = 5.0
+"""Minimum gain in log-likelihood by a larger correlation."""
+UNSOUND = 100.0
+"""Mean square of the whitened innovations above which a linear model does not follow the runs."""
+MIN_LOSS_WITHOUT_FORCE = 20.0
+"""Minimum loss in twice the log-likelihood without process noise that shows a missing force."""
+SIDE_BY_SIDE = 256
+"""Number of columns that pass through the filter together, so that they fit in the CPU cache."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Inputs that candidates add to the states and readings of R runs.
+
+    Attributes:
+        probes: the K candidates.
+        places: (K,) column of each candidate; candidates with the same effect share a column.
+        sizes: (K,) scaling coefficient of each probe.
+        pushed: (R, T - 1, E + nu, M) mean forces and controls of M columns between samples.
+        readings: ψ (R, T, C, M).
+    """
+
+    probes: tuple[CandidateDirection, ...]
+    places: Places
+    sizes: Array
+    pushed: SingleArray
+    readings: SingleArray
+
+    def joined(self, others: Columns) -> Columns:
+        """Return these candidates followed by others."""
+        return Columns(
+            self.probes + others.probes,
+            np.concatenate([self.places, others.places + self.pushed.shape[3]]),
+            np.concatenate([self.sizes, others.sizes]),
+            np.concatenate([self.pushed, others.pushed], axis=3),
+            np.concatenate([self.readings, others.readings], axis=3),
+        )
+
+    def total(self, chosen: Sequence[int], coefficients: Array) -> tuple[Array, Array]:
+        """Return the sum of the inputs of the chosen candidates.
+
+        Args:
+            chosen: indices of probes.
+            coefficients: coefficient of each chosen probe.
+
+        Returns:
+            Forces and controls (R, T - 1, E + nu), and ψ (R, T, C).
+        """
+        own = self.places[list(chosen)]
+        weights = coefficients / self.sizes[list(chosen)]
+        return self.pushed[..., own] @ weights, self.readings[..., own] @ weights
+
+
+@dataclass
+class FollowedRuns:
+    """Runs of a robot followed by a Kalman filter with the model.
+
+    Attributes:
+        world: the runs.
+        theta: (P,) parameters of the model.
+        noise: sensor noise.
+        linear: linearised model of each run.
+        runs: the linear models, stacked, without states for coloured noise.
+        force: (E,) standard deviations of the missing forces.
+        filtered: results of the filter.
+        smoothed: results of the smoother.
+        typical: (E,) typical forces.
+    """
+
+    world: RunEvaluator
+    theta: Array
+    noise: NoiseModel
+    linear: list[MeasuredLinear]
+    runs: LinearRuns
+    force: Array
+    filtered: Filtered
+    smoothed: Smoothed
+    typical: Array
+
+    @classmethod
+    def follow(
+        cls,
+        world: RunEvaluator,
+        theta: Array,
+        noise: NoiseModel,
+        trajectories: Sequence[Trajectory] | None = None,
+        force: Array | None = None,
+        max_linearisations: int = MAX_LINEARISATIONS,
+    ) -> FollowedRuns:
+        """Linearise a model about the measured motion and filter the runs.
+
+        Args:
+            world: the runs.
+            theta: (P,) parameters of the model.
+            noise: sensor noise.
+            trajectories: motion of each run, if it has been estimated before.
+            force: (E,) initial missing forces for the fit of the process noise.
+            max_linearisations: maximum number of linearisations if the motion is not given.
+        """
+        assert isinstance(world.simulator, RobotSimulator)
+        robot = world.simulator.robot
+        typical = np.concatenate(
+            [compute_joint_scales(robot).force, compute_floating_forces(robot)]
+        )
+        best: FollowedRuns | None = None
+        linear: list[MeasuredLinear] = []
+        for number in range(max_linearisations if trajectories is None else 1):
+            # Near the data, Jacobians change little from one motion to another.
+            nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
+            motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
+            linear = [
+                _linearised(world, theta, noise, run, motion[run], near)
+                for run, near in enumerate(nearby)
+            ]
+            begin = FIRST_FORCE * typical if force is None else force
+            found = cls._of_linear(world, theta, noise, linear, begin, typical)
+            force, noise, trajectories = found.force, found.noise, found.trajectories
+            gain = np.inf if best is None else found.log_likelihood - best.log_likelihood
+            # The first linearisation is about the readings alone, which are not a possible motion.
+            best = found if number < 2 or gain > 0.0 else best
+            if not gain > LINEARISED_GAIN:
+                break
+        assert best is not None
+        return best
+
+    def with_parameters(
+        self, theta: Array, simulator: RobotSimulator | None = None, is_alike: bool = False
+    ) -> FollowedRuns:
+        """Return the filter of a model with other parameters.
+
+        The model is linearised once about the smoothed motion of this filter, and its process noise
+        starts from the present one.
+
+        Args:
+            theta: (P,) the parameters.
+            simulator: simulator to use instead of that of the world.
+            is_alike: whether the Jacobians of this filter are reused.
+        """
+        linear = [
+            _linearised(self.world, theta, self.noise, run, motion, near, simulator, is_alike)
+            for run, (motion, near) in enumerate(zip(self.trajectories, self.linear, strict=True))
+        ]
+        given = self.noise, linear, self.force, self.typical
+        return self._of_linear(self.world, theta, *given)
+
+    @classmethod
+    def _of_linear(
+        cls,
+        world: RunEvaluator,
+        theta: Array,
+        noise: NoiseModel,
+        linear: list[MeasuredLinear],
+        force: Array,
+        typical: Array,
+    ) -> FollowedRuns:
+        """Filter the linearised models of all runs; other arguments as those of `_fit_noise`."""
+        # A model that diverges between two samples overflows; `is_sound` is then false.
+        with np.errstate(all="ignore"):
+            maps = [one.interval_maps() for one in linear]
+            # An effect may have its own states.
+            prior = _prior(world, linear, maps[0].states.shape[1])
+            runs = LinearRuns.stacked(maps, world.observed, prior)
+            fitted = _fit_noise(runs, noise, force, typical)
+        return cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
+
+    @classmethod
+    def of_model(cls, world: RunEvaluator, theta: Array, noise: NoiseModel) -> FollowedRuns:
+        """Return the filter stored in the world if it has these parameters, else a new one.
+
+        The new filter is stored in the world.
+
+        Args:
+            world: the runs.
+            theta: (P,) parameters of the model.
+            noise: sensor noise.
+        """
+        known: FollowedRuns | None = world.followed
+        if known is not None and known.world is world and np.array_equal(known.theta, theta):
+            return known
+        world.watch.stage("following the runs with the model", 1)
+        assert isinstance(world.simulator, RobotSimulator)
+        # With another step size, the motion at the ends of the steps is not known.
+        alike = known is not None and known.step == world.simulator.time_step
+        motion = known.trajectories if known is not None and alike else None
+        followed = world.followed = cls.follow(world, theta, noise, motion)
+        return followed
+
+    def refitted(self, runs: LinearRuns) -> FollowedRuns:
+        """Return the filter of changed linear models with refitted noise.
+
+        Process noise and the correlation of the sensor noise are fitted again.
+        """
+        return replace(
+            self, runs=runs, **_fit_noise(runs, self.noise, self.force, self.typical)._asdict()
+        )
+
+    def whitened_innovations(self, theta: Array) -> Array:
+        """Return the whitened innovations (R, T, C) of a model with similar parameters.
+
+        The model is linearised about the same motion and filtered with the same process noise.
+        """
+        maps = [
+            _linearised(self.world, theta, self.noise, run, near.trajectory, near).interval_maps()
+            for run, near in enumerate(self.linear)
+        ]
+        runs = LinearRuns.stacked(maps, self.world.observed, self.runs.prior)
+        coloured, white = with_coloured_noise(runs, self.noise)
+        return filter_runs(coloured, self.force, white).whitened
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log likelihood of the innovations of all runs."""
+        return float(self.filtered.log_likelihood.sum())
+
+    @cached_property
+    def losses_without_force(self) -> Array:
+        """Loss in twice the log-likelihood (E,) without each missing force."""
+        coloured, white = with_coloured_noise(self.runs, self.noise)
+        best = self.log_likelihood
+        losses = []
+        for j in range(self.force.size):
+            force = self.force.copy()
+            force[j] = SMALLEST_FORCE * self.typical[j]
+            found = filter_runs(coloured, force, white)
+            losses.append(2.0 * (best - float(found.log_likelihood.sum())))
+        return np.array(losses)
+
+    @property
+    def missing_forces(self) -> Mask:
+        """Whether the model lacks a force (E,), so that the filter needs process noise there."""
+        mask: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
+        return mask
+
+    @property
+    def lacks_force(self) -> bool:
+        """Whether the model lacks a force at any coordinate."""
+        return bool(self.missing_forces.any())
+
+    @property
+    def joints_by_loss(self) -> list[int]:
+        """Indices of the joints, in descending order of the loss without process noise."""
+        joints = len(self.world.simulator.system.coordinates)
+        order: list[int] = np.argsort(-self.losses_without_force[:joints], kind="stable").tolist()
+        return order
+
+    @property
+    def step(self) -> float:
+        """Time step of the simulator in seconds."""
+        return float(self.linear[0].step)
+
+    @cached_property
+    def trajectories(self) -> list[Trajectory]:
+        """Smoothed motion of each run."""
+        size = self.runs.prior.size
+        found = []
+        for run, linear in enumerate(self.linear):
+            count = linear.knots.size
+            states = self.smoothed.states[run, :count, :size]
+            forces = self.smoothed.forces[run, : count - 1, : self.force.size]
+            found.append(linear.moved(linear.propagated(states, forces)))
+        return found
+
+    def columns(self, probes: Sequence[CandidateDirection]) -> Columns:
+        """Compute the inputs that candidates add to states and readings, once per effect and place.
+
+        Args:
+            probes: the candidates.
+        """
+        effects: list[tuple[Effect, Array]] = []
+        known: dict[tuple[str, bytes], int] = {}
+        places = []
+        for probe in probes:
+            effect, c = self.world.available_effects[probe.effect], probe.coefficients
+            parts = [(one, k) for one, k in effect.parts(c[:, None, None]) if k.any()]
+            # A member of a family has the same response as the single effect.
+            if len(parts) == 1:
+                effect, c = parts[0][0], parts[0][1][:, 0, 0]
+            key = effect.name, c.tobytes()
+            if key not in known:
+                known[key] = len(effects)
+                effects.append((effect, c))
+            places.append(known[key])
+        number, samples, channels = self.runs.residuals.shape
+        inputs = self.runs.inputs.shape[3]
+        pushed = np.zeros((number, samples - 1, inputs, len(effects)), dtype=np.float32)
+        readings = np.zeros((number, samples, channels, len(effects)), dtype=np.float32)
+        for run, linear in enumerate(self.linear):
+            predicted = self.filtered.predicted[run, : linear.knots.size, : self.runs.prior.size]
+            own, read = linear.added(effects, np.nan_to_num(predicted))
+            pushed[run, : own.shape[0]] = own
+            readings[run, : read.shape[0]] = read
+        readings[~self.runs.recorded] = 0.0
+        fine = np.isfinite(pushed).all(axis=(0, 1, 2)) & np.isfinite(readings).all(axis=(0, 1, 2))
+        pushed[..., ~fine], readings[..., ~fine] = 0.0, 0.0
+        sizes = np.array([1.0 if p.fixed else p.coefficients[p.place] for p in probes])
+        return Columns(tuple(probes), np.array(places, dtype=np.intp), sizes, pushed, readings)
+
+    def step_error_response(self) -> Array:
+        """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
+        missed = self.runs.step_errors[..., None].astype(np.float32)
+        nothing = np.zeros((*self.runs.residuals.shape, 1), dtype=np.float32)
+        response: Array = self._through_filter(missed, nothing)[..., 0].astype(np.float64)
+        return response
+
+    def responses(self, columns: Columns) -> SingleArray:
+        """Propagate columns through the filter by (1).
+
+        Args:
+            columns: inputs of the candidates.
+
+        Returns:
+            Whitened responses (R, T, C, K), in units of the probes' coefficients.
+        """
+        inputs = self.runs.inputs.astype(np.float32)
+        found = self._through_filter(columns.pushed, columns.readings, inputs)
+        sizes: SingleArray = columns.sizes.astype(np.float32)
+        with np.errstate(all="ignore"):
+            result: SingleArray = found[..., columns.places] / sizes
+        # A candidate with a divergent motion gets a response of zero.
+        result[~(np.abs(result) < LARGEST)] = 0.0
+        return result
+
+    def state_sensitivities(self) -> Array:
+        """Return the derivatives (R, T, C, 2 D) of the readings by the first states of D joints.
+
+        The first states are positions and velocities; readings are not fed back.
+        """
+        joints = len(self.linear[0].trajectory.x[0])
+        own = np.concatenate([np.arange(joints), self.linear[0].positions + np.arange(joints)])
+        begin = np.zeros((len(self.linear), self.runs.prior.size, own.size))
+        begin[:, own, np.arange(own.size)] = 1.0
+        result = np.zeros((*self.runs.residuals.shape, len(self.world.states)))
+        result[..., : own.size] = self._without_gain(begin)
+        return result
+
+    def sensitivities(self, columns: Columns) -> Array:
+        """Return the changes of the readings of simulated runs (R, T, C, K) by candidates.
+
+        They follow from (1) without gain, in units of the probes' coefficients.
+        """
+        number, _, _, count = columns.readings.shape
+        changes = self._without_gain(np.zeros((number, self.runs.prior.size, count)), columns)
+        with np.errstate(all="ignore"):
+            return changes[..., columns.places] / columns.sizes
+
+    def _without_gain(self, s: Array, columns: Columns | None = None) -> Array:
+        """Propagate first states and optional columns by (1) without gain.
+
+        Args:
+            s: (R, Z, K) changes of the first states.
+            columns: inputs of candidates; None if there are none.
+
+        Returns:
+            Changes of the readings (R, T, C, K).
+        """
+        runs = self.runs
+        samples = runs.residuals.shape[1]
+        result = np.zeros((*runs.residuals.shape, s.shape[2]))
+        with np.errstate(all="ignore"):
+            for i in range(samples):
+                result[:, i] = runs.readings[:, i] @ s
+                if columns is not None:
+                    result[:, i] += columns.readings[:, i]
+                if i + 1 < samples:
+                    s = runs.states[:, i] @ s
+                    if columns is not None:
+                        s += runs.inputs[:, i] @ columns.pushed[:, i]
+        result[~(np.abs(result) < LARGEST)] = 0.0
+        return result
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the filter follows the runs: its innovations have the expected size."""
+        with np.errstate(all="ignore"):
+            size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
+        return bool(size < UNSOUND)
+
+    def state_prior(self) -> Array | None:
+        """Return the prior standard deviations (2 D,) of the first positions and velocities.
+
+        The result is None if further states are fitted. With a stiff servo, the first velocity
+        decays within a sample. Without a prior, a fit would make it so large that the motion leaves
+        the valid range of the linear model.
+        """
+        joints = len(self.linear[0].trajectory.x[0])
+        if len(self.world.states) != 2 * joints:
+            return None
+        own = self.runs.prior
+        velocities = own[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
+        return np.concatenate([own[:joints], velocities])
+
+    def first_positions(self) -> Array:
+        """Return the smoothed positions of the joints at the first samples (R, D)."""
+        found = []
+        for run, linear in enumerate(self.linear):
+            x = linear.trajectory.x[int(linear.knots[0])]
+            found.append(x + self.smoothed.states[run, 0, : x.size])
+        return np.array(found)
+
+    def first_states(self) -> Array:
+        """Return positions and velocities of the joints at the first samples (R, 2 D).
+
+        For recorded joints they are estimated from the readings alone, because a stiff servo hides
+        the first velocity from a linear model; for other joints they are smoothed states.
+        """
+        found = []
+        for run, trajectory in enumerate(self.trajectories):
+            first = int(self.linear[run].knots[0])
+            x, v = trajectory.x[first].copy(), trajectory.v[first].copy()
+            for joint, states in measured_states(self.world, self.noise.sigma, run).items():
+                x[joint], v[joint] = states[0, :2]
+            found.append(np.concatenate([x, v]))
+        return np.array(found)
+
+    def _through_filter(
+        self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
+    ) -> SingleArray:
+        """Propagate columns through (1).
+
+        Args:
+            pushed: (R, T - 1, E + nu, M) forces and controls, or states if `inputs` is None.
+            readings: ψ (R, T, C, M).
+            inputs: (R, T - 1, Z, E + nu) matrices that map `pushed` to b.
+        """
+        coloured, _ = with_coloured_noise(self.runs, self.noise)
+        number, samples, channels, count = readings.shape
+        size = self.runs.prior.size
+        result = np.zeros((number, samples, channels, count), dtype=np.float32)
+        h, a = coloured.readings.astype(np.float32), coloured.states.astype(np.float32)
+        gains = self.filtered.gains.astype(np.float32)
+        whiteners = self.filtered.whiteners.astype(np.float32)
+        with np.errstate(all="ignore"):
+            for run in range(number):
+                last = int(np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0))
+                for begin in range(0, count, SIDE_BY_SIDE):
+                    part = slice(begin, min(begin + SIDE_BY_SIDE, count))
+                    s = np.zeros((a.shape[2], part.stop - part.start), dtype=np.float32)
+                    for i in range(last + 1):
+                        u = h[run, i] @ s
+                        u += readings[run, i, :, part]
+                        np.matmul(whiteners[run, i], u, out=result[run, i, :, part])
+                        if i < last:
+                            s -= gains[run, i] @ u
+                            s = a[run, i] @ s
+                            more = pushed[run, i, :, part]
+                            s[:size] += more if inputs is None else inputs[run, i] @ more
+        result[~np.isfinite(result)] = 0.0
+        return result
+
+
+class _NoiseFit(NamedTuple):
+    """Fitted noise, with the results of filter and smoother.
+
+    Attributes:
+        noise: sensor noise.
+        force: (E,) standard deviations of the missing forces.
+        filtered: results of the filter.
+        smoothed: results of the smoother.
+    """
+
+    noise: NoiseModel
+    force: Array
+    filtered: Filtered
+    smoothed: Smoothed
+
+
+def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array) -> _NoiseFit:
+    """Fit the process noise and the correlation of the sensor noise by maximum likelihood.
+
+    Args:
+        runs: the linear models.
+        noise: sensor noise; larger correlations are tried, too.
+        force: (E,) initial standard deviations of the missing forces.
+        typical: (E,) typical forces.
+    """
+    best: _NoiseFit | None = None
+    lowest = float(noise.phi.max(initial=0.0))
+    for phi in (None, *(phi for phi in CORRELATIONS if phi > lowest)):
+        tried = noise if phi is None else NoiseModel(noise.sigma, np.full_like(noise.phi, phi))
+        coloured, white = with_coloured_noise(runs, tried)
+        if best is not None:
+            found = filter_runs(coloured, best.force, white)
+            before, after = best.filtered.log_likelihood.sum(), found.log_likelihood.sum()
+            # Both are minus infinity if the model diverges.
+            if not after > before + COLOURED:
+                break
+            force = best.force
+        best = _NoiseFit(tried, *fit_process_noise(coloured, force, white, typical))
+    assert best is not None
+    return best
+
+
+def _linearised(
+    world: RunEvaluator,
+    theta: Array,
+    noise: NoiseModel,
+    run: int,
+    trajectory: Trajectory | None,
+    nearby: MeasuredLinear | None,
+    simulator: RobotSimulator | None = None,
+    is_alike: bool = True,
+) -> MeasuredLinear:
+    """Linearise the model of one run about a motion.
+
+    The motion `trajectory` is estimated from the readings alone if it is None.
+    """
+    half = len(world.states) // 2
+    scenario = world.tracks[run].scenario
+    start = world.guess[run, :half], world.guess[run, half:]
+    robot = simulator or world.simulator
+    if trajectory is None:
+        states = measured_states(world, noise.sigma, run)
+        return MeasuredLinear(robot, theta, scenario, start, measured=states)
+    return MeasuredLinear(robot, theta, scenario, start, trajectory, None, nearby, is_alike)
+
+
+def _prior(world: RunEvaluator, linear: Sequence[MeasuredLinear], size: int) -> Array:
+    """Return standard deviations (Z,) of the first states about the measured motion.
+
+    With a stiff servo, the first velocity decays within a sample, so the readings do not determine
+    it.
+    """
+    coordinates = world.simulator.system.coordinates
+    prior = np.full(size, 1e-9)
+    joints, positions = len(coordinates), linear[0].positions
+    speeds = np.max([np.abs(one.trajectory.v).max(axis=0) for one in linear], axis=0)
+    for joint, name in enumerate(coordinates[:joints]):
+        if name in world.channels:
+            prior[joint] = POSITION_PRIOR
+            speed = VELOCITY_PRIOR * float(speeds[joint]) + LEAST_PRIOR
+            prior[positions + joint] = min(speed, LARGEST_PRIOR)
+        else:
+            prior[joint], prior[positions + joint] = UNMEASURED_PRIOR, UNMEASURED_SPEED
+    return prior

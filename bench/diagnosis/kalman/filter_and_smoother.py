@@ -1,0 +1,349 @@
+"""Kalman filter and smoother about a measured motion, with process noise by maximum likelihood.
+
+All runs are filtered side by side. With δ the deviation of the state from the motion about which
+the model is linear (`dynamics.measured_linearisation`, eqs. (3) and (4)), and r[i] = y[i] -
+h(x̄[i]),
+
+    δ-[i+1] = A_i δ[i] - d_i,        P-[i+1] = A_i P[i] A_iᵀ + G_i Q G_iᵀ + J_i                (1)
+    e[i] = r[i] - H_i δ-[i],         S_i = H_i P- H_iᵀ + R,     K_i = P- H_iᵀ S_i⁻¹            (2)
+    δ[i] = δ- + K_i e[i],            P[i] = P- - K_i S_i K_iᵀ                                  (3)
+    log L = - Σ_i (log det S_i + e_iᵀ S_i⁻¹ e_i) / 2                                           (4)
+
+with Q the variances of missing forces and J_i those of jumps (`dynamics.servo_force_limits`). (R.
+E.
+Kalman 1960, doi:10.1115/1.3662552; F. C. Schweppe 1965, doi:10.1109/TIT.1965.1053737.) The smoother
+is that of Bryson and Frazier in its modified form (G. J. Bierman, Automatica 9, 503, 1973,
+doi:10.1016/0005-1098(73)90076-9): backward, with C_i = I - K_i H_i,
+
+    λ_i = C_iᵀ A_iᵀ λ_{i+1} - H_iᵀ S_i⁻¹ e_i
+    Λ_i = C_iᵀ A_iᵀ Λ_{i+1} A_i C_i + H_iᵀ S_i⁻¹ H_i                                            (5)
+    δ[i|T] = δ-[i] - P-[i] λ_i,                 f[i|T] = - Q G_iᵀ λ_{i+1}                        (6)
+
+The likelihood is stationary in the variance q_j of the force that is missing at coordinate j where
+Σ_i (G_iᵀ λ_{i+1})_j² = Σ_i (G_iᵀ Λ_{i+1} G_i)_jj (S. J. Koopman, N. Shephard, J. R. Stat. Soc. B
+54(1), 135, 1992), which the iteration
+
+    q_j ← q_j Σ_i (G_iᵀ λ_{i+1})_j² / Σ_i (G_iᵀ Λ_{i+1} G_i)_jj                                  (7)
+
+solves. Sensor noise is white, or AR(1): then it is a state of its own (A. C. Harvey, Forecasting,
+Structural Time Series Models and the Kalman Filter, 1989, section 3.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.kalman.compiled_recursions import filter_recursion, smoother_recursion
+from sims.core.simulator import Array
+from sims.robot.dynamics.measured_linearisation import IntervalMaps
+
+Mask = NDArray[np.bool_]
+Places = NDArray[np.intp]
+
+AR_FLOOR = 1e-3
+"""White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
+LARGEST_CHANGE = 10.0
+"""Largest factor by which an iteration of (7) changes a variance."""
+LARGEST = 1e12
+"""Maximum magnitude of derivatives and defects; larger ones come from divergence.
+
+They are replaced by zero.
+"""
+LARGEST_COVARIANCE = 1e8
+"""Maximum variance of predicted states, in SI units squared."""
+LARGEST_LOSS = 1e30
+"""Maximum negative log-likelihood of a model that does not diverge."""
+SEGMENT = 80
+"""Number of samples of a segment on which the process noise is fitted."""
+ITERATIONS = 12
+"""Maximum number of iterations of (7)."""
+CONVERGED = 0.15
+"""Maximum relative change of the standard deviations at which (7) has converged."""
+SMALLEST_FORCE = 1e-6
+"""Minimum standard deviation of a missing force, as a share of the typical force."""
+STACKED = ("states", "defects", "forces", "inputs", "readings", "step_errors", "jumps")
+"""Arrays of the linear models of single runs that are stacked as they are."""
+
+
+@dataclass(frozen=True)
+class LinearRuns:
+    """Linear models of R runs, padded to T samples.
+
+    Attributes:
+        states: A (R, T - 1, Z, Z).
+        defects: d (R, T - 1, Z).
+        forces: G (R, T - 1, Z, E).
+        inputs: (R, T - 1, Z, E + nu) response of the states to forces and controls.
+        readings: H (R, T, C, Z).
+        residuals: r (R, T, C), zero where nothing was recorded.
+        recorded: (R, T, C) mask of recorded samples.
+        prior: (Z,) standard deviations of the first states.
+        step_errors: (R, T - 1, Z) errors of the steps of the integrator.
+        jumps: (R, T - 1, Z) standard deviations of further process noise of each state.
+    """
+
+    states: Array
+    defects: Array
+    forces: Array
+    inputs: Array
+    readings: Array
+    residuals: Array
+    recorded: Mask
+    prior: Array
+    step_errors: Array
+    jumps: Array
+
+    def subset(self, chosen: Places) -> LinearRuns:
+        """Return some of the runs."""
+        return self._mapped(lambda values: values[chosen])
+
+    def segments(self, length: int) -> LinearRuns:
+        """Split the runs into segments of `compute_norm` samples, each with the prior of a run."""
+        number, samples, _ = self.residuals.shape
+        count = -(-samples // length)
+
+        def cut(values: Any) -> Any:
+            padded = np.zeros((number, count * length, *values.shape[2:]), dtype=values.dtype)
+            padded[:, : values.shape[1]] = values
+            parts = padded.reshape(number * count, length, *values.shape[2:])
+            # A segment has one interval fewer than samples.
+            return parts if values.shape[1] == samples else parts[:, :-1]
+
+        return self._mapped(cut)
+
+    def _mapped(self, change: Callable[[Any], Any]) -> LinearRuns:
+        """Return the runs with a function applied to the arrays of all runs."""
+        names = [one.name for one in fields(self) if one.name != "prior"]
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
+        return replace(self, **changed)
+
+    @classmethod
+    def stacked(cls, maps: Sequence[IntervalMaps], observed: Array, prior: Array) -> LinearRuns:
+        """Stack the linear models of runs.
+
+        Args:
+            maps: linear model of each run.
+            observed: (R, T, C), NaN where nothing was recorded.
+            prior: (Z,) standard deviations of the first states.
+        """
+        runs, samples, _ = observed.shape
+        stacked: dict[str, Array] = {}
+        for name in STACKED:
+            parts = [getattr(own, name) for own in maps]
+            length = samples if name == "readings" else samples - 1
+            values = np.zeros((runs, length, *parts[0].shape[1:]))
+            if name == "states":
+                values[:] = np.eye(prior.size)
+            for run, part in enumerate(parts):
+                values[run, : len(part)] = part
+            # A step in which the model diverges gives no information on the next one.
+            values[~(np.abs(values) < LARGEST)] = 0.0
+            stacked[name] = values
+        residuals = np.zeros(observed.shape)
+        for run, own in enumerate(maps):
+            count = len(own.predicted)
+            residuals[run, :count] = observed[run, :count] - own.predicted
+        recorded = np.isfinite(residuals) & np.isfinite(observed)
+        residuals[~recorded] = 0.0
+        stacked["readings"][~recorded] = 0.0
+        return cls(residuals=residuals, recorded=recorded, prior=prior, **stacked)
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """Results of the filter for B runs.
+
+    Attributes:
+        predicted: δ- (B, T, Z).
+        covariances: P- (B, T, Z, Z).
+        innovations: e (B, T, C), zero where nothing was recorded.
+        gains: K (B, T, Z, C).
+        whiteners: W (B, T, C, C) with Wᵀ W = S⁻¹.
+        log_likelihood: log L (B,).
+    """
+
+    predicted: Array
+    covariances: Array
+    innovations: Array
+    gains: Array
+    whiteners: Array
+    log_likelihood: Array
+
+    def subset(self, chosen: Places) -> Filtered:
+        """Return some of the runs."""
+        return Filtered(*(getattr(self, one.name)[chosen] for one in fields(self)))
+
+    @property
+    def whitened(self) -> Array:
+        """Whitened innovations W e (B, T, C): white with unit variance if the model is right."""
+        whitened: Array = np.einsum("btcd,btd->btc", self.whiteners, self.innovations)
+        return whitened
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Results of the smoother.
+
+    Attributes:
+        states: δ (B, T, Z).
+        forces: f (B, T - 1, E).
+        score: (E,) factor of (7) by which variances change.
+    """
+
+    states: Array
+    forces: Array
+    score: Array
+
+
+def with_coloured_noise(runs: LinearRuns, noise: NoiseModel) -> tuple[LinearRuns, Array]:
+    """Add states for AR(1) noise.
+
+    Args:
+        runs: the linear models.
+        noise: standard deviation and correlation of each channel.
+
+    Returns:
+        The models with one more state for each channel with correlated noise, and R (C,), the
+        variances of the remaining white noise.
+    """
+    coloured = np.flatnonzero(noise.phi > 0)
+    white = np.square(noise.sigma)
+    if not coloured.size:
+        return runs, white
+    white = white.copy()
+    white[coloured] *= AR_FLOOR
+    (number, samples, channels), size = runs.residuals.shape, runs.prior.size
+    more = coloured.size
+    states = np.zeros((number, samples - 1, size + more, size + more))
+    states[:, :, :size, :size] = runs.states
+    own = size + np.arange(more)
+    states[:, :, own, own] = noise.phi[coloured]
+    nothing = np.zeros((number, samples - 1, more))
+    defects = np.concatenate([runs.defects, nothing], axis=2)
+    jumps = np.concatenate([runs.jumps, nothing], axis=2)
+    # The innovations of the noise act like forces of known variance.
+    forces = np.zeros((number, samples - 1, size + more, runs.forces.shape[3] + more))
+    forces[:, :, :size, : runs.forces.shape[3]] = runs.forces
+    sizes = noise.sigma[coloured] * np.sqrt(1.0 - np.square(noise.phi[coloured]))
+    forces[:, :, own, runs.forces.shape[3] + np.arange(more)] = sizes
+    readings = np.concatenate([runs.readings, np.zeros((number, samples, channels, more))], axis=3)
+    readings[:, :, coloured, own] = 1.0
+    readings[~runs.recorded] = 0.0
+    prior = np.concatenate([runs.prior, noise.sigma[coloured]])
+    found = replace(
+        runs,
+        states=states,
+        defects=defects,
+        forces=forces,
+        readings=readings,
+        prior=prior,
+        jumps=jumps,
+    )
+    return found, white
+
+
+def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
+    """Filter all runs by (1) to (4).
+
+    Args:
+        runs: the linear models.
+        force: (E,) standard deviations of the missing forces, or (B, E) of each run; further
+            columns of G, those of coloured noise, have 1.
+        white: R (C,) variances of white noise.
+    """
+    number, samples, channels = runs.residuals.shape
+    size = runs.prior.size
+    # A missing sample is replaced by a reading of zero with variance one.
+    variances = np.where(runs.recorded, white, 1.0)
+    predicted = np.zeros((number, samples, size))
+    covariances = np.zeros((number, samples, size, size))
+    innovations = np.zeros((number, samples, channels))
+    gains = np.zeros((number, samples, size, channels))
+    whiteners = np.zeros((number, samples, channels, channels))
+    likelihood = np.zeros(number)
+    filter_recursion(
+        *_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
+        *(np.square(runs.jumps), variances, runs.prior),
+        *(_completed(force, runs), LARGEST_COVARIANCE),
+        *(predicted, covariances, innovations, gains, whiteners, likelihood),
+    )
+    # The likelihood of a model that diverges is set to zero.
+    likelihood = np.where(likelihood > -LARGEST_LOSS, likelihood, -np.inf)
+    return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
+
+
+def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
+    """Smooth all runs by (5) and (6).
+
+    Args:
+        runs: the linear models.
+        filtered: results of the filter.
+        force: standard deviations of the missing forces, as for `filter_runs`.
+    """
+    number, samples, _ = runs.residuals.shape
+    count = runs.forces.shape[3]
+    states = np.zeros((number, samples, runs.prior.size))
+    forces = np.zeros((number, samples - 1, count))
+    measured, expected = np.zeros(count), np.zeros(count)
+    smoother_recursion(
+        *_contiguous(runs.states, runs.forces, runs.readings),
+        _completed(force, runs),
+        *(filtered.predicted, filtered.covariances, filtered.innovations),
+        *(filtered.gains, filtered.whiteners, states, forces, measured, expected),
+    )
+    states, forces = np.nan_to_num(states), np.nan_to_num(forces)
+    with np.errstate(all="ignore"):
+        score = np.nan_to_num(measured / np.maximum(expected, 1e-300), nan=1.0)
+    return Smoothed(states, forces, score)
+
+
+def fit_process_noise(
+    runs: LinearRuns, force: Array, white: Array, typical: Array
+) -> tuple[Array, Filtered, Smoothed]:
+    """Fit the standard deviations of the missing forces by maximum likelihood, (7).
+
+    Args:
+        runs: the linear models.
+        force: (E,) initial standard deviations.
+        white: R (C,) variances of white noise.
+        typical: (E,) typical forces, which define the minimum standard deviations.
+
+    Returns:
+        The standard deviations (E,), and the results of filter and smoother.
+    """
+    count = force.size
+    # Short segments in parallel need fewer steps, and show the same process noise.
+    long = runs.residuals.shape[1] > 2 * SEGMENT
+    short = runs.segments(SEGMENT) if long else runs
+    for _ in range(ITERATIONS):
+        filtered = filter_runs(short, force, white)
+        smoothed = smooth_runs(short, filtered, force)
+        ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
+        changed = np.maximum(force * ratio, SMALLEST_FORCE * typical)
+        done = bool((np.abs(changed / force - 1.0) < CONVERGED).all())
+        if done:
+            break
+        force = changed
+    if long:
+        filtered = filter_runs(runs, force, white)
+        smoothed = smooth_runs(runs, filtered, force)
+    return force, filtered, smoothed
+
+
+def _contiguous(*arrays: Array) -> tuple[Array, ...]:
+    """Return the arrays in the memory layout for which the recursions are compiled."""
+    return tuple(np.ascontiguousarray(array) for array in arrays)
+
+
+def _completed(force: Array, runs: LinearRuns) -> Array:
+    """Return the deviations of all columns of G for each run (B, E), including coloured noise."""
+    number, columns = len(runs.residuals), runs.forces.shape[3]
+    result = np.ones((number, columns))
+    result[:, : force.shape[-1]] = force
+    return result

@@ -1,0 +1,198 @@
+"""Maximum likelihood estimates of robot parameters from innovations, by Gauss-Newton steps.
+
+A simulation that starts far from the right parameters leaves the data within a second, and a fit to
+it has many local minima. A filter stays near the data for any parameters, so its innovations are
+nearly linear in them (L. Ljung, System Identification, 2nd ed., 1999, chapter 10). Its estimates
+are the initial values of a fit by simulation.
+
+Derivatives are differences of the innovations of whole filters. Responses about the measured
+accelerations contain the noise of the innovations that they should explain, which biases a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import bound_of, compute_coefficient_bounds
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.bound_widening import range_around, use_bounds
+from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from sims.core.simulator import Array
+
+Bounds = tuple[float, float]
+Follow: TypeAlias = Callable[[Array, FollowedRuns], FollowedRuns]
+
+ITERATIONS = 8
+"""Maximum number of Gauss-Newton steps for base parameters."""
+DIFFERENCE = 1e-3
+"""Finite-difference step of a parameter, as a share of its plausible range."""
+LEAST_GAIN = 1.0
+"""Minimum gain in log-likelihood by a step for which another step follows."""
+HALVINGS = 3
+"""Maximum number of times that a step without gain is halved."""
+RESISTANCE = ("friction.coulomb", "drag.linear", "force.bias")
+"""Effects at a joint that are fitted together with base parameters."""
+MAX_JOINTS = 3
+"""Maximum number of joints at which resisting effects are fitted with base parameters."""
+RIDGE = 1e-9
+"""Ridge of the normal equations, as a share of each parameter's sum of squares."""
+CLEAR = 2.0
+"""Minimum gain in log-likelihood of base parameters over the nominal ones."""
+
+
+def identify_base(
+    world: RunEvaluator, noise: NoiseModel, followed: FollowedRuns
+) -> tuple[FollowedRuns, dict[str, Bounds]]:
+    """Identify the base parameters of a robot from the innovations of a filter.
+
+    If they leave a force missing, friction and constant forces at the joints are fitted with them
+    and then set to zero again. Without these effects, a mass would be overestimated.
+
+    Args:
+        world: the runs for fitting; ranges that do not contain an estimate are replaced.
+        noise: sensor noise.
+        followed: the runs, filtered with the nominal parameters.
+
+    Returns:
+        The runs, filtered with the estimates, and the new ranges by name. If the likelihood gains
+        nothing or an estimate is at its widest bound, the filter with nominal parameters.
+    """
+
+    def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
+        world.watch.stage("identifying the base parameters")
+        return FollowedRuns.follow(world, theta, noise, force=best.force)
+
+    places = world.base.tolist()
+    limits = [range_around(world, i) for i in places]
+    resisting = [(i, b) for name in _resistance(followed) for i, b in _coefficients(world, name)]
+    found = []
+    for beside in ([], resisting):
+        own = [*places, *(i for i, _ in beside)]
+        bounds = [*limits, *(one for _, one in beside)]
+        tried = maximise_likelihood(followed, own, bounds, ITERATIONS, follow)
+        ends = [bound_of(float(tried.theta[i]), *b) for i, b in zip(places, limits, strict=True)]
+        if tried.is_sound and not any(ends):
+            found.append(tried)
+        # The base parameters alone leave no force missing, so friction is not needed.
+        if found and not tried.lacks_force:
+            break
+    best = max(found, key=lambda one: one.log_likelihood, default=followed)
+    if best.log_likelihood - followed.log_likelihood < CLEAR:
+        return followed, {}
+    values = {i: float(best.theta[i]) for i in places}
+    wider = {}
+    for i, value in values.items():
+        low, high = world.parameters[i].bounds
+        if not low <= value <= high:
+            wider[world.parameters[i].name] = range_around(world, i, value)
+    use_bounds(world, wider)
+    theta = followed.theta.copy()
+    theta[places] = best.theta[places]
+    return follow(theta, best), wider
+
+
+def _resistance(followed: FollowedRuns) -> list[str]:
+    """Return effects that resist the motion of the joints with the largest missing forces."""
+    world = followed.world
+    coordinates = world.simulator.system.coordinates
+    joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
+    names = [f"{effect}@{joint}" for joint in joints for effect in RESISTANCE]
+    return [name for name in names if name in world.slots]
+
+
+def _coefficients(world: RunEvaluator, name: str) -> list[tuple[int, Bounds]]:
+    """Return indices in theta and bounds of an effect's coefficients."""
+    return list(
+        zip(
+            world.get_coefficient_indices(name),
+            compute_coefficient_bounds(world, name),
+            strict=True,
+        )
+    )
+
+
+def maximise_likelihood(
+    followed: FollowedRuns,
+    places: Sequence[int],
+    bounds: Sequence[Bounds],
+    iterations: int,
+    follow: Follow,
+) -> FollowedRuns:
+    """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
+
+    Args:
+        followed: the runs, filtered with the initial parameters.
+        places: indices of the fitted parameters.
+        bounds: bounds of these parameters.
+        iterations: maximum number of steps.
+        follow: filters the runs with other parameters; its second argument is the best filter.
+
+    Returns:
+        The runs, filtered with the likeliest parameters.
+    """
+    best = followed
+    for _ in range(iterations):
+        if best.world.watch.has_abandoned_fits():
+            break
+        step, expected = gauss_newton_step(best, places, bounds)
+        if expected < LEAST_GAIN:
+            break
+        gained = 0.0
+        for _ in range(1 + HALVINGS):
+            tried = follow(best.theta + step, best)
+            gained = tried.log_likelihood - best.log_likelihood
+            if gained > 0:
+                best = tried
+                break
+            step = step / 2.0
+        if gained < LEAST_GAIN:
+            break
+    return best
+
+
+def gauss_newton_step(
+    followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]
+) -> tuple[Array, float]:
+    """Compute the Gauss-Newton step of some parameters on the innovations.
+
+    Args:
+        followed: the runs, filtered with the present parameters.
+        places: indices of the parameters that change.
+        bounds: bounds of these parameters, which limit the step.
+
+    Returns:
+        The change of all parameters (P,), and the predicted gain in log-likelihood for linear
+        innovations.
+    """
+    own, target = list(places), followed.filtered.whitened
+    rows = np.stack(
+        [_derivative(followed, target, i, one) for i, one in zip(own, bounds, strict=True)], axis=-1
+    ).reshape(-1, len(own))
+    gram, cross = rows.T @ rows, rows.T @ target.reshape(-1)
+    scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)
+    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(own))
+    values = followed.theta[own]
+    low, high = np.array(bounds).T
+    change = np.clip(values + np.linalg.solve(normal, cross / scale) / scale, low, high) - values
+    step = np.zeros_like(followed.theta)
+    step[own] = change
+    return step, float(change @ cross - 0.5 * change @ gram @ change)
+
+
+def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bounds) -> Array:
+    """Return the negative derivative (R, T, C) of the whitened innovations by a parameter."""
+    low, high = bounds
+    first, last = followed.world.parameters[place].bounds
+    step = DIFFERENCE * min(last - first, high - low)
+    # A parameter without a range has no derivative.
+    if not step > 0:
+        return np.zeros_like(target)
+    moved = followed.theta.copy()
+    moved[place] += step if moved[place] + step <= high else -step
+    change = target - followed.whitened_innovations(moved)
+    derivative: Array = np.nan_to_num(change / (moved[place] - followed.theta[place]))
+    return derivative

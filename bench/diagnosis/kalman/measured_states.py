@@ -1,0 +1,121 @@
+"""States of a robot from its recorded positions and velocities alone, without its dynamics.
+
+Each joint is filtered separately, as a body whose jerk j is constant between samples and otherwise
+unknown,
+
+    (q, v, a)[i+1] = [[1, h, h²/2], [0, 1, h], [0, 0, 1]] (q, v, a)[i] + (h³/6, h²/2, h) j_i     (1)
+
+(Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation,
+2001, section 6.2). The size of the jerk is selected from a grid by maximum likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
+from sims.core.simulator import Array
+
+JERKS = 10.0 ** np.arange(-2.0, 3.1, 1.0)
+"""Sizes of the jerk that are tried, in units of the range of positions over seconds cubed."""
+
+
+def measured_states(world: RunEvaluator, sigma: Array, run: int) -> Mapping[int, Array]:
+    """Estimate positions, velocities and accelerations of the recorded joints of one run.
+
+    Args:
+        world: the runs.
+        sigma: (C,) standard deviation of the noise of each channel.
+        run: index of the run.
+
+    Returns:
+        States (T, 3) at the samples, by index of the joint.
+    """
+    if run not in world.measured:
+        world.measured[run] = _measured(world, sigma, run)
+    return world.measured[run]
+
+
+def _measured(world: RunEvaluator, sigma: Array, run: int) -> Mapping[int, Array]:
+    """Estimate the states for `measured_states`."""
+    coordinates, rates = world.simulator.system.coordinates, world.simulator.system.rates
+    track = world.tracks[run]
+    times, observed = track.scenario.times, track.observed
+    joints, readings = [], []
+    for joint, names in enumerate(zip(coordinates, rates, strict=True)):
+        if names[0] not in world.channels:
+            continue
+        columns = [world.channels.index(n) if n in world.channels else -1 for n in names]
+        values = [observed[:, c] if c >= 0 else np.full(times.size, np.nan) for c in columns]
+        noise = [sigma[c] if c >= 0 else 1.0 for c in columns]
+        if np.isfinite(values[0]).sum() < 3:
+            continue
+        joints.append(joint)
+        readings.append((np.stack(values, axis=1), np.array(noise)))
+    if not joints:
+        return {}
+    found = track_joints(times, readings)
+    return dict(zip(joints, found, strict=True))
+
+
+def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
+    """Filter and smooth joints by (1), each with the likeliest jerk.
+
+    Args:
+        times: (T,) times of the samples.
+        readings: for each joint, positions and velocities (T, 2), NaN where missing, and the
+            standard deviations of their noise (2,).
+
+    Returns:
+        Positions, velocities and accelerations (T, 3) of each joint.
+    """
+    steps = np.diff(times)
+    count, samples = len(readings), times.size
+    a = np.tile(np.eye(3), (samples - 1, 1, 1))
+    a[:, 0, 1] = a[:, 1, 2] = steps
+    a[:, 0, 2] = 0.5 * steps**2
+    g = np.stack([steps**3 / 6.0, 0.5 * steps**2, steps], axis=1)[:, :, None]
+    values = np.stack([v for v, _ in readings])
+    # Use units of the noise, so that both channels have variance one.
+    scale = np.stack([n for _, n in readings])[:, None]
+    first = np.array([v[np.isfinite(v[:, 0]), 0][0] for v, _ in readings])
+    residuals = values.copy()
+    residuals[:, :, 0] -= first[:, None]
+    recorded = np.isfinite(residuals)
+    residuals = np.where(recorded, residuals, 0.0) / scale
+    reading = np.zeros((count, samples, 2, 3))
+    reading[..., 0, 0] = 1.0 / scale[..., 0]
+    reading[..., 1, 1] = 1.0 / scale[..., 1]
+    reading[~recorded] = 0.0
+    sizes = np.array(
+        [max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings]
+    )
+    # The scale is the range per second, or per duration of the run if that is shorter.
+    span = min(float(times[-1] - times[0]), 1.0)
+    prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(sizes.max()), 1e-9)
+    levels = JERKS.size
+    joints, nothing = np.arange(count), np.zeros((count, samples - 1, 3))
+    runs = LinearRuns(
+        states=np.tile(a, (count, 1, 1, 1)),
+        defects=nothing,
+        forces=np.tile(g, (count, 1, 1, 1)),
+        inputs=np.zeros((count, samples - 1, 3, 0)),
+        readings=reading,
+        residuals=residuals,
+        recorded=recorded,
+        prior=prior,
+        step_errors=nothing,
+        jumps=nothing,
+    ).subset(np.repeat(joints, levels))
+    force = (sizes[:, None] * JERKS / span**3).reshape(-1, 1)
+    filtered = filter_runs(runs, force, np.ones(2))
+    likely = filtered.log_likelihood.reshape(count, levels)
+    chosen = np.argmax(likely, axis=1) + levels * joints
+    best = runs.subset(chosen)
+    smoothed = smooth_runs(best, filtered.subset(chosen), force[chosen])
+    found = smoothed.states
+    found[:, :, 0] += first[:, None]
+    return list(found)

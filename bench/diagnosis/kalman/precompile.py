@@ -1,0 +1,34 @@
+"""Compile the recursions of the filter and the smoother during installation.
+
+The first command then need not compile them. `make install` runs `python -m
+bench.diagnosis.kalman.precompile`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.diagnosis.kalman.filter_and_smoother import LinearRuns, filter_runs, smooth_runs
+
+
+def precompile() -> None:
+    """Filter and smooth one run of two samples, so that numba compiles and caches the code."""
+    states, forces = np.ones((1, 1, 2, 2)), np.ones((1, 1, 2, 1))
+    runs = LinearRuns(
+        states=states,
+        defects=np.zeros((1, 1, 2)),
+        forces=forces,
+        inputs=forces,
+        readings=np.ones((1, 2, 1, 2)),
+        residuals=np.zeros((1, 2, 1)),
+        recorded=np.ones((1, 2, 1), dtype=bool),
+        prior=np.ones(2),
+        step_errors=np.zeros((1, 1, 2)),
+        jumps=np.zeros((1, 1, 2)),
+    )
+    force, white = np.ones(1), np.ones(1)
+    smooth_runs(runs, filter_runs(runs, force, white), force)
+
+
+if __name__ == "__main__":
+    precompile()

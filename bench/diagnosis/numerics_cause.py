@@ -1,0 +1,122 @@
+"""Report a too coarse time step or integrator as the first cause of a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from bench.diagnosis.search.verdict_rules import (
+    VerdictName,
+    improves_held_out,
+    is_indistinguishable,
+)
+from bench.diagnosis.verdict import Cause, Verdict
+from sims.extended_simulator import FittedValue
+
+if TYPE_CHECKING:
+    from bench.diagnosis.evaluation.integrator_check import StepRefinement
+
+Item = TypeVar("Item")
+
+SURE = 20.0
+"""Minimum gain in twice the log-likelihood of a finer step over the file's own step; it means odds
+of 22,000 to 1.
+"""
+PART = 0.5
+"""Minimum share of the base model's gap that a finer step must close alone to be used in the
+search. With a smaller share, another missing effect decides which step looks better.
+"""
+STEP, INTEGRATOR = "numerics.step", "numerics.integrator"
+_WITH: dict[VerdictName, VerdictName] = {"adequate": "named", "unknown": "partial"}
+"""Verdict on the whole if the step was too coarse, by the verdict on the remaining causes."""
+
+
+class Reusable(Generic[Item]):
+    """Iterable that computes each item once, when it is first needed."""
+
+    def __init__(self, items: Iterator[Item]) -> None:
+        self._rest, self._known = items, list[Item]()
+
+    def __iter__(self) -> Iterator[Item]:
+        """Yield all items from the first."""
+        number = 0
+        while True:
+            if number == len(self._known):
+                try:
+                    self._known.append(next(self._rest))
+                except StopIteration:
+                    return
+            yield self._known[number]
+            number += 1
+
+
+def is_finer_step_better(gain: float, gap: float, left: float) -> bool:
+    """Return whether a finer step is significantly better and alone closes a large part of the gap.
+
+    Args:
+        gain: Gain in twice the log-likelihood of the base model.
+        gap: Excess RMS residual of the base model with the file's own step, in units of the noise.
+        left: Excess RMS residual of the base model with the finer step, in units of the noise.
+    """
+    return gain >= SURE and gap - max(left, 0.0) >= PART * gap
+
+
+def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
+    """Return whether a model with a finer step is significantly better than one with the file's.
+
+    Args:
+        file: Penalised log-likelihood (twice the log-likelihood less log n for each parameter;
+            Schwarz's criterion) and excess RMS residual in units of the noise, with the file's
+            step.
+        finer: The two values with the finer step. Far from the noise floor, autocorrelated
+            residuals bias the likelihood, so the residual must be smaller too.
+    """
+    merits, excesses = zip(file, finer, strict=True)
+    return not is_indistinguishable(merits[1] - merits[0]) and improves_held_out(merits, excesses)
+
+
+class CoarseStepFinding(NamedTuple):
+    """Finding that the model file's own step is too coarse.
+
+    Attributes:
+        refinement: Finer step that corrects the error.
+        gain: Gain in twice the log-likelihood.
+    """
+
+    refinement: StepRefinement
+    gain: float
+
+
+def add_numerics_cause(verdict: Verdict, coarse: CoarseStepFinding) -> Verdict:
+    """Add the step or integrator to a verdict as its first cause.
+
+    Args:
+        verdict: Verdict on the remaining causes.
+        coarse: Finding that the file's step is too coarse.
+    """
+    causes = (*_causes(coarse), *verdict.causes)
+    return replace(verdict, verdict=_WITH.get(verdict.verdict, verdict.verdict), causes=causes)
+
+
+def _causes(coarse: CoarseStepFinding) -> list[Cause]:
+    from sims.robot.integrator_settings import INTEGRATOR_IDS
+
+    own, numerics = coarse.refinement.own, coarse.refinement.numerics
+    # At most two numbers are chosen, so Wilks' theorem gives this p-value of the gain.
+    chance = float(np.exp(-0.5 * min(coarse.gain, 1400.0)))
+    error = (
+        f"the file's own misses its fine motion by {coarse.refinement.error:.2g} times the noise"
+    )
+    causes = []
+    if numerics.integrator != own.integrator:
+        says = f"integrator = {numerics.integrator} follows the robot's motion; {error}"
+        number = FittedValue(float(INTEGRATOR_IDS[numerics.integrator]), "1", None, None)
+        causes.append(Cause(INTEGRATOR, (), says, {"coefficient": number}, chance))
+    if numerics.timestep != own.timestep:
+        says = f"a time step of {numerics.timestep:g} s follows the robot's motion; {error}"
+        number = FittedValue(numerics.timestep, "s", None, None)
+        causes.append(Cause(STEP, (), says, {"coefficient": number}, chance))
+    return causes

@@ -1,0 +1,148 @@
+"""Propose effects that a model may lack, by regression and from the standard joint model.
+
+Effects of the joint model are proposed at the joint with the largest missing force. A regression
+may miss them: they are not linear where a joint sticks, where a servo is stiff for a light joint,
+and where an encoder offset changes the pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.likelihood_fit import gauss_newton_step
+from bench.diagnosis.prediction_error.joint_effects import (
+    JOINT_MODEL,
+    SERVO_MODEL,
+    joint_name,
+    offset_from_command,
+    servo_input,
+)
+from bench.diagnosis.prediction_error.library_columns import LibraryColumns, regression_about
+from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
+from bench.diagnosis.search.refit_starts import with_effect
+from sims.core.simulator import Array
+from sims.robot.places.typical_forces import compute_joint_scales
+from sims.robot.robot_simulator import RobotSimulator
+
+MAX_REGRESSION_PROPOSALS = 4
+"""Maximum number of effects that are proposed by regression."""
+MAX_JOINT_PROPOSALS = 3
+"""Maximum number of effects of the joint and servo models that are added to a set."""
+MIN_GAIN_SHARE = 0.3
+"""Minimum gain by regression of a proposed effect, as a share of the largest gain."""
+FIRST_SHARE = 0.1
+"""Initial coefficient, as a share of the specified friction or of the typical force."""
+
+Proposals = list[tuple[str, Array]]
+"""Names of effects, each with its initial coefficients (k,)."""
+
+
+@dataclass
+class EffectProposals:
+    """The proposals of a search; those for the base model are cached.
+
+    Attributes:
+        filters: the filters of the search.
+        columns: the columns of the search.
+    """
+
+    filters: ModelFilters
+    columns: LibraryColumns
+    _for_base: dict[int, tuple[Proposals, Proposals]] = field(default_factory=dict)
+
+    def of(self, current: FilteredSet, most: int = MAX_JOINT_PROPOSALS) -> list[FitStart]:
+        """Return models with one more effect than a set.
+
+        Args:
+            current: the set.
+            most: maximum number of effects of the joint and servo models.
+        """
+        world, count = self.filters.world, len(self.columns.library.probes)
+        proposed = self._propose(current) if current.names else self._for_base.get(count)
+        if proposed is None:
+            proposed = self._for_base[count] = self._propose(current)
+        first, joint_model = proposed
+        own = FitStart(current.names, current.followed.theta, world.guess)
+        return [with_effect(world, own, name, c) for name, c in first + joint_model[:most]]
+
+    def _propose(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
+        """Return all proposals, with those of the joint and servo models in a separate list."""
+        found = self._by_regression(current)
+        others, joint = {*current.names, *dict(found)}, current.followed.joints_by_loss[0]
+        joint_model = self._joint_model(current.followed, joint, others)
+        return found + self._offset_and_friction(joint, others), joint_model
+
+    def _by_regression(self, current: FilteredSet) -> Proposals:
+        """Return the effects that gain most by regression, each with its coefficients."""
+        regression, _ = regression_about(current, self.columns.library, current.followed)
+        gains = regression.net_gains()
+        found: dict[str, Array] = {}
+        for i in np.argsort(-gains, kind="stable").tolist():
+            group = regression.groups[i]
+            if group.effect in (*current.names, *found):
+                continue
+            too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
+            if len(found) == MAX_REGRESSION_PROPOSALS or too_little:
+                break
+            solution = regression.solve([group])[1][0]
+            found[group.effect] = self.columns.coefficients(group, solution)
+        return list(found.items())
+
+    def _offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
+        """Return an encoder offset of a joint, and less dry friction than the model file specifies.
+
+        The derivative by more friction does not show the effect of less friction.
+        """
+        world, place = self.filters.world, joint_name(self.filters.world, joint)
+        found = {f"sensor.bias@q.{place}": offset_from_command(world, self.filters.noise, joint)}
+        friction = f"friction.coulomb@{place}"
+        if friction in world.library:
+            found[friction] = FIRST_SHARE * min(
+                compute_coefficient_bounds(world, friction)[0][0], 0.0
+            )
+        return [
+            (name, np.array([c]))
+            for name, c in found.items()
+            if c and name in world.library and name not in excluded
+        ]
+
+    def _joint_model(
+        self, followed: FollowedRuns, joint: int, excluded: Collection[str]
+    ) -> Proposals:
+        """Return friction, damping and armature of a joint, and stiffness and damping of its servo.
+
+        They are in descending order of their gain in likelihood.
+        """
+        world, place = self.filters.world, joint_name(self.filters.world, joint)
+        assert isinstance(world.simulator, RobotSimulator)
+        speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
+        typical = {
+            f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
+            f"inertia.armature@{place}": float(
+                compute_joint_scales(world.simulator.robot).inertia[joint]
+            ),
+        }
+        effects = [f"{effect}@{place}" for effect in JOINT_MODEL]
+        servo = servo_input(world, joint).removeprefix("u.")
+        effects += [f"{effect}@{servo}" for effect in SERVO_MODEL]
+        found = []
+        for name in effects:
+            if name in world.library and name not in excluded:
+                places, bounds = (
+                    world.get_coefficient_indices(name),
+                    compute_coefficient_bounds(world, name),
+                )
+                step, gain = gauss_newton_step(followed, places, bounds)
+                change = float(step[places[0]])
+                # If much process noise hides an effect, its typical size is tried.
+                if not gain > 0.5 * self.filters.penalty(name):
+                    change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
+                found.append((gain, name, np.array([change])))
+        found.sort(key=lambda one: -one[0])
+        return [(name, c) for _, name, c in found]

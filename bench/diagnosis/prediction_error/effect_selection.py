@@ -1,0 +1,165 @@
+"""Select the effects that a robot's model lacks, with repeated fits of the process noise.
+
+    1. Follow the runs with the model by a Kalman filter about the measured motion.
+    2. Compute the response of the innovations to every candidate effect.
+    3. Select effects by regression, whatever their number.
+    4. Put them into the linear model, fit the process noise again, and continue with 3, because the
+       innovations contain more information with less process noise.
+
+(L. Ljung, System Identification, 2nd ed., 1999, chapters 3, 7 and 16.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
+from bench.diagnosis.prediction_error.regression_selection import Regression, columns_of, groups_of
+from bench.diagnosis.search.explained_variance import DirectionGroup
+from sims.core.simulator import Array
+
+PASSES = 4
+"""Maximum number of regressions, each with the process noise of the previous selection."""
+MOST = 8
+"""Maximum number of effects in a set."""
+
+
+@dataclass(frozen=True)
+class Selected:
+    """The result of a selection.
+
+    Attributes:
+        groups: the selected groups of columns.
+        coefficients: coefficients of each group, in units of the probes' coefficients.
+        regression: the last regression.
+        log_likelihood: log-likelihood of the innovations with the selected effects.
+        followed: the runs, with the selected effects in the linear model.
+        numerics: share of the integrator's step errors in the linear model.
+        shows_steps: whether the innovations show these errors.
+    """
+
+    groups: Sequence[DirectionGroup]
+    coefficients: Sequence[Array]
+    regression: Regression
+    log_likelihood: float
+    followed: FollowedRuns
+    numerics: float
+    shows_steps: bool
+
+    @property
+    def effects(self) -> list[str]:
+        """Names of the selected effects."""
+        return [group.effect for group in self.groups]
+
+
+def shows_step_errors(followed: FollowedRuns) -> bool:
+    """Return whether the innovations show the errors of the integrator's steps.
+
+    They do if the recorded motion is one of continuous time, and do not if the engine generated it.
+    """
+    return regress(followed, followed.columns([])).shows_nuisance([])
+
+
+def identify(followed: FollowedRuns, columns: Columns) -> Selected:
+    """Select effects, with the process noise fitted again after each selection.
+
+    Args:
+        followed: the runs, without any effect.
+        columns: inputs of the candidates.
+    """
+    now, chosen = followed, list[DirectionGroup]()
+    coefficients: list[Array] = []
+    result: Selected | None = None
+    numerics = 0.0
+    for _ in range(PASSES):
+        regression = regress(now, columns, chosen, coefficients, numerics)
+        selected = regression.pruned(chosen) if chosen else []
+        selected = regression.select(MOST, selected)
+        _, found = regression.solve(selected)
+        numerics = regression.nuisance(selected)
+        now = with_effects(followed, columns, selected, found, numerics)
+        likelihood = now.log_likelihood
+        done = result is not None and likelihood < result.log_likelihood + 1.0
+        if result is None or likelihood > result.log_likelihood:
+            result = Selected(
+                selected,
+                found,
+                regression,
+                likelihood,
+                now,
+                numerics,
+                regression.shows_nuisance(selected),
+            )
+        if done:
+            break
+        chosen, coefficients = selected, found
+    assert result is not None
+    return result
+
+
+def regress(
+    now: FollowedRuns,
+    columns: Columns,
+    chosen: Sequence[DirectionGroup] = (),
+    coefficients: Sequence[Array] = (),
+    numerics: float = 0.0,
+    always: Sequence[int] = (),
+) -> Regression:
+    """Set up the regression of all that effects explain, including those in the linear model.
+
+    Args:
+        now: the runs, filtered with the chosen effects in the linear model.
+        columns: inputs of the candidates.
+        chosen: the effects in the linear model.
+        coefficients: coefficients of these effects.
+        numerics: share of the integrator's errors that is in the linear model.
+        always: indices of probes that are part of every set, and are not candidates.
+    """
+    responses = now.responses(columns)
+    number, _, _, count = responses.shape
+    nuisance = now.step_error_response()
+    own = columns_of(chosen)
+    weights = np.concatenate([*coefficients, np.zeros(0)])
+    grams = np.zeros((number, count + 1, count + 1))
+    crosses, totals = np.zeros((number, count + 1)), np.zeros(number)
+    for run in range(number):
+        target = now.filtered.whitened[run].reshape(-1)
+        rows = responses[run].reshape(target.size, count).astype(np.float64)
+        rows = np.concatenate([rows, nuisance[run].reshape(-1, 1)], axis=1)
+        target = target + rows[:, own] @ weights + numerics * rows[:, -1]
+        grams[run] = rows.T @ rows
+        crosses[run] = rows.T @ target
+        totals[run] = target @ target
+    contains = {name: effect.contains for name, effect in now.world.available_effects.items()}
+    groups = [g for g in groups_of(columns.probes) if not set(g.column_indices) & set(always)]
+    samples = int(now.runs.recorded.sum())
+    return Regression(groups, grams, crosses, totals, samples, contains, (count, *always))
+
+
+def with_effects(
+    followed: FollowedRuns,
+    columns: Columns,
+    chosen: Sequence[DirectionGroup],
+    coefficients: Sequence[Array],
+    numerics: float,
+) -> FollowedRuns:
+    """Put effects into the linear model, and fit the process noise again.
+
+    Args:
+        followed: the runs, without any effect.
+        columns: inputs of the candidates.
+        chosen: groups of columns of the effects.
+        coefficients: coefficients of each group.
+        numerics: share of the integrator's errors to put into the linear model.
+    """
+    own = [c for group in chosen for c in group.column_indices]
+    runs = followed.runs
+    defects, residuals = runs.defects - numerics * runs.step_errors, runs.residuals
+    if own:
+        pushed, readings = columns.total(own, np.concatenate(list(coefficients)))
+        defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, pushed)
+        residuals = np.where(runs.recorded, residuals - readings, 0.0)
+    return followed.refitted(replace(runs, defects=defects, residuals=residuals))

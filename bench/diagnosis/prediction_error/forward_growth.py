@@ -1,0 +1,217 @@
+"""Grow sets of effects one by one, each selected by filters with the effect in the model.
+
+If large forces are missing, the noise of the measured motion appears both in the innovations and in
+the responses of effects that depend on the same readings, and regression prefers these effects. A
+filter with the right effect in its model needs no process noise (forward selection; A. Miller,
+Subset Selection in Regression, 2nd ed., 2002, chapter 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.prediction_error.dry_friction import (
+    check_filter,
+    check_fit,
+    dry_friction_of,
+    stands_alone,
+)
+from bench.diagnosis.prediction_error.effect_proposals import MAX_REGRESSION_PROPOSALS
+from bench.diagnosis.prediction_error.effect_selection import Selected
+from bench.diagnosis.prediction_error.joint_effects import SERVO_MODEL
+from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.search_context import SearchContext
+from bench.diagnosis.prediction_error.selected_sets import LEAST_SHARE
+from bench.diagnosis.prediction_error.simulated_fits import (
+    fit_filtered,
+    higher_merit,
+    is_explained,
+    without_idle_effects,
+)
+
+MAX_STEPS = 4
+"""Maximum number of effects that are added one after another."""
+MAX_IMPROVED_TRIALS = 3
+"""Maximum number of tried effects whose coefficients are improved at each step."""
+SETTLED_SHARE = 0.1
+"""Minimum distance of a trial that is not improved, as a share of the gain of the best one."""
+MAX_FIRST_EFFECTS = 2
+"""Number of the likeliest trials that are fitted by simulation, at any distance from the best."""
+ALL_SERVOS_STEPS = 6
+"""Maximum number of Gauss-Newton steps for the coefficients of all servos."""
+RIVAL_MARGIN = 20.0
+"""Maximum distance in twice the log-likelihood of sets that are compared by simulation."""
+LINEARISATION_ERROR = 0.03
+"""Maximum relative error of a gain that is computed from linear responses."""
+
+
+def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
+    """Add effects to a fitted model as long as each pays, and fit the set.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
+    begin = FilteredSet(context.filters.of_model(model), model.effects)
+    larger = _grow(context, begin)
+    if larger is begin:
+        return model
+    return without_idle_effects(context, fit_filtered(context, larger))
+
+
+def add_to_dry_friction(
+    context: SearchContext, selected: Selected, friction: FittedModel
+) -> FittedModel:
+    """Add effects to the dry friction of a selection.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+        friction: its dry friction, fitted alone.
+
+    Returns:
+        The best model, or the base model if the selection has no friction or is likelier.
+
+    Raises:
+        SoftFrictionError: the friction has MuJoCo's soft form.
+    """
+    if not friction.effects or not stands_alone(context, selected, friction):
+        return context.search.base_model
+    return select_in_model(context, dry_friction_of(context, selected))
+
+
+def select_in_model(context: SearchContext, friction: FitStart | None = None) -> FittedModel:
+    """Add effects one after another to dry friction, or to the base model.
+
+    Args:
+        context: context of the search.
+        friction: dry friction that is in the model from the start, if any.
+
+    Raises:
+        SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
+    """
+    watch, filters, base = context.world.watch, context.filters, context.search.base_model
+    begin = filters.empty_set
+    if friction is not None:
+        begin = filters.with_effects(friction.theta, friction.effects)
+    first = _larger_that_pay(context, begin)
+    if not first and friction is None:
+        check_filter(context, begin.followed.log_likelihood)
+        return base
+    best = base if first else fit_filtered(context, begin)
+    for trial in _nearly_as_likely(context, first):
+        best = higher_merit(best, fit_filtered(context, trial))
+        if watch.has_abandoned_fits():
+            break
+    if friction is None and not is_explained(context, best) and not watch.has_abandoned_fits():
+        check_filter(context, first[0].followed.log_likelihood)
+        best = higher_merit(best, _fit_all_servos(context))
+    # Two effects together may explain what neither explains alone.
+    if first and not is_explained(context, best) and not watch.has_abandoned_fits():
+        best = higher_merit(best, fit_filtered(context, _grow(context, first[0])))
+    if not np.isfinite(best.fit.cost) or not best.effects:
+        return base
+    if not is_explained(context, best):
+        check_fit(context, best)
+    return without_idle_effects(context, best)
+
+
+def _grow(context: SearchContext, current: FilteredSet) -> FilteredSet:
+    """Add effects to a set as long as each pays."""
+    for _ in range(MAX_STEPS - 1):
+        larger = _larger_that_pay(context, current) if current.followed.lacks_force else []
+        if not larger:
+            break
+        current = larger[0]
+    return current
+
+
+def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
+    """Return sets with one more effect whose likelihood pays for it, the likeliest first."""
+    filters = context.filters
+    base = filters.log_likelihood(filters.reference)
+    own = current.followed.log_likelihood if current.names else base
+    share = LEAST_SHARE * 2.0 * (own - base)
+    return [
+        larger
+        for larger in try_one_more(context, current)
+        if 2.0 * (larger.followed.log_likelihood - own)
+        >= max(filters.penalty(larger.names[-1]), share)
+    ]
+
+
+def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
+    """Follow the runs with each effect that gains most in addition to a set.
+
+    Args:
+        context: context of the search.
+        current: the set.
+
+    Returns:
+        The larger sets, the likeliest first; empty if no effect gains.
+    """
+    watch, filters = context.world.watch, context.filters
+    watch.stage("testing effects in the model one by one", MAX_REGRESSION_PROPOSALS)
+    tried = []
+    for start in context.proposals.of(current):
+        tried.append(filters.with_effects(start.theta, start.effects, 0))
+        watch.advance()
+        watch.check_not_stopped()
+    tried.sort(key=lambda one: _criterion(context, one))
+    # The coefficients of the best are improved before they are compared.
+    found = list[FilteredSet]()
+    for one in tried[:MAX_IMPROVED_TRIALS]:
+        if found and _is_settled(context, found[0], one):
+            found.append(one)
+            continue
+        found.append(filters.with_effects(one.followed.theta, one.names))
+        found.sort(key=lambda one: _criterion(context, one))
+    return found
+
+
+def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
+    """Return whether a set explains the runs, and another one is far worse."""
+    behind = _criterion(context, other) - _criterion(context, best)
+    far = behind > RIVAL_MARGIN + SETTLED_SHARE * _gain(context, best)
+    return far and not best.followed.lacks_force
+
+
+def _nearly_as_likely(
+    context: SearchContext, tried: Sequence[FilteredSet]
+) -> Sequence[FilteredSet]:
+    """Return the sets between which simulation has to decide, the likeliest first."""
+    if not tried:
+        return ()
+    error = LINEARISATION_ERROR * _gain(context, tried[0])
+    limit = _criterion(context, tried[0]) + RIVAL_MARGIN + error
+    near = [one for one in tried if _criterion(context, one) <= limit]
+    return [*near, *tried[len(near) : MAX_FIRST_EFFECTS]]
+
+
+def _gain(context: SearchContext, current: FilteredSet) -> float:
+    """Return the gain of a set over the base model in twice the log likelihood."""
+    base = context.filters.log_likelihood(context.filters.reference)
+    return 2.0 * (current.followed.log_likelihood - base)
+
+
+def _criterion(context: SearchContext, current: FilteredSet) -> float:
+    """Return the penalised log likelihood of a set's last effect, as an information criterion."""
+    penalty = context.filters.penalty(current.names[-1])
+    return penalty - 2.0 * current.followed.log_likelihood
+
+
+def _fit_all_servos(context: SearchContext) -> FittedModel:
+    """Fit stiffness and damping of all servos together, if forces are missing at several joints.
+
+    Another effect may gain more than the stiffness or the damping alone.
+    """
+    names = [f"{effect}@*" for effect in SERVO_MODEL]
+    filters = context.filters
+    several = filters.base.missing_forces.sum() > 1
+    if not several or not set(names) <= set(context.world.library):
+        return context.search.base_model
+    return fit_filtered(context, filters.with_effects(filters.reference, names, ALL_SERVOS_STEPS))

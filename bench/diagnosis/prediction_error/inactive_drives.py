@@ -1,0 +1,530 @@
+"""Find samples of a robot's recording in which a drive exerts no force, before any fit.
+
+If a drive is switched off, if a servo is limp after a fault, or after an emergency stop, the
+commands continue. Effects of the library could only imitate this. Velocities and accelerations are
+estimated from positions alone (`measured_states`), and from them three forces at each joint and
+sample: the force f that the motion requires by inverse dynamics, the force τ of the model's drive,
+and the force g that holds the joint still. Three hypotheses have the residuals
+
+    on: f - τ,        off: f,        held (by a brake): f - g                                    (1)
+
+A sequence of hypotheses with few changes is found by dynamic programming (A. J. Viterbi 1967,
+doi:10.1109/TIT.1967.1054010). A sample costs min(|e| / s, `MAX_SAMPLE_COST`), with s the median of
+the smallest of (1), and each change costs `CHANGE_COST`. An interval that is off or held is
+accepted only if
+
+* the force error of the model's drive there is at least `MIN_MISSED_RATIO` times that elsewhere: a
+  wrong gain, friction or dead zone is wrong everywhere;
+* its hypothesis leaves at most `MAX_RESIDUAL_SHARE` of that force, and of the force of the drive
+  elsewhere: a drive at its force limit exerts more than elsewhere;
+* a run has at most `MAX_STRETCHES` such intervals.
+
+Magnitudes are the quantile `MAGNITUDE_QUANTILE` over all such intervals of a joint. Among 500
+random effects of the library on an arm with motors or servos, four were mistaken for an inactive
+drive.
+
+For the hypothesis "held", all drives are held at once, at the end or the beginning of a run, and
+the first two conditions apply to one of them: a joint that presses against a stop does not move,
+either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis.kalman.measured_states import track_joints
+from bench.logs.quality.noise_estimation import estimate_noise
+from sims.core.simulator import Array, Simulator
+from sims.recording.drive_switches import (
+    DriveSwitch,
+    parts_without,
+    spans,
+    spans_of_runs,
+    switched_runs,
+)
+from sims.recording.recording import Recording, Run
+from sims.robot.dynamics.activation_filters import activation_filters
+from sims.robot.dynamics.inverse_dynamics import motion_forces
+from sims.robot.robot_model import RobotModel
+
+Mask = NDArray[np.bool_]
+
+ON, OFF, HELD = 0, 1, 2
+"""Hypotheses about a drive: it is on, it is off, or its joint is held by a brake."""
+MAX_SAMPLE_COST = 8.0
+"""Maximum cost of a sample, so that no single sample decides."""
+CHANGE_COST = 40.0
+"""Cost of a change from one hypothesis to another."""
+MAX_EXTRA_COST = 0.5
+"""Maximum extra cost of a column over the likeliest intervals, per change.
+
+It is a share of `CHANGE_COST`.
+"""
+MAGNITUDE_QUANTILE = 0.8
+"""Quantile by which magnitudes are compared."""
+MIN_MISSED_RATIO = 2.0
+"""Minimum ratio of the force error of the model within the intervals to that elsewhere."""
+MAX_RESIDUAL_SHARE = 0.4
+"""Maximum residual of a hypothesis over all intervals, as a share of the force."""
+MAX_STRETCH_SHARE = 0.6
+"""Maximum residual of a hypothesis in a single interval, as a share of the force."""
+MAX_STILL_SPEED = 0.1
+"""Maximum velocity of a joint that is held, as a share of its usual velocity."""
+MAX_STRETCHES = 3
+"""Maximum number of inactive intervals in a run."""
+MIN_SAMPLES = 20
+"""Minimum number of samples in an interval, and in the part in which a drive works."""
+EDGE_SAMPLES = 5
+"""Number of samples on either side of a change in which the smoothed motion is blurred."""
+MAX_SAMPLES = 20_000
+"""Maximum number of samples at which forces are computed."""
+MIN_SCALE_SHARE = 1e-3
+"""Minimum of the scale s, as a share of the force that the motion requires."""
+
+
+class JointForces(NamedTuple):
+    """Forces at the D joints of a robot in the T samples of a run, (T, D) each.
+
+    Attributes:
+        needed: forces that the measured motion requires.
+        driven: forces of the model's drives at the measured motion.
+        holding: forces that hold the joints still.
+        velocity: velocities of the joints.
+    """
+
+    needed: Array
+    driven: Array
+    holding: Array
+    velocity: Array
+
+    def residuals(self, joint: int) -> Array:
+        """Return the residuals (3, T) of the hypotheses (1) at a joint."""
+        needed = self.needed[:, joint]
+        return np.stack([needed - self.driven[:, joint], needed, needed - self.holding[:, joint]])
+
+
+@dataclass(frozen=True)
+class InactiveDrive:
+    """A drive that exerts no force in some samples.
+
+    Attributes:
+        joint: name of the driven joint.
+        actuators: names of the actuators of the joint.
+        is_held: whether the joint is held still, as by a brake, and not free.
+        masks: inactive samples (T,) of each run.
+        costs: (2, T / every) costs in each run, of a drive that is on and of an inactive one.
+        every: interval, in samples, at which costs are computed.
+    """
+
+    joint: str
+    actuators: tuple[str, ...]
+    is_held: bool
+    masks: tuple[Mask, ...]
+    costs: tuple[Array, ...]
+    every: int
+
+    def is_likely(self, masks: Sequence[Mask]) -> bool:
+        """Return whether the drive is inactive in the given samples, and only there.
+
+        A drive with small commands does not show exactly when it is switched off, so the masks may
+        cost slightly more than the likeliest ones.
+
+        Args:
+            masks: (T,) samples of each run.
+        """
+        more, changes = 0.0, 0
+        for costs, mask, own in zip(self.costs, masks, self.masks, strict=True):
+            given = np.where(mask[:: self.every], costs[1], costs[0])
+            likeliest = np.where(own[:: self.every], costs[1], costs[0])
+            more += float((given - likeliest).sum())
+            if len(spans(mask)) > MAX_STRETCHES:
+                return False
+            changes += int((mask[1:] != mask[:-1]).sum())
+        return more <= MAX_EXTRA_COST * CHANGE_COST * max(changes, 1)
+
+
+def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
+    """Switch off inactive drives or omit these samples, and add notes to the recording.
+
+    If a column of the recording shows when a drive is off, the drive is switched off there;
+    otherwise the samples are omitted.
+
+    Args:
+        recording: the recording as it was read, before its runs are divided.
+        kind: a simulator of its system.
+    """
+    drives = inactive_drives(recording, kind)
+    if not drives:
+        return recording
+    notes = list(recording.notes)
+    runs = recording.runs
+    left_out = [np.zeros(run.times.size, dtype=bool) for run in runs]
+    unexplained: list[InactiveDrive] = []
+    for drive in drives:
+        switches = [] if drive.is_held else _switches(recording, drive)
+        if not switches:
+            unexplained.append(drive)
+            left_out = [a | _widened(b) for a, b in zip(left_out, drive.masks, strict=True)]
+            continue
+        runs, said = switched_runs(recording.path, runs, switches)
+        lines = " and ".join(switch.line for switch in switches)
+        description = recording.path.with_suffix(".toml").name
+        notes += [
+            f"{text}, and the motion needs no force of it: the drive is taken to be off; state it "
+            f"in {description}: {lines}"
+            for text in said
+        ]
+    pairs = zip(runs, left_out, strict=True)
+    kept = [part for run, mask in pairs for part in parts_without(run, mask)]
+    if unexplained and any(not run.held_out for run in kept):
+        notes += [_message(recording, unexplained, left_out)]
+        runs = tuple(kept)
+    return replace(recording, runs=tuple(runs), notes=tuple(notes))
+
+
+def _message(
+    recording: Recording, drives: Sequence[InactiveDrive], left_out: Sequence[Mask]
+) -> str:
+    """Return the note about drives whose state no column shows."""
+    joints = ", ".join(drive.joint for drive in drives)
+    where = spans_of_runs(recording.runs, left_out)
+    noun = "joint" if len(drives) == 1 else "joints"
+    does = "the joints stand still" if drives[0].is_held else "the motion needs no force of them"
+    column = _changing_column(recording, drives)
+    near = f"; column {column} changes there" if column else ""
+    name = drives[0].actuators[0]
+    line = DriveSwitch(name, "COLUMN", True).line
+    return (
+        f"the drives of {noun} {joints} do nothing in some samples, which are left out ({where}): "
+        f"{does}, whatever is commanded{near}; if a column says when a drive is on, state it: "
+        f"{line}"
+    )
+
+
+def _switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
+    """Return switches of a drive's actuators from the first column that shows when it is off."""
+    for column in recording.runs[0].extra:
+        for zero_is_off in (True, False):
+            found = [DriveSwitch(name, column, zero_is_off) for name in drive.actuators]
+            if drive.is_likely([found[0].off(run) for run in recording.runs]):
+                return found
+    return []
+
+
+def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> str:
+    """Return the first other column that changes only where drives become inactive or active.
+
+    The result is empty if there is no such column.
+    """
+    for column in recording.runs[0].extra:
+        hits, others = 0, 0
+        for number, run in enumerate(recording.runs):
+            values = run.extra[column]
+            changes = np.flatnonzero(np.diff(values) != 0) + 1
+            found = np.any([drive.masks[number] for drive in drives], axis=0)
+            near = _widened(found) & _widened(~found)
+            hits += int(near[changes].sum())
+            others += int((~near[changes]).sum())
+        if hits and not others:
+            return column
+    return ""
+
+
+def _widened(mask: Mask) -> Mask:
+    """Return a mask that is extended by some samples on either side."""
+    wide: Mask = np.convolve(mask, np.ones(2 * EDGE_SAMPLES + 1), mode="same") > 0.5
+    return wide
+
+
+def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[InactiveDrive]:
+    """Find drives that are inactive in some samples, by (1).
+
+    Args:
+        recording: the recording as it was read.
+        kind: a simulator of its system.
+
+    Returns:
+        The drives; empty if the positions of some joints are not recorded, if there is a floating
+        base, or if joints are coupled by equalities.
+    """
+    robot = getattr(kind, "robot", None)
+    if not kind.has_model or robot is None or not _is_open_chain(robot, recording):
+        return []
+    total = sum(run.times.size for run in recording.runs)
+    every = -(-total // MAX_SAMPLES)
+    with np.errstate(all="ignore"):
+        forces = [_forces(robot, recording, run) for run in _thinned(recording, every)]
+    driven = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
+    actuators = {
+        number: tuple(a.name for a in driven if a.joint == joint.name)
+        for number, joint in enumerate(robot.joints)
+    }
+    joints = [number for number, names in actuators.items() if names]
+    drives = []
+    for joint in joints:
+        stretches = _Stretches(forces, [joint], OFF)
+        if stretches.any():
+            drives.append((joint, stretches))
+    if not drives and joints:
+        stretches = _Stretches(forces, joints, HELD)
+        drives = [(joint, stretches) for joint in joints] if stretches.any() else []
+    return [
+        InactiveDrive(
+            robot.joints[joint].name,
+            actuators[joint],
+            stretches.state == HELD,
+            tuple(
+                np.repeat(mask, every)[: run.times.size]
+                for mask, run in zip(stretches.masks, recording.runs, strict=True)
+            ),
+            tuple(stretches.costs),
+            every,
+        )
+        for joint, stretches in drives
+    ]
+
+
+def _is_open_chain(robot: RobotModel, recording: Recording) -> bool:
+    """Return whether forces can be computed from the recorded positions."""
+    recorded = recording.runs[0].channels
+    singles = all(
+        joint.has_one_coordinate and f"q.{joint.name}" in recorded for joint in robot.joints
+    )
+    long = all(run.times.size > 3 * MIN_SAMPLES for run in recording.runs)
+    return singles and long and not robot.compiled.neq and bool(robot.actuators)
+
+
+def _thinned(recording: Recording, every: int) -> list[Run]:
+    """Return every k-th sample of all runs."""
+    return [run.part(slice(None, None, every)) for run in recording.runs]
+
+
+def _forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
+    """Compute the forces of (1) by MuJoCo's inverse dynamics."""
+    model = robot.compiled
+    states = np.stack(track_joints(run.times, _readings(robot, recording, run)))
+    motion = np.transpose(states, (2, 1, 0))
+    still = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
+    controls, activations = _controls(robot, run)
+    applied = np.zeros(motion.shape[1:])
+    for column, joint in enumerate(robot.joints):
+        name = f"force.{joint.name}"
+        if name in run.inputs:
+            applied[:, column] = _mean_input(run, name)
+    needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
+    holding, _ = motion_forces(model, robot.joints, still, controls, activations)
+    names = [joint.name for joint in robot.joints]
+    for name, off in run.off.items():
+        of = robot.actuator(name).joint
+        if of is not None:
+            # Where the drive is known to be off, both hypotheses agree.
+            driven[off, names.index(of)] = 0.0
+    return JointForces(needed - applied, driven, holding - applied, motion[1])
+
+
+def _readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
+    """Return recorded positions and velocities of all joints, and their noise."""
+    readings = []
+    for joint in robot.joints:
+        columns, noise = [], []
+        for name in (f"q.{joint.name}", f"qd.{joint.name}"):
+            values = run.channels.get(name, np.full(run.times.size, np.nan))
+            columns.append(values)
+            sigma = recording.noise.get(name, 0.0)
+            if not sigma > 0 and name in run.channels:
+                sigma = estimate_noise([(run.times, values)]).sigma
+            noise.append(sigma if np.isfinite(sigma) and sigma > 0 else 1e-6)
+        readings.append((np.stack(columns, axis=1), np.array(noise)))
+    return readings
+
+
+def _mean_input(run: Run, name: str) -> Array:
+    """Return an input (T,) at each sample: the mean of its values before and after the sample."""
+    values = run.inputs[name]
+    if name in run.linear:
+        return values
+    earlier = np.concatenate([values[:1], values[:-1]])
+    mean: Array = 0.5 * (values + earlier)
+    return mean
+
+
+def _controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
+    """Return controls (T, nu) and activations (T, na) at the samples."""
+    model = robot.compiled
+    controls = np.zeros((run.times.size, model.nu))
+    activations = np.zeros((run.times.size, model.na))
+    for actuator in robot.actuators:
+        name = f"u.{actuator.name}"
+        if name in run.inputs:
+            controls[:, actuator.control] = _mean_input(run, name)
+    steps = np.diff(run.times)
+    for one in activation_filters(robot):
+        taken = one.clipped(controls[:, one.actuator.control])
+        now = float(taken[0])
+        for k, kept in enumerate(np.exp(-np.append(steps, 0.0) / max(one.seconds, 1e-9)).tolist()):
+            activations[k, one.address] = now
+            now = taken[k] + kept * (now - taken[k])
+    return controls, activations
+
+
+class _Stretches:
+    """Intervals of runs in which a hypothesis about some joints holds instead of active drives.
+
+    Attributes:
+        state: number of the hypothesis, ``OFF`` or ``HELD``.
+        costs: (2, T) costs in each run, of active drives and of the hypothesis.
+        masks: (T,) samples of each run in which the hypothesis holds.
+
+    Args:
+        forces: forces in the runs.
+        joints: indices of the joints to which the hypothesis applies.
+        state: number of the hypothesis.
+    """
+
+    def __init__(self, forces: Sequence[JointForces], joints: Sequence[int], state: int) -> None:
+        self.state = state
+        self._forces, self._joints = forces, joints
+        self._residuals = [[one.residuals(joint) for one in forces] for joint in joints]
+        self.costs = [np.zeros((2, len(one.needed))) for one in forces]
+        for of_runs in self._residuals:
+            for cost, more in zip(self.costs, _costs(of_runs, state), strict=True):
+                cost += more
+        masks = [_without_short_stretches(_likeliest(cost)) for cost in self.costs]
+        if max(len(spans(mask)) for mask in masks) > MAX_STRETCHES:
+            masks = [np.zeros_like(mask) for mask in masks]
+        self.masks = self._accepted(masks)
+
+    def any(self) -> bool:
+        """Return whether there is an interval."""
+        return any(mask.any() for mask in self.masks)
+
+    def _accepted(self, masks: Sequence[Mask]) -> list[Mask]:
+        """Return masks (T,) if they fulfil the conditions of the module docstring, else empty ones.
+
+        Single intervals that do not fulfil them are removed.
+        """
+        nothing = [np.zeros_like(mask) for mask in masks]
+        working = [~_widened(mask) for mask in masks]
+        inner = [_without_edges(mask) for mask in masks]
+        if (
+            min(sum(int(m.sum()) for m in of_runs) for of_runs in (working, inner))
+            < MIN_SAMPLES // 2
+        ):
+            return nothing
+        missed = self._magnitudes(ON, working)
+        usual = self._magnitudes(self.state, working)
+        driven = self._magnitudes(ON, inner)
+        left = self._magnitudes(self.state, inner)
+        is_worse = any(d >= MIN_MISSED_RATIO * m for d, m in zip(driven, missed, strict=True))
+        is_small = all(e <= MAX_RESIDUAL_SHARE * u for e, u in zip(left, usual, strict=True))
+        if not (is_worse and is_small and sum(left) <= MAX_RESIDUAL_SHARE * sum(driven)):
+            return nothing
+        fast = [
+            _magnitude(np.concatenate([f.velocity[m, j] for f, m in self._paired(working)]))
+            for j in self._joints
+        ]
+        result = []
+        for run, (mask, within) in enumerate(zip(masks, inner, strict=True)):
+            standing = np.zeros_like(mask)
+            for first, end in spans(mask):
+                own = [np.zeros_like(m) for m in masks]
+                own[run][first:end] = within[first:end]
+                better = sum(self._magnitudes(self.state, own)) <= MAX_STRETCH_SHARE * sum(
+                    self._magnitudes(ON, own)
+                )
+                standing[first:end] = better and (
+                    self.state == OFF or self._is_still(run, own[run], (first, end), fast)
+                )
+            result.append(standing)
+        return result
+
+    def _paired(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
+        """Pair forces of runs with masks."""
+        return zip(self._forces, masks, strict=True)
+
+    def _magnitudes(self, state: int, masks: Sequence[Mask]) -> list[float]:
+        """Return the magnitude of the residuals of a hypothesis within masks (T,), by joint."""
+        return [
+            _magnitude(np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)]))
+            for of_runs in self._residuals
+        ]
+
+    def _is_still(self, run: int, mask: Mask, ends: tuple[int, int], fast: Sequence[float]) -> bool:
+        """Return whether all joints are at rest in an interval at an end of the run."""
+        velocity = self._forces[run].velocity
+        at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
+        still = [
+            _magnitude(velocity[mask, j]) <= MAX_STILL_SPEED * f
+            for j, f in zip(self._joints, fast, strict=True)
+        ]
+        return at_end and all(still)
+
+
+def _without_edges(mask: Mask) -> Mask:
+    """Return a mask without the samples near changes, where the smoothed motion is blurred."""
+    result = np.zeros_like(mask)
+    for first, end in spans(mask):
+        result[first + EDGE_SAMPLES * (first > 0) : end - EDGE_SAMPLES * (end < mask.size)] = True
+    return result
+
+
+def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
+    """Return costs (2, T) in each run, of an active drive and of a hypothesis about one joint."""
+    chosen = [ON, state]
+    pooled = np.concatenate(residuals, axis=1)[chosen]
+    pooled = pooled[:, np.isfinite(pooled).all(axis=0)]
+    if not pooled.size:
+        return [np.zeros((2, r.shape[1])) for r in residuals]
+    scale = float(np.median(np.abs(pooled).min(axis=0)))
+    scale = max(scale, MIN_SCALE_SHARE * _magnitude(pooled[1]))
+    if not scale > 0:
+        return [np.zeros((2, r.shape[1])) for r in residuals]
+    return [
+        np.minimum(
+            np.abs(np.nan_to_num(r[chosen], nan=MAX_SAMPLE_COST * scale)) / scale, MAX_SAMPLE_COST
+        )
+        for r in residuals
+    ]
+
+
+def _likeliest(costs: Array) -> Mask:
+    """Return where the second of two hypotheses is chosen (T,), from costs (2, T).
+
+    Dynamic programming finds the sequence with the lowest cost.
+    """
+    count = costs.shape[1]
+    from_other = np.zeros((2, count), dtype=bool)
+    best = costs[:, 0].copy()
+    for k in range(1, count):
+        changed = best[::-1] + CHANGE_COST
+        from_other[:, k] = changed < best
+        best = np.minimum(best, changed) + costs[:, k]
+    result = np.zeros(count, dtype=bool)
+    now = int(np.argmin(best))
+    for k in range(count - 1, -1, -1):
+        result[k] = now == 1
+        if from_other[now, k]:
+            now = 1 - now
+    return result
+
+
+def _without_short_stretches(mask: Mask) -> Mask:
+    """Return a mask without intervals that are too short."""
+    result = np.zeros_like(mask)
+    for first, end in spans(mask):
+        result[first:end] = end - first >= MIN_SAMPLES
+    return result
+
+
+def _magnitude(values: Array) -> float:
+    """Return a quantile of magnitudes (n,).
+
+    It excludes impacts, which the smoothed motion does not reproduce.
+    """
+    finite = np.abs(values[np.isfinite(values)])
+    return float(np.quantile(finite, MAGNITUDE_QUANTILE)) if finite.size else 0.0

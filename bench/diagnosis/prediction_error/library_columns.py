@@ -1,0 +1,222 @@
+"""Columns of the regressions: inputs that effects add to the states and readings of a filter.
+
+There are columns for library effects, for forces of any shape, and for effects that are already in
+the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    clip_coefficients,
+    compute_coefficient_bounds,
+)
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.kalman.candidate_responses import Columns, FollowedRuns
+from bench.diagnosis.prediction_error.effect_selection import Selected, identify, regress
+from bench.diagnosis.prediction_error.joint_effects import has_many_shapes
+from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
+from bench.diagnosis.prediction_error.regression_selection import Regression
+from bench.diagnosis.search.candidate_directions import CandidateDirection, first_probes
+from bench.diagnosis.search.explained_variance import DirectionGroup
+from bench.diagnosis.search.joint_force_basis import JointHatForce
+from bench.diagnosis.search.lack_of_fit import hat_probes
+from sims.core.simulator import Array
+
+RELATIVE_DIFFERENCE = 0.02
+"""Finite-difference step of a coefficient, as a share of the coefficient."""
+
+
+class ModelRegression(NamedTuple):
+    """A regression with effects in the model.
+
+    Attributes:
+        regression: regression of the innovations on the candidates.
+        own: columns of each effect in the model, by name, which are part of every set; the first
+            column is its whole change.
+    """
+
+    regression: Regression
+    own: dict[str, list[int]]
+
+
+@dataclass
+class LibraryColumns:
+    """The columns of a search, about the smoothed motion of the base model's filter.
+
+    Attributes:
+        filters: the filters of the search.
+    """
+
+    filters: ModelFilters
+    _library: Columns | None = None
+    _hats: Columns | None = None
+    _regressions: dict[bytes, ModelRegression] = field(default_factory=dict)
+
+    @property
+    def library(self) -> Columns:
+        """Candidates of the library: effects with few shapes, and those that were added."""
+        if self._library is None:
+            world = self.filters.world
+            names = [name for name in world.library if not has_many_shapes(name)]
+            world.watch.stage(f"testing {len(names)} effects", 1)
+            self._library = self.filters.base.columns(self.probes(names))
+        return self._library
+
+    @property
+    def hats(self) -> Columns:
+        """Forces of any shape as candidates, by the labels of their families."""
+        if self._hats is None:
+            probes, _ = hat_probes(self.filters.world)
+            named = [replace(probe, effect=JointHatForce.name) for probe in probes]
+            self._hats = replace(self.filters.base.columns(named), probes=tuple(probes))
+        return self._hats
+
+    def take_over(self, other: LibraryColumns) -> None:
+        """Reuse the columns of another search of the same runs."""
+        self._library, self._hats = other._library, other._hats
+
+    def add(self, names: Sequence[str]) -> None:
+        """Add effects to the candidates of the library."""
+        self._library = self.library.joined(self.filters.base.columns(self.probes(names)))
+
+    def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
+        """Return the probes of effects about the base model."""
+        base, world, found = (
+            self.filters.models.base_model,
+            self.filters.world,
+            list[CandidateDirection](),
+        )
+        for name in names:
+            bounds = compute_coefficient_bounds(world, name)
+            for probe in first_probes(world, base.fit, name):
+                # The value in the model file may be too large, so the correction may be negative.
+                signed = probe.signed or (bounds[probe.place][0] < 0 and not probe.fixed)
+                found.append(replace(probe, signed=signed))
+        return found
+
+    def select(self) -> Selected:
+        """Select effects of the library by regression."""
+        library = self.library
+        self.filters.world.watch.stage("selecting effects", 1)
+        selected = identify(self.filters.base, library)
+        self.filters.numerics = selected.numerics
+        return selected
+
+    def start(self, groups: Sequence[DirectionGroup], coefficients: Sequence[Array]) -> FitStart:
+        """Return a start with a set of groups of columns.
+
+        Args:
+            groups: groups of columns of the effects.
+            coefficients: coefficients of each group.
+        """
+        theta, base = self.filters.reference.copy(), self.filters.models.base_model
+        for group, own in zip(groups, coefficients, strict=True):
+            theta[self.filters.world.slots[group.effect]] = self.coefficients(group, own)
+        return FitStart(tuple(group.effect for group in groups), theta, base.fit.states)
+
+    def coefficients(self, group: DirectionGroup, solution: Array) -> Array:
+        """Return the coefficients (k,) of an effect from the regression.
+
+        Args:
+            group: columns of the effect.
+            solution: regression coefficients of these columns.
+        """
+        return group_coefficients(self.filters.world, self.library.probes, group, solution)
+
+    def regression(self, model: FittedModel) -> ModelRegression:
+        """Return the regression with the effects of a fitted model in the filter's model.
+
+        The candidates are the library and forces of any shape.
+        """
+        key = model.fit.theta.tobytes()
+        if key not in self._regressions:
+            current = FilteredSet(self.filters.of_model(model), model.effects)
+            columns = self.library.joined(self.hats)
+            self._regressions[key] = regression_about(current, columns, self.filters.base)
+        return self._regressions[key]
+
+    def sensitivities(self, start: FitStart) -> KnownJacobian:
+        """Return the derivatives of the runs by the coefficients of a model's effects.
+
+        They are differences of responses about the measured motion.
+        """
+        world, followed = self.filters.world, self.filters.base
+        tangents = [_tangents(world, name, start.theta) for name in start.effects]
+        columns = followed.columns([probe for own in tangents for probe in own])
+        responses = followed.sensitivities(columns)
+        places, derivatives, first = list[int](), [], 0
+        for name, (whole, *moved) in zip(start.effects, tangents, strict=True):
+            for k, probe in enumerate(moved):
+                # A coefficient without a range has no derivative.
+                step = float(probe.coefficients[k] - whole.coefficients[k]) or np.inf
+                change = responses[..., first + 1 + k] - responses[..., first]
+                derivatives.append(change / step)
+            places += world.get_coefficient_indices(name)
+            first += 1 + len(moved)
+        return KnownJacobian(np.array(places, dtype=np.intp), np.stack(derivatives, axis=-1))
+
+
+def group_coefficients(
+    world: RunEvaluator,
+    probes: Sequence[CandidateDirection],
+    group: DirectionGroup,
+    solution: Array,
+) -> Array:
+    """Return the coefficients (k,) of an effect from the regression, within their bounds.
+
+    Args:
+        world: the runs.
+        probes: probes of all columns.
+        group: columns of the effect.
+        solution: regression coefficients of these columns.
+    """
+    c = probes[group.column_indices[0]].coefficients.copy()
+    for column, value in zip(group.column_indices, solution, strict=True):
+        # A fixed change is valid only at its own size.
+        if not probes[column].fixed:
+            c[probes[column].place] = value
+    return clip_coefficients(world, group.effect, c)
+
+
+def regression_about(
+    current: FilteredSet, columns: Columns, followed: FollowedRuns
+) -> ModelRegression:
+    """Set up the regression with effects in the model.
+
+    Args:
+        current: the runs, filtered with these effects.
+        columns: inputs of the candidates.
+        followed: filtered runs about whose motion the effects are linearised.
+    """
+    own: dict[str, list[int]] = {}
+    probes: list[CandidateDirection] = []
+    count = len(columns.probes)
+    for name in current.names:
+        tangents = _tangents(followed.world, name, current.followed.theta)
+        first = count + len(probes)
+        own[name] = list(range(first, first + len(tangents)))
+        probes += tangents
+    joined = columns.joined(followed.columns(probes)) if probes else columns
+    always = range(count, len(joined.probes))
+    return ModelRegression(regress(current.followed, joined, always=always), own)
+
+
+def _tangents(world: RunEvaluator, name: str, theta: Array) -> list[CandidateDirection]:
+    """Return the whole change by an effect of a model, and one with each coefficient displaced."""
+    c = theta[world.slots[name]]
+    probes = [CandidateDirection(name, 0, 0, c, signed=True, fixed=True)]
+    for place, (low, high) in enumerate(compute_coefficient_bounds(world, name)):
+        moved = c.copy()
+        size = max(abs(float(c[place])), RELATIVE_DIFFERENCE * (high - low))
+        step = RELATIVE_DIFFERENCE * size
+        moved[place] += step if moved[place] + step <= high else -step
+        probes.append(CandidateDirection(name, 1 + place, place, moved, signed=True, fixed=True))
+    return probes

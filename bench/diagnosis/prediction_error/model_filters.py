@@ -1,0 +1,234 @@
+"""Kalman filters that follow the runs with effects in the model.
+
+Regression is linear about the base model; a filter with an effect in its model is not. With the
+right effects it needs no process noise, so its likelihood can compare sets of effects before any of
+them is simulated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    clip_coefficients,
+    compute_coefficient_bounds,
+)
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.friction_form_verdict import has_soft_form, soft_kind
+from bench.diagnosis.kalman.candidate_responses import FollowedRuns
+from bench.diagnosis.kalman.likelihood_fit import maximise_likelihood
+from bench.diagnosis.prediction_error.joint_effects import OFFSET_THRESHOLD, joint_name
+from bench.diagnosis.search.scored_models import ScoredModelSet
+from sims.core.simulator import Array
+from sims.robot.robot_simulator import RobotSimulator
+
+RELINEARISATION_THRESHOLD = 100.0
+"""Minimum change of the smoothed motion, in units of the noise, for another linearisation."""
+MAX_CACHED_FILTERS = 6
+"""Maximum number of cached filters of tried effects."""
+GAUSS_NEWTON_STEPS = 2
+"""Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
+SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
+"""Friction forces tried for dry friction in the soft form, as multiples of the missing force."""
+
+
+class FilteredSet(NamedTuple):
+    """A set of effects in the model of a filter.
+
+    Attributes:
+        followed: the runs, followed by this filter.
+        names: names of the effects.
+    """
+
+    followed: FollowedRuns
+    names: tuple[str, ...]
+
+
+@dataclass
+class ModelFilters:
+    """The filters of a search.
+
+    Attributes:
+        models: the base model and the fitted models.
+        numerics: share of the integrator's step errors that the selection puts into the model.
+    """
+
+    models: ScoredModelSet
+    numerics: float = 0.0
+    _of_models: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _of_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
+    _of_tried: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.world, self.noise = self.models.world, self.models.noise
+
+    @cached_property
+    def reference(self) -> Array:
+        """Parameters (P,) without any effect.
+
+        They are those of the base model, with free parameters as identified together with effects.
+        Without effects, the base model may need absurd values.
+        """
+        theta: Array = self.models.base_model.fit.theta.copy()
+        identified = self.world.identified
+        if identified is not None:
+            kept = [i not in self.models.frozen for i in self.world.base.tolist()]
+            theta[self.world.base[kept]] = identified[kept]
+        return theta
+
+    def theta_with(self, name: str, c: Array) -> Array:
+        """Return parameters (P,) with one effect.
+
+        Args:
+            name: name of the effect.
+            c: (k,) its coefficients.
+        """
+        theta = self.reference.copy()
+        theta[self.world.slots[name]] = c
+        return theta
+
+    @property
+    def base(self) -> FollowedRuns:
+        """The runs, followed with the base model."""
+        return FollowedRuns.of_model(self.world, self.reference, self.noise)
+
+    @property
+    def empty_set(self) -> FilteredSet:
+        """The base model as a set of effects."""
+        return FilteredSet(self.base, ())
+
+    def of_model(self, model: FittedModel) -> FollowedRuns:
+        """Return the runs, followed with a fitted model."""
+        if not model.effects:
+            return self.base
+        key = model.fit.theta.tobytes()
+        if key not in self._of_models:
+            names = frozenset(model.effects)
+            known = self._of_sets.get(names)
+            found = (known or self.base).with_parameters(model.fit.theta)
+            if known is None:
+                found = found.with_parameters(model.fit.theta, is_alike=True)
+            self._of_sets[names] = found
+            if self.numerics:
+                defects = found.runs.defects - self.numerics * found.runs.step_errors
+                found = found.refitted(replace(found.runs, defects=defects))
+            self._of_models[key] = found
+        return self._of_models[key]
+
+    def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
+        """Return the log-likelihood of the innovations of a model.
+
+        Args:
+            theta: (P,) parameters of the model.
+            is_soft: whether effects add dry friction in MuJoCo's soft form, whatever the form of
+                the search.
+        """
+        key = theta.tobytes(), is_soft
+        if key not in self._likelihoods:
+            simulator = self._soft_simulator if is_soft else None
+            self._likelihoods[key] = self.base.with_parameters(theta, simulator).log_likelihood
+        return self._likelihoods[key]
+
+    def with_effects(
+        self, theta: Array, names: Sequence[str], steps: int = GAUSS_NEWTON_STEPS
+    ) -> FilteredSet:
+        """Follow the runs with effects in the model, and improve their coefficients.
+
+        Args:
+            theta: (P,) initial parameters.
+            names: names of the effects.
+            steps: maximum number of Gauss-Newton steps.
+        """
+        begin = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
+        bounds = [b for name in names for b in compute_coefficient_bounds(self.world, name)]
+        places = [place for name in names for place in self.world.get_coefficient_indices(name)]
+        best = maximise_likelihood(begin, places, bounds, steps, self._follow_near)
+        newest = list(self._of_tried.items())[:MAX_CACHED_FILTERS]
+        self._of_tried = {best.theta.tobytes(): best, **dict(newest)}
+        return FilteredSet(best, tuple(names))
+
+    def _follow_near(self, theta: Array, known: FollowedRuns) -> FollowedRuns:
+        """Follow the runs with other parameters, linearised about a known motion."""
+        followed = known.with_parameters(theta)
+        moved = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
+        # With an encoder offset, the true motion is far from the readings.
+        far = moved.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
+        return followed.with_parameters(theta) if far else followed
+
+    def first_states(self, followed: FollowedRuns) -> Array:
+        """Return states at the first samples (R, s), estimated from the readings.
+
+        With an encoder offset, positions are smoothed ones. The states of the base fit are not
+        used, because they are biased by what is missing.
+        """
+        states, positions = self.world.guess.copy(), followed.first_positions()
+        own = states[:, : positions.shape[1]]
+        noise = float(np.nanmax(self.noise.sigma))
+        moved = np.abs(positions - own) > OFFSET_THRESHOLD * noise
+        fine = np.isfinite(positions) & moved & ~self.world.known[:, : positions.shape[1]]
+        states[:, : positions.shape[1]] = np.where(fine, positions, own)
+        return states
+
+    def penalty(self, name: str) -> float:
+        """Return the minimum gain of an effect in twice the log-likelihood."""
+        count = len(self.world.get_coefficient_indices(name))
+        return float(count * self.models.parameter_penalty + 2.0 * np.log(len(self.world.library)))
+
+    @property
+    def is_soft(self) -> bool:
+        """Whether effects add dry friction in MuJoCo's soft form."""
+        return has_soft_form(self.world)
+
+    @cached_property
+    def soft_friction(self) -> FitStart | None:
+        """The likeliest model of dry friction in MuJoCo's soft form; None if not in the library.
+
+        It acts at the joint with the largest missing force; the likelihood is that of filters.
+        """
+        models = soft_friction_models(self.base, self.reference)
+        if not models:
+            return None
+        states = self.first_states(self.base)
+        starts = [FitStart((name,), theta, states) for name, theta in models]
+        return max(starts, key=lambda start: self.log_likelihood(start.theta, is_soft=True))
+
+    @cached_property
+    def _soft_simulator(self) -> RobotSimulator:
+        """Simulator with dry friction in MuJoCo's soft form."""
+        simulator = self.world.simulator_of(soft_kind(self.world.kind))
+        assert isinstance(simulator, RobotSimulator)
+        return simulator
+
+
+def soft_friction_models(followed: FollowedRuns, theta: Array) -> list[tuple[str, Array]]:
+    """Return models with dry friction of several sizes at the joint with the largest missing force.
+
+    They are for a simulator with MuJoCo's soft form. The list is empty if the library has no such
+    effect, or if friction is already soft.
+
+    Args:
+        followed: the runs, without the effect.
+        theta: (P,) parameters without the effect.
+
+    Returns:
+        The effect and the parameters (P,) of each model.
+    """
+    world, joint = followed.world, followed.joints_by_loss[0]
+    name = f"friction.coulomb@{joint_name(world, joint)}"
+    if has_soft_form(world) or name not in world.library:
+        return []
+    models = []
+    for factor in SOFT_FACTORS:
+        # The missing force of a sliding joint is about the force of its friction.
+        size = np.array([factor * float(followed.force[joint])])
+        changed = theta.copy()
+        changed[world.slots[name]] = clip_coefficients(world, name, size)
+        models.append((name, changed))
+    return models

@@ -1,0 +1,245 @@
+"""Search for the effects that a robot's model lacks, by prediction errors.
+
+`identification` selects effects by the innovations of a filter. Here, selected sets are fitted to
+whole simulated runs (output errors), which decide. The search ends as soon as the residual of a set
+is only noise. The order is:
+
+    1. Select effects with few shapes by regression. Fit the dry friction among them first, because
+       it is not linear where a joint sticks (`dry_friction`), and then the set (`selected_sets`).
+    2. If a force is still missing, fit each of the effects with the largest gains alone, and those
+       of the standard joint model (`single_effects`, `effect_proposals`).
+    3. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
+       filters with the effect in the model (`forward_selection`).
+    4. Select again, with effects of many shapes at the joints where a force is missing
+       (`selected_sets`).
+    5. Simulate elasticity and backlash between a drive and its links (`single_effects`).
+    6. Try one effect in place of several (`rivals`).
+
+`PredictionErrorSearch.fit_rivals` then fits the sets that are nearly as good, because they may be
+equivalent. All steps share filters with effects in the model (`model_filters`), columns of
+regressions (`library_columns`) and fits (`simulated_fits`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.prediction_error.dry_friction import (
+    check_fit,
+    check_selection,
+    fit_dry_friction,
+)
+from bench.diagnosis.prediction_error.effect_selection import Selected
+from bench.diagnosis.prediction_error.forward_growth import (
+    add_to_dry_friction,
+    add_to_model,
+    select_in_model,
+)
+from bench.diagnosis.prediction_error.joint_effects import has_series
+from bench.diagnosis.prediction_error.null_distribution import null_scores, p_value_of_gain
+from bench.diagnosis.prediction_error.rival_sets import fit_rivals, fit_single_in_place
+from bench.diagnosis.prediction_error.search_context import SearchContext
+from bench.diagnosis.prediction_error.selected_sets import (
+    fit_quick_selection,
+    fit_selection,
+    select_with_shapes,
+)
+from bench.diagnosis.prediction_error.simulated_fits import (
+    fit,
+    higher_merit,
+    is_explained,
+    is_nearly_explained,
+    without_idle_effects,
+)
+from bench.diagnosis.prediction_error.single_effects import fit_series_effects, fit_single_effects
+from bench.diagnosis.search.candidate_directions import DirectionSet
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.refit_starts import with_effect
+from bench.diagnosis.search.score_test import CandidateScores
+from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
+from sims.core.simulator import Array
+
+TRIED_SHARES = (1.0, 0.5)
+"""Shares of the regression coefficients with which a filter must follow the runs better."""
+
+
+@dataclass
+class PredictionErrorSearch(EffectSearch):
+    """A search with candidates from prediction errors.
+
+    Attributes:
+        is_form_given: whether the form of dry friction is not tested before effects are fitted.
+        likely: a model that is fitted before any selection, if there is one.
+    """
+
+    is_form_given: bool = False
+    likely: FitStart | None = None
+
+    @cached_property
+    def _context(self) -> SearchContext:
+        return SearchContext.of(self)
+
+    def run(self) -> FittedModel:
+        """Return the model of all effects that the data show.
+
+        Raises:
+            SoftFrictionError: dry friction of the data has MuJoCo's soft form.
+        """
+        context, self.best_supported_model, best = self._context, self.base_model, None
+        if self.likely is not None:
+            best = without_idle_effects(context, fit(context, self.likely))
+        if best is None or not is_explained(context, best):
+            best = self._find()
+        self.best_supported_model = best
+        return best
+
+    def _find(self) -> FittedModel:
+        """Select, fit and add effects until the residual of a set is only noise."""
+        context = self._context
+        selected = context.columns.select()
+        if not self.is_form_given:
+            check_selection(context, selected)
+        friction = fit_dry_friction(context, selected)
+        best = friction
+        if not is_explained(context, best):
+            best = higher_merit(best, fit_quick_selection(context, selected))
+        if self._goes_on(best):
+            best = self._with_missing_effects(best, selected, friction)
+        if not is_explained(context, best):
+            selected = select_with_shapes(context, selected)
+            best = higher_merit(best, fit_quick_selection(context, selected))
+        if not is_explained(context, best) and not self.world.watch.has_abandoned_fits():
+            best = higher_merit(best, fit_series_effects(context, selected))
+        if not best.effects:
+            best = fit_selection(context, selected)
+        return fit_single_in_place(context, best)
+
+    def _goes_on(self, best: FittedModel) -> bool:
+        """Return whether to search effects that regression missed.
+
+        This is the case if a force is missing, the best model does not explain the runs, and there
+        is time left.
+        """
+        lacks = self._context.filters.base.lacks_force
+        return (
+            lacks
+            and not is_explained(self._context, best)
+            and not self.world.watch.has_abandoned_fits()
+        )
+
+    def _with_missing_effects(
+        self, best: FittedModel, selected: Selected, friction: FittedModel
+    ) -> FittedModel:
+        """Fit effects alone, and add effects one by one, until a set explains the runs.
+
+        Args:
+            best: the best model so far; effects are added to it if it removes most of the
+                discrepancy.
+            selected: the selection by regression.
+            friction: dry friction of the selection, fitted alone.
+        """
+        context = self._context
+        if is_nearly_explained(context, best):
+            check_fit(context, best)
+            if len(best.effects) > 1:
+                return higher_merit(best, add_to_model(context, best))
+        best = higher_merit(best, fit_single_effects(context))
+        if self._goes_on(best):
+            best = higher_merit(best, add_to_dry_friction(context, selected, friction))
+        if self._goes_on(best):
+            best = higher_merit(best, select_in_model(context))
+        return best
+
+    def fit_rivals(self, best: FittedModel) -> FittedModel:
+        """Fit the sets that are nearly as good, and return the best of all."""
+        return fit_rivals(self._context, best)
+
+    def take_over(self, other: PredictionErrorSearch) -> None:
+        """Reuse the filter and the responses of a search with the other form of dry friction.
+
+        Both searches have the same runs, and the base model has no friction of that form.
+        """
+        self.world.followed = replace(other._context.filters.base, world=self.world)
+        self._context.columns.take_over(other._context.columns)
+
+    def p_value_of_missing_effect(self, model: FittedModel) -> float:
+        """Return the p-value of the most significant effect that a fitted model lacks.
+
+        If it is significant by the linear innovations, it is fitted by simulation.
+        """
+        scores = self.score_missing_effects(model)
+        if scores.p_value > EFFECT_P_VALUE_THRESHOLD or not np.isfinite(model.fit.cost):
+            return scores.p_value
+        filters, columns, name = self._context.filters, self._context.columns, scores.effects[0]
+        c = columns.coefficients(*scores.peaks[0][0])
+        start = with_effect(self.world, model.fit.make_start(), name, c)
+        places, count = self.world.get_coefficient_indices(name), len(self.world.library)
+        # A filter with the effect in the model is faster than a fit, and not linear in the effect.
+        own = filters.of_model(model).log_likelihood
+        gains = []
+        for share in TRIED_SHARES:
+            theta = start.theta.copy()
+            theta[places] *= share
+            gains.append(2.0 * (filters.log_likelihood(theta) - own))
+        by_filter = p_value_of_gain(max(gains), len(places), count)
+        if by_filter > EFFECT_P_VALUE_THRESHOLD:
+            return by_filter
+        larger = self.fit_one(start)
+        gain = larger.likelihood.value - model.likelihood.value
+        return p_value_of_gain(gain, len(places), count)
+
+    def score_missing_effects(
+        self, model: FittedModel, against: Array | None = None
+    ) -> CandidateScores:  # noqa: ARG002
+        """Score every effect that the model lacks by the innovations.
+
+        Args:
+            model: the model.
+            against: not used.
+        """
+        key = frozenset(model.effects)
+        if key not in self.scores_by_effects:
+            self.enter_scores(key, self._scores(model))
+        return self.scores_by_effects[key]
+
+    def _scores(self, model: FittedModel) -> CandidateScores:
+        """Score the effects by the regression about the model."""
+        if has_series(self.world, model.effects):
+            # The candidates are linear about the robot without additional joints.
+            return replace(self.score_missing_effects(self.base_model), p_value=1.0)
+        self._look(model)
+        regression, _ = self._context.columns.regression(model)
+        stream = self.make_rng("library", model.effects)
+        return null_scores(regression, set(self._lacking(model)), stream)
+
+    def force_of_any_shape(self, model: FittedModel) -> tuple[float, str] | None:
+        """Return the p-value of the best additional force and the signal it depends on."""
+        if has_series(self.world, model.effects):
+            return None
+        columns = self._context.columns
+        regression, _ = columns.regression(model)
+        labels = {probe.effect for probe in columns.hats.probes}
+        scores = null_scores(regression, labels, self.make_rng("structure", model.effects))
+        return scores.p_value, scores.effects[0] if scores.effects else ""
+
+    def with_sensitivities(self, start: FitStart) -> FitStart:
+        """Return a start with derivatives by its coefficients about the measured motion."""
+        free = set(self.world.base.tolist()) - self.frozen
+        known = start.known is not None or not start.effects
+        if known or free or has_series(self.world, start.effects):
+            return start
+        return replace(start, known=self._context.columns.sensitivities(start))
+
+    def directions_known(self) -> tuple[TrajectoryFit, DirectionSet] | None:
+        """Return the first-order changes of the base model's runs by every candidate.
+
+        They are linearised about the measured motion.
+        """
+        library = self._context.columns.library
+        values = self._context.filters.base.sensitivities(library)
+        return self.base_model.fit, DirectionSet(library.probes, values)

@@ -1,0 +1,298 @@
+"""Selection of effects by linear regression of the innovations on the candidates' responses.
+
+With the whitened innovations e of N samples and the whitened responses W of the candidates,
+
+    G = Wᵀ W,   h = Wᵀ e,   rss(S) = eᵀ e - h_Sᵀ G_SS⁻¹ h_S                                     (1)
+
+for the columns S of a set of effects. Effects are added one by one, first the one that decreases N
+log rss most, until none fulfils
+
+    N log(rss(S) / rss(S ∪ g)) > k log N + 2 log M                                              (2)
+
+with k the number of coefficients of the effect g and M the number of candidates. The last term
+bounds the gain of the best of M under the null hypothesis (D. P. Foster, E. I. George, Ann. Stat.
+22(4), 1947, 1994, doi:10.1214/aos/1176325766). After each addition, effects that no longer fulfil
+(2) are removed (A. Miller, Subset Selection in Regression, 2nd ed., 2002, chapter 3). No simulation
+is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis.search.candidate_directions import CandidateDirection
+from bench.diagnosis.search.explained_variance import (
+    DirectionGroup,
+    batch_groups,
+    compute_explained_squares,
+)
+from sims.core.simulator import Array
+
+Places = NDArray[np.intp]
+
+ALIASED = 1e-7
+"""Maximum share of a column's sum of squares that remains if it is collinear with other columns."""
+MAJORITY = 0.5
+"""Minimum share of the left-out runs that a larger set must predict better."""
+SHOWN = 7.0
+"""Minimum gain of a column in twice the log-likelihood to be visible in the data."""
+RIDGE = 1e-10
+"""Ridge, as a share of each column's sum of squares."""
+SMALLEST_RSS = 1e-9
+"""Minimum residual sum of squares, as a share of the sum of squares of the innovations."""
+
+
+@dataclass
+class Regression:
+    """Regression of innovations on responses.
+
+    Attributes:
+        groups: columns that act together; a set has at most one group of each effect.
+        grams: G (R, K, K) of each run.
+        crosses: h (R, K) of each run.
+        totals: eᵀ e (R,) of each run.
+        count: N.
+        contains: effects that each effect contains, by name.
+        always: columns that are part of every set and belong to no effect.
+    """
+
+    groups: Sequence[DirectionGroup]
+    grams: Array
+    crosses: Array
+    totals: Array
+    count: int
+    contains: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    always: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.gram, self.cross = self.grams.sum(axis=0), self.crosses.sum(axis=0)
+        self.total = float(self.totals.sum())
+        self._batches = batch_groups(self.groups)
+        self.effects = list(dict.fromkeys(group.effect for group in self.groups))
+        self._nuisance = DirectionGroup("", self.always, (False,) * len(self.always))
+
+    def nuisance(self, chosen: Sequence[DirectionGroup]) -> float:
+        """Return the coefficient of the first column of `always`, fitted together with a set."""
+        _, parts = self._solve([*chosen, self._nuisance])
+        return float(parts[-1][0]) if self.always else 0.0
+
+    def instead_of(self, own: Sequence[int]) -> Regression:
+        """Return the regression without an effect that is in the model.
+
+        Args:
+            own: columns of the effect, which are part of every set; the first one is its whole
+                change.
+        """
+        whole, always = own[0], tuple(c for c in self.always if c not in own)
+        # Innovations without the effect: e + w of its whole change.
+        crosses = self.crosses + self.grams[:, :, whole]
+        totals = self.totals + 2.0 * self.crosses[:, whole] + self.grams[:, whole, whole]
+        return replace(self, crosses=crosses, totals=totals, always=always)
+
+    def gain_of(self, own: Sequence[int]) -> float:
+        """Return the gain of columns in twice the log-likelihood, with any signs."""
+        group = DirectionGroup("", tuple(own), (False,) * len(own))
+        return self.log_ratio(self.solve([])[0], self.solve([group])[0])
+
+    def shows_nuisance(self, chosen: Sequence[DirectionGroup]) -> bool:
+        """Return whether the data show the first column of `always`, in addition to a set."""
+        with_it, parts = self._solve([*chosen, self._nuisance])
+        rest = DirectionGroup("", self.always[1:], (False,) * (len(self.always) - 1))
+        without, _ = self._solve([*chosen, rest])
+        return float(parts[-1][0]) > 0.5 and self.log_ratio(without, with_it) > SHOWN
+
+    def solve(self, chosen: Sequence[DirectionGroup]) -> tuple[float, list[Array]]:
+        """Fit a set of groups, and return the residual sum of squares and all coefficients."""
+        rss, parts = self._solve([*chosen, self._nuisance])
+        return rss, parts[:-1]
+
+    def _solve(
+        self,
+        chosen: Sequence[DirectionGroup],
+        gram: Array | None = None,
+        cross: Array | None = None,
+    ) -> tuple[float, list[Array]]:
+        """Fit a set of groups.
+
+        Constrained coefficients that are negative are fixed at zero one by one, the most negative
+        first.
+        """
+        gram = self.gram if gram is None else gram
+        cross = self.cross if cross is None else cross
+        columns = columns_of(chosen)
+        positive = np.array([p for group in chosen for p in group.positive], dtype=bool)
+        active = np.ones(columns.size, dtype=bool)
+        solution = np.zeros(columns.size)
+        while active.any():
+            own = columns[active]
+            normal, scale = _normalised(gram, own)
+            solved = np.linalg.solve(normal, cross[own] / scale)
+            solution[:] = 0.0
+            solution[active] = solved / scale
+            negative = np.flatnonzero(active & positive & (solution < 0))
+            if not negative.size:
+                break
+            sizes = solution[negative] * np.sqrt(np.diagonal(gram)[columns[negative]])
+            active[negative[np.argmin(sizes)]] = False
+            solution[:] = 0.0
+        explained_squares = float(solution @ cross[columns])
+        # The formula also holds for a solution with some coefficients fixed at zero.
+        rss = max(self.total - explained_squares, SMALLEST_RSS * self.total)
+        parts, begin = [], 0
+        for group in chosen:
+            parts.append(solution[begin : begin + len(group.column_indices)].copy())
+            begin += len(group.column_indices)
+        return rss, parts
+
+    def log_ratio(self, before: float, after: float) -> float:
+        """Return twice the gain in log-likelihood, N log(before / after).
+
+        Args:
+            before: residual sum of squares of the smaller set.
+            after: residual sum of squares of the larger set.
+        """
+        return float(self.count * np.log(before / after))
+
+    def price(self, group: DirectionGroup) -> float:
+        """Return the minimum gain of an effect, the right side of (2)."""
+        coefficients = len(group.column_indices) * np.log(max(self.count, 2))
+        return float(coefficients + 2.0 * np.log(max(len(self.effects), 2)))
+
+    def gains(self, chosen: Sequence[DirectionGroup]) -> Array:
+        """Return the gain of each group in addition to a set, in twice the log-likelihood (n,)."""
+        columns = columns_of(chosen)
+        columns = np.append(columns, np.array(self.always, dtype=np.intp))
+        gram, cross, rss = self.gram, self.cross, self.total
+        if columns.size:
+            normal, scale = _normalised(gram, columns)
+            rows = gram[columns] / scale[:, None]
+            solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
+            gram = gram - rows.T @ solved[:, :-1]
+            cross = cross - rows.T @ solved[:, -1]
+            rss, _ = self.solve(chosen)
+        aliased = np.diagonal(gram) <= ALIASED * np.diagonal(self.gram)
+        held = set(self._held(chosen))
+        result = np.zeros(len(self.groups))
+        gram = np.where(aliased[:, None] | aliased[None], 0.0, gram)
+        cross = np.where(aliased, 0.0, cross)
+        for batch in self._batches:
+            blocks = gram[batch.columns[:, :, None], batch.columns[:, None, :]]
+            own, _ = compute_explained_squares(
+                blocks, cross[batch.columns][..., None], batch.positive
+            )
+            left = np.maximum(rss - own[:, 0], SMALLEST_RSS * self.total)
+            result[batch.places] = self.count * np.log(rss / left)
+        for i, group in enumerate(self.groups):
+            if group.effect in held:
+                result[i] = 0.0
+        return result
+
+    def net_gains(self, chosen: Sequence[DirectionGroup] = ()) -> Array:
+        """Return the gain of each group in addition to a set, minus its price (n,)."""
+        prices = np.array([self.price(group) for group in self.groups])
+        net: Array = self.gains(chosen) - prices
+        return net
+
+    def _held(self, chosen: Sequence[DirectionGroup]) -> list[str]:
+        """Return the effects of a set, with all effects that they contain."""
+        held = [group.effect for group in chosen]
+        return held + [name for own in held for name in self.contains.get(own, ())]
+
+    def select(self, most: int, begin: Sequence[DirectionGroup] = ()) -> list[DirectionGroup]:
+        """Select effects by forward and backward steps with (2).
+
+        Args:
+            most: maximum number of effects.
+            begin: initial set.
+        """
+        chosen = list(begin)
+        while len(chosen) < most:
+            gains = self.net_gains(chosen)
+            best = int(np.argmax(gains))
+            if gains[best] <= 0.0:
+                break
+            larger = [*chosen, self.groups[best]]
+            if not self.generalises(chosen, larger):
+                break
+            larger = self.pruned(larger)
+            if self.groups[best] not in larger:
+                break
+            chosen = larger
+        return chosen
+
+    def generalises(
+        self, smaller: Sequence[DirectionGroup], larger: Sequence[DirectionGroup]
+    ) -> bool:
+        """Return whether a larger set predicts left-out runs better.
+
+        Each run is left out in turn (cross-validation; M. Stone, J. R. Stat. Soc. B 36(2), 111,
+        1974).
+
+        Args:
+            smaller: the smaller set.
+            larger: the larger set.
+        """
+        if len(self.totals) < 2:
+            return True
+        before, after = self._left_out(smaller), self._left_out(larger)
+        return bool(after.sum() < before.sum() and (after < before).mean() >= MAJORITY)
+
+    def _left_out(self, chosen: Sequence[DirectionGroup]) -> Array:
+        """Return the residual sum of squares (R,) of each run, predicted from the others."""
+        found = []
+        groups = [*chosen, self._nuisance]
+        columns = columns_of(groups)
+        for run, total in enumerate(self.totals):
+            gram, cross = self.gram - self.grams[run], self.cross - self.crosses[run]
+            _, parts = self._solve(groups, gram, cross)
+            own = np.concatenate(parts) if parts else np.zeros(0)
+            block = self.grams[run][np.ix_(columns, columns)]
+            found.append(total - 2.0 * own @ self.crosses[run][columns] + own @ block @ own)
+        return np.array(found)
+
+    def pruned(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
+        """Remove effects that do not fulfil (2), the least useful first."""
+        left = list(chosen)
+        while left:
+            rss, _ = self.solve(left)
+            losses = []
+            for group in left:
+                rest = [other for other in left if other is not group]
+                without = self.solve(rest)[0]
+                losses.append(self.log_ratio(without, rss) - self.price(group))
+            least = int(np.argmin(losses))
+            if losses[least] > 0:
+                break
+            del left[least]
+        return left
+
+
+def _normalised(gram: Array, columns: Places) -> tuple[Array, Array]:
+    """Return the scaled normal matrix of some columns, and the lengths of these columns.
+
+    Its diagonal is one plus the ridge.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
+    normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]
+    normal[np.diag_indices_from(normal)] += RIDGE
+    return normal, scale
+
+
+def columns_of(groups: Sequence[DirectionGroup]) -> Places:
+    """Return the columns of some groups, one group after another."""
+    return np.array([c for group in groups for c in group.column_indices], dtype=np.intp)
+
+
+def groups_of(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
+    """Return the columns of probes that act together."""
+    places: dict[tuple[str, int], list[int]] = {}
+    for i, probe in enumerate(probes):
+        places.setdefault((probe.effect, probe.group), []).append(i)
+    return [
+        DirectionGroup(effect, tuple(columns), tuple(not probes[i].signed for i in columns))
+        for (effect, _), columns in places.items()
+    ]

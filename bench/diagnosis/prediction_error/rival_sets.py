@@ -1,0 +1,201 @@
+"""Fit sets of effects that are nearly as good as the best one by simulation.
+
+They may be equivalent to it, or better.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import MAX_ITERATIONS, FittedModel
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.prediction_error.forward_growth import (
+    LINEARISATION_ERROR,
+    RIVAL_MARGIN,
+    try_one_more,
+)
+from bench.diagnosis.prediction_error.joint_effects import (
+    JOINT_MODEL,
+    SERVO_MODEL,
+    at_coupled_joints,
+    has_series,
+    plain_effects_beside,
+)
+from bench.diagnosis.prediction_error.model_filters import GAUSS_NEWTON_STEPS
+from bench.diagnosis.prediction_error.search_context import SearchContext
+from bench.diagnosis.prediction_error.simulated_fits import (
+    fit_filtered,
+    higher_merit,
+    in_place_of,
+    is_explained,
+)
+from bench.diagnosis.prediction_error.single_effects import MAX_IMPROVED_SIZE, refine_single_effects
+from sims.core.simulator import Array
+
+MAX_RIVALS = 5
+"""Maximum number of rivals of each effect that are fitted by simulation."""
+ALIKE_SHARE = 0.5
+"""Minimum gain of an effect at the same joint that is tried as a replacement.
+
+It is a share of the gain by regression of the effect that it replaces.
+"""
+
+
+class _Rival(NamedTuple):
+    """An effect that may replace another one.
+
+    Attributes:
+        effect: its name.
+        c: (k,) its coefficients from the regression.
+        behind: loss in twice the log-likelihood.
+    """
+
+    effect: str
+    c: Array
+    behind: float
+
+
+def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedModel:
+    """Return a model with one effect in place of several if it is as good.
+
+    Two linear laws may imitate one nonlinear law.
+
+    Args:
+        context: context of the search.
+        best: the best model so far.
+    """
+    explained = len(best.effects) > 1 and is_explained(context, best)
+    if (
+        not explained
+        or has_series(context.world, best.effects)
+        or context.world.watch.has_abandoned_fits()
+    ):
+        return best
+    filters = context.filters
+    tried = try_one_more(context, filters.empty_set)
+    if not tried:
+        return best
+    (name,) = tried[0].names
+    penalty = sum(filters.penalty(one) for one in best.effects) - filters.penalty(name)
+    loss = filters.of_model(best).log_likelihood - tried[0].followed.log_likelihood
+    if 2.0 * loss > penalty + RIVAL_MARGIN:
+        return best
+    return higher_merit(fit_rivals(context, fit_filtered(context, tried[0])), best)
+
+
+def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
+    """Fit the sets that are nearly as good by the regression, and return the best of all.
+
+    Args:
+        context: context of the search.
+        best: the best model so far.
+    """
+    search, world = context.search, context.world
+    lost = not best.effects or not np.isfinite(best.fit.cost)
+    if lost or has_series(world, best.effects):
+        return best
+    starts = []
+    for name in best.effects:
+        for rival in _find_rivals(context, best, name):
+            start = in_place_of(world, best, [name], rival.effect, rival.c)
+            if frozenset(start.effects) in search.models:
+                continue
+            near = _confirm_by_filter(context, best, rival, start)
+            starts += [near] if near is not None else []
+    if starts:
+        search.refit_models(starts, race=False)
+    size = len(best.effects)
+    if size == 1 and context.filters.base.runs.jumps.any():
+        # Fits at force limits may stop in local minima.
+        known = [m for m in search.models.values() if len(m.effects) == 1 and m is not best]
+        laws = JOINT_MODEL + SERVO_MODEL
+        plain = [model for model in known if model.effects[0].partition("@")[0] in laws]
+        refine_single_effects(context, plain)
+    _fit_at_coupled_joints(context, size)
+    _refine_near(context, size)
+    likeliest = search.get_best(size)
+    return best if likeliest is None else likeliest
+
+
+def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[_Rival]:
+    """Return the effects that are nearly as good by the regression in place of the given one."""
+    world = context.world
+    regression, columns = context.columns.regression(model)
+    rest = regression.instead_of(columns[name])
+    # Effects with more coefficients gain more under the null hypothesis.
+    gains = rest.net_gains()
+    own = rest.gain_of(columns[name]) - context.filters.penalty(name)
+    same_joint = plain_effects_beside(world, name)
+    found, near_count = dict[str, _Rival](), 0
+    for i in np.argsort(-gains, kind="stable").tolist():
+        group = rest.groups[i]
+        effect, behind = group.effect, own - float(gains[i])
+        if effect not in world.library or effect in (*model.effects, *found):
+            continue
+        is_near = behind <= RIVAL_MARGIN + LINEARISATION_ERROR * own and near_count < MAX_RIVALS
+        # Regression is inaccurate for a large effect, so effects at the same joint are tried.
+        is_alike = effect in same_joint and gains[i] > ALIKE_SHARE * own
+        # A law that contains this one never replaces it.
+        if (is_near or is_alike) and name not in world.available_effects[effect].contains:
+            near_count += is_near
+            c = context.columns.coefficients(group, rest.solve([group])[1][0])
+            found[effect] = _Rival(effect, c, behind)
+    return list(found.values())
+
+
+def _confirm_by_filter(
+    context: SearchContext, best: FittedModel, rival: _Rival, start: FitStart
+) -> FitStart | None:
+    """Return a start with a rival that a filter confirms, else None.
+
+    A filter is used only if the rival is far behind by the regression, which is linear.
+    """
+    if rival.behind <= RIVAL_MARGIN:
+        return start
+    filters = context.filters
+    few = len(context.world.get_coefficient_indices(rival.effect)) <= MAX_IMPROVED_SIZE
+    steps = GAUSS_NEWTON_STEPS if few else 0
+    followed, names = filters.with_effects(start.theta, start.effects, steps)
+    loss = filters.of_model(best).log_likelihood - followed.log_likelihood
+    return None if 2.0 * loss > RIVAL_MARGIN else FitStart(names, followed.theta, start.states)
+
+
+def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
+    """Fit the best models of a size with each effect moved to the other joints of its loop."""
+    search, world = context.search, context.world
+    starts: dict[frozenset[str], FitStart] = {}
+    for model in _near_the_best(context, size):
+        for name in model.effects:
+            c = model.fit.theta[world.slots[name]]
+            for other in at_coupled_joints(world, name):
+                start = in_place_of(world, model, [name], other, c)
+                key = frozenset(start.effects)
+                if other not in model.effects and key not in search.models:
+                    starts[key] = start
+    if starts:
+        search.refit_models(list(starts.values()), race=False)
+
+
+def _refine_near(context: SearchContext, size: int) -> None:
+    """Fit the models of a size with nearly the best merit to convergence.
+
+    Otherwise, incomplete fits would decide between them.
+    """
+    search, near = context.search, _near_the_best(context, size)
+    if context.world.watch.has_abandoned_fits() or len(near) < 2:
+        return
+    fitter = TrajectoryFitter(context.world, search.noise, search.frozen, exact=True)
+    starts = [model.fit.make_start() for model in near]
+    for model, fit in zip(near, fitter.fit_models(starts, MAX_ITERATIONS), strict=True):
+        if fit.cost < model.fit.cost:
+            search.add_fit(fit)
+
+
+def _near_the_best(context: SearchContext, size: int) -> list[FittedModel]:
+    """Return the models with `size` effects whose merit is close to the highest."""
+    of_size = [m for m in context.search.models.values() if len(m.effects) == size]
+    highest = max((model.penalised_log_likelihood for model in of_size), default=-np.inf)
+    return [model for model in of_size if model.penalised_log_likelihood > highest - RIVAL_MARGIN]

@@ -1,0 +1,219 @@
+"""Fit sets of effects to whole simulated runs, and decide whether they explain these runs.
+
+The cost of a fit is not smooth where joints stick and where servos are at force limits, so a fit
+may stop in a local minimum. It is restarted from nearby coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import costs_of_starts
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.friction_form_verdict import has_dry_friction
+from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.search_context import SearchContext
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from sims.core.simulator import Array
+from sims.core.system import members_of
+
+NEARBY = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
+"""Factors of a coefficient at which a fit looks for a lower cost nearby."""
+EXPLAINED_EXCESS = 0.03
+"""Maximum excess over the noise of a fitted set that explains the data."""
+NEARLY_EXPLAINED = 0.1
+"""Maximum excess, as a share of that of the base model, at which effects are only added."""
+NEGLIGIBLE, NEGLIGIBLE_SHARE = 0.1, 0.005
+"""Maximum excess at which the search ends: absolute, and as a share of that of the base model."""
+
+
+def fit(context: SearchContext, start: FitStart) -> FittedModel:
+    """Fit a set by simulation.
+
+    If the residual is large, the fit is repeated with derivatives by the first states about the
+    simulated motion, because those about the measured motion may be invalid.
+
+    Args:
+        context: context of the search.
+        start: start of the fit.
+    """
+    search, world = context.search, context.world
+    found = search.fit_one(start)
+    if is_explained(context, found) or not np.isfinite(found.fit.cost):
+        return found
+    before = world.derivatives
+    compute_state_jacobian(world, found.fit.theta, found.fit.states, anew=True)
+    found = search.fit_one(found.fit.make_start())
+    if not is_explained(context, found):
+        # Derivatives about a wrong motion are not valid for other models.
+        world.derivatives = before
+    for name in found.effects:
+        if has_dry_friction(world, [name]) and not is_explained(context, found):
+            found = fit_nearby(context, found, name)
+    return found
+
+
+def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
+    """Fit a set by simulation, starting from the coefficients of its filter.
+
+    Args:
+        context: context of the search.
+        current: the set.
+    """
+    states = context.filters.first_states(current.followed)
+    return fit(context, FitStart(current.names, current.followed.theta, states))
+
+
+def fit_nearby(context: SearchContext, model: FittedModel, name: str) -> FittedModel:
+    """Fit a model again from the best of several nearby coefficients of an effect.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+        name: name of the effect.
+    """
+    ((cost, start),) = lowest_of_each(context, starts_nearby(context, model, name))
+    return context.search.fit_one(start) if cost < model.fit.cost else model
+
+
+def starts_nearby(context: SearchContext, model: FittedModel, name: str) -> list[FitStart]:
+    """Return starts with nearby coefficients of an effect.
+
+    Initial states are those of the fit, or those that were measured.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+        name: name of the effect.
+    """
+    measured = context.filters.first_states(context.filters.base)
+    starts = []
+    for place in context.world.get_coefficient_indices(name):
+        for factor in NEARBY:
+            theta = model.fit.theta.copy()
+            theta[place] *= factor
+            starts += [FitStart(model.effects, theta, own) for own in (model.fit.states, measured)]
+    return starts
+
+
+def lowest_of_each(
+    context: SearchContext, starts: Sequence[FitStart]
+) -> list[tuple[float, FitStart]]:
+    """Simulate starts, and return the one with the lowest cost for each set of effects.
+
+    Args:
+        context: context of the search.
+        starts: the starts.
+
+    Returns:
+        The cost and the start for each set, in ascending order of the cost.
+    """
+    if not starts:
+        return []
+    costs = costs_of_starts(context.world, context.search.noise, starts, share=1.0, lost=np.inf)
+    lowest: dict[tuple[str, ...], tuple[float, FitStart]] = {}
+    for i in np.argsort(costs, kind="stable").tolist():
+        lowest.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
+    return list(lowest.values())
+
+
+def is_explained(context: SearchContext, model: FittedModel) -> bool:
+    """Return whether a fitted model leaves only noise, or a negligible share of a large excess.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
+    if is_at_noise(context, model):
+        return True
+    # Friction of the wrong form may leave a small residual.
+    if has_dry_friction(context.world, model.effects) and not context.filters.is_soft:
+        return False
+    excess = context.search.compute_excess
+    return excess(model) < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * excess(context.search.base_model))
+
+
+def is_at_noise(context: SearchContext, model: FittedModel) -> bool:
+    """Return whether a fitted model leaves only noise.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
+    return (
+        context.search.is_noise_like(model)
+        and context.search.compute_excess(model) < EXPLAINED_EXCESS
+    )
+
+
+def is_nearly_explained(context: SearchContext, model: FittedModel) -> bool:
+    """Return whether a model removes most of the discrepancy.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
+    excess = context.search.compute_excess
+    return excess(model) < NEARLY_EXPLAINED * excess(context.search.base_model)
+
+
+def higher_merit(one: FittedModel, other: FittedModel) -> FittedModel:
+    """Return the model with the higher merit; the first one if they are equal."""
+    return max(one, other, key=lambda model: model.penalised_log_likelihood)
+
+
+def without_idle_effects(context: SearchContext, model: FittedModel) -> FittedModel:
+    """Remove effects that do not pay, and replace a family by a member that is as good.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
+    model = _merge_into_families(context, context.search.drop_unneeded_effects(model))
+    families = any(name.endswith("@*") for name in model.effects)
+    return context.search.simplify_laws(model) if families else model
+
+
+def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedModel:
+    """Replace all members of a family by the family, which needs fewer decisions."""
+    world = context.world
+    for family in (name for name in world.library if name.endswith("@*")):
+        members = [member.name for member in members_of(world.available_effects[family])]
+        if len(members) < 2 or not set(members) <= set(model.effects):
+            continue
+        own = np.concatenate([model.fit.theta[world.slots[name]] for name in members])
+        if own.size != len(world.get_coefficient_indices(family)):
+            continue
+        fitted = context.search.fit_one(in_place_of(world, model, members, family, own))
+        model = (
+            fitted
+            if fitted.penalised_log_likelihood
+            > model.penalised_log_likelihood - INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+            else model
+        )
+    return model
+
+
+def in_place_of(
+    world: RunEvaluator, model: FittedModel, names: Sequence[str], other: str, c: Array
+) -> FitStart:
+    """Return a start in which one effect replaces several others.
+
+    Args:
+        world: the runs.
+        model: the fitted model.
+        names: effects that are removed.
+        other: the effect that replaces them.
+        c: (k,) coefficients of the new effect.
+    """
+    theta = model.fit.theta.copy()
+    for name in names:
+        theta[world.slots[name]] = 0.0
+    theta[world.slots[other]] = c
+    rest = (name for name in model.effects if name not in names)
+    return FitStart((*rest, other), theta, model.fit.states)

@@ -1,0 +1,117 @@
+"""Confirm by simulation what prediction errors select, and determine the verdict.
+
+1. Fit the selected set and its rivals to whole simulated runs.
+2. Remove effects that make predictions of held-out runs worse.
+3. Test whether a force of any shape is missing (`bench.diagnosis.search.lack_of_fit`).
+4. Collect other effects that explain the data as well.
+5. Determine the verdict by the rules of `bench.diagnosis.search.verdict_rules`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.prediction_error.null_distribution import p_value_of_gain
+from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
+from bench.diagnosis.search.alternative_causes import AlternativeFinder
+from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
+from bench.diagnosis.search.verdict_rules import DiagnosisState, decide_verdict, is_unexplained
+from bench.diagnosis.validation.held_out_runs import Validation
+
+MIMICRY = 0.5
+"""Minimum share of the discrepancy that reported effects remove if the cause is unknown."""
+NEAR = 15.0
+"""Maximum distance in twice the log-likelihood of rivals that are evaluated on held-out runs."""
+
+
+class Confirmation(Inquiry):
+    """The steps of the diagnosis of a robot's recording.
+
+    Args:
+        search: search by prediction errors, which contains the fitted base model.
+        held_out: held-out runs for validation; None if there are none.
+    """
+
+    def __init__(self, search: EffectSearch, held_out: Validation | None) -> None:
+        super().__init__(search, held_out)
+        assert isinstance(search, PredictionErrorSearch)
+        self._robot = search
+
+    def answered(self) -> DiagnosisResult:
+        """Return the result of the complete diagnosis.
+
+        Raises:
+            EndedError: the search had to end early.
+        """
+        search, watch = self._robot, self._watch
+        unfit = self.unfit_base()
+        if unfit is not None:
+            return unfit
+        base = search.base_model
+        watch.begin_question("search")
+        self._model = search.run()
+        watch.begin_question("rivals")
+        self._model = search.fit_rivals(self._model)
+        size = len(self._model.effects)
+        self._measure()
+        if 0 < len(self._model.effects) < size:
+            # The rivals of the remaining effects were fitted together with the removed ones, so fit
+            # them again.
+            self._model = search.fit_rivals(self._model)
+            self._measure()
+        watch.begin_question("structure")
+        self._model = search.fit_to_convergence(self._model)
+        left = assess_lack_of_fit(search, self._model)
+        watch.begin_question("alternatives")
+        causes = _RobotAlternatives(search, self._trial, left.has_structure).collect_evidence(
+            self._model
+        )
+        watch.check_not_stopped()
+        model, trial = self._model, self._trial
+        state = DiagnosisState(
+            causes=len(causes),
+            alternatives=any(cause.alternatives for cause in causes),
+            closed=compute_gap_closed(search, model, left),
+            unexplained=is_unexplained(left.has_structure, search.p_value_of_missing_effect(model)),
+            missed=trial is not None and trial.has_unexplained_gap(model, left),
+        )
+        verdict = decide_verdict(state)
+        if verdict == "unknown" and state.closed < MIMICRY:
+            # Effects that leave most of the discrepancy only mimic what is missing.
+            model, causes = base, ()
+        return self._finding(verdict, base, model, causes, left)
+
+    def _measure(self) -> None:
+        """Evaluate the models on held-out runs, and remove effects that do not help there."""
+        if self._held_out is None or self._model is None:
+            return
+        search, model = self._robot, self._model
+        self._watch.begin_question("held_out")
+        names = set(model.effects)
+        if len(names) > 1:
+            for name in model.effects:
+                search.remove_effect(model, name)
+        parts = [m for m in search.models.values() if set(m.effects) < names and m.effects]
+        size = len(names)
+        rivals = [m for m in search.models.values() if len(m.effects) == size and m is not model]
+        rivals = [
+            m for m in rivals if m.penalised_log_likelihood > model.penalised_log_likelihood - NEAR
+        ]
+        trial = HeldOutValidation(self._held_out)
+        trial.evaluate_models([search.base_model, model, *parts, *rivals])
+        self._watch.check_not_stopped()
+        self._trial = trial
+        self._model = trial.drop_unhelpful_effects(search, model)
+
+
+@dataclass(frozen=True)
+class _RobotAlternatives(AlternativeFinder):
+    """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
+
+    def _p_value(self, rest: FittedModel, effect: str, gain: float) -> float:  # noqa: ARG002
+        slot = self.search.world.slots[effect]
+        return p_value_of_gain(gain, slot.stop - slot.start, len(self.search.world.library))

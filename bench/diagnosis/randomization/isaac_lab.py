@@ -1,0 +1,242 @@
+"""Ranges as event terms of Isaac Lab.
+
+The terms are functions of `isaaclab.envs.mdp` (source/isaaclab/isaaclab/envs/mdp/events.py of
+isaac-sim/IsaacLab): `randomize_joint_parameters`, `randomize_actuator_gains`,
+`randomize_rigid_body_mass`, `randomize_rigid_body_com`, `randomize_rigid_body_inertia` (since Isaac
+Lab 3) and `randomize_physics_scene_gravity`. Isaac Lab defines stiffness and damping of a drive at
+its joint. The gains of a servo are therefore multiplied by the square of its gear, and the damping
+of the joint is added.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.randomization.code_text import comment, heading, identifiers, literal, number
+from bench.diagnosis.randomization.ranges import RandomizationRange, RandomizationRanges, texts
+from sims.extended_simulator import ExtendedSimulator
+
+IMPORTS = (
+    "import isaaclab.envs.mdp as mdp",
+    "from isaaclab.managers import EventTermCfg as EventTerm",
+    "from isaaclab.managers import SceneEntityCfg",
+    "from isaaclab.utils import configclass",
+)
+FRICTION_NOTE = (
+    "On PhysX this term draws static, dynamic and viscous friction of the joint from one range; "
+    "set the viscous friction of the joint again if you use it."
+)
+DAMPING_NOTE = (
+    "Damping of the drive at the joint: what the model file states as damping of the joint, plus "
+    "the damping of its servos."
+)
+AXES = "xyz"
+
+
+class Term(NamedTuple):
+    """Event term: its name, function and parameters as code, and comments before it."""
+
+    name: str
+    function: str
+    params: Mapping[str, str]
+    comments: Sequence[str]
+
+
+def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, robot: Any) -> str:
+    """Return a Python file with a configclass of event terms.
+
+    Args:
+        ranges: Ranges to write.
+        extended: Extended simulator with the numbers.
+        robot: Robot with its compiled model.
+    """
+    said = dict(texts(ranges))
+    terms, missing = _terms(ranges, said, robot)
+    lines = [*heading(extended, "Isaac Lab", ranges.left_out)]
+    lines += comment(
+        "Let the events of your environment inherit from SimgapEventCfg; robot is the name of the "
+        "articulation in the scene. Centres of mass are moved relative to the original model."
+    )
+    lines += ["", *IMPORTS, "", "", "@configclass", "class SimgapEventCfg:"]
+    lines += ['    """Event terms that randomise the numbers that simgap found."""', ""]
+    for name, term in zip(identifiers(term.name for term in terms), terms, strict=True):
+        lines += _written(name, term)
+    if missing:
+        lines += comment("Isaac Lab has no event term for:", "    ")
+        for one in missing:
+            lines += comment(f"- {said[one]}", "    ")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _written(name: str, term: Term) -> Iterator[str]:
+    for text in term.comments:
+        yield from comment(text, "    ")
+    yield f"    {name} = EventTerm("
+    yield f"        func=mdp.{term.function},"
+    yield '        mode="startup",'
+    yield "        params={"
+    yield from (f'            "{key}": {value},' for key, value in term.params.items())
+    yield from ("        },", "    )", "")
+
+
+def _terms(
+    ranges: RandomizationRanges, said: Mapping[RandomizationRange, str], robot: Any
+) -> tuple[list[Term], list[RandomizationRange]]:
+    """Build the terms, and list the ranges for which there is no term."""
+    by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
+    for one in ranges.ranges:
+        by_effect.setdefault(one.effect, {}).setdefault(one.name, []).append(one)
+    terms: list[Term] = []
+    for effect, function, key in (
+        ("friction.coulomb", "randomize_joint_parameters", "friction_distribution_params"),
+        ("inertia.armature", "randomize_joint_parameters", "armature_distribution_params"),
+    ):
+        for name, (one,) in by_effect.pop(effect, {}).items():
+            notes = [FRICTION_NOTE] if effect == "friction.coulomb" else []
+            terms.append(
+                _joint_term(one.field, name, function, key, _ends(one), [said[one], *notes])
+            )
+    terms += _gains(by_effect, said, robot)
+    for name, (one,) in by_effect.pop("mass.scale", {}).items():
+        params = {"mass_distribution_params": _pair(*_ends(one)), "operation": '"abs"'}
+        if name in by_effect.get("inertia.scale", {}):
+            # The range of the inertia already includes the scaling by the mass.
+            params["recompute_inertia"] = "False"
+        terms.append(
+            _body_term("body_mass", name, "randomize_rigid_body_mass", params, [said[one]])
+        )
+    for name, offsets in by_effect.pop("mass.offset", {}).items():
+        pairs = [f'"{one.coefficient}": {_pair(one.minimum, one.maximum)}' for one in offsets]
+        params = {"com_range": "{" + ", ".join(pairs) + "}"}
+        notes = [said[one] for one in offsets]
+        terms.append(_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
+    for name, (one,) in by_effect.pop("inertia.scale", {}).items():
+        params = {
+            "inertia_distribution_params": _pair(one.minimum, one.maximum),
+            "operation": '"scale"',
+            "diagonal_only": "False",
+        }
+        notes = [said[one], "This term exists since Isaac Lab 3."]
+        function = "randomize_rigid_body_inertia"
+        terms.append(_body_term("body_inertia", name, function, params, notes))
+    terms += _gravity(by_effect, said, robot)
+    return terms, [one for places in by_effect.values() for own in places.values() for one in own]
+
+
+def _gains(
+    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    said: Mapping[RandomizationRange, str],
+    robot: Any,
+) -> Iterator[Term]:
+    """Yield the terms of stiffness and damping at joints."""
+    stiffness = by_effect.pop("actuator.stiffness", {})
+    damping = by_effect.pop("actuator.damping", {})
+    passive = by_effect.pop("drag.linear", {})
+    function = "randomize_actuator_gains"
+    for joint, actuators in _by_joint(robot, stiffness).items():
+        ends = _sum([_at_joint(robot, stiffness, name, 1) for name in actuators])
+        notes = [said[one] for name in actuators for one in stiffness.get(name, ())]
+        key = "stiffness_distribution_params"
+        yield _joint_term("stiffness", joint, function, key, ends, notes)
+    for joint in dict.fromkeys([*passive, *_by_joint(robot, damping)]):
+        names = [one.name for one in robot.actuators if one.joint == joint]
+        parts = [_at_joint(robot, damping, name, 2) for name in names]
+        stated = float(robot.compiled.dof_damping[robot.joint(joint).velocity])
+        own = passive.get(joint)
+        parts.append(_ends(own[0]) if own else (stated, stated))
+        found = [*(own or ()), *(one for name in names for one in damping.get(name, ()))]
+        notes = [*(said[one] for one in found), DAMPING_NOTE]
+        key = "damping_distribution_params"
+        yield _joint_term("damping", joint, function, key, _sum(parts), notes)
+
+
+def _by_joint(robot: Any, found: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return all actuators of each joint at which one of the given actuators acts."""
+    joints = dict.fromkeys(robot.actuator(name).joint for name in found)
+    return {j: [one.name for one in robot.actuators if one.joint == j] for j in joints if j}
+
+
+def _at_joint(
+    robot: Any, found: Mapping[str, Sequence[RandomizationRange]], name: str, term: int
+) -> tuple[float, float]:
+    """Return the interval of an actuator's gain, converted to its joint."""
+    number_ = robot.actuator(name).id
+    share = float(robot.compiled.actuator_gear[number_, 0]) ** 2
+    if name in found:
+        low, high = _ends(found[name][0])
+        return share * low, share * high
+    stated = -share * float(robot.compiled.actuator_biasprm[number_, term])
+    return stated, stated
+
+
+def _gravity(
+    by_effect: dict[str, dict[str, list[RandomizationRange]]],
+    said: Mapping[RandomizationRange, str],
+    robot: Any,
+) -> Iterator[Term]:
+    """Yield the term of gravity, which sets all components."""
+    scale = [one for own in by_effect.pop("gravity.scale", {}).values() for one in own]
+    tilt = [one for own in by_effect.pop("gravity.tilt", {}).values() for one in own]
+    if not scale and not tilt:
+        return
+    stated = np.asarray(robot.compiled.opt.gravity, dtype=float)
+    low, high = stated.copy(), stated.copy()
+    for one in scale:
+        ends = np.stack([one.minimum * stated, one.maximum * stated])
+        low, high = ends.min(axis=0), ends.max(axis=0)
+    for one in tilt:
+        axis = AXES.index(one.coefficient)
+        low[axis], high[axis] = one.low, one.high
+    vectors = [f"[{', '.join(number(value) for value in end)}]" for end in (low, high)]
+    params = {
+        "gravity_distribution_params": f"({', '.join(vectors)})",
+        "operation": '"abs"',
+    }
+    notes = [said[one] for one in (*scale, *tilt)]
+    yield Term("gravity", "randomize_physics_scene_gravity", params, notes)
+
+
+def _joint_term(
+    what: str,
+    joint: str,
+    function: str,
+    key: str,
+    ends: tuple[float, float],
+    notes: Sequence[str],
+) -> Term:
+    params = {
+        "asset_cfg": _asset("joint_names", joint),
+        key: _pair(*ends),
+        "operation": '"abs"',
+        "distribution": '"uniform"',
+    }
+    return Term(f"{what}_{joint}", function, params, notes)
+
+
+def _body_term(
+    what: str, body: str, function: str, params: Mapping[str, str], notes: Sequence[str]
+) -> Term:
+    return Term(
+        f"{what}_{body}", function, {"asset_cfg": _asset("body_names", body), **params}, notes
+    )
+
+
+def _asset(key: str, name: str) -> str:
+    """Format the asset with one joint or body; Isaac Lab reads names as regular expressions."""
+    return f'SceneEntityCfg("robot", {key}=[{literal(re.escape(name))}])'
+
+
+def _ends(one: RandomizationRange) -> tuple[float, float]:
+    return one.low, one.high
+
+
+def _sum(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    return sum(low for low, _ in parts), sum(high for _, high in parts)
+
+
+def _pair(low: float, high: float) -> str:
+    return f"({number(low)}, {number(high)})"

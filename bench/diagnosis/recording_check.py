@@ -1,0 +1,71 @@
+"""Identifiability check before a fit: which parameters and causes can a recording identify?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
+from bench.diagnosis.validation.gain_and_intervals import compute_central_jacobian
+from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.inspection import load_recording
+from bench.logs.segmentation import segment_recording
+from sims.core.simulator import InputError
+from sims.recording.recording import Recording
+from sims.system_simulator import SystemSimulator
+
+
+def check_identifiability(
+    source: str | Path | Recording,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    jobs: int = 1,
+) -> tuple[ParameterIdentifiability, ...]:
+    """Assess which free numbers and which causes a recording can identify.
+
+    Args:
+        source: Recording, or the path of its table.
+        system: Name of the system to use instead of the one in the description.
+        model: Model file of a robot to use instead of the one in the description.
+        free: Numbers of a robot's model file, or constants of a system, that are estimated.
+        jobs: Number of worker processes.
+
+    Returns:
+        Identifiability of each free number, then of each cause.
+
+    Raises:
+        InputError: The recording cannot be read, or its simulator takes no effects.
+    """
+    recording, kind = load_recording(source, system, model, free)
+    if not issubclass(kind, SystemSimulator):
+        raise InputError(f"{recording.path}: simulator {recording.system} takes no effects")
+    recording, _ = leave_out_settling(recording, kind)
+    recording, _ = segment_recording(recording, kind)
+    engine = kind.default_engine if kind.own_engine else "batch"
+    constants = () if kind.has_model else tuple(free)
+    with closing(ForkedWorkerPool(jobs)) as crew:
+        world = RunEvaluator(kind, recording, recording.training(), engine, (), constants)
+        world.crew = crew
+        crew.register(world)
+        floor = compute_noise_floor(world, recording)
+        noise = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
+        base = fit_base_model(world, noise)
+        if not np.isfinite(base.fit.cost):
+            raise InputError(
+                f"{recording.path}: the simulation fails wherever a fit begins; "
+                "check constants, units, inputs and initial states"
+            )
+        numbers = assess_identifiability(
+            world, noise, compute_central_jacobian(world, base.fit, noise)
+        )
+        world.close()
+    return numbers

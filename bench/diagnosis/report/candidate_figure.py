@@ -1,0 +1,291 @@
+"""Figure of the candidate causes: the share of the gap that each closes, and its score."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.diagnosis.report.candidate_ranking import (
+    get_candidate_status,
+    rank_candidates,
+    select_shown_candidates,
+    shorten_effect_name,
+)
+from bench.diagnosis.report.cause_text import has_placed_causes
+from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
+from bench.diagnosis.report.wording import format_number, format_p_value, format_percent, sanitise
+from bench.diagnosis.verdict import Candidate
+from bench.figures.style import (
+    BLUE,
+    CAPTION_GREY,
+    NEUTRAL_MARK,
+    NOISE_BAND_GREY,
+    SKY_BLUE,
+    ZERO_LINE_GREY,
+    make_panel_grid,
+)
+from bench.figures.text_layout import break_name, most_lines, text_width
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FOUND, ALIKE, NOT_NEEDED = "found", "found, but cannot be told apart", "not needed"
+"""Status texts of candidates, as returned by `get_candidate_status`."""
+LINE_LENGTH = 44
+"""Maximum number of characters per line of a candidate's name."""
+LONGEST_LINE = 50
+"""Maximum number of characters per line of the name of a place."""
+CERTAIN = 1e-3
+"""Maximum p-value that is not printed next to its bar; a note gives the largest of them."""
+CHANCE = 0.05
+"""Maximum p-value of a significant score. A candidate above it has a white bar without its p-value,
+and a note explains that.
+"""
+LOWEST_SHARE = -0.5
+"""Lower limit of a share in the figure; for a failed model the exact value has no meaning."""
+POINTER = "▸ "
+"""Marker before the name of a cause, visible in print without colour too."""
+
+_BARS: Mapping[str, Mapping[str, Any]] = {
+    FOUND: {"facecolor": BLUE},
+    ALIKE: {"facecolor": SKY_BLUE, "hatch": "///"},
+    NOT_NEEDED: {"facecolor": NOISE_BAND_GREY},
+}
+_DOTS: Mapping[str, Mapping[str, Any]] = {
+    FOUND: {"marker": "o", "markersize": 7, "markerfacecolor": BLUE},
+    ALIKE: {"marker": "D", "markersize": 6, "markerfacecolor": SKY_BLUE},
+    NOT_NEEDED: {"marker": "o", "markersize": 5, "markerfacecolor": "white"},
+}
+
+# Sizes in inches.
+_EDGE = 0.12
+_SHARES_WIDTH = 2.5
+_SHARE_TEXTS_WIDTH = 1.5
+_SCORES_WIDTH = 2.6
+_SCORE_TEXTS_WIDTH = 0.95
+_TOP = 0.9
+_TOP_WITHOUT_LEGEND = 0.65
+_BOTTOM = 0.95
+_ROW = 0.13
+_LINE = 0.145
+_BAR = 0.16
+_NAME_SIZE = 9
+
+
+def candidates_figure(story: DiagnosisReportData) -> Figure:
+    """Draw the candidates, the highest score first.
+
+    The left panel shows the share of the held-out gap that each closes alone, with its 95 %
+    interval, if any candidate was simulated on held-out runs. The right panel shows the score on
+    the fitted runs.
+    """
+    shown = select_shown_candidates(story)
+    names = [_name(story, candidate) for candidate in shown]
+    has_shares = any(candidate.heldout_gain is not None for candidate in shown)
+
+    # Names of causes are bold, which is a little wider.
+    left = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
+    between = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
+    width = max(left + between + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
+    # All rows have the height of the longest name, so that bars are evenly spaced.
+    row = _ROW + _LINE * most_lines(names)
+    handles, labels = _legend(story)
+    top = _TOP if handles else _TOP_WITHOUT_LEGEND
+    height = top + _BOTTOM + row * len(shown)
+
+    figure, axes = make_panel_grid(
+        1, 2 if has_shares else 1, (width, height), layout=None, sharey=True
+    )
+    bottom, size = _BOTTOM / height, row * len(shown) / height
+    scores = axes[0, -1]
+    scores.set_position(((left + between) / width, bottom, _SCORES_WIDTH / width, size))
+    _scores_panel(scores, story, shown, thickness=_BAR / row)
+    if has_shares:
+        shares = axes[0, 0]
+        shares.set_position((left / width, bottom, _SHARES_WIDTH / width, size))
+        _shares_panel(shares, story, shown)
+        scores.tick_params(axis="y", left=False, labelleft=False)
+    _label_rows(axes[0, 0], story, shown, names)
+
+    total = len(rank_candidates(story))
+    some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
+    title = f"Candidate causes, each by itself{some}"
+    figure.text(_EDGE / width, 1 - 0.2 / height, title, fontsize=11, va="center")
+    figure.legend(
+        handles,
+        labels,
+        loc="center left",
+        bbox_to_anchor=(_EDGE / width, 1 - 0.46 / height),
+        ncols=4,
+        fontsize=8.5,
+        borderaxespad=0.0,
+        handletextpad=0.5,
+        columnspacing=1.4,
+    )
+    note = "\n".join(_notes(story, shown))
+    figure.text(_EDGE / width, 0.1 / height, note, fontsize=8, color=CAPTION_GREY, va="bottom")
+    return figure
+
+
+def _name(story: DiagnosisReportData, candidate: Candidate) -> str:
+    """Format a candidate's name in as many lines as needed; its place is never cut off."""
+    text = sanitise(shorten_effect_name(candidate.effect), 160)
+    if get_candidate_status(story, candidate.effect) != NOT_NEEDED:
+        text = POINTER + text
+    if len(text) <= LINE_LENGTH:
+        return text
+    # The place has its own lines.
+    effect, at, place = text.rpartition(" at ")
+    lines = textwrap.wrap(effect if at else text, LINE_LENGTH)
+    return "\n".join([*lines, break_name(f"at {place}", LONGEST_LINE)] if at else lines)
+
+
+def _label_rows(
+    axis: Axes, story: DiagnosisReportData, shown: Sequence[Candidate], names: Sequence[str]
+) -> None:
+    axis.set_yticks(np.arange(len(shown)), names, fontsize=_NAME_SIZE, linespacing=1.15)
+    axis.set_ylim(len(shown) - 0.5, -0.5)
+    axis.tick_params(axis="y", length=0)
+    for label, candidate in zip(axis.get_yticklabels(), shown, strict=True):
+        if get_candidate_status(story, candidate.effect) != NOT_NEEDED:
+            label.set_fontweight("bold")
+
+
+def _shares_panel(axis: Axes, story: DiagnosisReportData, shown: Sequence[Candidate]) -> None:
+    """Draw the share of the held-out gap that each candidate closes, with its 95 % interval."""
+    lowest = 0.0
+    for row, candidate in enumerate(shown):
+        axis.axhline(row, color=NOISE_BAND_GREY, linewidth=0.5, zorder=0)
+        share = candidate.heldout_gain
+        if share is None:
+            continue
+        at = max(share, LOWEST_SHARE)
+        text = format_percent(share)
+        interval = story.share_intervals.get(candidate.effect)
+        if interval is not None:
+            low, high = (max(end, LOWEST_SHARE) for end in interval)
+            axis.plot([low, high], [row, row], color=NEUTRAL_MARK, linewidth=1.4, zorder=2)
+            lowest = min(lowest, low)
+            text += f" ({' to '.join(format_percent(end)[:-2] for end in interval)})"
+        lowest = min(lowest, at)
+        look = _DOTS[get_candidate_status(story, candidate.effect)]
+        axis.plot(at, row, markeredgecolor=NEUTRAL_MARK, linestyle="", zorder=3, **look)
+        axis.annotate(
+            text,
+            (1.0, row),
+            (8, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
+    axis.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.6)
+    axis.axvline(1.0, color=ZERO_LINE_GREY, linewidth=0.6, linestyle=":")
+    axis.set_xlim(lowest - 0.03, 1.05)
+    ticks = [tick for tick in (-0.5, 0.0, 0.25, 0.5, 0.75, 1.0) if tick >= lowest - 0.03]
+    axis.set_xticks(ticks, [f"{100 * tick:.0f}".replace("-", "−") for tick in ticks])
+    axis.set_xlabel("share of the held-out gap closed [%]")
+    axis.set_title("How much it closes (95 %)", fontsize=9.5, loc="left")
+
+
+def _scores_panel(
+    axis: Axes, story: DiagnosisReportData, shown: Sequence[Candidate], thickness: float
+) -> None:
+    """Draw the candidates' scores; ticks are the scores of the same effect at other places."""
+    elsewhere = {entry.best.effect: entry.elsewhere for entry in rank_candidates(story)}
+    longest = 1e-9
+    for row, candidate in enumerate(shown):
+        size = max(candidate.score, 0.0)
+        look = dict(_BARS[get_candidate_status(story, candidate.effect)])
+        if _is_chance(story, candidate):
+            look["facecolor"] = "white"
+        axis.barh(row, size, height=thickness, edgecolor=NEUTRAL_MARK, linewidth=0.6, **look)
+        others = [max(other.score, 0.0) for other in elsewhere.get(candidate.effect, ())]
+        axis.plot(
+            others, [row] * len(others), "|", color=NEUTRAL_MARK, markersize=8, markeredgewidth=1.0
+        )
+        longest = max(longest, size, *others)
+        text = format_number(candidate.score)
+        if CERTAIN < candidate.p_value <= CHANCE:
+            text += f"  ({_printed(candidate.p_value)})"
+        axis.annotate(
+            text,
+            (max([size, *others]), row),
+            (5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+            annotation_clip=False,
+        )
+    axis.set_xlim(0.0, longest)
+    axis.locator_params(axis="x", nbins=5)
+    axis.set_xlabel("score: twice the gain in log likelihood")
+    axis.set_title("Evidence on the fitted runs", fontsize=9.5, loc="left")
+
+
+def _is_chance(story: DiagnosisReportData, candidate: Candidate) -> bool:
+    """Return whether the score of a candidate that is not a cause is insignificant."""
+    return (
+        candidate.p_value > CHANCE and get_candidate_status(story, candidate.effect) == NOT_NEEDED
+    )
+
+
+def _printed(p_value: float) -> str:
+    """Format a p-value, such as ``p < 10⁻¹²``."""
+    return format_p_value(p_value).replace(" 1×10", " 10")
+
+
+def _notes(story: DiagnosisReportData, shown: Sequence[Candidate]) -> list[str]:
+    """Format the number of runs and samples, and p-values that are not printed next to bars."""
+    counts = f"Fitted: {_counted(story.fitting)}"
+    if story.held_out is not None and story.cross_validated:
+        counts += "; each run left out in turn"
+    elif story.held_out is not None:
+        counts += f"; held out: {_counted(story.held_out)}"
+    notes = [f"{counts}."]
+    what = "p: probability of such a score by chance"
+    certain = [c.p_value for c in shown if c.p_value <= CERTAIN]
+    by_chance = [c.p_value for c in shown if _is_chance(story, c)]
+    if certain:
+        which = "for all shown" if len(certain) == len(shown) else "for grey or coloured bars"
+        what += f"; {_printed(max(certain)).replace('=', '≤')} {which}"
+    if by_chance:
+        which = "for all shown" if len(by_chance) == len(shown) else "for white bars"
+        what += f"; {_printed(min(by_chance)).replace('=', '≥')} {which}"
+    notes.append(f"{what}.")
+    missing = sum(candidate.heldout_gain is None for candidate in shown)
+    if 0 < missing < len(shown):
+        notes[1] += f" Without a mark: not simulated on {story.validation_runs}."
+    return notes
+
+
+def _counted(side: DataSplit) -> str:
+    """Format the size of a data split, such as ``3 runs, 1200 samples of 2 channels``."""
+    runs, channels = len(side.times), side.observed.shape[2]
+    samples = int(np.isfinite(side.observed).any(axis=2).sum())
+    one = "1 run" if runs == 1 else f"{runs} runs"
+    of = f" of {channels} channels" if channels > 1 else ""
+    return f"{one}, {samples} samples{of}"
+
+
+def _legend(story: DiagnosisReportData) -> tuple[list[Any], list[str]]:
+    """Return handles and labels of the legend."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    there = {
+        get_candidate_status(story, candidate.effect) for candidate in story.verdict.candidates
+    }
+    # If all bars have the same style, no legend is needed.
+    names = [name for name in _BARS if name in there] if there != {NOT_NEEDED} else []
+    handles: list[Any] = [
+        Patch(edgecolor=NEUTRAL_MARK, linewidth=0.6, **_BARS[name]) for name in names
+    ]
+    if any(entry.elsewhere for entry in rank_candidates(story)) and has_placed_causes(story):
+        handles.append(Line2D([], [], color=NEUTRAL_MARK, marker="|", linestyle="", markersize=8))
+        names = [*names, "the same effect at other places"]
+    return handles, names

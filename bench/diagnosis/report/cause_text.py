@@ -1,0 +1,281 @@
+"""Text of causes and their places: missing effects, wrong values and indistinguishable sets."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.diagnosis.report.wording import (
+    ALL_PLACES,
+    append_unit,
+    format_effect,
+    format_effect_name,
+    format_fitted_value,
+    format_number,
+    format_percent,
+    format_places,
+    get_place_kind,
+    is_parameter_error,
+    joined,
+    sanitise,
+    split_effect_name,
+)
+from bench.diagnosis.verdict import Cause
+from bench.figures.robot_figure import PlaceMark
+from sims.extended_simulator import FittedValue
+from sims.robot.fitted_causes import GRAVITY_COMPENSATED
+
+MAX_NAMED_MEMBERS = 6
+"""Maximum number of members of a set that a sentence names; the remaining ones are counted."""
+DIFFERENCE_EFFECTS = frozenset(
+    {"drag.linear", "drag.quadratic", "friction.coulomb", "spring.linear"}
+)
+"""Effects whose coefficient is a difference from the value in the model file."""
+_MORE = {True: "larger", False: "smaller"}
+
+
+def format_effect_set(names: Sequence[str], last: str = "or") -> str:
+    """Format a set of effects.
+
+    For example ``Coulomb friction at any of the joints a, b or c``, or ``linear drag or Coulomb
+    friction at joint elbow``.
+
+    Args:
+        names: Names of the effects.
+        last: ``or`` if one of them is meant, ``and`` for all.
+    """
+    if not any("@" in name for name in names):
+        return joined([format_effect(name) for name in names], last)
+    parts = _grouped(names, last)
+    if len(parts) > MAX_NAMED_MEMBERS:
+        parts = [
+            *parts[: MAX_NAMED_MEMBERS - 1],
+            f"one of {len(parts) - MAX_NAMED_MEMBERS + 1} others",
+        ]
+    # Nested lists are separated by a comma before the last conjunction too.
+    nested = len(parts) > 1 and any(f" {last} " in part for part in parts)
+    return f", {last} ".join(parts) if nested else joined(parts, last)
+
+
+def _grouped(names: Sequence[str], last: str) -> list[str]:
+    """Format one text for an effect at several places, or for several effects at one place."""
+    by_effect: dict[str, list[str]] = {}
+    for name in names:
+        base, place = split_effect_name(name)
+        by_effect.setdefault(base if place else name, []).append(name)
+    by_place: dict[str, list[str]] = {}
+    for group in by_effect.values():
+        _, place = split_effect_name(group[0])
+        alone = len(group) == 1 and place not in ("", ALL_PLACES)
+        # A family comes last, after the single places.
+        group.sort(key=lambda name: split_effect_name(name)[1] == ALL_PLACES)
+        key = f"{get_place_kind(group[0])} {place}" if alone else group[0]
+        by_place.setdefault(key, []).extend(group)
+    return [_together(group, last) for group in by_place.values()]
+
+
+def _together(group: Sequence[str], last: str) -> str:
+    """Format a group of one effect, or of one place."""
+    if len(group) == 1:
+        return format_effect(group[0])
+    bases = list(dict.fromkeys(split_effect_name(name)[0] for name in group))
+    places = list(dict.fromkeys(split_effect_name(name)[1] for name in group))
+    nouns = [format_effect(base) for base in bases]
+    wrong = all(is_parameter_error(base) for base in bases)
+    kind = get_place_kind(group[0])
+    spots = [place for place in places if place != ALL_PLACES]
+    text = joined(nouns, last) + format_places(kind, spots, last, wrong)
+    return (
+        text
+        if spots == places
+        else f"{text} {last}{format_places(kind, [ALL_PLACES], last, wrong)}"
+    )
+
+
+def format_lacking(causes: Sequence[Cause]) -> str:
+    """Format what a simulation lacks and has wrong; causes with alternatives come last.
+
+    For example ``lacks wind, and linear drag or Coulomb friction``.
+    """
+    lacking: list[str] = []
+    wrong: list[str] = []
+    either: list[str] = []
+    certain = [cause.effect for cause in causes if not cause.alternatives]
+    # Causes without alternatives share one list; each other cause has its own "or" list.
+    for part, into in ((False, lacking), (True, wrong)):
+        if names := [name for name in certain if is_parameter_error(name) == part]:
+            into.append(joined([format_effect(name) for name in names]))
+    for cause in causes:
+        if not cause.alternatives:
+            continue
+        names = [cause.effect, *cause.alternatives]
+        bad = [name for name in names if is_parameter_error(name)]
+        good = [name for name in names if name not in bad]
+        if bad and good:
+            either.append(f"either lacks {format_effect_set(good)} or has {format_effect_set(bad)}")
+        else:
+            (wrong if bad else lacking).append(format_effect_set(names))
+    parts = [f"lacks {', and '.join(lacking)}"] if lacking else []
+    parts += [f"has {', and '.join(wrong)}"] if wrong else []
+    return ", and ".join([*parts, *either])
+
+
+def format_causes(causes: Sequence[Cause]) -> str:
+    """Format the causes; those with alternatives come last.
+
+    For example ``wind, and linear drag or Coulomb friction``.
+    """
+    sure = [format_effect(cause.effect) for cause in causes if not cause.alternatives]
+    parts = [joined(sure)] if sure else []
+    parts += [format_effect_set([c.effect, *c.alternatives]) for c in causes if c.alternatives]
+    return ", and ".join(parts)
+
+
+def format_number_error(cause: Cause) -> str:
+    """Format how wrong a value of the model file is, as a clause; empty for other causes.
+
+    For example ``the mass of body forearm is 12 % larger than the model file says``.
+    """
+    base, place = split_effect_name(cause.effect)
+    if cause.says == GRAVITY_COMPENSATED:
+        return sanitise(cause.says)
+    if base in _STEPPED:
+        return f"{_STEPPED[base]}: {sanitise(cause.says).rstrip('.')}"
+    say = _SIZED.get(base)
+    values = list(cause.coefficients.values())
+    if say is None or not place or place == ALL_PLACES or not values:
+        return ""
+    return say(format_places(get_place_kind(cause.effect), [place], wrong=True).strip(), values)
+
+
+def is_overstated(cause: Cause) -> bool:
+    """Return whether the model file has too much friction, damping or stiffness."""
+    values = [n.value for n in cause.coefficients.values()]
+    base, place = split_effect_name(cause.effect)
+    return bool(place) and base in DIFFERENCE_EFFECTS and bool(values) and max(values) < 0
+
+
+def _share(what: str) -> Callable[[str, Sequence[FittedValue]], str]:
+    def say(where: str, values: Sequence[FittedValue]) -> str:
+        c = values[0].value
+        return f"the {what} {where} is {format_percent(abs(c))} {_MORE[c > 0]} than the model file says"
+
+    return say
+
+
+def _difference(what: str) -> Callable[[str, Sequence[FittedValue]], str]:
+    def say(where: str, values: Sequence[FittedValue]) -> str:
+        size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
+        return f"the {what} {where} is {size} {_MORE[values[0].value > 0]} than the model file says"
+
+    return say
+
+
+def _moved(where: str, values: Sequence[FittedValue]) -> str:
+    far = append_unit(
+        format_number(float(np.linalg.norm([n.value for n in values])), 2), values[0].unit
+    )
+    return f"the centre of mass {where} is {far} from where the model file has it"
+
+
+_SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
+    "mass.scale": _share("mass"),
+    "inertia.scale": _share("inertia"),
+    "actuator.stiffness": _share("stiffness"),
+    "actuator.damping": _share("damping"),
+    "inertia.armature": _difference("armature"),
+    "mass.offset": _moved,
+}
+"""Functions that format how wrong a value of the model file is, by effect."""
+_STEPPED = {
+    "numerics.step": "the time step of the model file is too long",
+    "numerics.integrator": "the integrator of the model file does not follow the motion",
+}
+"""Description of a too coarse time step or integrator of the model file; the cause names the
+correction.
+"""
+
+
+def list_values(cause: Cause) -> list[tuple[str, str]]:
+    """List the coefficients of a cause by name, with their intervals and units."""
+    # The corrected step was chosen, not estimated, and an integrator is not a number.
+    if cause.effect == "numerics.integrator":
+        return []
+    if cause.effect == "numerics.step":
+        steps = cause.coefficients.values()
+        return [("time step", append_unit(format_number(step.value), step.unit)) for step in steps]
+    return [
+        (sanitise(name, 60), format_fitted_value(fitted))
+        for name, fitted in cause.coefficients.items()
+    ]
+
+
+def format_values(cause: Cause) -> str:
+    """Format the coefficients of a cause in one line; those of a family with their places."""
+    texts = []
+    for name, text in list_values(cause):
+        own, place = split_effect_name(name)
+        # If each member of a family has one coefficient, its place identifies it.
+        front = "" if place and own == "coefficient" else f"{own} "
+        texts.append(f"{front}{text}" + (f" at {place}" if place else ""))
+    return joined(texts)
+
+
+def strip_place(says: str) -> str:
+    """Remove the place in brackets from a description, because its noun names the place already."""
+    return re.sub(r" \(at [^()]*\)$", "", says)
+
+
+def has_placed_causes(story: DiagnosisReportData) -> bool:
+    """Return whether any candidate acts at a place."""
+    return any("@" in candidate.effect for candidate in story.verdict.candidates)
+
+
+def list_place_marks(story: DiagnosisReportData) -> list[PlaceMark]:
+    """List the diagnosed places, to be marked on the robot."""
+    found: dict[tuple[str, str, str], PlaceMark] = {}
+    for cause in story.verdict.causes:
+        alone = not cause.alternatives
+        for name in (cause.effect, *cause.alternatives):
+            said, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
+            for place in _places(story, name, cause):
+                size = _size(cause, name, place) if name == cause.effect else ""
+                # A family and one of its places give the same mark, which is kept once.
+                found.setdefault(
+                    (kind, place, said), PlaceMark(kind, place, f"{said}{size}", alone)
+                )
+    return list(found.values())
+
+
+def _places(story: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
+    """List the places of an effect: those of a family's coefficients, else all of its kind."""
+    _, place = split_effect_name(effect)
+    if place != ALL_PLACES:
+        return [place] if place else []
+    own = [split_effect_name(name)[1] for name in cause.coefficients if effect == cause.effect]
+    robot = story.robot
+    if any(own) or robot is None:
+        return list(dict.fromkeys(name for name in own if name))
+    tables = {
+        "joint": [joint.name for joint in robot.joints],
+        "actuator": [actuator.name for actuator in robot.actuators],
+        "body": [body.name for body in robot.bodies],
+    }
+    return tables.get(get_place_kind(effect), [])
+
+
+def _size(cause: Cause, effect: str, place: str) -> str:
+    """Format the coefficient of a cause at a place for a label; empty for several coefficients."""
+    there = [
+        n for name, n in cause.coefficients.items() if split_effect_name(name)[1] in ("", place)
+    ]
+    if len(there) != 1:
+        return ""
+    fitted = there[0]
+    if split_effect_name(effect)[0] in _SIZED and fitted.unit == "1":
+        sign = "+" if fitted.value > 0 else ""
+        return f": {sign}{format_percent(fitted.value)}"
+    return f": {append_unit(format_number(fitted.value, 2), fitted.unit)}"

@@ -1,0 +1,355 @@
+"""Figures of an explanation: the run with the largest gap, where the gap is, and the candidates.
+
+They are readable in print without colour: before is dashed with open squares, and after is solid
+with filled circles. Each figure is rendered as PNG, and as PDF and SVG if vector graphics are
+requested (`bench.figures.figure_files`). Texts from files are never parsed as mathematics.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.report.candidate_figure import candidates_figure
+from bench.diagnosis.report.candidate_ranking import select_shown_candidates
+from bench.diagnosis.report.cause_text import list_place_marks
+from bench.diagnosis.report.figure_panels import (
+    BASE_MODEL_LINE,
+    EXTENDED_MODEL_LINE,
+    LONGEST_NAME,
+    draw_gap_location_panel,
+    draw_profile_panel,
+    get_legend_entries,
+    has_extended_model,
+    place_names,
+    profile_label,
+    select_gap_locations,
+    select_informative_profiles,
+    shorten_label,
+)
+from bench.diagnosis.report.joint_figure import draw_joint_figure, is_robot
+from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.diagnosis.report.run_selection import (
+    MAX_OUTLINED_DOTS,
+    RunView,
+    decimate,
+    select_worst_run,
+)
+from bench.diagnosis.report.wording import sanitise
+from bench.figures import style
+from bench.figures.figure_files import is_pdf_wanted
+from bench.figures.robot_figure import compute_joint_positions, draw_robot_figure
+from bench.figures.style import NOISE_BAND_GREY, ZERO_LINE_GREY, make_panel_grid
+from bench.figures.text_layout import most_lines, text_width
+from sims.core.simulator import InputError, make_unknown_name_error
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DPI = 150
+"""Resolution of the PNG files in dots per inch; the page shows them at about two thirds of their
+size.
+"""
+_WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
+"""Width of the overview in inches, by the number of channels."""
+_HEADING = 0.22
+"""Distance from the upper edge to the middle of a heading, in inches."""
+_HEADING_SIZE = 11.0
+"""Maximum font size of a heading, in points."""
+_STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "text.usetex": False,
+    # Names come from files, where a dollar sign must not start mathematics.
+    "text.parse_math": False,
+}
+
+
+def list_figure_names(story: DiagnosisReportData) -> tuple[str, ...]:
+    """List the names of the figures for which there are data."""
+    there = {
+        "robot": story.robot is not None,
+        "overview": True,
+        "where": bool(select_gap_locations(story.places)),
+        "candidates": bool(select_shown_candidates(story)),
+    }
+    return tuple(name for name, drawn in there.items() if drawn)
+
+
+def draw_figure(story: DiagnosisReportData, name: str) -> Figure:
+    """Draw one figure.
+
+    Args:
+        story: Report data.
+        name: One of `list_figure_names`.
+
+    Raises:
+        InputError: There is no figure of that name.
+    """
+    known = list_figure_names(story)
+    if name not in known:
+        raise make_unknown_name_error("figure", name, known)
+    with _styled():
+        drawn = _MAKERS[name](story)
+        # Ticks take their style from the settings that are active when they are first drawn.
+        drawn.draw_without_rendering()
+    return drawn
+
+
+class RenderedFigure(NamedTuple):
+    """Rendered figure as the bytes of its files.
+
+    Attributes:
+        png: PNG file.
+        pdf: PDF file; None if no PDF is requested.
+        svg: SVG file; None if no PDF is requested.
+        joint_positions: For a robot, its joints: name, and position as shares of width and height
+            from the upper left corner.
+    """
+
+    png: bytes
+    pdf: bytes | None
+    svg: bytes | None
+    joint_positions: tuple[tuple[str, float, float], ...] = ()
+
+
+def render_figures(story: DiagnosisReportData) -> dict[str, RenderedFigure]:
+    """Draw all figures and render their files, by name."""
+    with _styled():
+        # The settings must stay active, because text is laid out again when a figure is written.
+        figures = {name: _MAKERS[name](story) for name in list_figure_names(story)}
+        made = {}
+        for name, drawn in figures.items():
+            png, pdf = style.render_png_and_pdf(drawn, DPI)
+            made[name] = RenderedFigure(
+                png, pdf, style.render_svg(drawn) if is_pdf_wanted() else None
+            )
+        if story.robot is not None and "robot" in made:
+            where = tuple(
+                compute_joint_positions(
+                    figures["robot"], story.robot, get_extreme_pose(story, select_worst_run(story))
+                )
+            )
+            made["robot"] = made["robot"]._replace(joint_positions=where)
+        return made
+
+
+@contextmanager
+def _styled() -> Iterator[None]:
+    """Apply the style settings while figures are drawn or written."""
+    from matplotlib import rc_context
+
+    with rc_context(_STYLE), warnings.catch_warnings():
+        # A title may be in any script; characters that the font lacks are drawn as boxes.
+        warnings.filterwarnings("ignore", message="Glyph")
+        yield
+
+
+def get_extreme_pose(story: DiagnosisReportData, shot: RunView) -> dict[str, float]:
+    """Return recorded joint positions at the sample of a run that is farthest from its start.
+
+    Args:
+        story: Report data.
+        shot: Run to use.
+    """
+    joints, columns = [], []
+    for c, channel in enumerate(story.channels):
+        kind, _, joint = channel.name.partition(".")
+        values = shot.side.observed[shot.row, :, c]
+        if kind == "q" and np.isfinite(values).any():
+            joints.append(joint)
+            columns.append(np.nan_to_num(values, nan=float(values[np.isfinite(values)][0])))
+    if not joints:
+        return {}
+    motion = np.stack(columns)
+    far = np.square(motion - motion[:, :1]).sum(axis=0)
+    return dict(zip(joints, motion[:, int(np.argmax(far))].tolist(), strict=True))
+
+
+def _robot(story: DiagnosisReportData) -> Figure:
+    """Draw the robot in the extreme pose of the run that is shown."""
+    if story.robot is None:
+        raise InputError(f"{story.path}: no robot was recorded")
+    return draw_robot_figure(
+        story.robot, get_extreme_pose(story, select_worst_run(story)), list_place_marks(story)
+    )
+
+
+def _overview(story: DiagnosisReportData) -> Figure:
+    shot = select_worst_run(story)
+    if is_robot(story):
+        return draw_joint_figure(story, shot)
+    count = len(shot.channels)
+    size = (_WIDTHS[count], 5.2)
+    figure, axes = make_panel_grid(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
+    for column, c in enumerate(shot.channels):
+        _signal(axes[0][column], axes[1][column], story, shot, c)
+    # A sample time counts once, however many channels were recorded.
+    samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
+    kind = f"{story.validation_run} run" if shot.held_out else "run"
+    how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
+    some = f"; {count} of {len(story.channels)} channels" if count < len(story.channels) else ""
+    title = (
+        f"The {kind} {how}: {shorten_label(shot.side.names[shot.row])} ({samples} samples{some})"
+    )
+    figure.suptitle(title, fontsize=11, y=0.985)
+    # The columns differ only in the channel, so they share one legend.
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    band, its_label = axes[1][0].get_legend_handles_labels()
+    figure.legend([*handles, *band], [*labels, *its_label], loc="lower center", ncols=4, fontsize=9)
+    left = 0.75 / figure.get_figwidth()
+    figure.subplots_adjust(left=left, right=0.985, top=0.92, bottom=0.165, hspace=0.1, wspace=0.2)
+    return figure
+
+
+def _signal(above: Axes, below: Axes, story: DiagnosisReportData, shot: RunView, c: int) -> None:
+    """Draw the measured and simulated signal of a channel, and the residual below it."""
+    channel, side = story.channels[c], shot.side
+    times = side.times[shot.row]
+    # Arrays are padded after the end of a shorter run.
+    signals = [a[shot.row, : len(times), c] for a in (side.observed, side.before, side.after)]
+    rows = decimate(signals[0])
+    t = times[rows]
+    measured, before, after = (signal[rows] for signal in signals)
+
+    size = 3.6 if rows.size < 250 else 2.6
+    marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
+    # Thousands of vector outlines would dominate the file size.
+    marks["rasterized"] = rows.size > MAX_OUTLINED_DOTS
+    above.plot(t, measured, "o", label="measured", zorder=4, **marks)
+    tuned = "simulated before (tuned)" if has_extended_model(story) else "simulated (tuned)"
+    above.plot(t, before, label=tuned, zorder=3, **BASE_MODEL_LINE)
+    noise, band = 2 * channel.sigma, "±2σ: 95 % of the noise"
+    below.axhspan(-noise, noise, color=NOISE_BAND_GREY, linewidth=0, label=band, zorder=0)
+    below.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
+    below.plot(t, measured - before, zorder=3, **{**BASE_MODEL_LINE, "linewidth": 1.0})
+    if has_extended_model(story):
+        # The wide curve is behind: where both agree, "before" is visible as dashes on it.
+        above.plot(
+            t, after, label="simulated after", zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 3.2}
+        )
+        below.plot(t, measured - after, zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 0.8})
+
+    above.set_ylabel(shorten_label(channel.name, channel.unit, 14))
+    below.set_ylabel(shorten_label("residual", channel.unit))
+    below.set_xlabel("time [s]; residual: measured − simulated")
+    above.margins(x=0.01)
+    for axis in (above, below):
+        axis.locator_params(nbins=6)
+    # Noise must not fill the panel: its band should look narrow.
+    _at_least(below, 3 * channel.sigma)
+
+
+def _at_least(axis: Axes, size: float) -> None:
+    """Extend a vertical axis to at least this size on both sides of zero."""
+    low, high = axis.get_ylim()
+    axis.set_ylim(min(low, -size), max(high, size))
+
+
+class _FigureLayout(NamedTuple):
+    """Figure layout in inches, so that margins do not change with the figure size.
+
+    Attributes:
+        figure: Figure that is laid out.
+        width: Width in inches.
+        height: Height in inches.
+    """
+
+    figure: Figure
+    width: float
+    height: float
+
+    def across(self, inches: float) -> float:
+        """Convert a distance from the left edge in inches to a share of the width."""
+        return inches / self.width
+
+    def up(self, inches: float) -> float:
+        """Convert a distance from the lower edge in inches to a share of the height."""
+        return inches / self.height
+
+    def heading(self, inches: float, text: str) -> None:
+        """Write a heading at a distance from the left edge, in a font size that fits.
+
+        Args:
+            inches: Distance from the left edge.
+            text: Text of the heading.
+        """
+        room = self.width - inches - 0.1
+        size = _HEADING_SIZE * min(1.0, room / text_width([text], _HEADING_SIZE))
+        y = 1 - self.up(_HEADING)
+        self.figure.text(self.across(inches), y, text, fontsize=size, va="center")
+
+
+_NAMES = 1.9
+"""Minimum width for the names of places, in inches."""
+_PROFILES_AFTER = 4.1
+"""Distance from the end of the names of places to the profiles, in inches."""
+
+
+def _where(story: DiagnosisReportData) -> Figure:
+    """Draw the gap locations on the left, and the most informative profiles on the right."""
+    places, profiles = (
+        select_gap_locations(story.places),
+        select_informative_profiles(story.profiles),
+    )
+    rows = min(2, len(profiles))
+    columns = -(-len(profiles) // 2)
+    names = place_names(places)
+    left = max(_NAMES, 0.25 + text_width(names, _STYLE["font.size"]))
+    profiles_from = left + _PROFILES_AFTER
+    # A single column of profiles is wider than one of several columns.
+    width = left + 3.3 + (3.1 * columns if columns != 1 else 4.4)
+    row = 0.27 + 0.13 * (most_lines(names) - 1)
+    # Variables of robots have long names, which need several lines below the panels.
+    more = 0.15 * (most_lines([profile_label(profile) for profile in profiles]) - 1)
+    height = max(2.6 + row * len(places), 1.5 + (1.9 + more) * rows)
+    figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
+    sheet, axis = _FigureLayout(figure, width, height), axes[0, 0]
+    axis.set_position((left / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
+    draw_gap_location_panel(axis, places, story)
+    sheet.heading(0.15, "Where the gap is")
+    figure.legend(
+        *get_legend_entries(axis), loc="lower left", ncols=2, fontsize=8.5, columnspacing=1.0
+    )
+    if not profiles:
+        return figure
+
+    channels = {profile.channel for profile in profiles}
+    of = f" of {sanitise(profiles[0].channel, LONGEST_NAME)}" if len(channels) == 1 else ""
+    sheet.heading(profiles_from, f"What the residual{of} follows: means in bins")
+    note = "residual: measured − simulated; bars: ±2 standard errors"
+    figure.text(sheet.across(profiles_from), sheet.up(0.2), note, fontsize=8.5, va="center")
+    grid = figure.add_gridspec(
+        rows,
+        columns,
+        left=sheet.across(profiles_from),
+        right=1 - sheet.across(0.12),
+        bottom=sheet.up(0.85 + more),
+        top=1 - sheet.up(0.5),
+        hspace=0.45 + 0.6 * more,
+        wspace=0.42,
+    )
+    units = {c.name: c.unit for c in story.channels}
+    for i, profile in enumerate(profiles):
+        axis = figure.add_subplot(grid[i // columns, i % columns])
+        unit = units.get(profile.channel, "1")
+        draw_profile_panel(
+            axis, profile, unit, has_extended_model(story), one_channel=len(channels) == 1
+        )
+    return figure
+
+
+_MAKERS: Mapping[str, Callable[[DiagnosisReportData], Figure]] = {
+    "robot": _robot,
+    "overview": _overview,
+    "where": _where,
+    "candidates": candidates_figure,
+}

@@ -1,0 +1,280 @@
+"""Panels of the figures for gap locations and residual profiles, and the style of all figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.diagnosis.report.report_data import DiagnosisReportData, GapLocation, ResidualProfile
+from bench.diagnosis.report.wording import format_label, sanitise
+from bench.figures.style import (
+    BLUE,
+    CHANCE_LEVEL_GREY,
+    CONNECTOR_GREY,
+    NEUTRAL_MARK,
+    VERMILION,
+    ZERO_LINE_GREY,
+)
+from bench.figures.text_layout import break_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MAX_RUNS = 8
+"""Maximum number of runs shown: those with the largest gap."""
+MAX_GAP_LOCATIONS = 10
+"""Maximum number of channels, and of phases, shown: those with the largest gap."""
+MAX_PROFILES = 4
+MAX_LABEL_LENGTH = 26
+"""Maximum number of characters of the name of a variable or of a channel."""
+LONGEST_NAME = 64
+"""Maximum number of characters of the name of a run or channel among the gap locations."""
+_NAME_LINE = 32
+"""Maximum number of characters per line of the name of a gap location or variable."""
+SHORT_LABEL_LENGTH = 9
+"""Maximum number of characters of a unit next to a panel."""
+BASE_MODEL_LINE: Mapping[str, Any] = {
+    "color": VERMILION,
+    "linestyle": (0, (5, 2)),
+    "linewidth": 1.3,
+}
+"""Line style of the fitted base model: dashed, so that it is recognised without colour."""
+EXTENDED_MODEL_LINE: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
+"""Line style of the extended model."""
+BASE_MODEL_MARKER: Mapping[str, Any] = {
+    "marker": "s",
+    "markersize": 6,
+    "markerfacecolor": "white",
+    "color": VERMILION,
+}
+"""Marker style of the fitted base model: open squares, recognised without colour."""
+EXTENDED_MODEL_MARKER: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE}
+"""Marker style of the extended model."""
+_SPAN_FOR_LOG = 8.0
+"""Minimum ratio of the largest to the smallest value for a logarithmic axis."""
+_FLOOR = "1: noise floor"
+_ALONE = "what noise alone gives"
+_WIDEST = 0.9
+"""Maximum half-length of the bar for the noise about 1, so that it ends above 0."""
+_NEXT = 1.0
+"""Distance between rows of gap locations."""
+_NEXT_KIND = 2.1
+"""Distance to the first row of another kind, with space for its heading."""
+_FIRST = 1.0
+"""Position of the first row."""
+
+
+def shorten_label(name: object, unit: str = "1", most: int = 30) -> str:
+    """Format a text from a file, optionally with its unit, short enough for a label.
+
+    Args:
+        name: Text of the label.
+        unit: Unit; ``1`` for none.
+        most: Maximum number of characters of the text.
+    """
+    return format_label(sanitise(name, most), sanitise(unit, 12))
+
+
+def has_extended_model(story: DiagnosisReportData) -> bool:
+    """Return whether there is an extended model to show next to the base model."""
+    return bool(story.verdict.causes)
+
+
+def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
+    """Select the runs, channels and phases with the largest gaps, in their original order."""
+    result: list[GapLocation] = []
+    # A part without samples has no RMS.
+    usable = [p for p in places if np.isfinite(p.before) and p.samples > 0]
+    for kind, most in (
+        ("run", MAX_RUNS),
+        ("channel", MAX_GAP_LOCATIONS),
+        ("phase", MAX_GAP_LOCATIONS),
+    ):
+        there = [p for p in usable if p.kind == kind]
+        worst = sorted(there, key=lambda p: -p.before)[:most]
+        # The original order is kept, because readers look for run 3 after run 2.
+        result += [p for p in there if p in worst]
+    return result
+
+
+def draw_gap_location_panel(
+    axis: Axes, places: Sequence[GapLocation], story: DiagnosisReportData
+) -> None:
+    """Draw the RMS by run, channel and phase, with the range that noise alone would give.
+
+    Args:
+        axis: Axes to draw on.
+        places: Gap locations to draw.
+        story: Report data.
+    """
+    rows = _rows_of(axis, places)
+    # The RMS of n noise samples has a standard deviation of 1 / sqrt(2 n); two of them are drawn.
+    noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
+    ones = np.ones(len(rows))
+    axis.errorbar(
+        ones, rows, xerr=noise, fmt="none", ecolor=CHANCE_LEVEL_GREY, elinewidth=7, label=_ALONE
+    )
+    axis.axvline(1.0, color=NEUTRAL_MARK, linewidth=1.0, linestyle=":", label=_FLOOR)
+    squares = [p.before for p in places]
+    dots = [p.after for p in places]
+    if has_extended_model(story):
+        axis.hlines(rows, dots, squares, color=CONNECTOR_GREY, linewidth=0.9)
+        axis.plot(dots, rows, linestyle="", label="after", **EXTENDED_MODEL_MARKER)
+    name = "before" if has_extended_model(story) else "simulated (tuned)"
+    axis.plot(squares, rows, linestyle="", label=name, **BASE_MODEL_MARKER)
+    drawn = [*squares, *dots] if has_extended_model(story) else squares
+    # The noise floor must be visible, whatever the sizes.
+    _decades(axis, [*drawn, 1.0])
+    axis.set_yticks(rows, place_names(places), linespacing=1.05)
+    axis.set_ylim(rows[-1] + 0.7, -0.1)
+    axis.set_xlabel("RMS of the residual, in units of the noise")
+
+
+def place_names(places: Sequence[GapLocation]) -> list[str]:
+    """Format each gap location with its number of samples, in as many lines as needed."""
+    names = [f"{sanitise(place.label, LONGEST_NAME)} ({place.samples})" for place in places]
+    return [break_name(name, _NAME_LINE) for name in names]
+
+
+def _rows_of(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
+    """Compute the position of each row downwards, and write a heading above each kind."""
+    rows: list[float] = []
+    for i, place in enumerate(places):
+        new = i == 0 or places[i - 1].kind != place.kind
+        if not rows:
+            rows.append(_FIRST)
+        else:
+            rows.append(rows[-1] + (_NEXT_KIND if new else _NEXT))
+        if new:
+            axis.text(
+                -0.035,
+                rows[-1] - 0.85,
+                f"by {place.kind} (samples)",
+                transform=axis.get_yaxis_transform(),
+                ha="right",
+                va="center",
+                fontsize=8.5,
+                weight="bold",
+            )
+    return rows
+
+
+def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:
+    """Return handles and labels of a legend in reading order."""
+    handles, labels = axis.get_legend_handles_labels()
+    by_label = dict(zip(labels, handles, strict=True))
+    order = ("before", "simulated (tuned)", "after", _FLOOR, _ALONE)
+    present = [name for name in order if name in by_label]
+    return [by_label[name] for name in present], present
+
+
+def _decades(axis: Axes, values: Sequence[float]) -> None:
+    """Use a logarithmic axis with plain numbers if the values have a large range."""
+    there = np.array([v for v in values if np.isfinite(v) and v > 0])
+    if not there.size or there.max() / there.min() < _SPAN_FOR_LOG:
+        axis.set_xlim(left=0)
+        return
+    axis.set_xscale("log")
+    low = there.min() / 1.4
+    high = there.max() * 1.4
+    ticks = _ticks(low, high)
+    axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    # Minor ticks of a short axis would be labelled too, in powers of ten.
+    axis.set_xticks([], minor=True)
+    axis.set_xlim(low, high)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Return round numbers in an interval of a logarithmic axis."""
+    # With more decades, each has fewer numbers, so that labels do not overlap.
+    steps: tuple[int, ...] = (1,)
+    if high / low < 200:
+        steps = (1, 2, 5)
+    elif high / low < 1000:
+        steps = (1, 3)
+    ticks = []
+    for exponent in range(-6, 10):
+        for step in steps:
+            tick = step * 10.0**exponent
+            if low <= tick <= high:
+                ticks.append(tick)
+    return ticks
+
+
+def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[ResidualProfile]:
+    """Select the profiles with the most significant residuals before the extension.
+
+    Each variable comes once before any comes a second time.
+    """
+    usable = [p for p in profiles if np.isfinite(_standing(p))]
+    strongest_first = sorted(usable, key=lambda p: -_standing(p))
+    variables = [p.variable for p in strongest_first]
+    again = [name in variables[:i] for i, name in enumerate(variables)]
+    # The sort is stable: first profiles of each variable come first, each group by significance.
+    order = np.argsort(again, kind="stable")
+    return [strongest_first[i] for i in order[:MAX_PROFILES]]
+
+
+def _standing(profile: ResidualProfile) -> float:
+    """Compute the mean squared residual in standard errors; 1 for noise, NaN for too few bins."""
+    there = np.isfinite(profile.before) & (profile.error > 0)
+    if there.sum() < 2:
+        return float("nan")
+    return float(np.mean((profile.before[there] / profile.error[there]) ** 2))
+
+
+def profile_label(profile: ResidualProfile) -> str:
+    """Format a variable with its unit, in as many lines as needed."""
+    name = format_label(
+        sanitise(profile.variable, LONGEST_NAME), sanitise(profile.unit, 12), LONGEST_NAME
+    )
+    return break_name(name, _NAME_LINE)
+
+
+def draw_profile_panel(
+    axis: Axes, profile: ResidualProfile, unit: str, extended: bool, *, one_channel: bool = False
+) -> None:
+    """Draw the mean residual of a channel against a variable.
+
+    Args:
+        axis: Axes to draw on.
+        profile: Residual in bins.
+        unit: Unit of the channel.
+        extended: Whether there is an extended model to draw.
+        one_channel: Whether all panels show the same channel, which their heading names.
+    """
+    # Bins without samples have no mean.
+    there = np.isfinite(profile.before)
+    centres = profile.centres[there]
+    bars = 2 * profile.error[there]
+    axis.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6)
+    looks = [
+        (
+            profile.before,
+            {**BASE_MODEL_LINE, **BASE_MODEL_MARKER, "markersize": 4.5, "linewidth": 1.0},
+        )
+    ]
+    if extended:
+        looks.append(
+            (
+                profile.after,
+                {
+                    **EXTENDED_MODEL_LINE,
+                    **EXTENDED_MODEL_MARKER,
+                    "markersize": 3.5,
+                    "linewidth": 1.2,
+                },
+            )
+        )
+    for values, look in looks:
+        axis.errorbar(centres, values[there], yerr=bars, elinewidth=1.0, **look)
+    axis.set_xlabel(profile_label(profile))
+    what = (
+        "residual" if one_channel else f"residual of {sanitise(profile.channel, MAX_LABEL_LENGTH)}"
+    )
+    axis.set_ylabel(
+        break_name(format_label(what, sanitise(unit, SHORT_LABEL_LENGTH)), MAX_LABEL_LENGTH)
+    )
+    axis.locator_params(nbins=5)

@@ -1,0 +1,363 @@
+"""Figure of a robot's motion joint by joint.
+
+Each row shows the measured and simulated motion, and next to it the residual of each recorded
+quantity in units of its noise.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.report.cause_text import list_place_marks
+from bench.diagnosis.report.figure_panels import (
+    BASE_MODEL_LINE,
+    EXTENDED_MODEL_LINE,
+    has_extended_model,
+    shorten_label,
+)
+from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.diagnosis.report.run_selection import MAX_OUTLINED_DOTS, RunView, decimate
+from bench.diagnosis.report.wording import ALL_PLACES, format_number, sanitise
+from bench.figures.style import (
+    BLUE,
+    CAPTION_GREY,
+    NEUTRAL_MARK,
+    NOISE_BAND_GREY,
+    ZERO_LINE_GREY,
+    make_panel_grid,
+)
+from bench.figures.text_layout import break_name, text_width
+from sims.core.simulator import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MAX_JOINTS = 10
+"""Maximum number of rows; those with the largest residuals are shown."""
+QUANTITY_LABELS: Mapping[str, str] = {"q": "position", "qd": "velocity", "tau": "torque"}
+"""Quantities of a joint, by the first part of a channel's name; a sensor has its own row."""
+MIN_RESIDUAL_AXIS_SIGMAS = 4.0
+"""Minimum half-height of a residual panel in noise standard deviations, so that noise does not fill
+the panel.
+"""
+RESIDUAL_AXIS_QUANTILE = 0.999
+"""Quantile of the residuals that fits into a panel, so that a single outlier does not flatten the
+others.
+"""
+_HEIGHTS = {1: 2.6, 2: 1.9, 3: 1.5, 4: 1.25, 5: 1.1}
+"""Height of a row in inches, by the number of rows."""
+_LEAST_HEIGHT = 1.0
+NAMED_JOINT_MARKER = "▸"
+"""Marker before the name of a diagnosed joint, visible in print without colour too."""
+LONGEST_NAME = 64
+"""Maximum number of characters of the name of a joint or sensor."""
+_NAME_LINE = 18
+"""Maximum number of characters per line of the name of a joint or sensor."""
+_NAME_SIZE = 9.5
+"""Font size of the names of joints and sensors, in points."""
+_BESIDE_NAME = 0.85
+"""Space between names and panels in inches, for ticks and units."""
+_HEAD, _FOOT = 0.75, 0.95
+"""Space above and below the rows, in inches."""
+
+
+class JointRow(NamedTuple):
+    """Row of the figure: a joint or a sensor.
+
+    Attributes:
+        name: Name of the joint or sensor.
+        shown: Index of the channel whose motion is shown.
+        channels: Indices of its channels, by quantity.
+    """
+
+    name: str
+    shown: int
+    channels: Mapping[str, int]
+
+
+def is_robot(story: DiagnosisReportData) -> bool:
+    """Return whether the channels are those of a robot."""
+    return story.robot is not None and len(list_joint_rows(story)) > 0
+
+
+def list_joint_rows(story: DiagnosisReportData) -> list[JointRow]:
+    """List a row for each joint, in the order of the channels, then one for each sensor."""
+    joints: dict[str, dict[str, int]] = {}
+    sensors = []
+    for c, channel in enumerate(story.channels):
+        quantity, _, name = channel.name.partition(".")
+        if quantity in QUANTITY_LABELS and name:
+            joints.setdefault(name, {})[quantity] = c
+        else:
+            sensors.append(JointRow(channel.name, c, {_first(story): c}))
+    rows = []
+    for name, channels in joints.items():
+        # The position is shown if it was recorded, otherwise the velocity or the torque.
+        shown = next(channels[q] for q in QUANTITY_LABELS if q in channels)
+        rows.append(JointRow(name, shown, channels))
+    return rows + sensors
+
+
+def _first(story: DiagnosisReportData) -> str:
+    """Return the quantity of the first residual column, which also holds those of sensors."""
+    return next(iter(_quantities(story)), "q")
+
+
+def _quantities(story: DiagnosisReportData) -> list[str]:
+    there = {channel.name.partition(".")[0] for channel in story.channels}
+    return [quantity for quantity in QUANTITY_LABELS if quantity in there]
+
+
+def draw_joint_figure(story: DiagnosisReportData, shot: RunView) -> Figure:
+    """Draw a run joint by joint.
+
+    Args:
+        story: Report data.
+        shot: Run to draw.
+    """
+    rows = _worst(story, shot)
+    quantities = _quantities(story) or ["q"]
+    height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
+    found = {mark.name for mark in list_place_marks(story)} | _joints_of_marks(story)
+    names = [_row_name(row, row.name in found) for row in rows]
+    left = max(1.95, 0.12 + text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
+    width = left + 5.15 + 2.6 * len(quantities)
+    size = (width, _HEAD + _FOOT + height * len(rows))
+    ratios = (4.2, *[3.0] * len(quantities))
+    figure, axes = make_panel_grid(
+        len(rows), len(ratios), size, layout=None, sharex=True, width_ratios=ratios
+    )
+    for row, panels in zip(rows, axes, strict=True):
+        _motion(panels[0], story, shot, row, row.name in found)
+        for panel, quantity in zip(panels[1:], quantities, strict=True):
+            if quantity in row.channels:
+                _residual(panel, story, shot, row.channels[quantity])
+            else:
+                panel.set_axis_off()
+    for column, quantity in enumerate(quantities, start=1):
+        _one_scale(axes[:, column], story, shot, rows, quantity)
+        what = QUANTITY_LABELS[quantity]
+        axes[0, column].set_title(f"residual of {what} [σ]", fontsize=9.5, loc="left")
+    axes[0, 0].set_title("measured and simulated", fontsize=9.5, loc="left")
+    for panel in axes[-1]:
+        panel.set_xlabel("time [s]")
+        # The narrow columns have little space for tick labels, which may be long.
+        panel.locator_params(axis="x", nbins=4)
+    _finish(figure, axes, story, shot, rows, left)
+    return figure
+
+
+def _worst(story: DiagnosisReportData, shot: RunView) -> list[JointRow]:
+    """Select the rows with the largest residuals, in their original order."""
+    rows = list_joint_rows(story)
+
+    def gap(row: JointRow) -> float:
+        return max(_size(story, shot, c, "before") for c in row.channels.values())
+
+    worst = sorted(rows, key=gap, reverse=True)[:MAX_JOINTS]
+    return [row for row in rows if row in worst]
+
+
+def _size(story: DiagnosisReportData, shot: RunView, c: int, which: str) -> float:
+    """Return the RMS residual of a channel in this run in noise units; 0 without samples."""
+    left = _left(story, shot, c, which)
+    there = left[np.isfinite(left)]
+    return float(np.sqrt(np.mean(there**2))) if there.size else 0.0
+
+
+def _left(story: DiagnosisReportData, shot: RunView, c: int, which: str) -> Array:
+    """Return the residual (T,) of a channel in units of its noise."""
+    count = len(shot.side.times[shot.row])
+    simulated = getattr(shot.side, which)
+    left: Array = (shot.side.observed - simulated)[shot.row, :count, c] / story.channels[c].sigma
+    return left
+
+
+def _motion(
+    panel: Axes, story: DiagnosisReportData, shot: RunView, row: JointRow, found: bool
+) -> None:
+    """Draw the measured and simulated motion, with the name of the joint next to it."""
+    channel, side = story.channels[row.shown], shot.side
+    times = side.times[shot.row]
+    signals = [
+        a[shot.row, : len(times), row.shown] for a in (side.observed, side.before, side.after)
+    ]
+    rows = decimate(signals[0])
+    measured, before, after = (signal[rows] for signal in signals)
+    t = times[rows]
+    size = 4.0 if rows.size < 250 else 3.4
+    panel.plot(
+        t,
+        measured,
+        "o",
+        color="black",
+        markersize=size,
+        markeredgewidth=0,
+        label="measured",
+        zorder=1,
+        rasterized=rows.size > MAX_OUTLINED_DOTS,
+    )
+    tuned = "simulated before (tuned)" if has_extended_model(story) else "simulated (tuned)"
+    panel.plot(t, before, label=tuned, zorder=3, **BASE_MODEL_LINE)
+    if has_extended_model(story):
+        # Where the curves agree, "before" is visible as dashes on "after", and "after" on the dots.
+        panel.plot(t, after, label="simulated after", zorder=2, **EXTENDED_MODEL_LINE)
+    quantity = channel.name.partition(".")[0]
+    symbol = quantity if quantity in QUANTITY_LABELS else ""
+    panel.set_ylabel(shorten_label(symbol, channel.unit, 14), fontsize=8)
+    panel.annotate(
+        _row_name(row, found),
+        (0, 0.5),
+        (-0.72 * 72, 0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=_NAME_SIZE,
+        weight="bold",
+        color=BLUE if found else NEUTRAL_MARK,
+        annotation_clip=False,
+    )
+    panel.margins(x=0.01)
+    panel.locator_params(axis="y", nbins=4)
+    panel.tick_params(labelsize=8)
+
+
+def _row_name(row: JointRow, found: bool) -> str:
+    """Format the name of a joint or sensor in short lines."""
+    name = break_name(sanitise(row.name, LONGEST_NAME), _NAME_LINE)
+    return f"{NAMED_JOINT_MARKER} {name}" if found else name
+
+
+def _residual(panel: Axes, story: DiagnosisReportData, shot: RunView, c: int) -> None:
+    """Draw the residuals of a channel, with their RMS."""
+    times = shot.side.times[shot.row]
+    panel.axhspan(
+        -2, 2, color=NOISE_BAND_GREY, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
+    )
+    panel.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
+    whiches = ("before", "after") if has_extended_model(story) else ("before",)
+    for which in whiches:
+        left = _left(story, shot, c, which)
+        rows = decimate(left)
+        look = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
+        if which == "after":
+            look = {**EXTENDED_MODEL_LINE, "linewidth": 0.8, "zorder": 2}
+        look["rasterized"] = rows.size > MAX_OUTLINED_DOTS
+        panel.plot(times[rows], left[rows], **look)
+    sizes = [format_number(_size(story, shot, c, which), 2) for which in whiches]
+    panel.text(
+        1.0,
+        1.02,
+        " → ".join(sizes),
+        transform=panel.transAxes,
+        ha="right",
+        va="bottom",
+        fontsize=8.5,
+        weight="bold",
+        color=NEUTRAL_MARK,
+    )
+    panel.margins(x=0.01)
+    panel.locator_params(axis="y", nbins=4)
+    panel.tick_params(labelsize=8)
+
+
+def _one_scale(
+    panels: Sequence[Axes],
+    story: DiagnosisReportData,
+    shot: RunView,
+    rows: Sequence[JointRow],
+    quantity: str,
+) -> None:
+    """Set one scale for a column of residuals, so that joints can be compared."""
+    most = MIN_RESIDUAL_AXIS_SIGMAS
+    for row in rows:
+        if quantity in row.channels:
+            left = np.abs(_left(story, shot, row.channels[quantity], "before"))
+            there = left[np.isfinite(left)]
+            if there.size:
+                most = max(most, 1.08 * float(np.quantile(there, RESIDUAL_AXIS_QUANTILE)))
+    for panel in panels:
+        panel.set_ylim(-most, most)
+
+
+def find_joint(story: DiagnosisReportData, kind: str, place: str) -> str:
+    """Return the joint that a place belongs to; empty without a joint or a robot.
+
+    Args:
+        story: Report data.
+        kind: Kind of the place: joint, channel, actuator or body.
+        place: Name of the place.
+    """
+    robot = story.robot
+    if kind == "joint":
+        return "" if place == ALL_PLACES else sanitise(place, 40)
+    if kind == "channel":
+        quantity, _, name = place.partition(".")
+        # A sensor has its own row.
+        return sanitise(name if quantity in QUANTITY_LABELS and name else place, 40)
+    if robot is None:
+        return ""
+    if kind == "actuator":
+        return next((sanitise(a.joint or "", 40) for a in robot.actuators if a.name == place), "")
+    if kind == "body":
+        of = {body.id for body in robot.bodies if body.name == place}
+        moved = [j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in of]
+        return sanitise(moved[0], 40) if moved else ""
+    return ""
+
+
+def _joints_of_marks(story: DiagnosisReportData) -> set[str]:
+    """Return the joints of the channels, actuators and bodies in the diagnosis."""
+    return {find_joint(story, mark.kind, mark.name) for mark in list_place_marks(story)}
+
+
+def _finish(
+    figure: Figure,
+    axes: Any,
+    story: DiagnosisReportData,
+    shot: RunView,
+    rows: Sequence[JointRow],
+    left: float,
+) -> None:
+    """Add title, legend and margins; the panels begin at `left` inches."""
+    width, height = figure.get_size_inches().tolist()
+    total = len(list_joint_rows(story))
+    some = f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
+    # A sample time counts once, however many channels were recorded.
+    samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
+    kind = f"{story.validation_run} run" if shot.held_out else "run"
+    how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
+    title = f"The {kind} {how}, joint by joint: {shorten_label(shot.side.names[shot.row])}"
+    title += f" ({samples} samples{some})"
+    figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    with warnings.catch_warnings():
+        # A residual column may have no panel in its first row.
+        warnings.simplefilter("ignore", UserWarning)
+        bands = [panel.get_legend_handles_labels() for panel in axes[:, 1]]
+    band, its_label = next(((h, name) for h, name in bands if h), ([], []))
+    figure.legend(
+        [*handles, *band],
+        [*labels, *its_label],
+        loc="lower center",
+        bbox_to_anchor=(0.5, 0.22 / height),
+        ncols=4,
+        fontsize=9,
+    )
+    before = "before → after" if has_extended_model(story) else "its size"
+    note = f"residual: measured − simulated; above each its RMS in σ, {before}"
+    figure.text(0.5, 0.14 / height, note, fontsize=8, ha="center", va="center", color=CAPTION_GREY)
+    figure.subplots_adjust(
+        left=left / width,
+        right=1 - 0.12 / width,
+        top=1 - _HEAD / height,
+        bottom=_FOOT / height,
+        hspace=0.3,
+        wspace=0.19,
+    )

@@ -1,0 +1,321 @@
+"""Interactive chart of measured and simulated motion, by run and channel, and its table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil, floor, log10
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis.report.figure_panels import has_extended_model
+from bench.diagnosis.report.joint_figure import QUANTITY_LABELS, is_robot, list_joint_rows
+from bench.diagnosis.report.report_data import DataSplit, DiagnosisReportData
+from bench.diagnosis.report.run_selection import select_worst_run
+from bench.diagnosis.report.summary_text import list_data_splits
+from bench.diagnosis.report.wording import format_label, format_number, format_unit, sanitise
+from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style
+from bench.figures.text_layout import brief
+from bench.pages.chart import Axis, AxisSpan, Chart, Panel, PrintedFigure, Series, TooltipLine
+from bench.pages.page_table import Table
+from sims.core.simulator import Array
+
+MOTION_TABLE_NAME = "motion"
+"""Name of the table, and of the chart."""
+MAX_ROWS = 30_000
+"""Maximum number of samples on the page, over all runs and channels; the file stays below 3 MB."""
+MIN_ROWS_PER_CHANNEL = 500
+"""Minimum number of samples per channel and run; if that is too many, runs are left out."""
+MAX_INITIAL_CHANNELS = 8
+"""Maximum number of channels that are visible at first: those with the largest gap."""
+NOISE_RESOLUTION = 100.0
+"""Resolution of written values, as the noise divided by this number."""
+MEASURED_STYLE = make_mark_style(BLACK, (), "o")
+BASE_MODEL_STYLE = make_mark_style(VERMILION, (5.0, 2.0))
+EXTENDED_MODEL_STYLE = make_mark_style(BLUE)
+_LEAST = 3.0
+"""Minimum half-height of a residual panel in noise standard deviations, so that noise does not fill
+the panel.
+"""
+_TALL, _LOW, _ROW = 250, 190, 190
+"""Heights in pixels: of a motion panel and of a residual panel below it, and of both side by side.
+"""
+
+
+class ShownRun(NamedTuple):
+    """Run that the page shows.
+
+    Attributes:
+        side: Data split of the run.
+        row: Index of the run in it.
+        says: Name, use and gap of the run, for the selection control.
+        gap: RMS residual of the base model, in units of the noise.
+    """
+
+    side: DataSplit
+    row: int
+    says: str
+    gap: float
+
+
+class MotionTable(NamedTuple):
+    """Table of the chart, with its runs and what was left out.
+
+    Attributes:
+        frame: Table with one row per sample, as text.
+        runs: Runs of the chart, the worst first, but the run of the printed figure before all
+            others.
+        stretches: Number of parts of the longest run of which the extremes are shown; 0 if all
+            samples are shown.
+        longest: Number of samples of the longest run.
+        absent: Number of runs that are not shown.
+    """
+
+    frame: Table
+    runs: tuple[ShownRun, ...]
+    stretches: int
+    longest: int
+    absent: int
+
+
+def build_motion_table(story: DiagnosisReportData, most: int = MAX_ROWS) -> MotionTable:
+    """Build the table of samples to show.
+
+    Args:
+        story: Report data.
+        most: Approximate maximum number of samples.
+    """
+    runs = _runs(story)
+    count = len(story.channels)
+    shown = runs[: max(1, most // (MIN_ROWS_PER_CHANNEL * count))]
+    each = max(MIN_ROWS_PER_CHANNEL, most // (len(shown) * count))
+    parts = [_rows(story, run, c, each) for run in shown for c in range(count)]
+    names = ["run", "channel", "t", "measured", "before"] + ["after"] * has_extended_model(story)
+    names += ["residual_before"] + ["residual_after"] * has_extended_model(story)
+    columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
+    frame = Table(dict(zip(names, columns, strict=True)))
+    longest = max(len(run.side.times[run.row]) for run in shown)
+    cut = _stretches(story, each) if longest > each else 0
+    return MotionTable(frame, tuple(shown), cut, longest, len(runs) - len(shown))
+
+
+def _runs(story: DiagnosisReportData) -> list[ShownRun]:
+    """List all runs, the worst first, but the run of the printed figure before all others."""
+    sigma = np.array([c.sigma for c in story.channels])
+    first = select_worst_run(story)
+    found = []
+    for side in list_data_splits(story):
+        squares = np.square((side.observed - side.before) / sigma)
+        use = ""
+        if side is story.held_out:
+            use = ", left out" if story.cross_validated else ", held out"
+        for row, name in enumerate(side.names):
+            there = squares[row][np.isfinite(squares[row])]
+            gap = float(np.sqrt(there.mean())) if there.size else 0.0
+            says = f"{sanitise(name, 40)}{use}: {format_number(gap, 2)} noises"
+            found.append(ShownRun(side, row, says, gap))
+    shot = (id(first.side), first.row)
+    return sorted(found, key=lambda run: ((id(run.side), run.row) != shot, -run.gap))
+
+
+def _stretches(story: DiagnosisReportData, most: int) -> int:
+    """Return the number of parts of a long run: the extremes of two or three signals are kept."""
+    return max(1, most // (6 if has_extended_model(story) else 4))
+
+
+def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[np.intp]:
+    """Select the samples at which any signal has its minimum or maximum within a part of the run.
+
+    The first and the last sample are included.
+
+    Args:
+        signals: Signals (T,), NaN where missing.
+        stretches: Number of parts, of nearly equal length.
+
+    Returns:
+        Sorted indices of the samples.
+    """
+    size = len(signals[0])
+    edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
+    long = np.diff([*edges, size]).max()
+    # Each row holds one part; shorter parts are padded with values that are never extremes.
+    places = np.minimum(edges[:, None] + np.arange(long), size - 1)
+    own = places < np.append(edges[1:], size)[:, None]
+    rows = np.arange(len(edges))
+    chosen = [np.array([0, size - 1])]
+    for signal in signals:
+        for sign in (1.0, -1.0):
+            values = np.where(own & np.isfinite(signal[places]), sign * signal[places], -np.inf)
+            chosen.append(places[rows, values.argmax(axis=1)])
+    return np.unique(np.concatenate(chosen))
+
+
+def _rows(story: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[list[str]]:
+    """Format the cells of a channel of a run, column by column."""
+    side, channel = run.side, story.channels[c]
+    times = side.times[run.row]
+    whiches = ("before", "after") if has_extended_model(story) else ("before",)
+    observed = side.observed[run.row, : len(times), c]
+    simulated = [getattr(side, which)[run.row, : len(times), c] for which in whiches]
+    residuals = [(observed - one) / channel.sigma for one in simulated]
+    kept = np.arange(len(times))
+    if len(times) > most:
+        kept = select_extreme_samples([observed, *residuals], _stretches(story, most))
+    digits = (
+        int(np.clip(ceil(log10(NOISE_RESOLUTION / channel.sigma)), 0, 15))
+        if channel.sigma > 0
+        else 9
+    )
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    # A thousandth of a step shows whether time stamps have jitter.
+    fine = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
+    count = len(kept)
+    texts = [[sanitise(side.names[run.row], 80)] * count, [sanitise(channel.name, 80)] * count]
+    texts.append(_written(times[kept], fine))
+    texts += [_written(values[kept], digits) for values in (observed, *simulated)]
+    return texts + [_written(values[kept], 2) for values in residuals]
+
+
+def _written(values: Array, digits: int) -> list[str]:
+    """Format numbers with at most this many decimals; empty for missing values."""
+    texts = [f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values.tolist()]
+    return [text.rstrip("0").rstrip(".") if "." in text else text for text in texts]
+
+
+def make_motion_chart(
+    story: DiagnosisReportData, shown: MotionTable, static: PrintedFigure | None, printed: str
+) -> Chart:
+    """Make the chart of the table.
+
+    Args:
+        story: Report data.
+        shown: Table of the chart.
+        static: Printed figure.
+        printed: Caption of the printed figure; safe HTML.
+    """
+    panels: list[Panel] = []
+    places = _places(story)
+    wide = len(places) > 2 or is_robot(story)
+    for run in shown.runs:
+        for facets, c in places:
+            panels += _pair(story, run, c, {"run": run.says, **facets}, wide)
+    sides = ("Left", "Right") if wide else ("Above", "Below")
+    caption = [
+        f"{sides[0]}: measured (dots) and simulated. {sides[1]}: the residual, measured less "
+        "simulated, in units of the noise σ; in the grey band 95 % of the noise would lie. All "
+        "panels have one time axis: drag across to zoom in, double-click for the whole."
+    ]
+    if shown.stretches:
+        caption.append(
+            f"Of runs of up to {shown.longest} samples not all are shown here: of each of "
+            f"{shown.stretches} stretches those at which what was measured, or a residual, is "
+            "least or largest. Each is a sample of the recording."
+        )
+    if shown.absent:
+        caption.append(f"{shown.absent} more runs, which fit better, are not shown.")
+    toggles = ("joint", "quantity") if is_robot(story) else ("channel",)
+    return Chart(
+        MOTION_TABLE_NAME,
+        "Measured and simulated",
+        f'<span class="alive">{" ".join(caption)}</span><span class="paper">{printed}</span>',
+        tuple(panels),
+        static,
+        columns=2 if wide else 1,
+        along=True,
+        toggles=toggles,
+        off={toggles[0]: _off(story, places, toggles[0])},
+        lights=toggles[0],
+    )
+
+
+def _places(story: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
+    """Return the switches of each channel; for a robot, joint and quantity."""
+    if not is_robot(story):
+        return [({"channel": sanitise(c.name, 40)}, i) for i, c in enumerate(story.channels)]
+    found = []
+    for row in list_joint_rows(story):
+        for quantity, c in row.channels.items():
+            own = story.channels[c].name.partition(".")[0] in QUANTITY_LABELS
+            what = QUANTITY_LABELS[quantity] if own else "sensor"
+            found.append(({"joint": sanitise(row.name, 40), "quantity": what}, c))
+    return found
+
+
+def _off(
+    story: DiagnosisReportData, places: Sequence[tuple[dict[str, str], int]], toggle: str
+) -> tuple[str, ...]:
+    """Return the channels that are hidden at first: with many channels, those that fit well."""
+    if len(places) <= MAX_INITIAL_CHANNELS:
+        return ()
+    gaps: dict[str, float] = {}
+    counts: dict[str, int] = {}
+    by_name = {place.label: place.before for place in story.places if place.kind == "channel"}
+    for facets, c in places:
+        name = facets[toggle]
+        gaps[name] = max(gaps.get(name, 0.0), by_name.get(story.channels[c].name, 0.0))
+        counts[name] = counts.get(name, 0) + 1
+    left = MAX_INITIAL_CHANNELS
+    on: set[str] = set()
+    for name in sorted(gaps, key=lambda one: -gaps[one]):
+        if not on or counts[name] <= left:
+            on.add(name)
+            left -= counts[name]
+    return tuple(name for name in gaps if name not in on)
+
+
+def _pair(
+    story: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], wide: bool
+) -> tuple[Panel, Panel]:
+    """Make the panels of a channel's motion and of its residual."""
+    channel = story.channels[c]
+    where = {"run": sanitise(run.side.names[run.row], 80), "channel": sanitise(channel.name, 80)}
+    extended = has_extended_model(story)
+    series = [Series("measured", "measured", MEASURED_STYLE, where, draw="points", under=True)]
+    left = [Series("simulated before", "residual_before", BASE_MODEL_STYLE, where)]
+    if extended:
+        series.append(Series("simulated after", "after", EXTENDED_MODEL_STYLE, where))
+        left.insert(0, Series("simulated after", "residual_after", EXTENDED_MODEL_STYLE, where))
+    series.append(Series("simulated before", "before", BASE_MODEL_STYLE, where))
+    across = Axis("time [s]", scales=("linear",))
+    name = sanitise(channel.name, 40)
+    # For the joints of a robot, a common scale makes residuals comparable.
+    of = facets.get("quantity", name)
+    residual = Axis(f"residual of {of} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
+    up = Axis(format_label(brief(sanitise(channel.name), 24), channel.unit), scales=("linear",))
+    band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
+    tells = _tells(format_unit(channel.unit), channel.sigma, extended)
+    heights = (_ROW, _ROW) if wide else (_TALL, _LOW)
+    above = Panel(
+        name, MOTION_TABLE_NAME, "t", tuple(series), across, up, facets, (), (), tells, heights[0]
+    )
+    below = Panel(
+        f"{name}: residual",
+        MOTION_TABLE_NAME,
+        "t",
+        tuple(left),
+        across,
+        residual,
+        facets,
+        spans=band,
+        tells=tells,
+        height=heights[1],
+    )
+    return above, below
+
+
+def _tells(unit: str, sigma: float, extended: bool) -> tuple[TooltipLine, ...]:
+    """Return the values at the cursor: signals, and residuals in noise units and their unit."""
+
+    def residual(says: str, y: str, look: MarkStyle) -> TooltipLine:
+        return TooltipLine(says, y, "σ", look, sigma, unit)
+
+    tells = [
+        TooltipLine("measured", "measured", unit, MEASURED_STYLE),
+        TooltipLine("before", "before", unit, BASE_MODEL_STYLE),
+    ]
+    tells += [TooltipLine("after", "after", unit, EXTENDED_MODEL_STYLE)] * extended
+    tells.append(residual("residual before", "residual_before", BASE_MODEL_STYLE))
+    if extended:
+        tells.append(residual("residual after", "residual_after", EXTENDED_MODEL_STYLE))
+    return tuple(tells)

@@ -1,0 +1,602 @@
+"""Plain-text summary of an explanation, for the terminal, the page and the figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from math import isclose, isfinite
+from textwrap import wrap
+
+import numpy as np
+
+from bench.diagnosis.evaluation.search_control import QUESTION_TEXTS
+from bench.diagnosis.report.candidate_ranking import rank_candidates
+from bench.diagnosis.report.cause_text import (
+    format_causes,
+    format_effect_set,
+    format_lacking,
+    format_number_error,
+    format_values,
+    has_placed_causes,
+    is_overstated,
+    strip_place,
+)
+from bench.diagnosis.report.consistency_section import format_consistency
+from bench.diagnosis.report.report_data import (
+    ChannelInfo,
+    DataSplit,
+    DiagnosisReportData,
+    GapLocation,
+    ParameterChange,
+)
+from bench.diagnosis.report.wording import (
+    END,
+    append_unit,
+    at_bound,
+    format_effect,
+    format_estimate,
+    format_number,
+    format_p_value,
+    format_percent,
+    format_sentence,
+    format_unit,
+    is_parameter_error,
+    joined,
+    sanitise,
+)
+from bench.diagnosis.verdict import Cause, HeldOutResult, RecordingFault, Verdict
+from sims.core.simulator import Array
+
+TERMINAL_WIDTH = 100
+"""Maximum number of characters of a line on the terminal."""
+NOISE_ESTIMATE_ERROR_FACTOR = 1.2
+"""Relative standard error of an estimated noise, times the square root of the number of samples
+(see `bench.diagnosis.evaluation.noise_floor`).
+"""
+Z95_ONE_SIDED = 1.645
+"""One-sided 95 % quantile of the normal distribution, in standard deviations."""
+MAX_PHI = 0.98
+"""Maximum correlation of neighbouring samples that is used; with 1 no sample would count."""
+MAX_PERCENT_SHIFT = 10.0
+"""Relative change of a parameter above which it is not reported in percent."""
+MAX_NAMED_CHANNELS = 6
+"""Maximum number of channels that a sentence names."""
+PERFECT_MODEL_NOTE = "with a perfect model the sensor's noise would leave"
+MIN_REPORTED_SHIFT = 0.05
+"""Minimum relative change of a parameter that is reported as absorption if its interval is unknown.
+"""
+LEAST_MOVE = 1e-3
+"""Minimum relative change of a parameter that can be reported as absorption, however narrow its
+interval.
+"""
+
+
+def format_summary(story: DiagnosisReportData) -> list[str]:
+    """Format the summary as terminal lines.
+
+    They contain the verdict in a sentence, the gain, the location of the gap, changed parameters,
+    and what remains unexplained.
+    """
+    # The title comes from a file: it must not contain line breaks or terminal control sequences.
+    lines = [sanitise(story.title, TERMINAL_WIDTH), ""]
+    for text in (format_headline(story), *format_gain_and_caveats(story)):
+        lines += wrap(text, TERMINAL_WIDTH)
+    for text in format_details(story):
+        lines += ["", *wrap(text, TERMINAL_WIDTH, subsequent_indent="  ")]
+    return lines
+
+
+def format_details(story: DiagnosisReportData) -> Iterator[str]:
+    """Yield the paragraphs below the headline."""
+    verdict = story.verdict.verdict
+    if story.verdict.recording_faults:
+        yield format_simulation_count(story)
+        return
+    # For these verdicts, the description of an effect is part of the text above the details.
+    explained = verdict in ("named", "partial")
+    for cause in story.verdict.causes:
+        name = f"{format_sentence(format_effect(cause.effect))[:-1]} ({sanitise(cause.effect, 60)})"
+        says = "" if explained else f"{_says(cause)}; "
+        yield f"{name}: {says}{format_coefficients(cause)}"
+    # The most important reasons come first; the page contains all of them.
+    if story.why:
+        yield "Why: " + " ".join(format_sentence(text) for text in story.why[:2])
+    largest_places = [format_largest_gap(story, kind) for kind in ("run", "channel", "phase")]
+    places = [text for text in largest_places if text]
+    # Without a gap, the largest residual of a part is random.
+    if places and verdict != "adequate":
+        unit = "RMS in units of the noise (1 is the noise floor)"
+        yield f"Where the gap is largest, {unit}: {'; '.join(places)}."
+    if story.parameters:
+        sentences = [format_parameter_shift(story, p) for p in story.parameters]
+        yield "Parameters: " + " ".join(sentences)
+    # For a single log with consistent runs there is nothing to report.
+    if any(
+        not one.is_consistent or one.by == "log"
+        for one in (*story.consistency.after, *story.consistency.before)
+    ):
+        yield "Which number to trust: " + " ".join(format_consistency(story))
+    if story.lack_of_fit:
+        yield "What remains: " + " ".join(format_sentence(text) for text in story.lack_of_fit)
+    # For an ambiguous verdict, the experiment directly follows the headline.
+    if verdict != "ambiguous" and (proposed := format_next_run(story)):
+        yield f"Next experiment: {proposed}"
+    yield format_simulation_count(story)
+
+
+def _says(cause: Cause) -> str:
+    """Return the description of an effect, to be used within a sentence."""
+    return strip_place(sanitise(cause.says).rstrip("."))
+
+
+def format_headline(story: DiagnosisReportData) -> str:
+    """Format in one sentence what is wrong with the simulator."""
+    verdict, causes = story.verdict.verdict, story.verdict.causes
+    if story.verdict.recording_faults:
+        return format_sentence(story.verdict.recording_faults[0].says)
+    if story.verdict.cut is not None:
+        return _headline_of_cut(story.verdict)
+    # A cause is reported as lacking only if the verdict supports it.
+    if verdict == "adequate":
+        return "Nothing is missing from the simulation that these data can show."
+    if verdict == "unidentifiable":
+        unknown = "what the simulation lacks cannot be told from them"
+        return f"These data cannot fix {joined(list_unidentified_parameters(story))}: {unknown}."
+    if verdict == "unknown" or not causes:
+        none = f"none of the {len(rank_candidates(story))} known causes explains it"
+        none += " at any place" if has_placed_causes(story) else ""
+        return f"Something is missing from the simulation, and {none}."
+    if verdict == "ambiguous":
+        return f"The simulation {format_lacking(causes)}: these data cannot tell which."
+    if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
+        return f"The simulation {format_lacking(causes)}, but {_undetermined(open_ones)}."
+    if bordering := story.verdict.bordering:
+        (name, first), *_ = bordering.items()
+        end = f"the {END[first.at_bound or 'high']} bound of its range"
+        value = append_unit(format_number(first.value), first.unit)
+        why = f"parameter {sanitise(name, 60)} ends at {end}, {value}"
+        return f"The simulation {format_lacking(causes)}, but {why}: the cause may stand for a value beyond it."
+    if verdict == "partial":
+        more = "something else that no known cause explains"
+        if len(causes) == 1 and (said := format_number_error(causes[0])):
+            return format_sentence(f"{said}, and the simulation lacks {more}")
+        return f"The simulation {format_lacking(causes)}, and {_also(causes)}{more}."
+    if len(causes) > 1:
+        # With several causes the sentence would be too long; their descriptions follow it.
+        return f"The simulation {format_lacking([replace(c, alternatives=()) for c in causes])}."
+    (cause,) = causes
+    if said := format_number_error(cause):
+        return format_sentence(said)
+    if is_overstated(cause):
+        return f"The simulation has too much {format_effect(cause.effect)}."
+    return f"The simulation {format_lacking([replace(cause, alternatives=())])}: {_says(cause)}."
+
+
+def _undetermined(causes: Sequence[Cause]) -> str:
+    """Explain why causes without result values are not confirmed."""
+    numbers = [n for cause in causes for n in cause.open_numbers.values()]
+    at_bounds = [n for n in numbers if n.at_bound is not None]
+    if not at_bounds:
+        which = "its number" if len(numbers) == 1 else "all of its numbers"
+        return f"these data do not determine {which if len(causes) == 1 else 'all numbers'}"
+    first = at_bounds[0]
+    value = append_unit(format_number(first.value), first.unit)
+    return f"the fit ends at the {END[first.at_bound or 'high']} bound of its range, {value}"
+
+
+def undetermined(story: DiagnosisReportData) -> Iterator[str]:
+    """Yield which coefficients are not results, what that means, and what to do."""
+    found = [
+        (f"{sanitise(cause.effect, 60)}, {sanitise(key, 60)}", fitted)
+        for cause in story.verdict.causes
+        for key, fitted in cause.open_numbers.items()
+    ]
+    at_bounds = [(name, fitted) for name, fitted in found if fitted.at_bound is not None]
+    loose = [name for name, fitted in found if fitted.at_bound is None]
+    if at_bounds:
+        parts = [
+            f"{name}: {append_unit(format_number(fitted.value), fitted.unit)} is the "
+            f"{END[fitted.at_bound or 'high']} bound of its range"
+            for name, fitted in at_bounds
+        ]
+        longer = any(fitted.unit == "s" for _, fitted in at_bounds)
+        remedy = "; for a time, record longer runs" * longer
+        yield (
+            f"{'; '.join(parts)}. A value at a bound is not a result and has no interval: the data "
+            "ask for a value beyond it, or another cause acts in a similar way. Check units and "
+            f"constants of the recording{remedy}."
+        )
+    if loose:
+        yield (
+            f"{'; '.join(loose)}: the data give no finite interval, so the value is not a result. "
+            "Record a motion in which the effect is larger."
+        )
+
+
+def _also(causes: Sequence[Cause]) -> str:
+    """Return the verb before a missing effect that follows wrong values."""
+    names = [name for cause in causes for name in (cause.effect, *cause.alternatives)]
+    return "lacks " if any(is_parameter_error(name) for name in names) else ""
+
+
+def _headline_of_cut(verdict: Verdict) -> str:
+    """Format the headline of a search that was stopped early, with its preliminary result."""
+    if verdict.verdict == "partial":
+        return (
+            f"The simulation {format_lacking(verdict.causes)}; what else, was not asked to the end."
+        )
+    nothing = "The search was ended before it could say what the simulation lacks"
+    if not verdict.causes:
+        return f"{nothing}."
+    return f"{nothing}; the best that it had come upon: {format_causes(verdict.causes)}."
+
+
+def format_early_stop(story: DiagnosisReportData) -> str:
+    """Format why the search stopped early and which questions it skipped; empty if complete."""
+    found = story.verdict.cut
+    if found is None:
+        return ""
+    by = {"budget": "its budget of time", "interrupt": "an interrupt"}[found.reason]
+    open_ones = joined(
+        [QUESTION_TEXTS[name] for name in found.skipped_questions if name in QUESTION_TEXTS]
+    )
+    during = (
+        f"; looked at last: {sanitise(found.during_question, 80)}" if found.during_question else ""
+    )
+    return f"The search was ended by {by}{during}. Not asked to the end: {open_ones}."
+
+
+def list_unidentified_parameters(story: DiagnosisReportData) -> list[str]:
+    """List the parameters that the recording cannot identify.
+
+    They are those reported by the search, else those without interval, else insensitive ones, else
+    all.
+    """
+    # Each list is the fallback of the previous one, because at least one parameter must be named.
+    unbounded = [
+        p.name for p in story.parameters if p.is_sensitive and not np.isfinite(p.before).all()
+    ]
+    untouched = [p.name for p in story.parameters if not p.is_sensitive]
+    names = (
+        list(story.unidentified_parameters)
+        or unbounded
+        or untouched
+        or [p.name for p in story.parameters]
+    )
+    return [sanitise(name, 60) for name in names] or ["the simulation's parameters"]
+
+
+def format_gain_and_caveats(story: DiagnosisReportData) -> Iterator[str]:
+    """Yield the sentences directly after the headline: gain, caveats and required details."""
+    verdict = story.verdict.verdict
+    yield from (format_sentence(note) for note in story.verdict.recording_notes)
+    if story.verdict.recording_faults:
+        yield from _of_faults(story.verdict.recording_faults)
+        return
+    if story.verdict.cut is not None:
+        yield format_early_stop(story)
+    # A result without a cause needs the tested causes and the detectable gap as context.
+    if verdict == "adequate":
+        yield format_search_summary(story)
+        yield format_detectable_gap(story)
+    yield format_gain(story)
+    yield from undetermined(story)
+    if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
+        # The headline describes a single diagnosed cause; several causes are described here.
+        sayings = [
+            format_number_error(cause) or f"{format_effect(cause.effect)}: {_says(cause)}"
+            for cause in story.verdict.causes
+        ]
+        yield format_sentence("; ".join(sayings))
+    if verdict == "ambiguous":
+        yield "To tell them apart: " + (format_next_run(story) or "no experiment is proposed.")
+
+
+def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
+    """Yield the evidence for a wrong unit or sign, alternative explanations, and what to do."""
+    first, *others = faults
+    if first.error_after is not None:
+        before = (
+            f"from {format_number(first.error_before)} " if first.error_before is not None else ""
+        )
+        yield (
+            "With this correction the error of the tuned simulation on the fitted runs falls "
+            f"{before}to {format_number(first.error_after)} times the noise."
+        )
+    for text in (*first.alternatives, *(fault.says for fault in others)):
+        yield format_sentence(f"{'or' if text in first.alternatives else 'also'}: {text}")
+    yield "No causes were searched, since each would only imitate this. Correct it and run again."
+
+
+def format_gain(story: DiagnosisReportData) -> str:
+    """Format the held-out error before and after, and the noise floor.
+
+    Without held-out runs, the text says that the gain was not measured.
+    """
+    held_out = story.verdict.heldout
+    if held_out is None:
+        return _format_fitted_gain(story)
+    base = _error(story, held_out.rmse_base)
+    extended = _error(story, held_out.rmse_extended)
+    perfect = f"{PERFECT_MODEL_NOTE} {_error(story, held_out.noise_floor)}"
+    runs = story.validation_runs
+    # Without a cause the extended model is the base model, so there is no error after.
+    if not story.verdict.causes:
+        return f"On {runs} the tuned simulation errs by {base} (RMSE); {perfect}."
+    errors = f"the error on {runs} (RMSE) is {base} before and {extended} after; {perfect}."
+    if not has_gap_closed(held_out):
+        return errors[0].upper() + errors[1:]
+    share = f"{format_percent(held_out.gap_closed)} of the gap{format_interval(held_out)}"
+    return f"{_closer(story)} {share}: {errors}"
+
+
+def has_gap_closed(held_out: HeldOutResult) -> bool:
+    """Return whether the share of the gap closed is known."""
+    return held_out.gap_closed is not None and isfinite(held_out.gap_closed)
+
+
+def format_interval(held_out: HeldOutResult) -> str:
+    """Format the 95 % interval of the share closed: `` (85 to 94 %)``; empty without one."""
+    low, high = held_out.low, held_out.high
+    if low is None or high is None:
+        return ""
+    return f" ({format_percent(low).removesuffix(' %')} to {format_percent(high)})"
+
+
+def _closer(story: DiagnosisReportData) -> str:
+    """Return the beginning of the sentence about the share of the gap that is closed."""
+    causes = story.verdict.causes
+    if story.verdict.verdict == "unknown" and story.verdict.cut is None:
+        names = joined([format_effect(cause.effect) for cause in causes])
+        return f"The best of them, {names}, {'closes' if len(causes) == 1 else 'close'} only"
+    if len(causes) > 1:
+        return "Together they close"
+    if is_parameter_error(causes[0].effect) and not causes[0].alternatives:
+        return "To correct it closes"
+    if story.verdict.verdict == "partial":
+        return format_sentence(f"{format_effect(causes[0].effect)} closes").rstrip(".")
+    if story.verdict.verdict != "ambiguous":
+        return "It closes"
+    several = len(causes[0].alternatives) > 1 and has_placed_causes(story)
+    return "Each closes" if several else "Either closes"
+
+
+def _format_fitted_gain(story: DiagnosisReportData) -> str:
+    before, after = (
+        compute_normalised_rms(story, story.fitting, which) for which in ("before", "after")
+    )
+    error = f"the tuned simulation's error is {format_number(before)} times the noise"
+    if story.verdict.causes:
+        error += f" before and {format_number(after)} times after"
+    caution = "No run is held out, so the gain is not measured independently"
+    found = story.verdict.cut
+    if found is not None and "held_out" in found.skipped_questions:
+        caution = f"The gain was not measured on {story.validation_runs}"
+    return f"{caution}; on the fitted runs {error}."
+
+
+def get_held_out_unit(story: DiagnosisReportData) -> str:
+    """Return the unit of the held-out errors.
+
+    It is the specified unit, or that of the channels whose combined noise is the noise floor.
+    """
+    held_out = story.verdict.heldout
+    if held_out is not None and held_out.unit:
+        return held_out.unit
+    # If the unit is not specified: the noise floor is the RMS noise of the channels of one unit.
+    floor = held_out.noise_floor if held_out is not None else None
+    units = list(dict.fromkeys(c.unit for c in story.channels))
+    for unit in units:
+        noises = [c.sigma for c in story.channels if c.unit == unit]
+        together = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
+        if isclose(together, floor or 0.0, rel_tol=0.02):
+            return unit
+    return units[0] if len(units) == 1 else "1"
+
+
+def _error(story: DiagnosisReportData, value: float | None) -> str:
+    return append_unit(format_number(value), get_held_out_unit(story))
+
+
+def format_search_summary(story: DiagnosisReportData) -> str:
+    """Format the number of tested causes and the best candidate."""
+    candidates = story.verdict.candidates
+    if not candidates:
+        return "No candidate causes were at hand."
+    best = candidates[0]
+    where = " at every place" if has_placed_causes(story) else ""
+    count = f"{len(rank_candidates(story))} possible causes were looked for{where}"
+    none = f"{count} and none stands out from chance"
+    promising = f"{format_effect(best.effect)} ({format_p_value(best.p_value)})"
+    return f"{none}; the most promising is {promising}."
+
+
+def format_detectable_gap(story: DiagnosisReportData) -> str:
+    """Format how large a gap the noise could hide in each channel.
+
+    With many channels, only the worst one of each kind is reported.
+    """
+    sizes = zip(story.channels, compute_detectable_gap(story).tolist(), strict=True)
+    # The detectable gap of a channel with too few samples is unknown.
+    known = [(channel, size) for channel, size in sizes if isfinite(size)]
+    parts = []
+    for channel, size in _worst_of_each(known):
+        amount = append_unit(format_number(size, 2), channel.unit)
+        share = f"{format_number(size / channel.sigma, 2)} of its noise"
+        parts.append(f"{amount} in {sanitise(channel.name, 30)} ({share})")
+    return f"A gap of up to {joined(parts)} RMS could still hide in the noise." if parts else ""
+
+
+def _worst_of_each(sizes: Sequence[tuple[ChannelInfo, float]]) -> list[tuple[ChannelInfo, float]]:
+    """Select, from many channels, the one of each kind that hides most, in units of its noise."""
+    if len(sizes) <= MAX_NAMED_CHANNELS:
+        return list(sizes)
+    worst: dict[str, tuple[ChannelInfo, float]] = {}
+    for channel, size in sizes:
+        kind = channel.name.partition(".")[0]
+        if kind not in worst or size / channel.sigma > worst[kind][1] / worst[kind][0].sigma:
+            worst[kind] = channel, size
+    return list(worst.values())
+
+
+def compute_detectable_gap(story: DiagnosisReportData) -> Array:
+    """Compute the largest gap (C,) that the noise of a channel could hide at 95 %.
+
+    The gap is an RMS in the unit of the channel. r are the n residuals in units of the noise, and s
+    = mean(r^2), which is 1 without a gap:
+
+            phi = mean(r_t r_t+1) / s                                   (1)
+            n'  = n (1 - phi^2) / (1 + phi^2)                           (2)
+            gap^2 = max(0, s - 1) + 1.645 hypot(s sqrt(2 / n'), d)      (3)
+
+    Autocorrelated noise reduces the effective number of samples: (2) is the number of independent
+    samples whose mean square has the same variance as that of noise with the correlation phi^k over
+    k samples. An estimated noise has itself a relative error of 1.2 / sqrt(n); d is the error of
+    its square, twice as much.
+    """
+    sizes = []
+    for c, channel in enumerate(story.channels):
+        rows = []
+        for side in list_data_splits(story):
+            rows += [*((side.observed - side.before)[:, :, c] / channel.sigma)]
+        residuals = np.concatenate([row[np.isfinite(row)] for row in rows])
+        # A single sample has no neighbour, and its square is not a variance.
+        if residuals.size < 2:
+            sizes.append(np.nan)
+            continue
+        square = float(np.mean(residuals**2))
+        # Products use neighbours within a run; a product with a missing sample is NaN.
+        products = np.concatenate([row[1:] * row[:-1] for row in rows])
+        phi = 0.0
+        if np.isfinite(products).any() and square:
+            phi = float(np.clip(np.nanmean(products) / square, 0.0, MAX_PHI))  # (1)
+        counted = residuals.size * (1.0 - phi**2) / (1.0 + phi**2)  # (2)
+        doubt = 0.0 if channel.stated else 2.0 * NOISE_ESTIMATE_ERROR_FACTOR / residuals.size**0.5
+        chance = float(np.hypot(square * (2.0 / counted) ** 0.5, doubt))
+        excess = max(0.0, square - 1.0) + Z95_ONE_SIDED * chance  # (3)
+        sizes.append(channel.sigma * excess**0.5)
+    return np.array(sizes)
+
+
+def list_data_splits(story: DiagnosisReportData) -> list[DataSplit]:
+    """List the fitted runs and the held-out runs, as far as they exist."""
+    both = (story.fitting, story.held_out)
+    return [side for side in both if side is not None and len(side.names)]
+
+
+def compute_normalised_rms(story: DiagnosisReportData, side: DataSplit, which: str) -> float:
+    """Compute the RMS residual of a data split over all channels, in units of the noise.
+
+    Args:
+        story: Report data.
+        side: Data split.
+        which: ``before`` or ``after``.
+    """
+    sigma = np.array([c.sigma for c in story.channels])
+    left = (side.observed - getattr(side, which)) / sigma
+    # The mean of an empty set would cause a warning.
+    return float(np.sqrt(np.nanmean(left**2))) if np.isfinite(left).any() else float("nan")
+
+
+def format_coefficients(cause: Cause) -> str:
+    """Format a cause's coefficients with intervals, its p-value, and its alternatives."""
+    others = ""
+    if cause.alternatives:
+        names = format_effect_set(cause.alternatives)
+        others = f"; {names} instead would do as well"
+    parts = [text for text in (format_values(cause), format_p_value(cause.p_value)) if text]
+    return f"{'; '.join(parts)}{others}."
+
+
+def format_largest_gap(story: DiagnosisReportData, kind: str) -> str:
+    """Format the run, channel or phase with the largest gap, if there are several.
+
+    Args:
+        story: Report data.
+        kind: ``run``, ``channel`` or ``phase``.
+    """
+    there = [place for place in story.places if place.kind == kind and isfinite(place.before)]
+    # With a single one, its gap is the largest anyway.
+    if len(there) < 2:
+        return ""
+    place: GapLocation = max(there, key=lambda p: p.before)
+    after = f" before, {format_number(place.after, 2)} after" if story.verdict.causes else ""
+    return f"{kind} {sanitise(place.label, 60)} ({format_number(place.before, 2)}{after})"
+
+
+def format_parameter_shift(story: DiagnosisReportData, p: ParameterChange) -> str:
+    """Format how far a parameter moves once the cause is in the model.
+
+    The base model had changed it to absorb part of the gap.
+
+    Args:
+        story: Report data.
+        p: Parameter before and after.
+    """
+    name = sanitise(p.name, 60)
+    unit = f" {format_unit(p.unit)}" if format_unit(p.unit) else ""
+    if not p.is_sensitive:
+        nominal = f"its nominal {format_number(p.before[0])}{unit}"
+        return f"{name} is not touched by these data and stays at {nominal}."
+    if not story.verdict.causes:
+        # Without a cause, the last fit is also of the base model, and is the best one.
+        return f"{name} = {tuned(p, 1)}."
+    before, after = tuned(p, 0), tuned(p, 1)
+    end = ": it had absorbed part of the gap." if has_absorbed_gap(p) else "."
+    return f"{name} {before} before, {after} after ({format_shift(p)}){end}"
+
+
+def tuned(p: ParameterChange, when: int) -> str:
+    """Format a parameter's estimate with its interval, or the bound that it is at.
+
+    Args:
+        p: Parameter before and after.
+        when: 0 for the estimate before, 1 for the one after.
+    """
+    value, bound = (p.before, p.after)[when], p.bounds[when]
+    total = p.in_file if when else ""
+    if bound is not None:
+        return at_bound(value[0], p.unit, bound) + total
+    return append_unit(format_estimate(*value), p.unit) + total
+
+
+def format_shift(p: ParameterChange) -> str:
+    """Format the change of a parameter in percent, or as a number if it was zero before."""
+    move = p.after[0] - p.before[0]
+    if not move:
+        return "unchanged"
+    if abs(move) < LEAST_MOVE * abs(p.before[0]):
+        return f"changes by less than {format_percent(LEAST_MOVE)}"
+    sign = "+" if move > 0 else ""
+    # For zero a percentage is undefined, and a very large one is less clear than the number.
+    if not p.before[0] or abs(move / p.before[0]) > MAX_PERCENT_SHIFT:
+        return sign + append_unit(format_number(move, 2), p.unit)
+    return sign + format_percent(move / abs(p.before[0]))
+
+
+def has_absorbed_gap(p: ParameterChange) -> bool:
+    """Return whether a parameter changes significantly.
+
+    The change must exceed the combined 95 % intervals, and be at least `LEAST_MOVE` of the value.
+    """
+    move = abs(p.after[0] - p.before[0])
+    # Without intervals, a minimum relative change is required instead.
+    if not np.isfinite([*p.before, *p.after]).all():
+        return move > MIN_REPORTED_SHIFT * abs(p.before[0])
+    before, after = ((high - low) / 2.0 for _, low, high in (p.before, p.after))
+    return bool(move > np.hypot(before, after) and move >= LEAST_MOVE * abs(p.before[0]))
+
+
+def format_next_run(story: DiagnosisReportData) -> str:
+    """Format the proposed next experiment; empty if there is none."""
+    proposed = story.verdict.next_experiment
+    return format_sentence(proposed.says) if proposed is not None else ""
+
+
+def format_simulation_count(story: DiagnosisReportData) -> str:
+    """Format the number of simulations, system, engine and duration."""
+    verdict = story.verdict
+    system = sanitise(verdict.system, 60)
+    engine = sanitise(verdict.engine, 60)
+    simulations = f"{verdict.simulations:,} simulations of system {system} on engine {engine}"
+    return f"{simulations}, {format_number(verdict.seconds, 2)} s."

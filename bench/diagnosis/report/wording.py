@@ -1,0 +1,192 @@
+"""Text of numbers, units and effect names, for the summary, the figures and the page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+# All text functions of explain's pages are imported from this module, including the shared ones.
+from bench.pages.text_format import SUPERSCRIPT_DIGITS
+from bench.pages.text_format import format_estimate as format_estimate
+from bench.pages.text_format import format_number as format_number
+from bench.pages.text_format import format_p_value as format_p_value
+from bench.pages.text_format import format_percent as format_percent
+from bench.pages.text_format import joined as joined
+from bench.pages.text_format import sanitise as sanitise
+from sims import effects
+from sims.core.simulator import InputError
+from sims.extended_simulator import FittedValue
+
+END = {"low": "lower", "high": "upper"}
+"""Words for the ends of a range."""
+ALL_PLACES = "*"
+"""Place of a family: all places of one kind."""
+_AT = {
+    "joint": ("at", "joints"),
+    "actuator": ("at", "actuators"),
+    "body": ("of", "bodies"),
+    "channel": ("in", "channels"),
+    "level": ("of", "levels"),
+}
+"""Preposition before a place of each kind, and the plural of the kind."""
+NUMERICS_NAMES = {
+    "numerics.step": "too long a time step",
+    "numerics.integrator": "an integrator that does not follow the motion",
+}
+"""Names of a too coarse time step or integrator as causes; they are errors of the model file, not
+effects.
+"""
+_WRONG = re.compile(r"an? (wrong|misplaced) ")
+"""Pattern of nouns that name a wrong value, not a missing effect."""
+
+
+def format_effect(effect: str) -> str:
+    """Format an effect as a noun, such as ``linear drag``.
+
+    Effects joined by + become ``a and b``. Unknown effects keep their name.
+    """
+    return joined([_noun(part.strip()) for part in effect.split("+")])
+
+
+def _noun(name: str) -> str:
+    """Format one effect as a noun with its place, or by its name and description without a noun."""
+    base, place = split_effect_name(name)
+    if base in NUMERICS_NAMES:
+        return NUMERICS_NAMES[base]
+    try:
+        effect = effects.get_effect(base)
+    except InputError:
+        # A verdict may name an effect of a plugin that is not loaded.
+        return sanitise(name, 60)
+    if effect.noun:
+        what = sanitise(effect.noun, 60)
+        return what + (
+            format_places(get_place_kind(name), [place], wrong=is_parameter_error(name))
+            if place
+            else ""
+        )
+    clause = re.split(r"[,:;]", effect.says, maxsplit=1)[0]
+    return sanitise(f"{name} ({clause})", 60)
+
+
+def split_effect_name(effect: str) -> tuple[str, str]:
+    """Split an effect into its registered name and its place, which is ``*`` for a family."""
+    base, _, place = effect.partition("@")
+    return base, place
+
+
+def get_place_kind(effect: str) -> str:
+    """Return the kind of an effect's places, such as ``joint`` or ``body``; empty if unknown."""
+    try:
+        kind: str = getattr(effects.get_effect(split_effect_name(effect)[0]), "at", "")
+    except InputError:
+        return ""
+    return kind if kind in _AT else ""
+
+
+def is_parameter_error(effect: str) -> bool:
+    """Return whether the effect corrects a wrong value instead of adding a missing effect."""
+    base, _ = split_effect_name(effect)
+    if base in NUMERICS_NAMES:
+        return True
+    try:
+        said = effects.get_effect(base).noun
+    except InputError:
+        said = ""
+    return bool(_WRONG.match(said))
+
+
+def format_places(kind: str, places: Sequence[str], last: str = "or", wrong: bool = False) -> str:
+    """Format places: `` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``.
+
+    Args:
+        kind: Kind of the places.
+        places: Names of the places.
+        last: Conjunction before the last name.
+        wrong: Whether the effect is a wrong value of the place: `` of joint elbow``.
+    """
+    before, several = _AT.get(kind, ("at", "places"))
+    before = "of" if wrong else before
+    names = [sanitise(place, 40) for place in places]
+    if names == [ALL_PLACES]:
+        return f" {before} every {kind}" if kind else " everywhere"
+    if len(names) < 3:
+        return f" {before} {kind} {joined(names, last)}".replace("  ", " ")
+    each = "any" if last == "or" else "each"
+    return f" {before} {each} of the {several} {joined(names, last)}"
+
+
+def format_effect_name(effect: str) -> str:
+    """Format an effect as a noun without its article, for lists."""
+    return re.sub(r"^an? ", "", format_effect(effect))
+
+
+def format_sentence(text: object) -> str:
+    """Format text as a sentence, with a capital first letter and a final period."""
+    plain = sanitise(text)
+    if not plain:
+        return plain
+    # A name with digits or underscores stays unchanged.
+    word = plain.split()[0].rstrip(",:;.").isalpha()
+    first = plain[0].upper() if word else plain[0]
+    stop = "" if plain[-1] in ".!?…" else "."
+    return first + plain[1:] + stop
+
+
+def format_unit(unit: str) -> str:
+    """Format a unit for print, such as ``kg·m²``; empty for a pure number."""
+    power = r"(?:\^|\*\*)(-?\d+)"
+    raised = re.sub(power, lambda match: match[1].translate(SUPERSCRIPT_DIGITS), sanitise(unit, 60))
+    return "" if raised == "1" else raised.replace("*", "·")
+
+
+def format_label(name: str, unit: str, most: int = 30) -> str:
+    """Format a label with its unit: ``q [rad]``, or ``q`` for a pure number.
+
+    Args:
+        name: Text of the label.
+        unit: Unit.
+        most: Maximum number of characters of the text.
+    """
+    return (
+        f"{sanitise(name, most)} [{format_unit(unit)}]"
+        if format_unit(unit)
+        else sanitise(name, most)
+    )
+
+
+def append_unit(text: str, unit: str) -> str:
+    """Append a unit to a number."""
+    return f"{text} {format_unit(unit)}" if format_unit(unit) else text
+
+
+def format_fitted_value(fitted: FittedValue) -> str:
+    """Format a fitted number with its interval and unit, or the bound that it is at.
+
+    The resulting value in the model file, and a value outside the usual range, are added.
+    """
+    text = append_unit(format_estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
+    if fitted.at_bound is not None:
+        text = at_bound(fitted.value, fitted.unit, fitted.at_bound)
+    return text + in_file(fitted) + beyond_usual(fitted)
+
+
+def in_file(fitted: FittedValue) -> str:
+    """Format the change in the model file: ``, in the model file 0.2 → 0.15 N·m``; else empty."""
+    if fitted.stated is None or fitted.total is None:
+        return ""
+    total = append_unit(format_number(fitted.total), fitted.total_unit or fitted.unit)
+    return f", in the model file {format_number(fitted.stated)} → {total}"
+
+
+def beyond_usual(fitted: FittedValue) -> str:
+    """Format the usual range of a value outside it: ``, beyond the usual range of 0 to 0.6 N``."""
+    if fitted.usual_range is None:
+        return ""
+    low, high = map(format_number, fitted.usual_range)
+    return f", beyond the usual range of {append_unit(f'{low} to {high}', fitted.unit)}"
+
+
+def at_bound(value: float, unit: str, bound: str) -> str:
+    """Format a value at a bound: ``4 s (upper bound of its range)``."""
+    return f"{append_unit(format_number(value), unit)} ({END[bound]} bound of its range)"

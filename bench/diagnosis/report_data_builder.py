@@ -1,0 +1,295 @@
+"""Collect the data that text, figures and page of a report need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.diagnosis import residual_analysis
+from bench.diagnosis.fitting.base_fit import BaseFit
+from bench.diagnosis.identifiability import ParameterIdentifiability, assess_identifiability
+from bench.diagnosis.report.cause_text import format_effect_set
+from bench.diagnosis.report.report_data import (
+    ChannelInfo,
+    DataSplit,
+    DiagnosisReportData,
+    GapLocation,
+    ParameterChange,
+)
+from bench.diagnosis.report.wording import END, in_file
+from bench.diagnosis.search.diagnose import DiagnosisResult
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.verdict_rules import STRUCTURE_P_VALUE_THRESHOLD
+from bench.diagnosis.validation.run_consistency import (
+    ConsistencySummary,
+    ParameterConsistency,
+    assess_consistency,
+)
+from bench.diagnosis.verdict import Verdict
+from bench.diagnosis.verdict_builder import VerdictBuilder
+from sims.core.simulator import Array
+from sims.extended_simulator import FittedValue as Estimate
+
+TRACK_COLUMNS = {"u", "v", "radius_px"}
+"""Columns by which the recording of a tracked film is recognised."""
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+"""First bytes of every PNG file."""
+MAX_TRACK_FIGURE_BYTES = 1_000_000
+"""Maximum size in bytes of the track figure that a page includes."""
+
+
+@dataclass(frozen=True)
+class DiagnosisReportDataBuilder:
+    """Builder of the report data of a finding.
+
+    Attributes:
+        assessor: Builder of the verdict, with the recording, the run evaluators and the noise.
+        search: Search that produced the finding.
+        base: Fit of the base model.
+        finding: Outcome of the search.
+        notes: Further notes, one sentence each.
+    """
+
+    assessor: VerdictBuilder
+    search: EffectSearch
+    base: BaseFit
+    finding: DiagnosisResult
+    notes: tuple[str, ...] = ()
+
+    def build_report_data(self, verdict: Verdict) -> DiagnosisReportData:
+        """Build the report data for the verdict on the finding."""
+        world = self.assessor.fitting_evaluator
+        recording = self.assessor.recording
+        before = self.finding.base.fit.simulated
+        after = self.finding.model.fit.simulated
+        # The noise is that of the finding, because a good model estimates it better.
+        sigma = self.assessor.estimate_noise_sigma(self.finding)
+        held_out, held_out_places = self._held_out(sigma)
+        return DiagnosisReportData(
+            # A recording without a title is identified by its file name.
+            recording.title or recording.path.stem,
+            recording.path,
+            verdict,
+            self._channels(sigma),
+            residual_analysis.build_data_split(world, before, after),
+            held_out,
+            (
+                *residual_analysis.compute_gap_locations(world, before, after, sigma),
+                *held_out_places,
+            ),
+            tuple(residual_analysis.compute_residual_profiles(world, before, after, sigma)),
+            tuple(self._parameters()),
+            () if verdict.recording_faults else tuple(self._remains()),
+            () if verdict.recording_faults else tuple(self._why()),
+            self.finding.unidentified_parameters,
+            residual_analysis.get_robot(world),
+            identifiability=self._fixable(),
+            consistency=ConsistencySummary() if verdict.recording_faults else self._apart(),
+            track=self._track(),
+            logs=max(1, len({run.log for run in recording.runs})),
+            thorough=self.search.thorough,
+            cross_validated=self._is_cross_validated,
+            share_intervals=self.assessor.share_intervals(self.finding),
+        )
+
+    def _track(self) -> bytes:
+        """Return the figure that film tracking saved next to the recording; empty if none."""
+        recording = self.assessor.recording
+        path = recording.path.with_suffix(".png")
+        if not recording.extra.keys() >= TRACK_COLUMNS:
+            return b""
+        try:
+            with path.open("rb") as file:
+                picture = file.read(MAX_TRACK_FIGURE_BYTES + 1)
+        except OSError:
+            return b""
+        return (
+            picture
+            if picture.startswith(PNG_SIGNATURE) and len(picture) <= MAX_TRACK_FIGURE_BYTES
+            else b""
+        )
+
+    def _apart(self) -> ConsistencySummary:
+        """Assess the consistency of runs, logs and loads for the base and the extended model."""
+        if self.finding.early_stop is not None or self.finding.unidentified_parameters:
+            return ConsistencySummary()
+        before = assess_consistency(self.search, self.finding.base)
+        after = (
+            assess_consistency(self.search, self.finding.model)
+            if self.finding.model.effects
+            else before
+        )
+        return ConsistencySummary(before, after, self._rival())
+
+    def _rival(self) -> tuple[ParameterConsistency, ...]:
+        """Return the group estimates of the best other effect, for a diagnosis of one cause."""
+        if len(self.finding.causes) != 1:
+            return ()
+        (cause,) = self.finding.causes
+        alike = {cause.effect, *cause.alternatives, *self.finding.model.effects}
+        singles = [m for m in self.search.models.values() if len(m.effects) == 1]
+        others = [
+            model
+            for model in singles
+            if not alike & set(model.effects)
+            and np.isfinite(model.penalised_log_likelihood)
+            # A trend of a coefficient is only visible in effects with a single coefficient.
+            and len(self.search.world.get_coefficient_indices(model.effects[0])) == 1
+        ]
+        if not others:
+            return ()
+        best = max(others, key=lambda model: model.penalised_log_likelihood)
+        (name,) = best.effects
+        own = [one for one in assess_consistency(self.search, best) if one.number.startswith(name)]
+        return tuple(own)
+
+    def _fixable(self) -> tuple[ParameterIdentifiability, ...]:
+        """Assess identifiability from the directions that the search has simulated."""
+        key: frozenset[str] = frozenset()
+        scanned = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
+        known = self.search.directions_known()
+        if known is not None:
+            return assess_identifiability(self.search.world, self.search.noise, *known)
+        if scanned is None:
+            return ()
+        return assess_identifiability(
+            self.search.world, self.search.noise, scanned.at, scanned.directions
+        )
+
+    @property
+    def _is_cross_validated(self) -> bool:
+        validation = self.assessor.validation
+        return validation is not None and validation.is_cross_validation
+
+    @property
+    def _how_validated(self) -> str:
+        return "left out" if self._is_cross_validated else "held out"
+
+    def _held_out(self, sigma: Array) -> tuple[DataSplit | None, list[GapLocation]]:
+        """Return the held-out runs and their gap locations; None and empty if not measured."""
+        world = self.assessor.held_out_evaluator
+        measured = self.finding.held_out_fits
+        names = self.finding.model.effects
+        # If the data do not identify the base model, it is not validated on held-out runs.
+        if world is None or measured is None or names not in measured:
+            return None, []
+        before = measured[()].simulated
+        after = measured[names].simulated
+        places = residual_analysis.compute_gap_locations(
+            world, before, after, sigma, f" ({self._how_validated})"
+        )
+        # Channels and phases are reported for the fitted runs only; held-out gaps by run.
+        runs = [place for place in places if place.kind == "run"]
+        return residual_analysis.build_data_split(world, before, after), runs
+
+    def _channels(self, sigma: Array) -> tuple[ChannelInfo, ...]:
+        floor = self.assessor.noise_floor
+        rows = zip(
+            self.assessor.fitting_evaluator.simulator.channels,
+            sigma.tolist(),
+            floor.is_stated.tolist(),
+            floor.quantisation_step.tolist(),
+            strict=True,
+        )
+        return tuple(
+            ChannelInfo(c.name, c.unit, size, stated, step) for c, size, stated, step in rows
+        )
+
+    def _parameters(self) -> Iterator[ParameterChange]:
+        """Yield the base parameters before and after; insensitive ones are marked."""
+        world = self.assessor.fitting_evaluator
+        before = self.assessor.collect_parameter_estimates(self.search, self.finding.base)
+        after = self.assessor.collect_parameter_estimates(self.search, self.finding.model)
+        for i in world.base.tolist():
+            parameter = world.parameters[i]
+            touched = i not in self.base.fixed_parameters
+            yield ParameterChange(
+                parameter.name,
+                parameter.unit,
+                _triple(before[i]),
+                _triple(after[i]),
+                touched,
+                (before[i].at_bound, after[i].at_bound),
+                in_file(after[i]),
+            )
+
+    def _remains(self) -> Iterator[str]:
+        """Yield sentences on what the extended model leaves unexplained, and further notes."""
+        world = self.assessor.fitting_evaluator
+        remains = self.finding.lack_of_fit
+        for channel in remains.channels_above_noise:
+            times = remains.excess[world.channels.index(channel)]
+            yield f"channel {channel} still misses by {times:.3g} times its noise"
+        # Without a result of the test for unmodelled forces there is no dependence to report.
+        if remains.has_structure and remains.where:
+            yield f"what is left behaves like a force that depends on {remains.where}"
+        untouched = [world.parameters[i].name for i in sorted(self.base.insensitive_parameters)]
+        if untouched:
+            names = ", ".join(untouched)
+            yield f"the recording does not touch {names}: kept at the nominal value"
+        vague = [world.parameters[i].name for i in sorted(self.base.unidentified_parameters)]
+        if vague:
+            names = ", ".join(vague)
+            yield f"the recording does not fix {names} beside the others: kept at the nominal value"
+        yield from self._bordering()
+        yield from self.notes
+
+    def _bordering(self) -> Iterator[str]:
+        """Yield sentences on parameters that a fit leaves at a bound of their range."""
+        for one in self._parameters():
+            values = one.before[0], one.after[0]
+            for when, value, bound in zip(
+                ("in the base fit ", ""), values, one.bounds, strict=True
+            ):
+                if bound is None:
+                    continue
+                yield (
+                    f"{when}{one.name} lies at the {END[bound]} bound of its range, {value:g}"
+                    f" {one.unit}: larger ranges were not searched, and a cause may compensate for"
+                    " a value beyond the bound. Check the units and constants of the recording"
+                )
+                break
+
+    def _why(self) -> Iterator[str]:
+        """Yield the reasons for the verdict, the most important first."""
+        finding = self.finding
+        if finding.early_stop is not None:
+            return
+        if finding.verdict == "unknown" and finding.causes:
+            yield "the effects that help most do not close enough of the gap to be its explanation"
+        if finding.verdict in ("partial", "unknown") and finding.lack_of_fit.has_structure:
+            yield self._structure()
+        for cause in finding.causes:
+            if cause.alternatives:
+                names = [cause.effect, *cause.alternatives]
+                placed = any("@" in name for name in names)
+                all_of_them = format_effect_set(names, "and") if placed else _named(names)
+                yield (
+                    f"{all_of_them} make the same difference in these runs, "
+                    "once parameters and initial states are fitted with each: "
+                    "their likelihoods differ by odds of less than 33 to 1"
+                )
+
+    def _structure(self) -> str:
+        chance = self.finding.lack_of_fit.p_value
+        # Lack of fit is either a residual with a pattern, or one that is only too large.
+        if chance < STRUCTURE_P_VALUE_THRESHOLD:
+            return (
+                f"structure is left over (chance {chance:.2g}) "
+                "that the sensor's noise does not have"
+            )
+        return "what is left over exceeds the stated noise of the sensors"
+
+
+def _named(effects: list[str]) -> str:
+    """Join registered names of effects."""
+    return f"{effects[0]} and {', '.join(effects[1:])}"
+
+
+def _triple(number: Estimate) -> tuple[float, float, float]:
+    """Return value and interval as used by figures: NaN where the data give no bound."""
+    low = np.nan if number.low is None else number.low
+    high = np.nan if number.high is None else number.high
+    return number.value, low, high

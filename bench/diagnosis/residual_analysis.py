@@ -1,0 +1,327 @@
+"""Residual analysis: size of the gap by run, channel and phase, and residual profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.report.report_data import DataSplit, GapLocation, ResidualProfile
+from sims.core.simulator import Array
+
+if TYPE_CHECKING:
+    from sims.robot.robot_model import RobotModel
+
+PROFILE_BIN_COUNT = 12
+"""Number of bins of a profile."""
+PROFILE_TAIL_SHARE = 0.005
+"""Share of the samples at either end that a profile's bins leave out, because outliers would
+stretch the axis.
+"""
+REVERSAL_SPEED_SHARE = 0.05
+"""Speed, as a share of the largest one, below which a motion counts as a reversal."""
+REST_SPEED_SHARE = 0.01
+"""Speed, as a share of the largest one, below which a motion counts as at rest if it lasts."""
+MIN_CONSECUTIVE_SAMPLES = 5
+"""Minimum number of consecutive samples for a lasting state."""
+SATURATION_SHARE = 0.999
+"""Share of its largest magnitude above which an input counts as saturated."""
+IMPACT_MARGIN_SAMPLES = 2
+"""Number of samples before and after an impact that belong to it."""
+
+
+def build_data_split(world: RunEvaluator, before: Array, after: Array) -> DataSplit:
+    """Return the runs of a run evaluator with two simulations of them.
+
+    Args:
+        world: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+    """
+    names = tuple(track.name for track in world.tracks)
+    times = tuple(track.scenario.times for track in world.tracks)
+    return DataSplit(names, times, world.observed, before, after)
+
+
+def compute_gap_locations(
+    world: RunEvaluator, before: Array, after: Array, sigma: Array, mark: str = ""
+) -> list[GapLocation]:
+    """Compute the RMS residual in units of the noise, by run, channel and phase.
+
+    Args:
+        world: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+        sigma: (C,) noise of each channel.
+        mark: Text that is appended to the names of runs.
+    """
+    parts = _parts(world, after, mark)
+    residuals = [(world.observed - simulated) / sigma for simulated in (before, after)]
+    shown = []
+    for kind, label, mask in parts:
+        # A run or phase without samples has no RMS.
+        if not mask.any():
+            continue
+        sizes = []
+        for residual in residuals:
+            square = np.square(residual[mask]).mean()
+            sizes.append(float(np.sqrt(square)))
+        samples = int(mask.sum())
+        shown.append(GapLocation(kind, label, samples, *sizes))
+    return shown
+
+
+def _parts(world: RunEvaluator, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
+    """List the kind, label and observed mask (R, T, C) of each run, channel and phase."""
+    seen = np.isfinite(world.observed)
+    runs, _, channels = seen.shape
+    parts: list[tuple[str, str, Mask]] = []
+    for r, track in enumerate(world.tracks):
+        of_run = np.arange(runs) == r
+        mask = seen & of_run[:, None, None]
+        parts.append(("run", track.name + mark, mask))
+    for c, name in enumerate(world.channels):
+        of_channel = np.arange(channels) == c
+        parts.append(("channel", name, seen & of_channel))
+    # Phases come from the simulation, because noise of a measured speed would cause false ones.
+    for phase, where in detect_phases(world, simulated).items():
+        parts.append(("phase", phase, seen & where[:, :, None]))
+    return parts
+
+
+def detect_phases(world: RunEvaluator, simulated: Array) -> dict[str, Mask]:
+    """Detect phases of the motion as masks (R, T).
+
+    They are flight, impact and at rest for a system that bounces; motion, reversal and at rest for
+    others; and saturated input.
+
+    Args:
+        world: Run evaluator of the runs.
+        simulated: (R, T, C) simulated motion.
+    """
+    system = world.simulator.system
+    speed = compute_speeds(world, simulated)
+    if speed is None:
+        return {}
+    # The lower limit avoids a division by zero if nothing moves; then all is at rest.
+    largest = max(float(np.nanmax(speed)), 1e-300)
+    # A reversal is slow for a moment too, so only a lasting state counts as rest.
+    still = _lasting(speed < REST_SPEED_SHARE * largest)
+    if system.bounces:
+        impact = _impacts(world, simulated) & ~still
+        masks = {"flight": ~impact & ~still, "impact": impact, "at rest": still}
+    else:
+        reversal = (speed < REVERSAL_SPEED_SHARE * largest) & ~still
+        masks = {"motion": ~reversal & ~still, "reversal": reversal, "at rest": still}
+    # This phase may overlap with the others, because an input can saturate in each of them.
+    saturated = _saturated(world)
+    if saturated.any():
+        masks["saturated input"] = saturated
+    return masks
+
+
+def compute_speeds(world: RunEvaluator, simulated: Array) -> Array | None:
+    """Compute the speed (R, T) of the simulated motion along the recorded coordinates.
+
+    Args:
+        world: Run evaluator of the runs.
+        simulated: (R, T, C) simulated motion.
+
+    Returns:
+        Speed, 0 after the end of a run; None without recorded coordinates.
+    """
+    squares = np.zeros(simulated.shape[:2])
+    shown = [n for n in world.simulator.system.coordinates if n in world.channels]
+    for name in shown:
+        values = simulated[:, :, world.channels.index(name)]
+        for r, track in enumerate(world.tracks):
+            size = len(track.observed)
+            # A single sample has no slope.
+            if size > 1:
+                slope = np.gradient(values[r, :size], track.scenario.times)
+                squares[r, :size] += np.square(slope)
+    return np.sqrt(np.nan_to_num(squares)) if shown else None
+
+
+def _lasting(mask: Mask) -> Mask:
+    """Return where a mask is true for at least `MIN_CONSECUTIVE_SAMPLES` consecutive samples."""
+    lasting = np.zeros_like(mask)
+    for row, out in zip(mask, lasting, strict=True):
+        # With zeros at both ends, changes come in pairs: start and end of each interval.
+        framed = np.concatenate([[0], row.astype(np.int8), [0]])
+        edges = np.flatnonzero(np.diff(framed))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            out[begin:end] = end - begin >= MIN_CONSECUTIVE_SAMPLES
+    return lasting
+
+
+def _impacts(world: RunEvaluator, simulated: Array) -> Mask:
+    """Return the samples around the lowest points of the flight."""
+    name = world.simulator.system.coordinates[-1]
+    mask = np.zeros(simulated.shape[:2], dtype=bool)
+    if name not in world.channels:
+        return mask
+    height = simulated[:, :, world.channels.index(name)]
+    # After the end of a shorter run heights are NaN, which are never lowest points.
+    before, here, behind = height[:, :-2], height[:, 1:-1], height[:, 2:]
+    with np.errstate(invalid="ignore"):
+        # In a flat interval only the last sample counts, so that one impact is not counted twice.
+        low = (here <= before) & (here < behind)
+    low = np.pad(low, ((0, 0), (1, 1)))
+    for shift in range(-IMPACT_MARGIN_SAMPLES, IMPACT_MARGIN_SAMPLES + 1):
+        mask |= np.roll(low, shift, axis=1)
+    return mask
+
+
+def _saturated(world: RunEvaluator) -> Mask:
+    """Return where the first input stays at its extreme."""
+    mask = np.zeros(world.observed.shape[:2], dtype=bool)
+    for r, track in enumerate(world.tracks):
+        for signal in list(track.scenario.inputs.values())[:1]:
+            size = np.abs(signal)
+            largest = max(float(size.max()), 1e-300)
+            mask[r, : signal.size] = (size >= SATURATION_SHARE * largest) & (size > 0)
+    lasting = _lasting(mask)
+    # A constant or square input is always at its extreme, which is not saturation.
+    return lasting if lasting.mean() < 0.5 else np.zeros_like(mask)
+
+
+def compute_residual_profiles(
+    world: RunEvaluator, before: Array, after: Array, sigma: Array
+) -> list[ResidualProfile]:
+    """Compute the profiles of the residual against time, position, speed and inputs.
+
+    The channel is the one that sensor effects act on. For a robot it is the one with the largest
+    gap, against the variables of its joint.
+
+    Args:
+        world: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+        sigma: (C,) noise of each channel.
+    """
+    name = world.simulator.system.reading(world.channels)
+    followed_by = _variables(world, after)
+    if get_robot(world) is not None:
+        name = _loudest(world, before, sigma)
+        followed_by = _variables_of_joint(world, after, name)
+    c = world.channels.index(name)
+    shown = []
+    for variable, unit, values in followed_by:
+        good = np.isfinite(world.observed[:, :, c]) & np.isfinite(values)
+        followed = values[good]
+        edges = _edges(followed)
+        if edges is None:
+            continue
+        # Values outside the edges count in the outermost bins.
+        places = np.searchsorted(edges, followed, side="right") - 1
+        bins = np.clip(places, 0, PROFILE_BIN_COUNT - 1)
+        counts = np.bincount(bins, minlength=PROFILE_BIN_COUNT).astype(np.float64)
+        # The mean of an empty bin is NaN and is not drawn.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means = []
+            for simulated in (before, after):
+                residual = (world.observed - simulated)[:, :, c][good]
+                means.append(np.bincount(bins, residual, PROFILE_BIN_COUNT) / counts)
+            error = sigma[c] / np.sqrt(counts)
+        error[counts == 0] = np.nan
+        centres = (edges[1:] + edges[:-1]) / 2.0
+        shown.append(ResidualProfile(name, variable, unit, centres, means[0], means[1], error))
+    return shown
+
+
+def get_robot(world: RunEvaluator) -> RobotModel | None:
+    """Return the robot of a recording; None for other systems."""
+    robot: RobotModel | None = getattr(world.kind.system, "robot", None)
+    return robot
+
+
+def _loudest(world: RunEvaluator, before: Array, sigma: Array) -> str:
+    """Return the channel with the largest residual in units of its noise."""
+    squares = np.square((world.observed - before) / sigma)
+    sizes = []
+    for c in range(len(world.channels)):
+        there = squares[:, :, c][np.isfinite(squares[:, :, c])]
+        sizes.append(float(there.mean()) if there.size else 0.0)
+    return world.channels[int(np.argmax(sizes))]
+
+
+def _edges(values: Array) -> Array | None:
+    """Return bin edges (BINS + 1,) over most of the values; None if they are all equal."""
+    if not values.size or np.ptp(values) == 0:
+        return None
+    low, high = (
+        float(v) for v in np.quantile(values, [PROFILE_TAIL_SHARE, 1.0 - PROFILE_TAIL_SHARE])
+    )
+    edges: Array = np.linspace(low, high, PROFILE_BIN_COUNT + 1)
+    return edges if edges[-1] > edges[0] else None
+
+
+def _variables(world: RunEvaluator, simulated: Array) -> Iterator[tuple[str, str, Array]]:
+    """Yield name, unit and values (R, T) of the variables of the profiles."""
+    times = _times(world)
+    yield "time", "s", times
+    system = world.simulator.system
+    units = {channel.name: channel.unit for channel in world.kind.channels}
+    primary = system.coordinates[system.primary] if system.coordinates else ""
+    # The simulated position is used, because the noise of a measured one is part of the residual.
+    if primary in world.channels:
+        position = simulated[:, :, world.channels.index(primary)]
+        yield "position", units[primary], position
+    speed = compute_speeds(world, simulated)
+    if speed is not None:
+        unit = f"{units.get(primary, 'm')}/s"
+        yield "speed", unit, np.where(np.isfinite(times), speed, np.nan)
+    yield from _inputs(world, [channel.name for channel in world.kind.inputs])
+
+
+def _times(world: RunEvaluator) -> Array:
+    """Return the time (R, T) in seconds since the start of each run, whatever its clock."""
+    times = np.full(world.observed.shape[:2], np.nan)
+    for r, track in enumerate(world.tracks):
+        times[r, : len(track.observed)] = track.scenario.times - track.scenario.times[0]
+    return times
+
+
+def _inputs(world: RunEvaluator, names: Collection[str]) -> Iterator[tuple[str, str, Array]]:
+    """Yield name, unit and values (R, T) of the recorded inputs with these names."""
+    for channel in world.kind.inputs:
+        values = np.full(world.observed.shape[:2], np.nan)
+        for r, track in enumerate(world.tracks):
+            signal = track.scenario.inputs.get(channel.name)
+            if signal is not None and channel.name in names:
+                values[r, : len(track.observed)] = signal
+        if np.isfinite(values).any():
+            yield channel.name, channel.unit, values
+
+
+def _variables_of_joint(
+    world: RunEvaluator, simulated: Array, channel: str
+) -> Iterator[tuple[str, str, Array]]:
+    """Yield the variables of a channel's joint, with signed velocity, which friction needs."""
+    times = _times(world)
+    yield "time", "s", times
+    robot = get_robot(world)
+    joints = robot.joints if robot is not None else ()
+    joint = next((j for j in joints if j.name == channel.partition(".")[2]), None)
+    if robot is None or joint is None:
+        return
+    position, rate = f"q.{joint.name}", f"qd.{joint.name}"
+    unit = joint.unit
+    if position in world.channels:
+        values = simulated[:, :, world.channels.index(position)]
+        yield f"position of {joint.name}", unit, values
+        slopes = np.full_like(values, np.nan)
+        for r, track in enumerate(world.tracks):
+            size = len(track.observed)
+            if size > 1:
+                slopes[r, :size] = np.gradient(values[r, :size], track.scenario.times)
+        yield f"velocity of {joint.name}", f"{unit}/s", slopes
+    elif rate in world.channels:
+        values = simulated[:, :, world.channels.index(rate)]
+        yield f"velocity of {joint.name}", f"{unit}/s", values
+    drives = [f"u.{a.name}" for a in robot.actuators if a.joint == joint.name]
+    yield from _inputs(world, [*drives, f"force.{joint.name}"])

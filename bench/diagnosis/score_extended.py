@@ -1,0 +1,214 @@
+"""Score an extended simulator, or a robot's model file, on another recording.
+
+Only the initial states are estimated on that recording.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from bench.benchmark.storage.provenance import read_environment
+from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.validation.held_out_runs import HeldOutRuns
+from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.inspection import check_value_sizes
+from bench.logs.quality.timestamp_check import check_recording_plausible
+from bench.logs.size_limits import check_recording_size
+from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.extended_simulator import ExtendedSimulator, open_extended, read_extended
+from sims.recording.recording import Recording, read_recording, read_system_name
+from sims.recording.recording_description import ModelFileReference, read_model_reference
+from sims.system_simulator import SystemSimulator
+
+MODEL_FILES = (".xml", ".mjcf", ".urdf")
+"""File name extensions of robot model files."""
+
+
+def score_model(
+    model: Path, recording: str | Path | Recording, held_out: bool = False, force: bool = False
+) -> dict[str, Any]:
+    """Compute the RMS error of a model on a recording, by channel and over all channels.
+
+    Args:
+        model: An extended.toml, or a robot's model file, such as extended.xml.
+        recording: Recording, or the path of its table.
+        held_out: Count only runs that are marked as held out.
+        force: Use recordings that are otherwise refused.
+
+    Returns:
+        RMSE by channel in its unit, normalised RMSE over all channels in units of the noise, number
+        of runs and samples, and units.
+
+    Raises:
+        InputError: A file cannot be read, or the recording is of another system.
+    """
+    memory = recording if isinstance(recording, Recording) else None
+    path = recording.path if isinstance(recording, Recording) else Path(recording)
+    if model.suffix not in MODEL_FILES:
+        _check_plugin(model)
+    # The description names the system of the recording before the table is read.
+    of_robot = memory.model if memory is not None else read_model_reference(path)
+    if model.suffix in MODEL_FILES:
+        extended, kind = _robot(model, of_robot)
+    else:
+        extended, kind, _ = open_extended(model, simulators.get)
+        # A recording of another robot is recognised by its channels.
+        if of_robot is None or extended.robot is None:
+            _check_system(path, _system(memory or path, of_robot), extended, model)
+    # All runs count by default, because only initial states are fitted here.
+    data = memory or read_recording(path, kind, whole=True)
+    # Constants of the recording take precedence over those that the model was fitted with.
+    data = replace(data, constants={**extended.constants, **data.constants})
+    data, _ = leave_out_settling(data, kind)
+    runs = data.held_out() if held_out else data.runs
+    if not runs:
+        raise InputError(f"{path}: no run is marked held_out, and only such runs were to count")
+    _check_channels(path, extended, list(runs[0].channels))
+    engine = None if kind.own_engine else extended.engine
+    check_value_sizes(data)
+    check_recording_plausible(data, kind, force)
+    check_recording_size(data, kind(engine=engine), force)
+    # Only the effects in the file are needed; the others are not part of the model.
+    world = RunEvaluator(
+        kind,
+        data,
+        runs,
+        engine,
+        candidates=list(extended.effects),
+    )
+    sigma = compute_noise_floor(world, data).sigma
+    squares = _squares(world, _simulated(world, extended, sigma))
+    world.close()
+    if not np.isfinite(squares).all():
+        raise InputError(f"{path}: the simulation failed with the parameters of {model}")
+    return _errors(world, squares, sigma)
+
+
+def _check_plugin(model: Path) -> None:
+    """Refuse the model of a user-defined simulator whose plugin is not loaded.
+
+    Raises:
+        InputError: The plugin is missing; the message names the option, with the plugin given to
+            explain if it is stored in the folder.
+    """
+    extended = read_extended(model)
+    if extended.robot is not None or extended.system in simulators.names():
+        return
+    # The plugin is only named, not loaded: a data file must not decide which code is run.
+    settings = read_environment(model.parent).get("settings")
+    plugins = settings.get("plugin") if isinstance(settings, dict) else None
+    files = [str(plugin) for plugin in plugins] if isinstance(plugins, list) else ["FILE.py"]
+    options = " ".join(f"--plugin {file}" for file in files)
+    raise InputError(
+        f"{model}: extends simulator '{extended.system}', which is not one of "
+        f"{', '.join(simulators.names())}; add the file that defines it: {options}"
+    )
+
+
+def _robot(
+    model: Path, stated: ModelFileReference | None
+) -> tuple[ExtendedSimulator, type[SystemSimulator]]:
+    """Load a robot from its model file, without fitted numbers and without added effects."""
+    from sims.robot.parsing.read_model_file import read_robot as read_robot
+
+    tables = stated.actuators if stated else {}
+    # A file written by explain contains the actuators of the recording already.
+    there = {actuator.name for actuator in read_robot(model).actuators}
+    lacking = {name: table for name, table in tables.items() if name not in there}
+    # An MJCF contains its own step and integrator, which may be a result of the diagnosis.
+    engine = stated.engine if stated and model.suffix == ".urdf" else {}
+    kind = cast(type[SystemSimulator], make_robot_simulator(model, lacking, engine))
+    return ExtendedSimulator(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
+
+
+def _system(recording: Path | Recording, of_robot: ModelFileReference | None) -> str:
+    """Return the system of a recording: the name of a robot's model file, or of a system."""
+    if of_robot is not None:
+        return of_robot.path.name
+    return recording.system if isinstance(recording, Recording) else read_system_name(recording)
+
+
+def _check_system(recording: Path, system: str, extended: ExtendedSimulator, model: Path) -> None:
+    """Refuse a recording of another system."""
+    if system not in (extended.system, extended.name):
+        raise InputError(
+            f"{recording}: expected a recording of {extended.system}, as {model} is; "
+            f"found one of {system}"
+        )
+
+
+def _check_channels(recording: Path, extended: ExtendedSimulator, recorded: list[str]) -> None:
+    """Refuse a recording that lacks a channel of the model."""
+    for channel in extended.observe:
+        # Otherwise the error would cover fewer channels than the model was fitted to.
+        if channel not in recorded:
+            raise make_unknown_name_error(f"channel of {recording}", channel, recorded)
+
+
+def build_theta(world: RunEvaluator, extended: ExtendedSimulator) -> Array:
+    """Build the parameter vector (P,) of an extended simulator; missing numbers are nominal.
+
+    Args:
+        world: Run evaluator with the effects of the extended simulator.
+        extended: Extended simulator.
+    """
+    # Missing parameters are nominal, and missing coefficients are off.
+    theta = world.get_nominal_theta()
+    own = world.parameters[: world.own]
+    for place, parameter in enumerate(own):
+        if parameter.name in extended.parameters:
+            number = extended.parameters[parameter.name]
+            theta[place] = number.value
+    for name, numbers in extended.effects.items():
+        coefficients = world.available_effects[name].on(world.simulator.system)
+        places = world.get_coefficient_indices(name)
+        for place, coefficient in zip(places, coefficients, strict=True):
+            if coefficient.name in numbers:
+                theta[place] = numbers[coefficient.name].value
+    return theta
+
+
+def _simulated(world: RunEvaluator, extended: ExtendedSimulator, sigma: Array) -> Array:
+    """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states."""
+    white = np.zeros(len(sigma))
+    runs = HeldOutRuns(world, NoiseModel(sigma, white))
+    (measured,) = runs.fit_initial_states([build_theta(world, extended)])
+    return measured.simulated
+
+
+def _squares(world: RunEvaluator, simulated: Array) -> Array:
+    """Compute the squared errors (R, T, C); zero where no sample was observed."""
+    seen = np.isfinite(world.observed)
+    errors = world.observed - simulated
+    squares: Array = np.where(seen, np.square(errors), 0.0)
+    return squares
+
+
+def _errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
+    """Summarise the RMSE by channel, and over all channels in units of the noise."""
+    seen = np.isfinite(world.observed)
+    counts = seen.sum(axis=(0, 1))
+    rmse = {}
+    for c, name in enumerate(world.channels):
+        # A channel without samples has no error.
+        if counts[c]:
+            total = squares[:, :, c].sum()
+            rmse[name] = float(np.sqrt(total / counts[c]))
+    # Errors of different channels can be added in units of their noise.
+    in_noise = squares / np.square(sigma)
+    normalised = np.sqrt(in_noise.sum() / counts.sum())
+    channels = world.simulator.channels
+    return {
+        "rmse": rmse,
+        "normalised_rmse": float(normalised),
+        "runs": len(world.runs),
+        "samples": int(seen.any(axis=2).sum()),
+        "units": {channel.name: channel.unit for channel in channels},
+    }

@@ -1,0 +1,214 @@
+"""Alternative causes that explain the data as well as the effects found.
+
+A model is compared with every model of the same size that shares all effects but one. The differing
+effect is an alternative if that model is not worse by odds of 33 to 1, on fitted and held-out runs
+together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.model_moves import MAX_RICHER_LAW_EXCESS_RATIO
+from bench.diagnosis.search.score_test import estimate_tail_p_value
+from bench.diagnosis.search.verdict_rules import (
+    compute_excess_ratio,
+    convert_excess_ratio,
+    is_indistinguishable,
+)
+
+
+@dataclass(frozen=True)
+class CauseEvidence:
+    """An effect that was found, with its evidence.
+
+    Attributes:
+        effect: its name.
+        alternatives: effects that explain the data as well, the most plausible first.
+        p_value: p-value of its gain under the hypothesis that it is absent.
+        gain: loss of twice the log-likelihood without it.
+        preferred: effect to report for the set: the likeliest one, including held-out runs, among
+            those with plausible coefficients.
+    """
+
+    effect: str
+    alternatives: tuple[str, ...]
+    p_value: float
+    gain: float
+    preferred: str = ""
+
+
+@dataclass(frozen=True)
+class AlternativeFinder:
+    """Collects alternatives for the effects of a model.
+
+    Attributes:
+        search: the search, with every fitted model.
+        held_out_validation: results on held-out runs; None if there are none.
+        structure: whether the residual of the model has structure that no effect explains.
+        simulates: False to use only existing fits and scores.
+    """
+
+    search: EffectSearch
+    held_out_validation: HeldOutValidation | None
+    structure: bool
+    simulates: bool = True
+
+    def collect_evidence(self, model: FittedModel) -> tuple[CauseEvidence, ...]:
+        """Return the evidence for each effect of the model, strongest first."""
+        effects = [self._evidence(model, name) for name in model.effects]
+        return tuple(sorted(effects, key=lambda evidence: -evidence.gain))
+
+    def _evidence(self, model: FittedModel, effect: str) -> CauseEvidence:
+        """Return the evidence for one effect of the model."""
+        rest = self._rest(model, effect)
+        gain = model.likelihood.value - rest.likelihood.value
+        p_value = self._p_value(rest, effect, gain)
+        rivals = self._rivals(model, effect)
+        # Effects with implausible coefficients come last in their set.
+        rivals.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
+        ordered = [name for _, name in rivals]
+        alternatives = tuple(name for name in ordered if name != effect)
+        # With structure in the residual, indistinguishable does not mean equally likely, so the
+        # effect found is kept.
+        preferred = effect if self.structure and effect in ordered else ordered[0]
+        return CauseEvidence(
+            effect=effect,
+            alternatives=alternatives,
+            p_value=float(np.clip(p_value, 0.0, 1.0)),
+            gain=float(gain),
+            preferred=preferred,
+        )
+
+    def _rest(self, model: FittedModel, effect: str) -> FittedModel:
+        """Return the model without the effect, or the base model if that would need a new fit."""
+        if self.simulates:
+            return self.search.remove_effect(model, effect)
+        rest = frozenset(model.effects) - {effect}
+        return self.search.models.get(rest, self.search.base_model)
+
+    def _p_value(self, rest: FittedModel, effect: str, gain: float) -> float:
+        """Return the p-value of a gain about the model without the effect.
+
+        It is the smaller one of the p-values of the gain and of the best score.
+        """
+        search = self.search
+        key = frozenset(rest.effects)
+        known = search.scores_by_effects.get(key)
+        if known is None and not self.simulates:
+            return search.best_p_values.get(key, 1.0)
+        scores = known or search.score_missing_effects(rest)
+        chances = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
+        # A score is linear and the gain of a fit is not; either may be more sensitive.
+        excess = gain - chances.get(effect, 0.0)
+        by_refit = estimate_tail_p_value(scores.null_scores, np.array([excess]))
+        by_score = search.best_p_values.get(key, 1.0)
+        return min(by_score, by_refit)
+
+    def _rivals(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
+        """Return equivalent effects in place of the given one, with their distance."""
+        shared = set(model.effects) - {effect}
+        rivals = [(0.0, effect)]
+        for other in list(self.search.models.values()):
+            names = set(other.effects)
+            same_size = len(names) == len(model.effects)
+            # Only a model that differs in this one effect shows what could replace it.
+            if not same_size or not shared < names:
+                continue
+            (added,) = names - shared
+            # Skip the model itself, and other fits of the same effects.
+            if added == effect:
+                continue
+            behind = self._behind(model, other)
+            if is_indistinguishable(behind) and not self._buys_nothing(effect, added, behind):
+                rivals.append((behind, added))
+        return self._without_richer(rivals)
+
+    def _buys_nothing(self, effect: str, other: str, behind: float) -> bool:
+        """Return whether another effect needs more coefficients without reducing the excess enough.
+
+        If the residual has structure, likelihoods do not account for the number of coefficients.
+        Each further coefficient must then reduce the excess as much as a richer law must.
+        """
+        if not self.structure:
+            return False
+        slots = self.search.world.slots
+        mine, others = (int(slots[name].stop - slots[name].start) for name in (effect, other))
+        further = others - mine
+        return further > 0 and behind > further * convert_excess_ratio(
+            [MAX_RICHER_LAW_EXCESS_RATIO]
+        )
+
+    def _without_richer(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
+        """Return the rivals without those that contain another rival.
+
+        These are families of which one member explains as much, and richer laws of which the
+        simpler one does.
+        """
+        effects = self.search.world.available_effects
+        names = {name for _, name in rivals}
+        return [
+            (behind, name) for behind, name in rivals if not names & set(effects[name].contains)
+        ]
+
+    def _behind(self, model: FittedModel, other: FittedModel) -> float:
+        """Return the distance of another model in twice the log-likelihood.
+
+        It is negative if the other model is better. If the residual has structure that neither
+        model explains, likelihoods only compare how each model mimics it. The distance then depends
+        on the excesses.
+        """
+        trial = self.held_out_validation
+        # Held-out runs compare the models only if both were evaluated there.
+        if trial is not None and not {model.effects, other.effects} <= trial.held_out_fits.keys():
+            trial = None
+        if self.structure:
+            left = self.search.compute_excess(other)
+            ratios = [compute_excess_ratio(left, self.search.compute_excess(model))]
+            if trial is not None:
+                left = trial.compute_excess(other.effects)
+                ratios.append(compute_excess_ratio(left, trial.compute_excess(model.effects)))
+            return convert_excess_ratio(ratios)
+        behind = self._merit(model) - self._merit(other)
+        # Held-out runs are further data, so their log-likelihoods are added.
+        if trial is not None:
+            mine = trial.held_out_fits[model.effects]
+            others = trial.held_out_fits[other.effects]
+            behind += mine.penalised_log_likelihood - others.penalised_log_likelihood
+        return behind
+
+    def _merit(self, model: FittedModel) -> float:
+        """Return the merit; for robots without the null-hypothesis penalty of single-shape effects.
+
+        Two such effects differ, for example, only in a sign constraint: if all commands have the
+        same sign, a dead band is equivalent to a bias.
+        """
+        world = self.search.world
+        if not world.has_linearisation:
+            return model.penalised_log_likelihood
+        lucky = 0.0
+        for name in model.effects:
+            parameters = world.parameters[world.slots[name]]
+            if not any(parameter.bounds[0] > 0 for parameter in parameters):
+                lucky += self.search.get_effect_penalty(name)
+        return model.penalised_log_likelihood + lucky
+
+    def _is_plausible(self, effect: str) -> bool:
+        """Return whether the best fit with an effect has plausible coefficients."""
+        world = self.search.world
+        having = [m for m in self.search.models.values() if effect in m.effects]
+        if not having:
+            return False
+        best = max(having, key=lambda m: m.penalised_log_likelihood)
+        parameters = world.parameters[world.slots[effect]]
+        values = best.fit.theta[world.slots[effect]]
+        for parameter, value in zip(parameters, values, strict=True):
+            low, high = parameter.bounds
+            if not low <= value <= high:
+                return False
+        return True

@@ -1,0 +1,497 @@
+"""Candidate effects: their sensitivity directions along the trajectories, and starts of fits.
+
+The coefficients of an effect scale it (a drag), shape it (a period), or modify it (a wind speed,
+which only matters if there is drag). Each scaling coefficient gives one direction. Shape parameters
+and modifiers are tried on a grid, because trajectories do not depend on them while the effect is
+off.
+
+With y(c) the simulated runs at coefficients c, the direction of a scaling coefficient is
+
+    d = (y(c) - y(0)) / c                                                                      (1)
+
+at a c so small that y is linear in it. If an effect has no such c (a limit changes nothing until
+the input reaches it), the direction is the whole change at one size, and is valid only there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    MIN_CYCLES_PER_RUN,
+    compute_coefficient_bounds,
+)
+from bench.diagnosis.evaluation.noise_model import Mask
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.time_scale import LASTING, is_instant
+from bench.diagnosis.fitting.finite_differences import is_finite_response
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.search.initial_values import (
+    EVENT_TIME_COUNT,
+    compute_reachable_levels,
+    generate_end_stops,
+    generate_equal_travel_end_stops,
+    list_coefficients,
+)
+from sims.core.simulator import Array, Parameter
+from sims.core.system import ALL_PLACES, members_of
+
+INITIAL_PROBE_SHARE = 1e-4
+"""Size at which a direction is first computed, as a share of the plausible range."""
+INPUT_LEVEL_SHARES = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
+"""Sizes of limits, dead bands and backlash that are tried, as shares of the largest input."""
+GAP_TRAVEL_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
+"""Widths of backlash that are tried, as shares of the largest range of motion within one run."""
+COMPLIANCE_SHARES = (0.01, 0.09, 0.6)
+"""Compliances of a joint that are tried, as shares of the largest plausible one."""
+NONLINEAR_COEFFICIENT_KINDS = ("drive", "input/s", "input/s^2", "level", "travel", "stop", "give")
+"""Kinds of coefficients for which a small size does not act like a large one.
+
+A small limit removes everything, and within the backlash nothing is transmitted.
+"""
+RATE_LIMIT_SHARES = (0.015, 0.05, 0.12, 0.3, 0.6, 0.9)
+"""Sizes of rate and error limits that are tried, as shares of the largest value.
+
+These quantities, such as the rate of a command or the error of a servo, peak only briefly.
+"""
+ACCELERATION_LIMIT_SHARES = (1.0, 0.25, 0.06, 0.016, 0.004)
+"""Acceleration limits that are tried, as shares of the largest one.
+
+At a quarter of the acceleration, a command takes twice as long.
+"""
+ROUNDING_SHARE = 1e-11
+"""Minimum change of the observations that is not rounding, as a share of the largest one."""
+SHAPE_GRID_SIZE = 12
+"""Number of values tried of a shape parameter."""
+MAX_FREQUENCIES = 96
+"""Maximum number of frequencies tried."""
+FREQUENCY_SPACING_EXPONENT = 1.5
+"""Exponent of the spacing of frequencies, so that low ones are closer together."""
+MODIFIER_SHARES = (-0.7, -0.25, 0.0, 0.25, 0.7)
+"""Values of a modifier that are tried, as shares of its plausible range."""
+END_STOP_DEPTH_SHARES = (0.005, 0.02, 0.08, 0.2)
+"""Depths of end stops that are tried, as shares of the range of the coordinate."""
+END_STOP_STIFFNESS_SHARES = (0.003, 0.03, 0.3, 3.0)
+"""Stiffnesses of end stops that are tried, as shares of the largest plausible one."""
+EVENT_TIME_SHIFTS_SAMPLES = (-8, -4, -2, -1, 1, 2, 4, 8)
+"""Shifts of the time of a single event that are tried, in samples."""
+FREQUENCY_SHIFTS_CYCLES = (-1.0, -0.5, 0.5, 1.0)
+"""Shifts of a frequency or period that are tried, in cycles over the longest run."""
+
+
+@dataclass(frozen=True)
+class CandidateDirection:
+    """One candidate direction.
+
+    Attributes:
+        effect: name of the effect.
+        group: number of the grid point; directions of one group act together.
+        place: index of the coefficient that scales it.
+        coefficients: (k,) coefficients that are simulated.
+        signed: whether the scaling coefficient may be negative.
+        fixed: whether the direction is valid only at this size.
+    """
+
+    effect: str
+    group: int
+    place: int
+    coefficients: Array
+    signed: bool
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class DirectionSet:
+    """Candidate directions and their responses.
+
+    Attributes:
+        candidates: the K candidates.
+        responses: (R, T, C, K) changes of the runs, per unit of the scaling coefficient, or the
+            whole change for a fixed candidate.
+    """
+
+    candidates: tuple[CandidateDirection, ...]
+    responses: Array
+
+
+def compute_directions(
+    world: RunEvaluator, at: TrajectoryFit, names: Sequence[str]
+) -> DirectionSet:
+    """Compute the sensitivity directions of effects about a fitted model.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        names: names of effects that the model does not contain.
+    """
+    probes = [probe for name in names for probe in first_probes(world, at, name)]
+    values = _responses(world, at, probes)
+    acting = _find_observable_probes(world, probes, values)
+    # The first responses show which coefficients only modify, for effects that act at all.
+    modified = list(_make_modifier_probes(world, probes, acting))
+    places = np.flatnonzero(acting)
+    probes = [probes[i] for i in places] + modified
+    # This is the largest array of an explanation, so active rows are moved up in place.
+    for row, place in enumerate(places.tolist()):
+        if row < place:
+            values[row] = values[place]
+    values = values[: places.size]
+    if modified:
+        values = np.concatenate([values, _responses(world, at, modified)])
+    return DirectionSet(tuple(probes), np.moveaxis(values, 0, -1))
+
+
+def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[CandidateDirection]:
+    """Yield a small value of every scaling coefficient of an effect, at every shape.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        name: name of the effect.
+    """
+    parameters = list_coefficients(world, name)
+    # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
+    shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
+    count = len(parameters)
+    scaling = [i for i in range(count) if i not in shaping]
+    travel = world.get_effect_travel(name)
+    coefficients = world.available_effects[name].coefficients
+    grids = [
+        parameters[i].bounds[:1]
+        if coefficients[i].of == "rotor" and _is_contained_in_model(world, at, name)
+        else _make_shape_grid(world, parameters[i], coefficients[i].tried, travel)
+        for i in shaping
+    ]
+    group = 0
+    leading = coefficients[0]
+    # Scaling coefficients at one grid point act together, such as a sine and a cosine.
+    for point in product(*grids):
+        # A small limit of a force or a rate would remove all of it.
+        for place in scaling if leading.of not in NONLINEAR_COEFFICIENT_KINDS else ():
+            low, high = parameters[place].bounds
+            c = np.zeros(count)
+            c[shaping] = point
+            c[place] = INITIAL_PROBE_SHARE * high
+            yield CandidateDirection(
+                effect=name,
+                group=group,
+                place=place,
+                coefficients=c,
+                signed=low < 0,
+            )
+        group += 1
+    if leading.of == "stop":
+        yield from _make_end_stop_probes(world, name, group)
+        return
+    least, _ = parameters[0].bounds
+    # A small limit does not act like a large one, so limits are tried at values that the input
+    # reaches.
+    if leading.of in NONLINEAR_COEFFICIENT_KINDS or (
+        leading.of in ("input", "error") and least == 0
+    ):
+        shapes = np.array(list(product(*grids)))
+        yield from _make_limit_probes(world, name, group, shapes if shaping else None)
+
+
+def _is_contained_in_model(world: RunEvaluator, at: TrajectoryFit, name: str) -> bool:
+    """Return whether the model has an effect that this one contains, itself or in a family."""
+    effects = [world.available_effects[own] for own in at.effects]
+    there = {m.name for effect in effects for m in members_of(effect)}
+    return bool(there & set(world.available_effects[name].contains))
+
+
+def _make_end_stop_probes(
+    world: RunEvaluator, name: str, first: int
+) -> Iterator[CandidateDirection]:
+    """Yield soft and hard end stops at both ends of the range of a coordinate."""
+    either = [
+        c
+        for side in (1.0, -1.0)
+        for c in generate_end_stops(
+            world, name, side, END_STOP_STIFFNESS_SHARES, END_STOP_DEPTH_SHARES
+        )
+    ]
+    for number, c in enumerate(either, start=first):
+        yield CandidateDirection(
+            effect=name, group=number, place=0, coefficients=c, signed=True, fixed=True
+        )
+
+
+def _make_limit_probes(
+    world: RunEvaluator, name: str, group: int, shapes: Array | None
+) -> Iterator[CandidateDirection]:
+    """Yield limits, dead bands and backlash of sizes that the motion or the input reaches.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        group: number of the first group.
+        shapes: (n, k - 1) shape parameters to combine with each size; None if there are none.
+    """
+    largest = compute_reachable_levels(world, name)
+    if not largest.any():
+        return
+    # The error of a servo peaks briefly after a jump, as the rate of a command does.
+    seldom = {
+        "input/s": RATE_LIMIT_SHARES,
+        "input/s^2": ACCELERATION_LIMIT_SHARES,
+        "error": RATE_LIMIT_SHARES,
+        "travel": GAP_TRAVEL_SHARES,
+        "give": COMPLIANCE_SHARES,
+    }
+    of = world.available_effects[name].coefficients[0].of
+    levels = seldom.get(of, INPUT_LEVEL_SHARES)
+    if of == "travel" and world.has_linearisation:
+        # Simulating a robot costs a hundred times as much, so fewer sizes are tried.
+        levels = GAP_TRAVEL_SHARES[1:4]
+    sizes = [level * largest for level in levels]
+    if shapes is not None:
+        sizes = [np.append(size, shape) for shape in shapes for size in sizes]
+    for number, c in enumerate(sizes, start=group):
+        yield CandidateDirection(
+            effect=name,
+            group=number,
+            place=0,
+            coefficients=c,
+            signed=False,
+            fixed=True,
+        )
+
+
+def _make_shape_grid(
+    world: RunEvaluator, parameter: Parameter, tried: tuple[float, ...], travel: float
+) -> Array:
+    """Return the values to try of a shape parameter.
+
+    Args:
+        world: the runs.
+        parameter: the shape parameter.
+        tried: values that the coefficient specifies itself, if any.
+        travel: largest range of the position in one run.
+    """
+    if tried:
+        return np.array(tried)
+    low, high = parameter.bounds
+    if parameter.unit == "Hz":
+        # A periodic effect must complete a cycle within a run, otherwise any slow change would be
+        # periodic.
+        seldom = max(low, MIN_CYCLES_PER_RUN / world.longest)
+        slowest = min(seldom, high / 2.0)
+        return _frequencies(slowest, high, world.longest)
+    if _is_period(parameter, travel):
+        frequencies = _frequencies(1.0 / high, 1.0 / low, travel)
+        return 1.0 / frequencies
+    if is_instant(parameter):
+        first, last = world.clock
+        # An event at the ends of the recording would have nothing before or after it.
+        return np.linspace(first, last, EVENT_TIME_COUNT + 2)[1:-1]
+    if parameter.unit == "s":
+        # A decay much longer than the runs is constant within them; successive times differ by at
+        # most a factor of two.
+        high = max(min(high, LASTING * world.longest), 2.0 * low)
+        return np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
+    return np.geomspace(low, high, SHAPE_GRID_SIZE)
+
+
+def _is_period(parameter: Parameter, travel: float) -> bool:
+    """Return whether a coefficient is a period over position, in runs with motion."""
+    return parameter.name.endswith(".period") and travel > 0
+
+
+def generate_frequency_neighbours(world: RunEvaluator, fit: TrajectoryFit) -> Iterator[FitStart]:
+    """Yield starts with shifted periodic effects, event times and end stops.
+
+    Least squares stops at the nearest of the many local minima that such effects have.
+
+    Args:
+        world: the runs.
+        fit: the fitted model.
+    """
+    for name in fit.effects:
+        for c in generate_equal_travel_end_stops(world, name, fit.theta[world.slots[name]]):
+            theta = fit.theta.copy()
+            theta[world.slots[name]] = c
+            yield FitStart(fit.effects, theta, fit.states)
+        bounds = compute_coefficient_bounds(world, name)
+        for number, place in enumerate(world.get_coefficient_indices(name)):
+            parameter = world.parameters[place]
+            value = float(fit.theta[place])
+            for moved in _shift_frequency_or_time(
+                world, parameter, value, world.get_effect_travel(name)
+            ):
+                theta = fit.theta.copy()
+                theta[place] = np.clip(moved, *bounds[number])
+                yield FitStart(fit.effects, theta, fit.states)
+
+
+def _shift_frequency_or_time(
+    world: RunEvaluator, parameter: Parameter, value: float, travel: float
+) -> Iterator[float]:
+    """Yield shifted values of a frequency, a period or an event time; nothing for others.
+
+    Frequencies and periods are shifted by parts of a cycle, event times by samples.
+    """
+    if is_instant(parameter):
+        for samples in EVENT_TIME_SHIFTS_SAMPLES:
+            yield value + samples * world.sample_interval
+    for cycles in FREQUENCY_SHIFTS_CYCLES:
+        if parameter.unit == "Hz":
+            yield value + cycles / world.longest
+        elif _is_period(parameter, travel) and value > 0:
+            frequency = 1.0 / value + cycles / travel
+            # Beyond the longest period, the frequency might become negative.
+            lowest = 1.0 / parameter.bounds[1]
+            yield 1.0 / max(frequency, lowest)
+
+
+def _frequencies(low: float, high: float, extent: float) -> Array:
+    """Return frequencies from low to high, about half a cycle over the extent apart on average."""
+    halves = 2.0 * (high - low) * extent
+    count = int(np.clip(halves, 4, MAX_FREQUENCIES))
+    # Low frequencies are closer together, because their periods would be far apart otherwise.
+    shares = np.linspace(0.0, 1.0, count) ** FREQUENCY_SPACING_EXPONENT
+    frequencies: Array = low + (high - low) * shares
+    return frequencies
+
+
+def _find_observable_probes(
+    world: RunEvaluator, probes: Sequence[CandidateDirection], values: Array
+) -> Mask:
+    """Return which probes (K,) change the runs (K, R, T, C) by more than rounding."""
+    rounding = ROUNDING_SHARE * np.nanmax(np.abs(world.observed), axis=(0, 1))
+    # One changed channel is sufficient, because effects of a sensor show only in its channel.
+    changes = [
+        bool((np.abs(size * value) > rounding).any())
+        for value, size in zip(values, _sizes(probes).tolist(), strict=True)
+    ]
+    acting: Mask = np.array(changes, dtype=bool)
+    return acting
+
+
+def _sizes(probes: Sequence[CandidateDirection]) -> Array:
+    """Return the scaling coefficients (K,); one where the direction is the whole change."""
+    sizes = []
+    for probe in probes:
+        size = 1.0 if probe.fixed else probe.coefficients[probe.place]
+        sizes.append(size)
+    return np.array(sizes)
+
+
+def _make_modifier_probes(
+    world: RunEvaluator, probes: Sequence[CandidateDirection], acting: Mask
+) -> Iterator[CandidateDirection]:
+    """Yield grid points of modifiers: coefficients that act only together with an active one."""
+    leading: dict[str, CandidateDirection] = {}
+    idle: list[CandidateDirection] = []
+    for probe, acts in zip(probes, acting, strict=True):
+        if acts:
+            leading.setdefault(probe.effect, probe)
+        # The first shape already shows whether a coefficient acts by itself; members of a family do
+        # not modify each other.
+        elif (
+            probe.group == 0
+            and not probe.fixed
+            and world.available_effects[probe.effect].place != ALL_PLACES
+        ):
+            idle.append(probe)
+    modifiers: dict[str, list[CandidateDirection]] = {}
+    for probe in idle:
+        # An effect that does not act at all cannot be modified.
+        if probe.effect in leading:
+            modifiers.setdefault(probe.effect, []).append(probe)
+    for name, members in modifiers.items():
+        yield from _grid_points(world, leading[name], members)
+
+
+def _grid_points(
+    world: RunEvaluator, first: CandidateDirection, modifiers: Sequence[CandidateDirection]
+) -> Iterator[CandidateDirection]:
+    """Yield the first active probe of an effect with all combinations of modifier values."""
+    parameters = list_coefficients(world, first.effect)
+    points = product(MODIFIER_SHARES, repeat=len(modifiers))
+    for group, point in enumerate(points, start=1):
+        # All modifiers at zero give the effect that was already tried.
+        if not any(point):
+            continue
+        c = first.coefficients.copy()
+        for modifier, share in zip(modifiers, point, strict=True):
+            _, high = parameters[modifier.place].bounds
+            c[modifier.place] = share * high
+        yield CandidateDirection(
+            effect=first.effect,
+            group=group,
+            place=first.place,
+            coefficients=c,
+            signed=first.signed,
+        )
+
+
+def _responses(
+    world: RunEvaluator, at: TrajectoryFit, probes: Sequence[CandidateDirection]
+) -> Array:
+    """Return the responses (K, R, T, C), per unit of the coefficient or as a whole change."""
+    added = [(probe.effect, probe.coefficients) for probe in probes]
+    # These are the largest arrays of a search, so all operations are in place.
+    values = compute_responses(world, at, added)
+    near = is_finite_response(values)
+    # A probe that the simulator cannot follow gets a direction of zeros.
+    if not near.all():
+        values[~near] = 0.0
+    values /= _sizes(probes)[:, None, None, None]  # (1)
+    return values
+
+
+def compute_responses(
+    world: RunEvaluator, at: TrajectoryFit, added: Sequence[tuple[str, Array]]
+) -> Array:
+    """Compute the changes of a fitted model's runs by one additional effect each.
+
+    Linearised responses are used if the simulator provides them, because they cost less.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        added: K effects with their coefficients.
+
+    Returns:
+        Changes (K, R, T, C).
+    """
+    if world.has_linearisation:
+        # Imported here, because only robots need it.
+        from bench.diagnosis.fitting.linearised_runs import compute_effect_responses
+
+        return compute_effect_responses(world, at.theta, at.states, added)
+    values = simulate_with_effect(world, at, added)
+    values -= at.simulated
+    return values
+
+
+def simulate_with_effect(
+    world: RunEvaluator, at: TrajectoryFit, added: Sequence[tuple[str, Array]]
+) -> Array:
+    """Simulate the runs of a fitted model with one additional effect each.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        added: K effects with their coefficients.
+
+    Returns:
+        Observations (K, R, T, C).
+    """
+    runs = len(world.tracks)
+    theta = np.tile(at.theta, (len(added), 1))
+    for row, (name, c) in zip(theta, added, strict=True):
+        row[world.slots[name]] = c
+    # All candidates and runs are simulated in one engine call, as one batch.
+    count = len(added)
+    simulated = world.simulate(
+        theta=np.repeat(theta, runs, axis=0),
+        runs=np.tile(np.arange(runs), count),
+        states=np.tile(at.states, (count, 1)),
+    )
+    return simulated.reshape(count, runs, *simulated.shape[1:])

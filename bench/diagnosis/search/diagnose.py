@@ -1,0 +1,339 @@
+"""Diagnose a recording: search for causes, validate them on held-out runs, and select a verdict.
+
+The questions are asked in order. Does anything move? Do the data determine the base parameters?
+Which effects does the search find, and are they better than their rivals? Do held-out runs confirm
+them? Which alternatives explain the data as well? Does the residual have structure? The thresholds
+are in `bench.diagnosis.search.verdict_rules`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.diagnosis.evaluation.search_control import EarlyStop, SearchStoppedError
+from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.search import verdict_rules
+from bench.diagnosis.search.alternative_causes import AlternativeFinder, CauseEvidence
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.lack_of_fit import (
+    LackOfFitResult,
+    assess_lack_of_fit,
+    assess_residual_size,
+)
+from bench.diagnosis.search.refine_candidates import list_competing_models, refine_best_model
+from bench.diagnosis.search.subsampled_search import search_with_subsampling
+from bench.diagnosis.search.verdict_rules import (
+    DiagnosisState,
+    VerdictName,
+    decide_early_stop_verdict,
+    decide_verdict,
+)
+from bench.diagnosis.validation.gain_and_intervals import compute_covariance
+from bench.diagnosis.validation.held_out_runs import HeldOutFit, Validation
+from sims.core.simulator import Array
+
+MAX_VALIDATED_SINGLES = 6
+"""Number of best single-effect models that are evaluated on held-out runs, for display."""
+
+
+@dataclass(frozen=True)
+class DiagnosisResult:
+    """Result of a diagnosis.
+
+    Attributes:
+        verdict: one of six verdicts.
+        model: the extended model; the base model if no cause was found.
+        base: the base model.
+        causes: the causes, strongest first.
+        lack_of_fit: lack-of-fit result of the extended model.
+        unidentified_parameters: names of base parameters that the data do not determine.
+        held_out_fits: models on held-out runs, by their effects; None if there are none.
+        early_stop: early end of the search with its open questions; None if it was completed.
+    """
+
+    verdict: VerdictName
+    model: FittedModel
+    base: FittedModel
+    causes: tuple[CauseEvidence, ...]
+    lack_of_fit: LackOfFitResult
+    unidentified_parameters: tuple[str, ...] = ()
+    held_out_fits: Mapping[EffectNames, HeldOutFit] | None = None
+    early_stop: EarlyStop | None = None
+
+
+def diagnose(search: EffectSearch, held_out: Validation | None) -> DiagnosisResult:
+    """Search, validate on held-out runs, collect alternatives, and select a verdict.
+
+    Args:
+        search: the search, which contains the fitted base model.
+        held_out: held-out runs for validation; None if there are none.
+    """
+    return answer(Inquiry(search, held_out))
+
+
+def answer(inquiry: Inquiry) -> DiagnosisResult:
+    """Answer all questions, or those for which there is time."""
+    try:
+        return inquiry.answered()
+    except SearchStoppedError:
+        return inquiry.so_far()
+
+
+class Inquiry:
+    """The steps of a diagnosis, and their results so far.
+
+    Args:
+        search: the search, which contains the fitted base model.
+        held_out: predicts held-out runs, or each run by cross-validation; None if neither is
+            possible.
+    """
+
+    def __init__(self, search: EffectSearch, held_out: Validation | None) -> None:
+        self._search = search
+        self._held_out = held_out
+        self._watch = search.world.watch
+        self._trial: HeldOutValidation | None = None
+        self._model: FittedModel | None = None
+
+    def answered(self) -> DiagnosisResult:
+        """Return the result of the complete diagnosis.
+
+        Raises:
+            EndedError: the search had to end early.
+        """
+        unfit = self.unfit_base()
+        if unfit is not None:
+            return unfit
+        search, base = self._search, self._search.base_model
+        self._watch.begin_question("search")
+        self._model = search_with_subsampling(search)
+        self._watch.begin_question("rivals")
+        self._model = search.simplify_laws(refine_best_model(search, self._model))
+        self._model = search.fit_to_convergence(self._model)
+        told = self._model.effects
+        self._try()
+        self._watch.begin_question("structure")
+        left = assess_lack_of_fit(search, self._model)
+        if search.thorough and self._fuller(left):
+            left = assess_lack_of_fit(search, self._model)
+        self._watch.begin_question("alternatives")
+        model, causes = _select_preferred_model(search, self._trial, self._model, left)
+        trial = self._trial
+        if model.effects != told:
+            model = search.fit_to_convergence(model)
+            if trial is not None:
+                trial.evaluate_models([model])
+        self._watch.check_not_stopped()
+        state = DiagnosisState(
+            causes=len(causes),
+            alternatives=any(cause.alternatives for cause in causes),
+            closed=compute_gap_closed(search, model, left),
+            unexplained=_is_unexplained(search, model, left),
+            missed=trial is not None and trial.has_unexplained_gap(model, left),
+        )
+        # Report the base model that was fitted first, even if the search found a better fit of it.
+        return self._finding(decide_verdict(state), base, model, causes, left)
+
+    def unfit_base(self) -> DiagnosisResult | None:
+        """Return the result if causes cannot be searched, else None.
+
+        This is the case if nothing moves, or if the data do not determine the base model.
+
+        Raises:
+            EndedError: the search had to end before the base model was fitted.
+        """
+        search = self._search
+        # An unfinished base fit gives no information, not even about motion.
+        if self._watch.has_abandoned_fits():
+            raise SearchStoppedError
+        # Without motion, residual tests would only test rounding.
+        if is_motionless(search):
+            return _without_motion(search)
+        base = search.base_model
+        vague = find_unidentified_parameters(search, base)
+        # Causes would represent values of parameters that the data do not determine.
+        if vague:
+            left = assess_lack_of_fit(search, base)
+            return DiagnosisResult(
+                decide_verdict(DiagnosisState(fixed=False)), base, base, (), left, vague
+            )
+        return None
+
+    def _try(self) -> None:
+        """Validate models on held-out runs, and drop idle effects."""
+        if self._held_out is None or self._model is None:
+            return
+        self._watch.begin_question("held_out")
+        trial = _validate_on_held_out(self._search, self._model, self._held_out)
+        # Unfinished fits of initial states would be held against their model.
+        self._watch.check_not_stopped()
+        self._trial = trial
+        # The effects that remain after dropping an idle one may have simpler forms.
+        self._model = self._search.simplify_laws(
+            trial.drop_unhelpful_effects(self._search, self._model)
+        )
+
+    def _fuller(self, left: LackOfFitResult) -> bool:
+        """Replace the model by one with more effects if held-out runs confirm it.
+
+        Returns:
+            Whether the model was replaced.
+        """
+        found, trial, search = self._model, self._trial, self._search
+        if found is None or trial is None or not found.effects or not left.has_structure:
+            return False
+        fuller = trial.find_better_extension(search, found)
+        if fuller is found:
+            return False
+        self._model = search.simplify_laws(search.fit_to_convergence(fuller))
+        trial.evaluate_models([self._model])
+        return True
+
+    def so_far(self) -> DiagnosisResult:
+        """Return the result of a search that had to end, which claims only what was tested."""
+        search = self._search
+        cut = self._watch.make_early_stop(self._held_out is not None)
+        model = self._model or search.get_best_so_far()
+        # The residual was not tested, so it is counted as structure and not as noise.
+        left = replace(assess_residual_size(search, model), p_value=0.0)
+        alternatives = AlternativeFinder(search, self._trial, structure=False, simulates=False)
+        causes = alternatives.collect_evidence(model)
+        share = compute_gap_closed(search, model, left)
+        verdict = decide_early_stop_verdict(len(causes), share, cut.skipped_questions)
+        found = self._finding(
+            verdict, search.base_model, model, causes, assess_residual_size(search, model)
+        )
+        return replace(found, early_stop=cut)
+
+    def _finding(
+        self,
+        verdict: VerdictName,
+        base: FittedModel,
+        model: FittedModel,
+        causes: tuple[CauseEvidence, ...],
+        left: LackOfFitResult,
+    ) -> DiagnosisResult:
+        """Return a result with the held-out evaluations."""
+        measured = self._trial.held_out_fits if self._trial is not None else None
+        return DiagnosisResult(verdict, model, base, causes, left, held_out_fits=measured)
+
+
+def is_motionless(search: EffectSearch) -> bool:
+    """Return whether the recording shows no motion, and the model expects none."""
+    observed = search.world.observed
+    largest = np.nanmax(observed, axis=(0, 1))
+    smallest = np.nanmin(observed, axis=(0, 1))
+    ranges = largest - smallest
+    # Parameters that do not influence the simulated runs were fixed by the base fit.
+    touched = len(search.frozen) != search.world.base.size
+    left = search.base_model.likelihood.sigma
+    return verdict_rules.is_motionless(ranges, left, search.noise.sigma, touched)
+
+
+def _without_motion(search: EffectSearch) -> DiagnosisResult:
+    """Return the result for a recording without motion."""
+    base, world = search.base_model, search.world
+    # No parameter can be determined, and no test of the residual is meaningful.
+    vague = tuple(world.parameters[i].name for i in world.base)
+    excess = base.likelihood.sigma / search.noise.sigma
+    nothing = LackOfFitResult(1.0, "", excess, ())
+    return DiagnosisResult(
+        decide_verdict(DiagnosisState(fixed=False)), base, base, (), nothing, vague
+    )
+
+
+def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tuple[str, ...]:
+    """Return the sensitive base parameters that the data do not determine, the worst first.
+
+    Args:
+        search: the search.
+        base: the base model.
+    """
+    variances = np.diagonal(compute_covariance(search, base))
+    spread = np.sqrt(np.maximum(variances, 0.0))
+    parameters = [search.world.parameters[place] for place in base.fit.free]
+    vague = []
+    for parameter, sd in zip(parameters, spread.tolist(), strict=True):
+        low, high = parameter.bounds
+        if not verdict_rules.is_identified(sd, low, high):
+            vague.append((sd / (high - low), parameter.name))
+    return tuple(name for _, name in sorted(vague, key=lambda one: -one[0]))
+
+
+def _validate_on_held_out(
+    search: EffectSearch, model: FittedModel, held_out: Validation
+) -> HeldOutValidation:
+    """Evaluate the base model, the best singles, the result and its rivals on held-out runs."""
+    models = search.models.values()
+    # Parts of the model are included, because an effect that does not help on held-out runs is
+    # dropped.
+    names = set(model.effects)
+    parts = [m for m in models if set(m.effects) < names]
+    singles = [m for m in models if len(m.effects) == 1]
+    singles.sort(key=lambda m: -m.penalised_log_likelihood)
+    near = list_competing_models(search, model)
+    trial = HeldOutValidation(held_out)
+    # All models are evaluated together, so that initial states start from those of the nearest
+    # model.
+    trial.evaluate_models(
+        [search.base_model, model, *near, *parts, *singles[:MAX_VALIDATED_SINGLES]]
+    )
+    return trial
+
+
+def _select_preferred_model(
+    search: EffectSearch, trial: HeldOutValidation | None, model: FittedModel, left: LackOfFitResult
+) -> tuple[FittedModel, tuple[CauseEvidence, ...]]:
+    """Return the model with the preferred effect of each set, and its causes."""
+    alternatives = AlternativeFinder(search, trial, left.has_structure)
+    causes = alternatives.collect_evidence(model)
+    names = frozenset(cause.preferred for cause in causes)
+    preferred = search.models.get(names, model)
+    if preferred is model:
+        return model, causes
+    return preferred, alternatives.collect_evidence(preferred)
+
+
+def _is_unexplained(search: EffectSearch, model: FittedModel, left: LackOfFitResult) -> bool:
+    """Return whether the model lacks something, with a score test if none exists yet."""
+    chance = search.best_p_values.get(frozenset(model.effects))
+    # A model with a residual above the noise was not scored, because the search did not need it.
+    if chance is None:
+        loud = not left.has_structure and not search.is_noise_like(model)
+        chance = search.score_missing_effects(model).p_value if loud else 1.0
+    return verdict_rules.is_unexplained(left.has_structure, chance)
+
+
+def compute_gap_closed(search: EffectSearch, model: FittedModel, left: LackOfFitResult) -> float:
+    """Return the share of the discrepancy on the fitted runs that a model removes.
+
+    With the RMS residuals b of the base model and a of this model, in units of the noise, it is (b
+    - max(a, 1)) / (b - 1), or 0 if the base model leaves no discrepancy.
+
+    Args:
+        search: the search.
+        model: the extended model.
+        left: its lack-of-fit result.
+    """
+    own = model.likelihood.sigma
+    # A residual without structure is noise, even if it exceeds an estimated noise floor.
+    usable = np.isfinite(own) & ~left.has_structure
+    floor = np.where(usable, own, search.noise.sigma)
+    noise = np.maximum(floor, search.noise.sigma)
+    before = _compute_normalised_rms(search, search.base_model, noise)
+    after = _compute_normalised_rms(search, model, noise)
+    # At the noise floor there is no discrepancy, and the quotient would be rounding error.
+    if not before > 1.0 + 1e-9:
+        return 0.0
+    return (before - max(after, 1.0)) / (before - 1.0)
+
+
+def _compute_normalised_rms(search: EffectSearch, model: FittedModel, noise: Array) -> float:
+    """Return the RMS residual of a model in units of the noise."""
+    left = search.compute_residual(model.fit) / noise
+    squares = np.square(left[search.observed_mask])
+    return float(np.sqrt(squares.mean()))

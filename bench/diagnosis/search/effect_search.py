@@ -1,0 +1,340 @@
+"""Beam search for the set of effects that explains a recording.
+
+Linear scores select candidates, full fits decide, and moves between models correct errors. Forward
+selection alone is not enough: if two effects act, the first choice is often a third effect that
+mimics both. Therefore several models are extended (beam search), and each larger model is compared
+with those that lack or replace one of its effects (A. Miller, Subset Selection in Regression, 2nd
+ed., 2002, doi:10.1201/9781420035933, chapter 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.multiple_shooting import (
+    forgets_initial_state,
+    join_segment_fits,
+    make_segment_evaluator,
+)
+from bench.diagnosis.search.model_moves import MAX_REFITTED_CANDIDATES, ModelMoves
+from bench.diagnosis.search.verdict_rules import EFFECT_P_VALUE_THRESHOLD
+
+MAX_P_VALUE_FIRST_EFFECT = 0.1
+"""Maximum p-value of the linear scores at which a first effect is tried by simulation."""
+MAX_P_VALUE_FURTHER_EFFECT = 0.015
+"""Maximum p-value of the linear scores at which a further effect is tried by simulation."""
+MAX_EFFECTS = 3
+"""Maximum number of effects in a model."""
+FAR_EXCESS = 0.5
+"""Minimum excess over the noise at which the search continues although no effect was added."""
+MAX_PAIR_EXCESS_SHARE = 0.5
+"""Maximum share of the base model's excess left by two effects at which a third is tried."""
+MAX_PAIR_EXCESS_SHARE_OF_SINGLE = 0.85
+"""Maximum excess of a model with two effects at which a third is tried, relative to single effects.
+
+It is a share of the excess of the best single effect. Above it, no effect of the library explains
+the residual.
+"""
+MAX_REPLACEMENT_EXCESS_SHARE = 0.5
+"""Maximum excess of a model that replaces effects of a smaller one, as a share of its excess."""
+MAX_EFFECTS_ON_SEGMENTS = 2
+"""Maximum number of effects of models that are searched on short segments."""
+SEGMENT_MODELS_KEPT = 5
+"""Number of best models on short segments that are fitted to the whole runs."""
+STEP_CORRECTION_REFIT_DISTANCE = 100.0
+"""Maximum distance in merit of models that are refitted after a discretisation correction."""
+BEAM_WIDTH = 3
+"""Maximum number of models with the highest merit that are extended."""
+BEAM_WIDTH_BY_SQUARES = 2
+"""Number of models with the lowest sum of squares that are extended in addition."""
+MIN_RELATIVE_GAIN_IN_BEAM = 0.5
+"""Minimum gain of a model in the beam, as a share of the gain of the best model."""
+
+
+@dataclass
+class EffectSearch(ModelMoves):
+    """Search from the base model to the model of all effects that the data show.
+
+    Attributes:
+        best_supported_model: the model that the data support so far.
+        settled_effects: effects of a model that was already compared with all its neighbours on
+            thinned runs.
+        step_corrected_effects: effects of the model for which the discretisation error was last
+            corrected.
+        thorough: whether the search continues while the models with the lowest excess improve, even
+            if the model that it extends does not.
+    """
+
+    best_supported_model: FittedModel | None = None
+    settled_effects: frozenset[str] | None = None
+    step_corrected_effects: frozenset[str] | None = None
+    thorough: bool = False
+    _sketch: EffectSearch | None = None
+
+    def run(self) -> FittedModel:
+        """Return the model of all effects that the data show.
+
+        While the excess is large, the search continues although no single step pays off: if two
+        effects explain the data only together, neither has much merit alone.
+        """
+        best = self.base_model
+        for size in range(1, MAX_EFFECTS + 1):
+            self.best_supported_model = best
+            # A further effect requires stronger evidence than the first one.
+            if self.is_complete(
+                best, MAX_P_VALUE_FURTHER_EFFECT if best.effects else MAX_P_VALUE_FIRST_EFFECT
+            ):
+                break
+            larger = self._larger(best, size)
+            if larger is None:
+                break
+            if (
+                larger.penalised_log_likelihood > best.penalised_log_likelihood
+                and self.compute_missing_effect_p_value(best, larger) <= EFFECT_P_VALUE_THRESHOLD
+            ):
+                best = self.without_step_errors(larger)
+            # Near the noise, or if the residual may be noise, adding two effects at once would fit
+            # noise.
+            elif self.compute_excess(best) < FAR_EXCESS or self.is_noise_like(best):
+                break
+            # The missing effect is then not in the library, and three effects would only mimic it.
+            if size > 1 and is_hopeless(self, larger):
+                break
+        self.best_supported_model = best
+        return best
+
+    def without_step_errors(self, model: FittedModel) -> FittedModel:
+        """Correct the discretisation error about a model, and refit its close rivals.
+
+        Returns:
+            The best model of the same size after the correction, which may be a simpler one.
+        """
+        key = frozenset(model.effects)
+        if not self.world.has_linearisation or key == self.step_corrected_effects:
+            return model
+        self.step_corrected_effects = key
+        # Imported here, because only robots need it.
+        from bench.diagnosis.fitting.linearised_runs import correct_discretisation
+
+        correct_discretisation(self.world, self.noise, model.fit.theta, model.fit.states)
+        size = len(model.effects)
+        # A richer effect may have fitted only the discretisation error.
+        near = [
+            m
+            for m in select_by_size(self, size)
+            if m.penalised_log_likelihood
+            > model.penalised_log_likelihood - STEP_CORRECTION_REFIT_DISTANCE
+        ]
+        self.refit_models([m.fit.make_start() for m in near], race=False)
+        return select_by_size(self, size)[0]
+
+    def get_best_so_far(self) -> FittedModel:
+        """Return the best supported model of a search that has to end now, without any simulation.
+
+        A larger fitted model replaces the present one if its gain is significant by the known
+        scores.
+        """
+        best = self.models[frozenset((self.best_supported_model or self.base_model).effects)]
+        larger = [m for m in self.models.values() if len(m.effects) > len(best.effects)]
+        scores = self.scores_by_effects.get(frozenset(best.effects))
+        if scores is None or not larger:
+            return best
+        found = max(larger, key=lambda model: model.penalised_log_likelihood)
+        gain = found.likelihood.value - best.likelihood.value
+        real = self.compute_gain_p_value(scores, found, gain) <= EFFECT_P_VALUE_THRESHOLD
+        return (
+            found
+            if real and found.penalised_log_likelihood > best.penalised_log_likelihood
+            else best
+        )
+
+    def _larger(self, best: FittedModel, size: int) -> FittedModel | None:
+        """Return a model with at most `size` effects to compare with the best smaller one."""
+        if size > 1:
+            self.world.watch.begin_larger_models()
+        larger = self._grown(size)
+        if larger is None:
+            return None
+        if size == 1:
+            return self.simplify_laws(self._simpler(larger))
+        # An idle effect is dropped before the exchange, which would replace it by another idle one.
+        return self.simplify_laws(
+            select_conservative_model(
+                self,
+                best,
+                self.drop_unneeded_effects(self.swap_effect(self.drop_unneeded_effects(larger))),
+            )
+        )
+
+    def _grown(self, size: int) -> FittedModel | None:
+        """Return the best model with `size` effects.
+
+        First only the best smaller model is extended. If that does not explain the data, segments,
+        further models of the beam or patient fits are used.
+        """
+        smaller = select_beam(self, size - 1)
+        self.refit_extensions(smaller[:1], MAX_REFITTED_CANDIDATES)
+        # Each further method needs more simulations, so it is skipped if the data are explained.
+        if self._explained_by(size):
+            return self.get_best(size)
+        self.refit_from_segments(size)
+        if self._explained_by(size):
+            return self.get_best(size)
+        if size == 1:
+            self.refit_extensions(smaller, MAX_REFITTED_CANDIDATES, patient=True)
+        else:
+            for members in self._turns(smaller[1:]):
+                self.refit_extensions(members, MAX_REFITTED_CANDIDATES)
+                if self._explained_by(size):
+                    break
+        return self.get_best(size)
+
+    def _explained_by(self, size: int) -> bool:
+        """Return whether the best model with `size` effects leaves nothing to explain.
+
+        A residual above the noise answers this without a score test.
+        """
+        model = self.get_best(size)
+        if model is None:
+            return False
+        # The discretisation error, of friction for example, could be mistaken for a missing effect.
+        if self.world.has_linearisation and self.compute_excess(model) < FAR_EXCESS:
+            model = self.without_step_errors(model)
+        return self.is_noise_like(model) and self.is_complete(model, EFFECT_P_VALUE_THRESHOLD)
+
+    def _turns(self, rivals: Sequence[FittedModel]) -> Sequence[Sequence[FittedModel]]:
+        """Return groups of models to extend together.
+
+        If simulations are expensive, models are extended one by one until the data are explained.
+        """
+        return [[rival] for rival in rivals] if self.world.has_linearisation else [rivals]
+
+    def refit_from_segments(self, size: int) -> None:
+        """Fit the models with `size` effects that explain short segments of the runs best."""
+        if size > MAX_EFFECTS_ON_SEGMENTS or self._forgets:
+            return
+        cut = make_segment_evaluator(self.world)
+        if cut is None:
+            return
+        # One search on segments serves every size; it decides nothing, and only provides starts.
+        if self._sketch is None:
+            self._sketch = EffectSearch(
+                cut, self.noise, self.frozen, self.make_rng("pieces"), self.stated
+            )
+            self._sketch.refit_models([FitStart((), self.base_model.fit.theta, cut.guess)])
+        sketch = self._sketch
+        sketch.refit_extensions(select_beam(sketch, size - 1), MAX_REFITTED_CANDIDATES)
+        best = select_by_size(sketch, size)[:SEGMENT_MODELS_KEPT]
+        if best:
+            self.refit_models([join_segment_fits(self.world, model.fit) for model in best])
+
+    @cached_property
+    def _forgets(self) -> bool:
+        """Whether segments of the runs are no easier to fit than whole runs."""
+        fit, world = self.base_model.fit, self.world
+        by_states = (
+            world.derivatives if world.has_linearisation else fit.jacobian[..., fit.free.size :]
+        )
+        return by_states is not None and forgets_initial_state(world, self.noise, by_states)
+
+    def _simpler(self, single: FittedModel) -> FittedModel:
+        """Return the effect that a single effect contains if the simpler one is preferable.
+
+        This applies if the residual has structure to which the richer effect may have adapted.
+        """
+        if self.is_complete(single, EFFECT_P_VALUE_THRESHOLD):
+            return single
+        for name in self.world.available_effects[single.effects[0]].contains:
+            part = self.models.get(frozenset([name]))
+            # The richer effect must reduce the excess clearly, otherwise it mimics a missing
+            # effect.
+            if part is not None and self.compute_excess(
+                single
+            ) > MAX_REPLACEMENT_EXCESS_SHARE * self.compute_excess(part):
+                return part
+        return single
+
+
+def select_by_size(models: ModelSet, size: int) -> list[FittedModel]:
+    """Return the models with `size` effects, those with the highest merit first."""
+    members = [model for model in models.models.values() if len(model.effects) == size]
+    return sorted(members, key=lambda model: -model.penalised_log_likelihood)
+
+
+def select_beam(search: EffectSearch, size: int) -> list[FittedModel]:
+    """Return the models with `size` effects to extend: highest merit, and lowest sum of squares.
+
+    Far from the data merit is misleading, because AR(1) noise explains almost any residual there.
+    """
+    members = select_by_size(search, size)
+    if not size or not members:
+        return members
+    base = search.base_model.penalised_log_likelihood
+    best_gain = members[0].penalised_log_likelihood - base
+    rivals = [
+        model
+        for model in members
+        if model.penalised_log_likelihood - base >= MIN_RELATIVE_GAIN_IN_BEAM * best_gain
+    ][:BEAM_WIDTH]
+    nearest = sorted(members, key=lambda model: model.fit.cost)[:BEAM_WIDTH_BY_SQUARES]
+    return rivals + [model for model in nearest if model not in rivals]
+
+
+def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
+    """Return whether a model of several effects is too far from the data to try another effect.
+
+    In a thorough search, all models of the same size must be too far.
+
+    Args:
+        search: the search, with all fitted models.
+        larger: the model of several effects.
+    """
+    # If two effects leave as much as the best single one, a third effect will not help.
+    of_base = MAX_PAIR_EXCESS_SHARE * search.compute_excess(search.base_model)
+    of_single = MAX_PAIR_EXCESS_SHARE_OF_SINGLE * min(_list_excesses(search, 1), default=np.inf)
+    left = search.compute_excess(larger)
+    if search.thorough:
+        # The model to extend need not have the lowest excess, because merit is misleading there.
+        left = min(left, *_list_excesses(search, len(larger.effects)))
+    return left > min(of_base, of_single)
+
+
+def _list_excesses(search: EffectSearch, size: int) -> list[float]:
+    """Return the excess of each model with `size` effects."""
+    return [search.compute_excess(m) for m in search.models.values() if len(m.effects) == size]
+
+
+def select_conservative_model(
+    search: EffectSearch, best: FittedModel, larger: FittedModel
+) -> FittedModel:
+    """Return the larger model, or one that extends the best smaller model.
+
+    Two effects can mimic many a third one. A larger model that replaces effects of the best smaller
+    one must reduce the excess clearly. Otherwise the best one-effect extension of the smaller model
+    is returned, or the smaller model itself.
+
+    Args:
+        search: the search, with all fitted models.
+        best: the best smaller model.
+        larger: the larger model.
+    """
+    # A model that contains the effects of the best one replaces none of them.
+    kept = set(best.effects) <= set(larger.effects)
+    if kept or search.compute_excess(larger) < MAX_REPLACEMENT_EXCESS_SHARE * search.compute_excess(
+        best
+    ):
+        return larger
+    built = [
+        model
+        for model in search.models.values()
+        if set(best.effects) < set(model.effects)
+        and len(model.effects) == len(best.effects) + 1
+        and model.penalised_log_likelihood > best.penalised_log_likelihood
+    ]
+    return max(built, key=lambda model: model.penalised_log_likelihood, default=best)

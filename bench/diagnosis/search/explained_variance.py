@@ -1,0 +1,199 @@
+"""Explained sums of squares of groups of directions: least squares for many groups and residuals.
+
+With G = <D, D> and h = <D, e> of the directions D of a group and a residual e, the coefficients
+G^-1 h explain h'G^-1 h of the sum of squares <e, e>.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import Indices
+from bench.diagnosis.search.candidate_directions import DirectionSet
+from bench.diagnosis.search.whitened_products import RANK_TOLERANCE
+from sims.core.simulator import Array
+
+MAX_COLUMNS_FOR_SUBSETS = 4
+"""Maximum number of columns of a group for which subsets of columns are tried."""
+
+
+@dataclass(frozen=True)
+class DirectionGroup:
+    """Directions that act together.
+
+    Attributes:
+        effect: name of the effect.
+        column_indices: indices of the directions.
+        positive: whether each coefficient must be nonnegative.
+    """
+
+    effect: str
+    column_indices: tuple[int, ...]
+    positive: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class GroupBatch:
+    """Groups that are solved together: same number of columns, same sign constraints.
+
+    Attributes:
+        places: (n,) indices of the groups.
+        columns: (n, k) indices of their directions.
+        positive: (k,) whether each coefficient must be nonnegative.
+    """
+
+    places: Indices
+    columns: Indices
+    positive: tuple[bool, ...]
+
+
+def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
+    """Return the groups of directions that act together."""
+    places: dict[tuple[str, int], list[int]] = {}
+    for i, probe in enumerate(directions.candidates):
+        key = probe.effect, probe.group
+        places.setdefault(key, []).append(i)
+    members = []
+    for (effect, _), columns in places.items():
+        probes = [directions.candidates[i] for i in columns]
+        positive = tuple(not probe.signed for probe in probes)
+        members.append(DirectionGroup(effect, tuple(columns), positive))
+    return members
+
+
+def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
+    """Return the groups in batches with equal sign constraints."""
+    alike: dict[tuple[bool, ...], list[int]] = {}
+    for i, group in enumerate(members):
+        alike.setdefault(group.positive, []).append(i)
+    result = []
+    for positive, places in alike.items():
+        columns = [members[i].column_indices for i in places]
+        result.append(
+            GroupBatch(
+                np.array(places, dtype=np.intp),
+                np.array(columns, dtype=np.intp),
+                positive,
+            )
+        )
+    return result
+
+
+def compute_explained_squares(
+    gram: Array, cross: Array, positive: Sequence[bool]
+) -> tuple[Array, Array]:
+    """Compute the sums of squares that groups explain, each with its best subset of columns.
+
+    A constrained coefficient is fixed at zero if it would be negative. The constrained
+    least-squares solution is the unconstrained solution of some subset of columns, so all subsets
+    are tried (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+
+    Args:
+        gram: G (n, k, k) of each group.
+        cross: h (n, k, S).
+        positive: (k,) whether each coefficient must be nonnegative.
+
+    Returns:
+        The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
+    """
+    number, count, samples = cross.shape
+    if count > MAX_COLUMNS_FOR_SUBSETS:
+        return _solve_unconstrained(gram, cross)
+    best = np.zeros((number, samples))
+    coefficients = np.zeros((number, count))
+    rest = np.arange(number)
+    # Most effects have no constraint, and then all columns together explain most.
+    if not any(positive):
+        solved = _solved(gram, cross, list(range(count)))
+        best[solved.groups] = solved.gain
+        coefficients[solved.groups] = solved.own
+        rest = np.setdiff1d(rest, solved.groups)
+    if rest.size:
+        best[rest], coefficients[rest] = _solve_best_subset(gram[rest], cross[rest], positive)
+    return best, coefficients
+
+
+def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
+    """Solve for the best of all subsets of columns; arguments and result as in `compute_explained_squares`."""
+    number, count, samples = cross.shape
+    best = np.zeros((number, samples))
+    coefficients = np.zeros((number, count))
+    for chosen in _enumerate_subsets(count):
+        solved = _solved(gram, cross, chosen)
+        held = [place for place, i in enumerate(chosen) if positive[i]]
+        former = best[solved.groups]
+        # More columns must explain more than rounding error, otherwise the smaller subset is kept.
+        better = solved.gain > former * (1.0 + 1e-9)
+        if held:
+            better &= (solved.scaled[:, held] >= 0).all(axis=1)
+        best[solved.groups] = np.where(better, solved.gain, former)
+        # Columns outside the subset get zero coefficients.
+        improved = better[:, 0]
+        rows = solved.groups[improved]
+        coefficients[rows] = 0.0
+        coefficients[rows[:, None], chosen] = solved.own[improved]
+    return best, coefficients
+
+
+def _enumerate_subsets(count: int) -> Iterator[list[int]]:
+    """Yield every nonempty subset of `count` columns, the smallest first."""
+    for size in range(1, count + 1):
+        for chosen in combinations(range(count), size):
+            yield list(chosen)
+
+
+class _SubsetSolution(NamedTuple):
+    """Least-squares solution for a subset of columns.
+
+    Attributes:
+        groups: (m,) indices of the groups in which the columns are neither absorbed nor collinear.
+        gain: (m, S) h'G^-1 h.
+        scaled: (m, k, S) G^-1 h in units of the lengths of the columns.
+        own: (m, k) G^-1 h of the first residual.
+    """
+
+    groups: Indices
+    gain: Array
+    scaled: Array
+    own: Array
+
+
+def _solved(gram: Array, cross: Array, chosen: list[int]) -> _SubsetSolution:
+    """Solve for a subset of columns of each group."""
+    products = gram[:, chosen][:, :, chosen]
+    lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
+    acting = np.flatnonzero((lengths > 0).all(axis=1))
+    scale = lengths[acting][:, :, None]
+    normal = products[acting] / scale / scale.transpose(0, 2, 1)
+    # Collinear columns have no unique solution, and a smaller subset explains the same.
+    apart = np.linalg.eigvalsh(normal)[:, 0] >= RANK_TOLERANCE
+    solvable = acting[apart]
+    scale = scale[apart]
+    right = cross[solvable[:, None], chosen] / scale
+    # With hundreds of right-hand sides, inverses are faster, and these matrices have unit
+    # diagonals.
+    scaled = np.linalg.inv(normal[apart]) @ right
+    gain = np.einsum("nks,nks->ns", scaled, right)
+    return _SubsetSolution(solvable, gain, scaled, scaled[:, :, 0] / scale[:, :, 0])
+
+
+def _solve_unconstrained(gram: Array, cross: Array) -> tuple[Array, Array]:
+    """Solve for all columns of groups with many columns, without constraints."""
+    # Some of many columns nearly repeat others, as overlapping hats do; their contribution is
+    # rounding.
+    powers = np.diagonal(gram, axis1=1, axis2=2)
+    scale = np.sqrt(np.maximum(powers, 1e-300))[:, :, None]
+    values, vectors = np.linalg.eigh(gram / scale / scale.transpose(0, 2, 1))
+    counted = values > RANK_TOLERANCE * values[:, -1:]
+    weights = np.where(counted, 1.0 / np.where(counted, values, 1.0), 0.0)
+    # In the eigenbasis G is diagonal, so h'G^-1 h is a sum with one term for each eigenvector.
+    right = vectors.transpose(0, 2, 1) @ (cross / scale)
+    solved = weights[:, :, None] * right
+    gain: Array = np.einsum("nks,nks->ns", right, solved)
+    coefficients = (vectors @ solved[:, :, :1]) / scale
+    return gain, coefficients[:, :, 0]

@@ -1,0 +1,182 @@
+"""Validation of the models of a search on held-out runs.
+
+If there are too few runs to hold one out, each run is predicted by fits to the others
+(`validation.cross_validation`), and counts as held out. An effect that makes held-out predictions
+worse is dropped. A discrepancy that only held-out runs show is something that the model does not
+contain. Between models that explain the fitted runs equally well, the held-out likelihood counts,
+too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.search.effect_search import MAX_PAIR_EXCESS_SHARE_OF_SINGLE, EffectSearch
+from bench.diagnosis.search.lack_of_fit import LackOfFitResult
+from bench.diagnosis.search.verdict_rules import (
+    HELD_OUT_EXCESS_THRESHOLD,
+    INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO,
+    compute_excess_ratio,
+    explains_gap,
+    improves_held_out,
+    is_indistinguishable,
+    misses_held_out_gap,
+)
+from bench.diagnosis.validation.held_out_runs import HeldOutFit, Validation
+from sims.core.simulator import Array
+
+CLEARLY_CLOSED = 0.5
+"""Maximum excess on fitted runs, as a share of that without the effect, to keep the effect.
+
+It applies to an effect that improves the held-out runs only slightly.
+"""
+MAX_RICHER_MODELS = 8
+"""Maximum number of models that contain the result and are evaluated on held-out runs."""
+
+
+@dataclass(frozen=True)
+class HeldOutValidation:
+    """Models evaluated on held-out runs.
+
+    Attributes:
+        runs: predicts the held-out runs, or each run by cross-validation.
+        held_out_fits: evaluated models, by their effects.
+    """
+
+    runs: Validation
+    held_out_fits: dict[EffectNames, HeldOutFit] = field(default_factory=dict)
+
+    def evaluate_models(self, models: Iterable[FittedModel]) -> None:
+        """Evaluate models together; each starts from the initial states of the nearest one."""
+        # Stored by effects, so that a repeated model is simulated only once.
+        chosen = {model.effects: model for model in models}
+        results = self.runs.validate([model.fit for model in chosen.values()])
+        self.held_out_fits.update(zip(chosen, results, strict=True))
+
+    def compute_excess(self, names: EffectNames, sigma: Array | None = None) -> float:
+        """Return the RMS residual of a model on the held-out runs in units of the noise, minus one.
+
+        Args:
+            names: effects of a model that has been evaluated.
+            sigma: (C,) noise; None for the noise of the runs.
+        """
+        runs = self.runs
+        noise = runs.noise.sigma if sigma is None else sigma
+        residual = runs.world.observed - self.held_out_fits[names].simulated
+        scaled = residual / noise
+        squares = np.square(scaled[runs.seen])
+        return float(np.sqrt(squares.mean())) - 1.0
+
+    def drop_unhelpful_effects(self, search: EffectSearch, model: FittedModel) -> FittedModel:
+        """Return the model without idle effects.
+
+        An effect is idle if it makes held-out predictions worse, or hardly better while the excess
+        is large.
+
+        Args:
+            search: the search, with every fitted model.
+            model: the model.
+        """
+        while model.effects and model.effects in self.held_out_fits:
+            smaller = self._smaller(search, model)
+            idle = [m for m in smaller if not self._helps(search, m, model)]
+            if not idle:
+                return model
+            # If several effects are idle, drop the one without which held-out runs are predicted
+            # best.
+            model = max(idle, key=lambda m: self.held_out_fits[m.effects].penalised_log_likelihood)
+        return model
+
+    def find_better_extension(self, search: EffectSearch, model: FittedModel) -> FittedModel:
+        """Return the extension of a model that held-out runs confirm best, or the model itself.
+
+        If the residual has structure, merits on fitted runs are unreliable, because each model
+        mimics what is missing. A clearly lower residual on runs that were not fitted is not
+        mimicry.
+
+        Args:
+            search: the search, with every fitted model.
+            model: the model that was found; it has been evaluated.
+        """
+        names = set(model.effects)
+        fuller = [m for m in search.models.values() if names < set(m.effects)]
+        fuller = sorted(fuller, key=lambda m: m.fit.cost)[:MAX_RICHER_MODELS]
+        known = search.models.values()
+        parts = [m for m in known if any(set(m.effects) < set(other.effects) for other in fuller)]
+        # The model is included again, so that all initial states start from the same values.
+        self.evaluate_models([model, *fuller, *parts])
+        borne = {m.effects: self._share(search, model, m) for m in fuller}
+        best = min(fuller, key=lambda m: borne[m.effects], default=model)
+        if best is model or not borne[best.effects] < 1.0:
+            return model
+        lean = self.drop_unhelpful_effects(search, best)
+        return lean if names < set(lean.effects) else model
+
+    def _share(self, search: EffectSearch, model: FittedModel, fuller: FittedModel) -> float:
+        """Return the excess of a larger model relative to what its further effects must achieve.
+
+        The value is one if the reduction is just enough; the worse of fitted and held-out runs
+        counts.
+        """
+        enough = MAX_PAIR_EXCESS_SHARE_OF_SINGLE ** (len(fuller.effects) - len(model.effects))
+        fitted = compute_excess_ratio(search.compute_excess(fuller), search.compute_excess(model))
+        unseen = compute_excess_ratio(
+            self.compute_excess(fuller.effects), self.compute_excess(model.effects)
+        )
+        return max(fitted, unseen) / enough
+
+    def _smaller(self, search: EffectSearch, model: FittedModel) -> list[FittedModel]:
+        """Return the evaluated models that lack one of the effects of the model."""
+        names = set(model.effects)
+        size = len(names) - 1
+        smaller = []
+        for other in search.models.values():
+            # A model that was not evaluated on held-out runs cannot be compared there.
+            if other.effects not in self.held_out_fits:
+                continue
+            if len(other.effects) == size and set(other.effects) < names:
+                smaller.append(other)
+        return smaller
+
+    def _helps(self, search: EffectSearch, without: FittedModel, having: FittedModel) -> bool:
+        """Return whether the effect by which two models differ improves held-out predictions.
+
+        It is also accepted if it explains the fitted runs, and held-out runs hardly show it.
+        """
+        before = self.held_out_fits[without.effects].penalised_log_likelihood
+        after = self.held_out_fits[having.effects].penalised_log_likelihood
+        # Both merit and excess are tested, because far from the noise merit alone may be mimicry.
+        excesses = self.compute_excess(without.effects), self.compute_excess(having.effects)
+        if improves_held_out((before, after), excesses):
+            return True
+        left, closed = search.compute_excess(without), search.compute_excess(having)
+        # Errors of a motion without feedback accumulate, whatever their cause.
+        better = (
+            after > before + INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO and excesses[1] < excesses[0]
+        )
+        if better and closed < CLEARLY_CLOSED * left:
+            return True
+        # A limit that no held-out run approaches cannot be tested there; the result would be
+        # random.
+        faint = max(excesses) < HELD_OUT_EXCESS_THRESHOLD and is_indistinguishable(before - after)
+        return faint and left > HELD_OUT_EXCESS_THRESHOLD and explains_gap((left - closed) / left)
+
+    def has_unexplained_gap(self, model: FittedModel, left: LackOfFitResult) -> bool:
+        """Return whether held-out runs show a discrepancy that the model does not remove.
+
+        Args:
+            model: the model, which has been evaluated.
+            left: its lack-of-fit result.
+        """
+        own = np.nan_to_num(model.likelihood.sigma)
+        # The residual of fitted runs is noise if it has no structure; otherwise only the noise
+        # floor is.
+        known = np.where(left.has_structure, 0.0, own)
+        noise = np.maximum(self.runs.noise.sigma, known)
+        before = self.compute_excess((), noise)
+        after = self.compute_excess(model.effects, noise)
+        return misses_held_out_gap(before, after)

@@ -1,0 +1,207 @@
+"""Initial values of effect coefficients: levels that signals reach, end stops, and event times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_data import RunData
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.time_scale import is_instant
+from sims.core.simulator import Array, Parameter
+from sims.core.system import Effect, members_of
+
+END_STOP_STIFFNESS_FACTORS = (0.3, 1.0, 3.0)
+"""Stiffness factors of end stops that a fit starts from, relative to the best-scoring one."""
+END_STOP_DEPTH_SHARES = tuple(np.geomspace(0.002, 0.4, 10).tolist())
+"""Depths of end stops within the range of a coordinate, as shares of the range."""
+REFIT_STIFFNESS_FACTORS = (0.25, 0.5, 2.0, 4.0)
+"""Stiffness factors of alternative end stops with the same turning point as the fitted one."""
+EVENT_TIME_COUNT = 24
+"""Number of times tried for a single event."""
+MIN_PROFILE_SECONDS = 0.05
+"""Duration in seconds below which the motion profile of a servo is hardly visible."""
+MAX_EVENT_TIME_SUBDIVISIONS = 16
+"""Maximum number of times between two tried event times at which a fit starts."""
+
+
+def list_coefficients(world: RunEvaluator, name: str) -> Sequence[Parameter]:
+    """Return the coefficients of an effect as parameters, with units and plausible ranges.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+    """
+    return world.parameters[world.slots[name]]
+
+
+def compute_reachable_levels(world: RunEvaluator, name: str) -> Array:
+    """Return the largest values (k,) that the limited quantity of an effect reaches in the runs.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+
+    Returns:
+        One value for each member of the effect (a family has several).
+    """
+    effect = world.available_effects[name]
+    members = members_of(effect)
+    of = effect.coefficients[0].of
+    if of == "give":
+        # The coefficients after the first one are shape parameters.
+        return np.array([list_coefficients(world, name)[0].bounds[1]])
+    if of == "drive" or (of == "level" and not _recorded(world, effect)):
+        # The range of the quantity is not recorded, so the plausible range is used.
+        return np.array([p.bounds[1] for p in list_coefficients(world, name)])
+    if of == "travel":
+        return np.array([world.get_effect_travel(name)])
+    found = {
+        "input/s": _max_input_rate,
+        "input/s^2": _max_input_acceleration,
+        "error": _max_servo_error,
+        "level": _max_level,
+    }
+    most = found.get(of, _largest)
+    return np.array([max(most(world, t, one) for t in world.tracks) for one in members])
+
+
+def _command(track: RunData, effect: Effect) -> Array:
+    """Return the input (T,) that an effect acts on; the first input if it names none."""
+    signals = track.scenario.inputs
+    nothing = np.zeros(track.scenario.times.size)
+    first = next(iter(signals.values()), nothing)
+    return signals.get(effect.signal, nothing) if effect.signal else first
+
+
+def _largest(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the largest magnitude of the input in a run."""
+    return float(np.abs(_command(track, effect)).max())
+
+
+def _max_input_rate(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the largest rate of change of the input in a run, per second."""
+    risen = np.abs(np.diff(_command(track, effect)))
+    return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
+
+
+def _max_input_acceleration(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
+    """Return the acceleration that moves the input over its range to rest within `MIN_PROFILE_SECONDS`."""
+    return 4.0 * float(np.ptp(_command(track, effect))) / MIN_PROFILE_SECONDS**2
+
+
+def _recorded(world: RunEvaluator, effect: Effect) -> str:
+    """Return the channel of the level that an effect acts on; empty if it is not recorded."""
+    name = effect.place or world.simulator.system.levels[0]
+    return name if name in world.channels else ""
+
+
+def _max_level(world: RunEvaluator, track: RunData, effect: Effect) -> float:
+    """Return the largest value of the level in a run."""
+    shown = track.observed[:, world.channels.index(_recorded(world, effect))]
+    return float(np.nanmax(shown, initial=0.0))
+
+
+def _max_servo_error(world: RunEvaluator, track: RunData, effect: Effect) -> float:
+    """Return the largest servo error in a run; zero if the coordinate is not recorded."""
+    system = world.simulator.system
+    place = system.primary if effect.coordinate is None else effect.coordinate
+    name = system.coordinates[place]
+    if name not in world.channels:
+        return 0.0
+    turned = system.get_gear_ratio(place) * track.observed[:, world.channels.index(name)]
+    apart = _command(track, effect) - turned
+    return float(np.nanmax(np.abs(apart), initial=0.0))
+
+
+def generate_end_stops(
+    world: RunEvaluator, name: str, side: float, hardness: Sequence[float], depths: Sequence[float]
+) -> Iterator[Array]:
+    """Yield coefficients (k,) of end stops on one side, for every stiffness and depth.
+
+    There are none if the range of the coordinate is not recorded.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        side: 1 for the upper end, -1 for the lower end.
+        hardness: stiffnesses, as shares of the largest plausible one.
+        depths: depths within the range of the coordinate, as shares of the range.
+    """
+    low, high = world.get_coordinate_range(name)
+    parameters = list_coefficients(world, name)
+    stiffest = parameters[0].bounds[1]
+    for part, share in product(hardness, depths) if low < high else ():
+        c = np.zeros(len(parameters))
+        c[0] = side * part * stiffest
+        c[1] = (high if side > 0 else low) - side * share * (high - low)
+        yield c
+
+
+def generate_neighbouring_end_stops(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+    """Yield end stops (k,) on the same side as a given one; nothing for other effects.
+
+    All depths are tried, because the stiffness determines the depth of contact.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) coefficients of the given end stop.
+    """
+    if world.available_effects[name].coefficients[0].of == "stop":
+        part = abs(c[0]) / list_coefficients(world, name)[0].bounds[1]
+        # Simulating a robot costs a hundred times as much, so fewer stops are tried.
+        times, depths = (
+            ((1.0,), END_STOP_DEPTH_SHARES[::2])
+            if world.has_linearisation
+            else (END_STOP_STIFFNESS_FACTORS, END_STOP_DEPTH_SHARES)
+        )
+        yield from generate_end_stops(world, name, np.sign(c[0]), [part * t for t in times], depths)
+
+
+def generate_equal_travel_end_stops(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+    """Yield softer and harder end stops (k,) with the same turning point as a given one.
+
+    The depth of contact for a motion of equal energy is proportional to k^(-2/5), by (2) of
+    `sims.effects.state_limits`.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) coefficients of the given end stop.
+    """
+    low, high = world.get_coordinate_range(name)
+    if world.available_effects[name].coefficients[0].of != "stop" or not c[0]:
+        return
+    end = high if c[0] > 0 else low
+    for times in REFIT_STIFFNESS_FACTORS:
+        firmer = c.copy()
+        firmer[0] = times * c[0]
+        firmer[1] = end - (end - c[1]) * times**-0.4
+        yield firmer
+
+
+def generate_event_times(world: RunEvaluator, name: str, c: Array) -> Iterator[Array]:
+    """Yield coefficients (k,) with event times between time stamps, near a given event time.
+
+    The times cover the interval to the next tried event times. Nothing is generated for effects
+    without an event time.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) given coefficients.
+    """
+    for i, parameter in enumerate(list_coefficients(world, name)):
+        if not is_instant(parameter):
+            continue
+        first, last = world.clock
+        stamps = np.unique(np.concatenate([track.scenario.times for track in world.tracks]))
+        between = (stamps[1:] + stamps[:-1]) / 2.0
+        near = between[np.abs(between - c[i]) <= (last - first) / (EVENT_TIME_COUNT + 1)]
+        for instant in near[:: -(-near.size // MAX_EVENT_TIME_SUBDIVISIONS) or 1].tolist():
+            moved = c.copy()
+            moved[i] = instant
+            yield moved

@@ -1,0 +1,105 @@
+"""Hat basis forces along single joints, for the lack-of-fit test of systems with several joints.
+
+They correspond to the hats of `search.lack_of_fit`, for systems in which each coordinate
+has its own drive and friction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Force, StateSnapshot
+
+TIME, POSITION, SPEED = 0, 1, 2
+"""Variables of a hat: time, position or speed of the joint."""
+ALONG, AGAINST, DRY = 0, 1, 2
+"""Directions of a hat: along the joint, against its motion in proportion to speed, or dry."""
+
+
+class JointHatForce(Force):
+    """A force within an interval of time, position or speed of one joint."""
+
+    name = "probe.joint_hat"
+    says = "a force acts over a stretch of time, position or speed"
+    source = "this module"
+    of = "probe.joint_hat"
+    coefficients = tuple(
+        Coefficient(name, ("1", "1", "1"), ((-1, 1), (-1, 1), (-1, 1)))
+        for name in ("strength", "joint", "variable", "centre", "width", "direction", "slow")
+    )
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return strength times a triangle around the centre.
+
+        All batch elements of a call have the same joint, variable and direction.
+        """
+        strength, joint, variable, centre, width, direction, slow = c
+        acting = np.flatnonzero(strength[:, 0])
+        if not acting.size:
+            return np.zeros_like(moment.x)
+        j = int(joint[acting[0], 0])
+        x, v = moment.x[:, j, None], moment.v[:, j, None]
+        follows = int(variable[acting[0], 0])
+        value = (moment.t, x, np.abs(v))[follows]
+        # A hat that is off has zero width, which must not be a divisor.
+        height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
+        dry = -v / (np.abs(v) + np.maximum(slow, 1e-9))
+        way = (np.ones_like(v), -v, dry)[int(direction[acting[0], 0])]
+        result = np.zeros_like(moment.x)
+        result[:, j] = (strength * height * way)[:, 0]
+        return result
+
+
+class JointHatFamily(NamedTuple):
+    """Hats over the range of one variable of one joint, with one direction."""
+
+    label: str
+    joint: int
+    variable: int
+    direction: int
+    low: float
+    high: float
+    slow: float
+
+
+def list_joint_families(world: RunEvaluator, slow: float) -> Iterator[JointHatFamily]:
+    """Yield every family of hats that the recording can show.
+
+    Args:
+        world: the runs.
+        slow: speed over which dry friction reverses its sign, as a share of the high speed of a
+            joint.
+    """
+    longest = world.longest
+    for joint, name in enumerate(world.simulator.system.coordinates):
+        if name not in world.channels:
+            continue
+        values = world.observed[:, :, world.channels.index(name)]
+        low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
+        speed = _fastest(world, world.channels.index(name))
+        about = slow * speed
+        yield JointHatFamily(f"time, along {name}", joint, TIME, ALONG, 0.0, longest, about)
+        if high > low:
+            for direction, how in ((ALONG, "along it"), (AGAINST, "against it"), (DRY, "dry")):
+                label = f"position {name}, {how}"
+                yield JointHatFamily(label, joint, POSITION, direction, low, high, about)
+        if speed > 0:
+            for direction, how in ((AGAINST, "against it"), (DRY, "dry")):
+                label = f"speed of {name}, {how}"
+                yield JointHatFamily(label, joint, SPEED, direction, 0.0, speed, about)
+
+
+def _fastest(world: RunEvaluator, channel: int) -> float:
+    """Return the 98 % quantile of the speed of a joint."""
+    rates = [np.zeros(1)]
+    for track in world.tracks:
+        if len(track.observed) > 3:
+            # Use every third sample, because differences of neighbours are mostly noise.
+            step = np.diff(track.scenario.times[::3])
+            rates.append(np.diff(track.observed[::3, channel]) / step)
+    return float(np.nanquantile(np.abs(np.concatenate(rates)), 0.98))

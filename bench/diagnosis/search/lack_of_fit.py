@@ -1,0 +1,351 @@
+"""Lack-of-fit test: structure in the residual that no effect of the library explains.
+
+There are two tests. If the recording specifies its noise, the residual must not exceed it. In any
+case, an additional force of any shape must not improve the fit. Hat basis functions over time,
+position and speed, along each axis and against the motion, represent unknown causes (a
+nonparametric lack-of-fit test; J. D. Hart, Nonparametric Smoothing and Lack-of-Fit Tests, 1997,
+doi:10.1007/978-1-4757-2722-7). The test is calibrated by surrogates, like the score test.
+
+A hat of width w around a centre m of a variable z (time, position or speed) is a force
+
+    f(z) = c max(1 - |z - m| / w, 0) d                                                         (1)
+
+with direction d. Neighbouring hats overlap by half, so the sum of a family over one variable is any
+piecewise linear force with `HAT_COUNT` knots. If sigma is estimated from n samples of AR(1) noise
+with correlation phi, its relative standard error is (formula of M. S. Bartlett, 1946, at lag 0)
+
+    sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))                                (2)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.search.candidate_directions import (
+    CandidateDirection,
+    DirectionSet,
+    compute_responses,
+)
+from bench.diagnosis.search.joint_force_basis import JointHatFamily, JointHatForce
+from bench.diagnosis.search.joint_force_basis import list_joint_families as joint_families
+from bench.diagnosis.search.score_test import ScoreTest, compute_calibrated_scores
+from bench.diagnosis.search.verdict_rules import (
+    STRUCTURE_P_VALUE_THRESHOLD,
+    exceeds_noise,
+    get_structure_threshold,
+    has_structure,
+)
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Effect, Force, StateSnapshot
+from sims.system_simulator import SystemSimulator
+
+HAT_COUNT = 7
+"""Number of hats over the range of a variable."""
+SURROGATE_COUNT = 150
+"""Number of surrogate residuals that calibrate the test."""
+SIGN_CHANGE_SPEED_SHARE = 0.05
+"""Speed over which dry friction reverses its sign, as a share of the high speed of the runs."""
+HAT_STRENGTH_SHARE = 1e-4
+"""Strength of a simulated hat, as a share of a typical force; the response is linear there."""
+TYPICAL_FORCES = {"point": 2.0, "linear": 5.0, "rotary": 0.5}
+"""Typical force of each kind of system: m/s^2 for point, N for linear, N m for rotary."""
+
+VISCOUS_DIRECTION = 0
+"""Direction of a hat: against the motion, proportional to speed."""
+DRY_FRICTION_DIRECTION = 1
+"""Direction of a hat: against the motion, independent of speed."""
+AXIS_DIRECTION = 2
+"""Direction of a hat: along the first axis; larger numbers are the other axes."""
+
+TIME_VARIABLE = 0
+"""Variable of a hat: time."""
+SPEED_VARIABLE = 1
+"""Variable of a hat: speed."""
+POSITION_VARIABLE = 2
+"""Variable of a hat: the first coordinate; larger numbers are the other coordinates."""
+
+
+class HatForce(Force):
+    """A force within an interval of time, position or speed.
+
+    It acts along an axis, against the motion, or as dry friction.
+    """
+
+    name = "probe.hat"
+    says = "a force acts over a stretch of time, position or speed"
+    source = "this module"
+    coefficients = tuple(
+        Coefficient(name, ("1", "1", "1"), ((-1, 1), (-1, 1), (-1, 1)))
+        for name in ("strength", "variable", "centre", "width", "direction", "slow")
+    )
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return strength times a triangle around the centre, eq. (1)."""
+        strength, variable, centre, width, direction, slow = c
+        axes = moment.x.shape[1]
+        variables = [moment.t, moment.speed, *(moment.x[:, k, None] for k in range(axes))]
+        # The batch elements of one call follow different variables; each element has exactly one.
+        value = sum(np.where(variable == i, one, 0.0) for i, one in enumerate(variables))
+        # A hat that is off has zero width, which must not be a divisor.
+        reach = np.maximum(width, 1e-12)
+        distance = np.abs(value - centre) / reach
+        height = np.maximum(1.0 - distance, 0.0)  # (1)
+        # The force is smooth in the speed, so no step must be shortened where the motion reverses.
+        dry = -moment.v / (moment.speed + np.maximum(slow, 1e-9))
+        ways = [-moment.v, dry, *(np.eye(axes)[axis] for axis in range(axes))]
+        chosen = sum(np.where(direction == i, way, 0.0) for i, way in enumerate(ways))
+        result: Array = strength * height * chosen
+        return result
+
+
+@dataclass(frozen=True)
+class LackOfFitResult:
+    """Result of the lack-of-fit test of a model.
+
+    Attributes:
+        p_value: p-value of the best force of any shape; 1 if the test does not apply.
+        where: variable of that force, e.g. ``position x``.
+        excess: (C,) RMS residual in units of the noise floor.
+        channels_above_noise: names of channels whose residual exceeds their noise.
+        p_value_threshold: p-value threshold of the test.
+    """
+
+    p_value: float
+    where: str
+    excess: Array
+    channels_above_noise: tuple[str, ...]
+    p_value_threshold: float = STRUCTURE_P_VALUE_THRESHOLD
+
+    @property
+    def has_structure(self) -> bool:
+        """Whether the residual has structure."""
+        return has_structure(self.p_value, self.p_value_threshold, self.channels_above_noise)
+
+
+def list_hat_effects(kind: type[SystemSimulator]) -> list[type[Effect]]:
+    """Return the hat effects for lack-of-fit tests of this kind of simulator."""
+    return [JointHatForce] if kind.has_model else [HatForce]
+
+
+def assess_lack_of_fit(models: ModelSet, model: FittedModel) -> LackOfFitResult:
+    """Test a fitted model for lack of fit.
+
+    Args:
+        models: the models of the recording.
+        model: the fitted model.
+    """
+    world, stated = models.world, models.stated
+    quick = assess_residual_size(models, model)
+    if not any(probe.name in world.slots for probe in (HatForce, JointHatForce)):
+        return quick
+    world.watch.report_and_check("a force of any shape")
+    known = models.force_of_any_shape(model)
+    level = get_structure_threshold(bool(stated.all()))
+    # The linear innovations test decides if it finds no force; otherwise the force is simulated.
+    if known is not None and known[0] > level:
+        return LackOfFitResult(known[0], known[1], quick.excess, quick.channels_above_noise, level)
+    model = models.refine_jacobian(model)
+    directions = compute_hat_directions(world, model)
+    if not directions.candidates:
+        return quick
+    residual = models.compute_residual(model.fit)
+    test = ScoreTest(
+        model.fit, directions, models.observed_mask, models.compute_channel_weights(model)
+    )
+    rng = models.make_rng("structure", model.effects)
+    scores = compute_calibrated_scores(
+        test,
+        residual,
+        lambda count: draw_surrogates(
+            residual, models.observed_mask, count, rng, left=test.project_out
+        ),
+        SURROGATE_COUNT,
+    )
+    promise = scores.score - scores.null_quantiles
+    where = scores.effects[int(np.argmax(promise))]
+    return LackOfFitResult(scores.p_value, where, quick.excess, quick.channels_above_noise, level)
+
+
+def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResult:
+    """Test only the size of the residual, without a force of any shape.
+
+    Args:
+        models: the models of the recording.
+        model: the fitted model.
+    """
+    sigma = model.likelihood.sigma
+    # A channel without samples has no sigma and no residual.
+    left = np.where(np.isfinite(sigma), sigma, 0.0)
+    excess = left / models.noise.sigma
+    channels = []
+    for c, name in enumerate(models.world.channels):
+        error = _sigma_standard_error(models, model, c)
+        if exceeds_noise(excess[c], error, models.stated[c]):
+            channels.append(name)
+    return LackOfFitResult(1.0, "", excess, tuple(channels))
+
+
+def _sigma_standard_error(models: ModelSet, model: FittedModel, channel: int) -> float:
+    """Return the relative standard error of the sigma of a channel, eq. (2)."""
+    # At a correlation of one, the formula diverges, and no channel would exceed its noise.
+    phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
+    count = max(int(models.observed_mask[:, :, channel].sum()), 2)
+    square = phi * phi
+    variance = (1.0 + square) / (1.0 - square) / (2.0 * count)
+    return float(np.sqrt(variance))  # (2)
+
+
+def compute_hat_directions(world: RunEvaluator, model: FittedModel) -> DirectionSet:
+    """Compute the responses of a model to hats over every recorded variable.
+
+    Args:
+        world: the runs.
+        model: the fitted model.
+    """
+    probes, size = hat_probes(world)
+    names = [JointHatForce.name if JointHatForce.name in world.slots else HatForce.name] * len(
+        probes
+    )
+    added = [(name, probe.coefficients) for name, probe in zip(names, probes, strict=True)]
+    changed = compute_responses(world, model.fit, added)
+    values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
+    # A hat outside the range of all runs changes nothing and would be a column of zeros.
+    acting = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
+    return DirectionSet(tuple(probes[i] for i in acting), values[..., acting])
+
+
+def hat_probes(world: RunEvaluator) -> tuple[list[CandidateDirection], float]:
+    """Return hats over every recorded variable, and their strength.
+
+    All hats of a family have the same label, because they form one hypothesis and act together.
+    """
+    size = HAT_STRENGTH_SHARE * TYPICAL_FORCES[world.simulator.system.kind]
+    probes = []
+    for label, low, high, coefficients in _shapes(world, size):
+        # With this spacing, each hat extends to the centres of its neighbours.
+        width = (high - low) / (HAT_COUNT - 1)
+        for centre in np.linspace(low, high, HAT_COUNT):
+            _, c = coefficients(centre, width)
+            probes.append(CandidateDirection(label, group=0, place=0, coefficients=c, signed=True))
+    return probes, size
+
+
+HatFactory = Callable[[float, float], tuple[str, Array]]
+"""Function from the centre and width of a hat to the name of its effect and its coefficients."""
+
+
+def _shapes(world: RunEvaluator, size: float) -> Iterator[tuple[str, float, float, HatFactory]]:
+    """Yield families of hats: label, range of the variable, and a function that creates one hat."""
+    if JointHatForce.name in world.slots:
+        for joint in joint_families(world, SIGN_CHANGE_SPEED_SHARE):
+            yield joint.label, joint.low, joint.high, partial(_on_joint, joint, size)
+        return
+    slow = SIGN_CHANGE_SPEED_SHARE * _high_speed_quantile(world)
+    for family in _families(world):
+        yield family.label, family.low, family.high, partial(_anywhere, family, size, slow)
+
+
+def _on_joint(
+    family: JointHatFamily, size: float, centre: float, width: float
+) -> tuple[str, Array]:
+    """Return the effect name and the coefficients of one hat on a joint."""
+    follows = family.joint, family.variable, centre, width, family.direction, family.slow
+    return JointHatForce.name, np.array([size, *follows])
+
+
+def _anywhere(
+    family: _Family, size: float, slow: float, centre: float, width: float
+) -> tuple[str, Array]:
+    """Return the effect name and the coefficients of one hat on a system without joints."""
+    return HatForce.name, np.array([size, family.variable, centre, width, family.direction, slow])
+
+
+class _Family(NamedTuple):
+    """Hats over the range of one variable, with one direction."""
+
+    label: str
+    variable: int
+    direction: int
+    low: float
+    high: float
+
+
+def _families(world: RunEvaluator) -> Iterator[_Family]:
+    """Yield every family of hats that the recording can show."""
+    yield from _over_time(world)
+    yield from _over_positions(world)
+    yield from _over_speed(world)
+
+
+def _over_time(world: RunEvaluator) -> Iterator[_Family]:
+    """Yield families of hats over time."""
+    durations = []
+    for track in world.tracks:
+        times = track.scenario.times
+        durations.append(float(times[-1] - times[0]))
+    longest = max(durations)
+    for axis, name in enumerate(world.simulator.system.coordinates):
+        if name in world.channels:
+            yield _Family(f"time, along {name}", TIME_VARIABLE, AXIS_DIRECTION + axis, 0.0, longest)
+    yield _Family("time, against the motion", TIME_VARIABLE, VISCOUS_DIRECTION, 0.0, longest)
+
+
+def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
+    """Yield families of hats over each recorded coordinate."""
+    system = world.simulator.system
+    # A bouncing body flies freely and slides on nothing; its last coordinate is the height.
+    free, last = system.bounces, len(system.coordinates) - 1
+    for axis, name in enumerate(system.coordinates):
+        if name not in world.channels:
+            continue
+        values = world.observed[:, :, world.channels.index(name)]
+        low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
+        if not high > low:
+            continue
+        position = POSITION_VARIABLE + axis
+        if not (free and axis == last):
+            along = f"position {name}, along {system.coordinates[last]}"
+            yield _Family(along, position, AXIS_DIRECTION + last, low, high)
+        yield _Family(
+            f"position {name}, against the motion", position, VISCOUS_DIRECTION, low, high
+        )
+        if not free:
+            yield _Family(f"position {name}, dry", position, DRY_FRICTION_DIRECTION, low, high)
+
+
+def _over_speed(world: RunEvaluator) -> Iterator[_Family]:
+    """Yield families of hats over the speed."""
+    speed = _high_speed_quantile(world)
+    if speed > 0:
+        yield _Family("speed, against the motion", SPEED_VARIABLE, VISCOUS_DIRECTION, 0.0, speed)
+    if speed > 0 and not world.simulator.system.bounces:
+        yield _Family("speed, dry", SPEED_VARIABLE, DRY_FRICTION_DIRECTION, 0.0, speed)
+
+
+def _high_speed_quantile(world: RunEvaluator) -> float:
+    """Return the 98 % quantile of the speed, from the recorded coordinates."""
+    squares = []
+    for name in world.simulator.system.coordinates:
+        if name not in world.channels:
+            continue
+        c = world.channels.index(name)
+        rates = [np.zeros(1)]
+        for track in world.tracks:
+            if len(track.observed) > 3:
+                # Use every third sample, because differences of neighbours are mostly noise.
+                step = np.diff(track.scenario.times[::3])
+                rates.append(np.diff(track.observed[::3, c]) / step)
+        squares.append(np.square(np.concatenate(rates)))
+    # Without recorded coordinates there is no speed.
+    if not squares:
+        return 0.0
+    speed = np.nanquantile(sum(squares), 0.98)
+    return float(np.sqrt(speed))

@@ -1,0 +1,247 @@
+"""Starts of fits with one more effect: high-scoring effects at the sizes that scores predict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import FIT_HORIZONS
+from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian
+from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.search.candidate_directions import DirectionSet
+from bench.diagnosis.search.explained_variance import DirectionGroup
+from bench.diagnosis.search.initial_values import (
+    generate_event_times,
+    generate_neighbouring_end_stops,
+)
+from bench.diagnosis.search.score_test import CandidateScores
+from sims.core.simulator import Array
+
+MAX_REFITS_BY_SQUARES = 3
+"""Number of best candidates by sum of squares that are refitted in addition.
+
+Far from the data, AR(1) noise explains almost any residual, so likelihood scores are misleading.
+"""
+MAX_REFITS_BY_SIMULATION = 2
+"""Maximum number of candidates scored by full simulation that are refitted.
+
+They are refitted if they outscore the best linearised candidate.
+"""
+MIN_RELATIVE_SCORE = 0.25
+"""Minimum score of a candidate to be refitted, as a share of the best score."""
+MIN_RELATIVE_SCORE_EXACT = 0.6
+"""Minimum score of a candidate to be refitted if scores are exact to first order.
+
+It is a share of the best score.
+"""
+MAX_REFITS_THOROUGH = 20
+"""Maximum number of candidates that are refitted in patient fits of robots."""
+SIZE_SHARES = (1.0, 0.25)
+"""Shares of the size predicted by a score at which fits start.
+
+Scores are linear, so a smaller size is tried, too.
+"""
+RANGE_SHARES = (0.2, 0.7, 1.5)
+"""Shares of the plausible range at which fits of a single coefficient start in addition."""
+
+
+def select_refit_starts(
+    world: RunEvaluator,
+    noise: NoiseModel,
+    model: FittedModel,
+    found: DirectionSet,
+    scores: CandidateScores,
+    most: int,
+    patient: bool,
+) -> list[FitStart]:
+    """Return starts for fits with the most promising candidates.
+
+    Args:
+        world: the runs.
+        noise: noise of each channel.
+        model: the model to extend.
+        found: sensitivity directions of the candidates.
+        scores: their scores.
+        most: maximum number of candidates.
+        patient: whether to include all candidates, or for robots up to `MAX_REFITS_THOROUGH`.
+    """
+    numbered = []
+    # If scores use derivatives of the simulator, few candidates are better than their score.
+    share = MIN_RELATIVE_SCORE_EXACT if world.has_linearisation else MIN_RELATIVE_SCORE
+    if patient and world.has_linearisation:
+        most, share = MAX_REFITS_THOROUGH, 0.0
+    # If scores are less reliable, they only order the patient fits, and exclude none.
+    everything = patient and not world.has_linearisation
+    for i in _rank_candidates(
+        scores, most, share, everything, _find_simulated_scores(world, scores)
+    ):
+        name = scores.effects[i]
+        # The score peaks of an effect are fitted separately, because each may lead to its own
+        # minimum.
+        for peak, (group, scored) in enumerate(scores.peaks[i]):
+            known = _predict_jacobian(world, model, found, group, name)
+            for c in _list_start_sizes(world, found, group, scored, name):
+                start = replace(with_effect(world, model.fit.make_start(), name, c), known=known)
+                numbered.append((peak, start))
+    # Patient fits begin with the first part of the runs, so starts are compared there.
+    share = FIT_HORIZONS[0].share if patient else 1.0
+    return _select_nearest_start(world, noise, numbered, share)
+
+
+def _find_simulated_scores(world: RunEvaluator, scores: CandidateScores) -> frozenset[int]:
+    """Return the indices of candidates scored by full simulation, if the others are linearised."""
+    if not world.has_linearisation:
+        return frozenset()
+    # Imported here, because only robots need it.
+    from sims.robot.dynamics.series_joints import is_series_effect
+
+    return frozenset(
+        i
+        for i, name in enumerate(scores.effects)
+        if is_series_effect(world.available_effects[name])
+    )
+
+
+def _rank_candidates(
+    scores: CandidateScores, most: int, share: float, everything: bool, apart: frozenset[int]
+) -> list[int]:
+    """Return the indices of the candidates to refit, the most promising first."""
+    promise = scores.score - scores.null_quantiles
+    ranked: list[int] = np.argsort(-promise, kind="stable").tolist()
+    if everything:
+        return ranked
+    # Far from the data, the score of a full simulation may exceed the first-order score of the true
+    # effect, so such candidates are added to the others and displace none.
+    order = [i for i in ranked if i not in apart]
+    good = [i for i in order if promise[i] >= share * promise[order[0]]][:most]
+    by_squares = [
+        int(i) for i in np.argsort(-scores.white_noise_scores, kind="stable") if i not in apart
+    ]
+    besides = by_squares[:MAX_REFITS_BY_SQUARES]
+    leading = promise[order[0]] if order else -np.inf
+    whole = [i for i in ranked if i in apart and promise[i] >= leading][:MAX_REFITS_BY_SIMULATION]
+    good += [i for i in besides if i not in good]
+    return good + whole
+
+
+def with_effect(world: RunEvaluator, start: FitStart, name: str, c: Array) -> FitStart:
+    """Add an effect to a model, in place of the effects that it contains.
+
+    Args:
+        world: the runs.
+        start: the model.
+        name: name of the effect.
+        c: (k,) coefficients of the effect.
+    """
+    effect = world.available_effects[name]
+    contained, theta = effect.contains, start.theta.copy()
+    # An effect and one that it contains together would have no unique solution.
+    for part in sorted(set(contained) & set(start.effects)):
+        own = world.slots[part]
+        c = effect.taking(c, part, theta[own])
+        theta[own] = 0.0
+    theta[world.slots[name]] = c
+    rest = [n for n in start.effects if n not in contained]
+    return FitStart((*rest, name), theta, start.states)
+
+
+def _predict_jacobian(
+    world: RunEvaluator, model: FittedModel, found: DirectionSet, group: DirectionGroup, name: str
+) -> KnownJacobian | None:
+    """Return approximate derivatives of the model with one more effect of small size.
+
+    They consist of the derivatives of the model and the directions; None if these do not contain
+    all coefficients.
+    """
+    if not world.has_linearisation:
+        return None
+    columns = {
+        found.candidates[i].place: i for i in group.column_indices if not found.candidates[i].fixed
+    }
+    places = world.get_coefficient_indices(name)
+    shaping = [i for i in range(len(places)) if world.parameters[places[i]].bounds[0] > 0]
+    if not columns or shaping:
+        return None
+    jacobian = np.zeros((*found.responses.shape[:3], len(places)))
+    for place, column in columns.items():
+        jacobian[..., place] = found.responses[..., column]
+    contained = [
+        world.get_coefficient_indices(n)
+        for n in world.available_effects[name].contains
+        if n in model.effects
+    ]
+    gone = {place for span in contained for place in span}
+    return model.fit.get_known_jacobian().drop_parameters(gone).add_parameters(places, jacobian)
+
+
+def _list_start_sizes(
+    world: RunEvaluator, found: DirectionSet, group: DirectionGroup, scored: Array, name: str
+) -> Iterator[Array]:
+    """Yield initial coefficients: as scored, smaller, and at shares of the plausible range."""
+    bounds = compute_coefficient_bounds(world, name)
+    first = found.candidates[group.column_indices[0]]
+    # A direction for one full size says nothing about other sizes.
+    if first.fixed:
+        yield first.coefficients
+        yield from generate_neighbouring_end_stops(world, name, first.coefficients)
+        return
+    for share in SIZE_SHARES:
+        c = first.coefficients.copy()
+        for column, size in zip(group.column_indices, scored, strict=True):
+            place = found.candidates[column].place
+            c[place] = share * float(np.clip(size, *bounds[place]))
+        yield c
+        yield from generate_event_times(world, name, c)
+    # With several coefficients, the ranges do not show how the coefficients are related.
+    if len(group.column_indices) > 1:
+        return
+    place = world.slots[name].start + first.place
+    _, reach = world.parameters[place].bounds
+    shares = list(RANGE_SHARES)
+    if first.signed:
+        shares += [-share for share in RANGE_SHARES]
+    for share in shares:
+        c = first.coefficients.copy()
+        c[first.place] = share * reach
+        yield c
+
+
+def _select_nearest_start(
+    world: RunEvaluator, noise: NoiseModel, numbered: Sequence[tuple[int, FitStart]], share: float
+) -> list[FitStart]:
+    """Return the start with the lowest cost for each peak number and set of effects.
+
+    Args:
+        world: the runs.
+        noise: noise of each channel.
+        numbered: starts with the number of their score peak.
+        share: initial share of the runs on which the cost is computed.
+    """
+    if not numbered:
+        return []
+    starts = [start for _, start in numbered]
+    runs = len(world.tracks)
+    count = len(starts)
+    theta = np.repeat([s.theta for s in starts], runs, axis=0)
+    states = np.concatenate([s.states for s in starts])
+    lanes = np.tile(np.arange(runs), count)
+    # All starts are simulated in one engine call, as one batch.
+    seen = world.simulate(theta, lanes, states, share)
+    seen = seen.reshape(count, runs, *seen.shape[1:])
+    counted = world.get_sample_mask(share)
+    best: dict[tuple[int, EffectNames], tuple[float, FitStart]] = {}
+    for (number, start), simulated in zip(numbered, seen, strict=True):
+        residual = world.observed - simulated
+        left = np.where(counted, residual, 0.0) / noise.sigma
+        cost = float(np.square(left).sum())
+        key = (number, start.effects)
+        nearest = best[key][0] if key in best else np.inf
+        # A failed simulation has the cost NaN, which is never the lowest.
+        if cost < nearest:
+            best[key] = cost, start
+    return [start for _, start in best.values()]

@@ -1,0 +1,350 @@
+"""Score test of every candidate effect in trajectory space, calibrated over the whole library.
+
+The response to an effect is compared with the residual after both are projected onto the complement
+of what fitted parameters and initial states can absorb (a Lagrange multiplier test; C. R. Rao 1948,
+doi:10.1017/S0305004100023987; R. F. Engle, Handbook of Econometrics II, chapter 13). The score is
+twice the gain in log-likelihood. Each hypothesis uses the noise correlation that suits it best, so
+that autocorrelated noise is not mistaken for a cause. The distribution of the best score under the
+null hypothesis is found from surrogate residuals (max-statistic calibration; P. H. Westfall, S. S.
+Young 1993).
+
+The inner products <a, b> of residuals e and directions D, whitened with correlation phi and
+projected, are defined in `search.whitened_products`, eqs. (1) and (2). The part that a group of
+directions explains, with G = <D, D> and h = <D, e>, is computed in `search.explained_variance`.
+With sigma also estimated from n samples, twice the log-likelihood is, up to a constant,
+
+    l(phi) = log det W'W - n log(<e, e> - h'G^-1 h)                                            (3)
+
+and the score of an effect is the likelihood ratio, with the best correlation on either side,
+
+    score = max over phi and groups of l(phi) - max over phi of l(phi) without directions      (4)
+
+For effects k and surrogates s, with chance_k the 90 % quantile of score_k over s, the p-value is
+
+    p = P(max over k of (score_k(s) - chance_k) >= max over k of (score_k - chance_k))         (5)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis.evaluation.noise_model import (
+    PHI_GRID,
+    Mask,
+    NoiseModel,
+    compute_log_determinant,
+)
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.search.candidate_directions import DirectionSet
+from bench.diagnosis.search.explained_variance import (
+    DirectionGroup,
+    GroupBatch,
+    batch_groups,
+    compute_explained_squares,
+    group_directions,
+)
+from bench.diagnosis.search.whitened_products import InnerProducts, WhiteningDesign
+from sims.core.simulator import Array
+
+SHAPE_COUNT_FOR_MULTISTART = 12
+"""Number of shapes above which fits of an effect start from several of them."""
+STARTS_PER_EFFECT = 3
+"""Maximum number of shapes from which fits of an effect with many shapes start."""
+NULL_QUANTILE = 0.9
+"""Quantile of a score over the surrogates that is subtracted as its null-hypothesis level."""
+TAIL_QUANTILE = 0.8
+"""Quantile over the surrogates above which the tail of the distribution is exponential."""
+TAIL_SHARE = 0.2
+"""Share of the surrogates in the exponential tail."""
+MIN_SURROGATES_FOR_TAIL = 20
+"""Minimum number of surrogates for which a tail is extrapolated."""
+UNCERTAIN_P_VALUE_RANGE = (3e-4, 0.06)
+"""Range of p-values that may decide, and are therefore computed from more surrogates."""
+SURROGATE_COUNT_FACTOR = 4
+"""Factor by which the number of surrogates is increased for such p-values."""
+
+ScorePeak = tuple[DirectionGroup, Array]
+
+
+@dataclass(frozen=True)
+class CandidateScores:
+    """Scores of the library about one model.
+
+    Attributes:
+        effects: names of the effects, the highest score first.
+        score: twice the gain in log-likelihood of each effect.
+        null_quantiles: 90 % quantile of the score over surrogates (0 without them).
+        peaks: for each effect, its best group with the coefficients of its columns, in units of the
+            directions; for effects with many shapes, followed by further local maxima.
+        p_value: p-value of the highest score minus its null-hypothesis level.
+        phi: correlation of the noise under the best hypothesis.
+        null_scores: (E, S) scores of the surrogates minus their null-hypothesis level.
+        white_noise_scores: (E,) scores for white noise.
+    """
+
+    effects: tuple[str, ...]
+    score: Array
+    null_quantiles: Array
+    peaks: tuple[tuple[ScorePeak, ...], ...]
+    p_value: float
+    phi: float
+    null_scores: Array
+    white_noise_scores: Array
+
+
+class ScoreTest:
+    """Score test of candidate effects against any residuals of one model.
+
+    Args:
+        at: the model that the directions refer to.
+        directions: directions of the candidates.
+        seen: (R, T, C) mask of available samples.
+        noise: its sigma weights the channels; its correlation is not used.
+    """
+
+    def __init__(
+        self, at: TrajectoryFit, directions: DirectionSet, seen: Mask, noise: NoiseModel
+    ) -> None:
+        self._groups = group_directions(directions)
+        self._batches = batch_groups(self._groups)
+        self._count = int(seen.sum())
+        blocks = [batch.columns for batch in self._batches]
+        self._design = WhiteningDesign(at, directions.responses, seen, noise.sigma, blocks)
+        self._determinants = {
+            phi: 2.0 * compute_log_determinant(seen, np.full(seen.shape[2], phi))
+            for phi in PHI_GRID
+        }
+
+    def project_out(self, residuals: Array) -> Array:
+        """Return residuals (S, R, T, C) after a linear fit of parameters and initial states."""
+        return self._design.project_out(residuals)
+
+    def compute_scores(self, residual: Array, surrogate: Array | None = None) -> CandidateScores:
+        """Score a residual.
+
+        Args:
+            residual: (R, T, C) residual of the model, zero where no sample exists.
+            surrogate: (S, R, T, C) surrogate residuals for the null hypothesis; None to omit the
+                p-value.
+        """
+        # The residual comes first, and is scored with the same products as the surrogates.
+        drawn = np.zeros((0, *residual.shape)) if surrogate is None else surrogate
+        table = _BestScores(self._groups, 1 + len(drawn), self._count)
+        products = InnerProducts(self._design, residual[None], drawn)
+        # The sums of products from one pass over the samples serve every correlation of the grid.
+        for phi, determinant in self._determinants.items():
+            total, grams, cross = products.project(phi)
+            table.begin(phi, determinant, total)
+            for batch, gram in zip(self._batches, grams, strict=True):
+                table.enter(
+                    batch, *compute_explained_squares(gram, cross[batch.columns], batch.positive)
+                )
+            table.end()
+        return table.ranked()
+
+
+def compute_calibrated_scores(
+    test: ScoreTest, residual: Array, draw: Callable[[int], Array], count: int
+) -> CandidateScores:
+    """Score a residual, with more surrogates if the p-value is close to a threshold.
+
+    A p-value of 0.01 from a hundred surrogates is uncertain by a factor of three, and a p-value far
+    from every threshold need not be more accurate (J. Besag, P. Clifford, Sequential Monte Carlo
+    p-values, Biometrika 78(2), 301, 1991, doi:10.1093/biomet/78.2.301).
+
+    Args:
+        test: score test about the model.
+        residual: (R, T, C) residual of the model.
+        draw: function that draws the given number of surrogates (S, R, T, C).
+        count: number of surrogates that are drawn first.
+    """
+    first = test.compute_scores(residual, draw(count))
+    low, high = UNCERTAIN_P_VALUE_RANGE
+    if not low < first.p_value < high:
+        return first
+    return test.compute_scores(residual, draw(SURROGATE_COUNT_FACTOR * count))
+
+
+def score_candidates(
+    at: TrajectoryFit,
+    residual: Array,
+    directions: DirectionSet,
+    seen: Mask,
+    noise: NoiseModel,
+    surrogate: Array | None = None,
+) -> CandidateScores:
+    """Score every effect once, with a new `ScoreTest`.
+
+    Args:
+        at: the model that the directions refer to.
+        residual: (R, T, C) residual of the model, zero where no sample exists.
+        directions: directions of the candidates.
+        seen: (R, T, C) mask of available samples.
+        noise: its sigma weights the channels.
+        surrogate: (S, R, T, C) surrogate residuals; None to omit the p-value.
+    """
+    return ScoreTest(at, directions, seen, noise).compute_scores(residual, surrogate)
+
+
+class _BestScores:
+    """Best likelihood of every group and effect over the correlations so far.
+
+    Args:
+        members: groups of all effects.
+        residuals: number of residuals.
+        count: n of eq. (3).
+    """
+
+    def __init__(self, members: Sequence[DirectionGroup], residuals: int, count: int) -> None:
+        self._count = count
+        self._groups = members
+        self._names = list(dict.fromkeys(group.effect for group in members))
+        rows = {name: row for row, name in enumerate(self._names)}
+        self._rows = np.array([rows[group.effect] for group in members], dtype=np.intp)
+        effects = len(self._names)
+        self._best = np.full((effects, residuals), -np.inf)
+        self._without = np.full(residuals, -np.inf)
+        self._white = np.zeros(effects)
+        # For each group: twice its log-likelihood, its correlation and its coefficients.
+        self._values = np.full(len(members), -np.inf)
+        self._phis = np.zeros(len(members))
+        widest = max((len(group.column_indices) for group in members), default=0)
+        self._coefficients = np.zeros((len(members), widest))
+        self._gains = np.zeros((effects, residuals))
+        self._phi = self._determinant = 0.0
+        self._total = np.zeros(residuals)
+
+    def begin(self, phi: float, determinant: float, total: Array) -> None:
+        """Start a correlation, with log det W'W and <e, e> (S,) of eq. (3).
+
+        Args:
+            phi: the correlation.
+            determinant: log det W'W.
+            total: (S,) sums of squares of the residuals.
+        """
+        self._phi, self._determinant, self._total = phi, determinant, total
+        self._gains[...] = 0.0
+        nothing = self._value(total, total)
+        self._without = np.maximum(self._without, nothing)
+
+    def _value(self, left: Array, total: Array) -> Array:
+        """Return eq. (3) for the remaining sums of squares."""
+        # A fully explained residual leaves only rounding, so the logarithm is bounded.
+        floor = 1e-12 * total + 1e-300
+        logarithms = np.log(np.maximum(left, floor))
+        result: Array = self._determinant - self._count * logarithms
+        return result
+
+    def enter(self, batch: GroupBatch, gain: Array, coefficients: Array) -> None:
+        """Enter what the groups of a batch explain.
+
+        Args:
+            batch: the groups.
+            gain: (n, S) explained sums of squares.
+            coefficients: (n, k) coefficients for the first residual.
+        """
+        rows = self._rows[batch.places]
+        order = np.argsort(rows, kind="stable")
+        present, first = np.unique(rows[order], return_index=True)
+        largest = np.maximum.reduceat(gain[order], first, axis=0)
+        self._gains[present] = np.maximum(self._gains[present], largest)
+        own = self._value(self._total[0] - gain[:, 0], self._total[0])
+        # The first residual is the observed one; only its coefficients are used as starts of fits.
+        better = own > self._values[batch.places]
+        places = batch.places[better]
+        self._values[places] = own[better]
+        self._phis[places] = self._phi
+        self._coefficients[places, : coefficients.shape[1]] = coefficients[better]
+
+    def end(self) -> None:
+        """Finish a correlation after all groups were entered."""
+        values = self._value(self._total - self._gains, self._total)
+        self._best = np.maximum(self._best, values)
+        # With phi = 0, whitening leaves sums of squares unchanged.
+        if self._phi == 0 and len(self._names):
+            nothing = self._value(self._total[0], self._total[0])
+            self._white = np.maximum(values[:, 0] - nothing, 0.0)
+
+    def ranked(self) -> CandidateScores:
+        """Return the scores in descending order, with their p-value."""
+        gains = self._best - self._without  # (4)
+        observed = gains[:, 0]
+        drawn = gains[:, 1:]
+        chance = np.zeros(len(self._names))
+        p_value = 1.0
+        if drawn.shape[1]:
+            # An effect with many shapes has higher scores under the null hypothesis, which must not
+            # raise the level of other effects.
+            chance = np.quantile(drawn, NULL_QUANTILE, axis=1)
+            p_value = estimate_tail_p_value(drawn - chance[:, None], observed - chance)  # (5)
+        by_chance = drawn - chance[:, None]
+        order = np.argsort(-observed, kind="stable")
+        phi = 0.0
+        if order.size:
+            members = np.flatnonzero(self._rows == order[0])
+            phi = float(self._phis[members[np.argmax(self._values[members])]])
+        return CandidateScores(
+            effects=tuple(self._names[i] for i in order),
+            score=observed[order],
+            null_quantiles=chance[order],
+            peaks=tuple(self._peaks(np.flatnonzero(self._rows == i)) for i in order),
+            p_value=p_value,
+            phi=phi,
+            null_scores=by_chance[order],
+            white_noise_scores=self._white[order],
+        )
+
+    def _peaks(self, places: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
+        """Return the best group of an effect; with many shapes also further local maxima."""
+        values = self._values[places]
+        several = len(places) > SHAPE_COUNT_FOR_MULTISTART
+        peaks = values == values.max()
+        if several:
+            # Neighbours of the best group give the same result, so only local maxima count.
+            around = np.concatenate([[-np.inf], values, [-np.inf]])
+            above_former = values >= around[:-2]
+            above_latter = values >= around[2:]
+            peaks = above_former & above_latter
+        order = np.argsort(-values, kind="stable")
+        most = STARTS_PER_EFFECT if several else 1
+        chosen = [places[i] for i in order if peaks[i]][:most]
+        result = []
+        for i in chosen:
+            group = self._groups[i]
+            result.append((group, self._coefficients[i, : len(group.columns)].copy()))
+        return tuple(result)
+
+
+def estimate_tail_p_value(by_chance: Array, observed: Array) -> float:
+    """Return the p-value (5) of the largest observed value.
+
+    Beyond the most extreme fifth of the surrogates, the tail is assumed to be exponential, as that
+    of a likelihood ratio is.
+
+    Args:
+        by_chance: (E, S) values of the surrogates; the maximum over E is compared.
+        observed: (E,) observed values.
+    """
+    if not observed.size:
+        return 1.0
+    largest = np.sort(by_chance.max(axis=0))
+    value = float(observed.max())
+    count = largest.size
+    above = int((largest >= value).sum())
+    # Counting cannot give less than one in the number of surrogates; smaller p-values are
+    # extrapolated.
+    first = int(TAIL_QUANTILE * count)
+    extreme = largest[first:]
+    begin = extreme[0]
+    if value <= begin or count < MIN_SURROGATES_FOR_TAIL:
+        # The residual counts as one of the surrogates, so the p-value is never zero.
+        return (1.0 + above) / (1.0 + count)
+    # The scale of an exponential distribution is its mean excess over the threshold.
+    beyond = extreme - begin
+    mean = max(float(beyond.mean()), 1e-9)
+    chance = TAIL_SHARE * np.exp(-(value - begin) / mean)
+    return float(chance)

@@ -1,0 +1,406 @@
+"""Fitted models together with the scores of all effects that they lack.
+
+Each model is scored once against the whole library by a linear test
+(`search.score_test`). The score and the size of the residual show whether the model lacks
+something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, compute_portmanteau_p_value
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
+from bench.diagnosis.search.refit_starts import select_refit_starts
+from bench.diagnosis.search.score_test import (
+    CandidateScores,
+    ScoreTest,
+    compute_calibrated_scores,
+    estimate_tail_p_value,
+)
+from sims.core.simulator import Array
+
+SURROGATE_COUNT = 120
+"""Number of surrogate residuals that calibrate the scores about one model."""
+CERTAIN_P_VALUE = 1e-6
+"""P-value below which surrogates with another spectrum are not needed."""
+NOISE_RATIO_THRESHOLD = 1.3
+"""Maximum ratio of the residual to the noise floor at which the scores alone are trusted.
+
+A larger residual is examined by simulation, whatever the scores are.
+"""
+WHITENESS_P_VALUE_THRESHOLD = 0.01
+"""Minimum p-value at which a residual above an estimated noise floor counts as AR(1) noise."""
+
+DIRECTION_CACHE_BYTES = 400e6
+"""Maximum size in bytes of stored directions, in addition to those of the base model.
+
+The oldest ones are removed; in the rare case that they are needed again, they are recomputed.
+"""
+MAX_EXCESS_TO_STOP = 0.02
+"""Maximum excess of a model at which no richer law is fitted."""
+NESTED_MODEL_TOLERANCE = 1.0
+"""Maximum distance in twice the log-likelihood of a model from one that it contains.
+
+A fit that is further behind has stopped in a poor local minimum.
+"""
+UNCHANGED_FIT_SIGMAS = 0.1
+"""Maximum RMS change of a fit, in sigmas, at which its directions are kept.
+
+Directions are derivatives, so they have changed as little as the fit.
+"""
+
+
+class ModelScan(NamedTuple):
+    """Directions, score test and scores about one model.
+
+    Attributes:
+        at: the fit that the directions refer to.
+        directions: directions of the effects that the model lacks.
+        test: score test with these directions.
+        scores: scores of these effects.
+    """
+
+    at: TrajectoryFit
+    directions: DirectionSet
+    test: ScoreTest
+    scores: CandidateScores
+
+
+@dataclass
+class ScoredModelSet(ModelSet):
+    """Models and their scores.
+
+    Attributes:
+        scores_by_effects: scores about each scored model, by its effects.
+        cached_scans: directions, tests and scores about the base model and the latest scored
+            models.
+        best_p_values: p-value of the best score about each model, by its effects.
+        superseded_scans: results about models that have been replaced by better fits.
+    """
+
+    scores_by_effects: dict[frozenset[str], CandidateScores] = field(default_factory=dict)
+    cached_scans: dict[frozenset[str], ModelScan] = field(default_factory=dict)
+    best_p_values: dict[frozenset[str], float] = field(default_factory=dict)
+    superseded_scans: dict[frozenset[str], ModelScan] = field(default_factory=dict)
+
+    @property
+    def base_model(self) -> FittedModel:
+        """The model without any effect."""
+        return self.models[frozenset()]
+
+    @property
+    def base_scores(self) -> CandidateScores | None:
+        """Scores about the base model or its previous fit; None if there are none."""
+        key: frozenset[str] = frozenset()
+        if key in self.scores_by_effects or key not in self.superseded_scans:
+            return self.scores_by_effects.get(key)
+        return self.superseded_scans[key].scores
+
+    def directions_known(self) -> tuple[TrajectoryFit, DirectionSet] | None:
+        """Return the directions of all candidates about the base model, if already computed.
+
+        Here always None; subclasses may compute them separately from the scores.
+        """
+        return None
+
+    def on_replaced(self, key: frozenset[str]) -> None:
+        """Discard the scores about a model that was replaced."""
+        self.scores_by_effects.pop(key, None)
+        if key in self.cached_scans:
+            self.superseded_scans[key] = self.cached_scans.pop(key)
+
+    def score_missing_effects(
+        self, model: FittedModel, against: Array | None = None
+    ) -> CandidateScores:
+        """Score every effect that the model lacks.
+
+        Args:
+            model: the model.
+            against: (R, T, C) residual whose spectrum the surrogates have; None for that of the
+                model.
+        """
+        key = frozenset(model.effects)
+        if key not in (self.scores_by_effects if against is None else self.cached_scans):
+            self._survey([model])
+        if against is None:
+            return self.scores_by_effects[key]
+        known = self.cached_scans[key]
+        self._look(model)
+        # Directions cost one simulation per candidate, and are reused with other surrogates. The
+        # spectrum of the noise is best estimated from a model with less structure in its residual.
+        residual = self.compute_residual(model.fit)
+        stream = self.make_rng("library", model.effects)
+        scores = _scored(known.test, residual, against, self.observed_mask, stream)
+        self._take(key, known._replace(scores=scores))
+        return scores
+
+    def _survey(self, models: Sequence[FittedModel], beside: Sequence[FittedModel] = ()) -> None:
+        """Score the effects that each of the models lacks.
+
+        Args:
+            models: models to score.
+            beside: further models whose stored results must not be removed.
+        """
+        calls, keys = [], []
+        for model in models:
+            self._look(model)
+            model = self.refine_jacobian(model)
+            key = frozenset(model.effects)
+            residual, stream = (
+                self.compute_residual(model.fit),
+                self.make_rng("library", model.effects),
+            )
+            former = self.superseded_scans.pop(key, None)
+            # A model that has hardly moved keeps its directions.
+            if former is not None and self._moved(former.at, model.fit) < UNCHANGED_FIT_SIGMAS:
+                scores = _scored(former.test, residual, residual, self.observed_mask, stream)
+                self._take(key, former._replace(scores=scores))
+                continue
+            keys.append(key)
+            calls.append(
+                (
+                    model.fit,
+                    self._lacking(model),
+                    self.compute_channel_weights(model),
+                    residual,
+                    self.observed_mask,
+                    stream,
+                )
+            )
+        if calls:
+            most = max(len(lacking) for _, lacking, *_ in calls)
+            several = f" beside {len(calls)} models" if len(calls) > 1 else ""
+            self.world.watch.stage(f"testing {most} effects{several}", len(calls))
+        found = {}
+        for number, scanned in self.world.crew.map_unordered(self.world, _scan_model, calls):
+            found[number] = scanned
+            self.world.watch.advance()
+        for number, key in enumerate(keys):
+            scores = self.scores_by_effects.get(key, found[number].scores)
+            # Scores that were kept when the directions were removed remain valid.
+            self._take(key, found[number]._replace(scores=scores))
+        self._make_room([*keys, *(frozenset(model.effects) for model in beside)])
+
+    def _look(self, model: FittedModel) -> None:
+        """Report the scoring of a model as the next step."""
+        about = " + ".join(model.effects) or "the base model"
+        self.world.watch.report_and_check(f"scores of the library about {about}")
+
+    def _make_room(self, asked: Sequence[frozenset[str]]) -> None:
+        """Remove the oldest stored directions, except those of the base model and of `asked`."""
+        for kept in (self.superseded_scans, self.cached_scans):
+            for key in [k for k in kept if k and k not in asked]:
+                held = [*self.superseded_scans.items(), *self.cached_scans.items()]
+                if (
+                    sum(one.directions.responses.nbytes for k, one in held if k)
+                    <= DIRECTION_CACHE_BYTES
+                ):
+                    return
+                del kept[key]
+
+    def _take(self, key: frozenset[str], scanned: ModelScan) -> None:
+        # Insert the entry again, so that it is the newest one.
+        """Store results as the latest ones."""
+        self.cached_scans.pop(key, None)
+        self.cached_scans[key] = scanned
+        self.enter_scores(key, scanned.scores)
+
+    def enter_scores(self, key: frozenset[str], scores: CandidateScores) -> None:
+        """Store the scores about a model.
+
+        Args:
+            key: effects of the model.
+            scores: the scores.
+        """
+        self.scores_by_effects[key] = scores
+        self.best_p_values[key] = scores.p_value
+        # Kept from the first scan, so that merits remain comparable after a better base fit.
+        if not key and not self.null_gains:
+            self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
+
+    def _moved(self, one: TrajectoryFit, other: TrajectoryFit) -> float:
+        """Return the RMS difference of two fits at the samples, in sigmas."""
+        apart = (one.simulated - other.simulated) / self.noise.sigma
+        return float(np.sqrt(np.square(apart[self.observed_mask]).mean()))
+
+    def _lacking(self, model: FittedModel) -> list[str]:
+        """Return the effects that a model lacks."""
+        held = set(model.effects)
+        # An effect and one that it contains have no unique solution together.
+        for name in model.effects:
+            held.update(self.world.available_effects[name].contains)
+        return [name for name in self.world.library if name not in held]
+
+    def refit_extensions(
+        self, beam: Iterable[FittedModel], most: int, patient: bool = False
+    ) -> None:
+        """Refit the most promising extensions of models; known ones only if patient.
+
+        Args:
+            beam: models to extend.
+            most: maximum number of candidates per model.
+            patient: whether to include all candidates, and fit the beginnings of the runs first.
+        """
+        starts = []
+        models = list(beam)
+        # A better fit may have discarded the scores of some models.
+        lost = [model for model in models if frozenset(model.effects) not in self.cached_scans]
+        self._survey(lost, beside=models)
+        for model in models:
+            key = frozenset(model.effects)
+            known = self.cached_scans[key]
+            # The model may have been improved since it was put into the beam.
+            newest = self.models[key]
+            further = select_refit_starts(
+                self.world,
+                self.noise,
+                newest,
+                known.directions,
+                known.scores,
+                most,
+                patient,
+            )
+            starts += [s for s in further if patient or self._is_new(s, newest)]
+        if not self.world.has_linearisation or patient:
+            if starts:
+                self.refit_models(starts, patient=patient)
+            return
+        # Laws that are evaluated in every step cost most, and the laws that they contain are often
+        # sufficient.
+        names = {frozenset(start.effects) for start in starts} | set(self.models)
+        parts = {id(start): self._contained(start) & names for start in starts}
+        plain = [start for start in starts if not parts[id(start)]]
+        if plain:
+            self.refit_models(plain)
+        richer = [s for s in starts if parts[id(s)] and not self._explained(parts[id(s)])]
+        if richer:
+            self.refit_models(richer)
+
+    def _is_new(self, start: FitStart, model: FittedModel) -> bool:
+        """Return whether a fit from this start may find something new.
+
+        This is the case if no fit of these effects is known. For a robot, whose effects start far
+        from the optimum, it is also the case if the known fit is worse than a model that it
+        contains.
+        """
+        known = self.models.get(frozenset(start.effects))
+        if known is None:
+            return True
+        behind = model.likelihood.value - known.likelihood.value
+        return self.world.has_linearisation and behind > NESTED_MODEL_TOLERANCE
+
+    def _contained(self, start: FitStart) -> set[frozenset[str]]:
+        """Return the models in which one effect is replaced by an effect that it contains."""
+        own = frozenset(start.effects)
+        effects = self.world.available_effects
+        return {own - {name} | {part} for name in own for part in effects[name].contains}
+
+    def _explained(self, keys: Iterable[frozenset[str]]) -> bool:
+        """Return whether one of these models leaves only noise."""
+        models = [self.models[key] for key in keys if key in self.models]
+        return any(
+            self.is_noise_like(m) and self.compute_excess(m) < MAX_EXCESS_TO_STOP for m in models
+        )
+
+    def compute_missing_effect_p_value(self, model: FittedModel, larger: FittedModel) -> float:
+        """Return the p-value of the gain of a larger model.
+
+        The null hypothesis is that the smaller model lacks nothing. The surrogates have the
+        spectrum of the larger model's residual, which is closer to pure noise.
+
+        Args:
+            model: the smaller model.
+            larger: the larger model.
+        """
+        gain = larger.likelihood.value - model.likelihood.value
+        model = self.models[frozenset(model.effects)]
+        first = self.compute_gain_p_value(self.score_missing_effects(model), larger, gain)
+        # Such a gain is significant whatever the spectrum of the surrogates.
+        if first < CERTAIN_P_VALUE:
+            return first
+        scores = self.score_missing_effects(model, self.compute_residual(larger.fit))
+        return min(scores.p_value, self.compute_gain_p_value(scores, larger, gain))
+
+    def compute_gain_p_value(
+        self, scores: CandidateScores, larger: FittedModel, gain: float
+    ) -> float:
+        """Return the p-value of a gain in twice the log-likelihood.
+
+        The null-hypothesis level of the larger model's effects is subtracted first.
+
+        Args:
+            scores: scores about the smaller model.
+            larger: the larger model.
+            gain: gain in twice the log-likelihood.
+        """
+        chance = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
+        # Among several effects, the highest null-hypothesis level is used.
+        chances = [chance.get(name, 0.0) for name in larger.effects]
+        lucky = max(chances, default=0.0)
+        excess = np.array([gain - lucky])
+        return estimate_tail_p_value(scores.null_scores, excess)
+
+    def is_complete(self, model: FittedModel, doubt: float) -> bool:
+        """Return whether neither scores nor residual suggest that the model lacks something.
+
+        Args:
+            model: the model.
+            doubt: p-value threshold of the scores.
+        """
+        return self.score_missing_effects(model).p_value > doubt and self.is_noise_like(model)
+
+    def is_noise_like(self, model: FittedModel) -> bool:
+        """Return whether the residual of a model may be noise.
+
+        It is at the noise floor, or it is above an estimated floor and AR(1) noise. The floor is
+        estimated for white noise, so AR(1) noise may exceed it.
+        """
+        left = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
+        loud = left >= NOISE_RATIO_THRESHOLD * self.noise.sigma
+        if not loud.any():
+            return True
+        # Specified noise is known, so a larger residual is not noise, whatever its spectrum.
+        if (loud & self.stated).any():
+            return False
+        # Ljung-Box test, eq. (5) of `bench.diagnosis.evaluation.noise_model`.
+        residual = self.compute_residual(model.fit)
+        return (
+            compute_portmanteau_p_value(residual, self.observed_mask, model.likelihood)
+            > WHITENESS_P_VALUE_THRESHOLD
+        )
+
+
+def _scan_model(
+    world: RunEvaluator,
+    at: TrajectoryFit,
+    lacking: Sequence[str],
+    weights: NoiseModel,
+    residual: Array,
+    seen: Mask,
+    stream: np.random.Generator,
+) -> ModelScan:
+    """Score one model; runs in this process or in a worker."""
+    candidates = compute_directions(world, at, lacking)
+    test = ScoreTest(at, candidates, seen, weights)
+    return ModelScan(at, candidates, test, _scored(test, residual, residual, seen, stream))
+
+
+def _scored(
+    test: ScoreTest, residual: Array, against: Array, seen: Mask, stream: np.random.Generator
+) -> CandidateScores:
+    """Return the scores of a residual, with surrogates that have the spectrum of `against`."""
+    return compute_calibrated_scores(
+        test,
+        residual,
+        lambda count: draw_surrogates(against, seen, count, stream, left=test.project_out),
+        SURROGATE_COUNT,
+    )

@@ -1,0 +1,112 @@
+"""Search of long recordings on thinned runs first, confirmed on all samples.
+
+The model found and its close rivals are fitted to all samples. The search is repeated on all
+samples only if these show more than the thinned runs did.
+"""
+
+from __future__ import annotations
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.run_thinning import thin_runs
+from bench.diagnosis.evaluation.search_control import SearchStoppedError
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.search.effect_search import (
+    FAR_EXCESS,
+    MAX_P_VALUE_FIRST_EFFECT,
+    MAX_P_VALUE_FURTHER_EFFECT,
+    EffectSearch,
+    select_by_size,
+)
+from bench.diagnosis.search.refine_candidates import (
+    list_competing_models,
+    list_submodels,
+    refine_best_model,
+)
+
+MAX_SINGLE_EFFECT_REFITS = 6
+"""Number of best single-effect models that are fitted to all samples in addition."""
+
+
+def search_with_subsampling(search: EffectSearch) -> FittedModel:
+    """Return the model of all effects that the data show; long runs are thinned first.
+
+    Args:
+        search: the search, which contains the fitted base model.
+
+    Raises:
+        EndedError: the search had to end early.
+    """
+    few = thin_runs(search.world)
+    if few is None:
+        return search.run()
+    try:
+        return _search_subsampled(search, few)
+    finally:
+        few.close()
+
+
+def _search_subsampled(search: EffectSearch, few: RunEvaluator) -> FittedModel:
+    """Search on thinned runs, then confirm the result on all samples."""
+    # If the scores of the base model, which all merits need anyway, show nothing, no search is
+    # needed.
+    if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
+        return search.run()
+    rng = search.make_rng("fewer samples")
+    given = few, search.noise, search.frozen, rng, search.stated
+    sketch = EffectSearch(*given, thorough=search.thorough)
+    sketch.refit_models([search.base_model.fit.make_start()])
+    try:
+        found = refine_best_model(sketch, sketch.run())
+    except SearchStoppedError:
+        _adopt_subsampled_models(search, sketch.get_best_so_far())
+        raise
+    starts = _collect_full_fit_starts(sketch, found)
+    if starts:
+        search.refit_models(starts)
+    model = _select_full_model(search, found)
+    if not _is_confirmed_by_all_samples(search, model):
+        return search.run()
+    search.settled_effects = frozenset(model.effects)
+    search.best_supported_model = model
+    return model
+
+
+def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
+    """Store the model that the thinned runs support without a fit, for lack of time."""
+    fitter = TrajectoryFitter(search.world, search.noise, search.frozen)
+    (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
+    search.best_supported_model = search.add_fit(fit)
+
+
+def _collect_full_fit_starts(sketch: EffectSearch, found: FittedModel) -> list[FitStart]:
+    """Return starts of fits to all samples: the result, its rivals and parts, and best singles."""
+    near = [found, *list_competing_models(sketch, found), *list_submodels(sketch, found)]
+    near += [sketch.remove_effect(found, name) for name in found.effects]
+    near += select_by_size(sketch, 1)[:MAX_SINGLE_EFFECT_REFITS]
+    chosen = {model.effects: model.fit.make_start() for model in near if model.effects}
+    return list(chosen.values())
+
+
+def _select_full_model(search: EffectSearch, found: FittedModel) -> FittedModel:
+    """Return the fit to all samples of the model that was found.
+
+    Near the noise, return the best model of its size, because thinned runs distinguish rivals less
+    well.
+    """
+    model = search.models[frozenset(found.effects)]
+    best = search.get_best(len(found.effects))
+    if best is None or search.compute_excess(model) >= FAR_EXCESS:
+        return model
+    return best
+
+
+def _is_confirmed_by_all_samples(search: EffectSearch, model: FittedModel) -> bool:
+    """Return whether all samples show no more effects than the thinned runs did."""
+    # Far from the noise, more samples of the same runs show nothing new.
+    if search.compute_excess(model) >= FAR_EXCESS:
+        return True
+    return search.is_complete(
+        model, MAX_P_VALUE_FURTHER_EFFECT if model.effects else MAX_P_VALUE_FIRST_EFFECT
+    )

@@ -1,0 +1,307 @@
+"""Decision thresholds, and the rules that select one of six verdicts.
+
+`search.diagnose` asks the questions in order; each answer is decided by one function here.
+Errors are in units of the noise unless stated otherwise: RMS 1 is noise alone. An *excess* is this
+RMS minus one, so it is 0 for a model whose residual is only noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sims.core.simulator import Array
+
+VerdictName = Literal["adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable"]
+
+VERDICT_MEANINGS: Mapping[VerdictName, str] = {
+    "adequate": "nothing is missing that these data can show",
+    "named": "one cause, or several jointly, explains the gap",
+    "ambiguous": "causes that these data cannot tell apart explain the gap",
+    "partial": "the causes are real, and something besides them is missing",
+    "unknown": "something is missing that no effect of the library explains",
+    "unidentifiable": "the data do not fix the parameters of the model without any cause",
+}
+"""Meaning of each verdict, in one sentence."""
+
+MIN_MOTION_SIGMAS = 6.0
+"""Maximum range of a channel without motion, in sigmas of its noise."""
+MAX_RESIDUAL_SIGMAS_AT_REST = 3.0
+"""Maximum residual of the base model for a recording without motion, in sigmas of the noise."""
+MAX_RELATIVE_STANDARD_ERROR = 0.5
+"""Maximum standard error of an identifiable base parameter, as a share of its bounds."""
+NOISE_TOLERANCE = 0.05
+"""Maximum relative excess of the residual over specified noise; no sensor is known better."""
+EXCESS_STANDARD_ERRORS = 4.0
+"""Maximum further excess of the residual, in standard errors of its finite-sample RMS."""
+MAX_AUTOCORRELATED_NOISE_RATIO = 7.0
+"""Maximum ratio of the residual to an estimated noise floor that AR(1) noise may explain.
+
+A larger ratio would require a correlation over 30 samples, which no sensor noise has.
+"""
+STRUCTURE_P_VALUE_THRESHOLD = 1e-3
+"""P-value threshold of the lack-of-fit test if the recording specifies its noise."""
+STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE = 1e-4
+"""P-value threshold of the lack-of-fit test if noise is estimated, as it may be autocorrelated."""
+EFFECT_P_VALUE_THRESHOLD = 0.003
+"""P-value threshold for accepting an effect."""
+HELD_OUT_EXCESS_THRESHOLD = 0.5
+"""Excess on held-out runs above which an effect must reduce it clearly."""
+MIN_HELD_OUT_IMPROVEMENT = 0.1
+"""Minimum relative reduction of the held-out excess that is a clear reduction."""
+INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO = 7.0
+"""Minimum difference in twice the log-likelihood of distinguishable models: odds of 33 to 1."""
+INDISTINGUISHABLE_EXCESS_RATIO = 1.2
+"""Maximum ratio of excesses of indistinguishable causes, if the residual has structure."""
+NEGLIGIBLE_EXCESS = 0.1
+"""Minimum excess in ratios of excesses; smaller values are replaced by it."""
+MIN_GAP_CLOSED = 0.7
+"""Minimum share of the discrepancy that effects must remove to be its explanation."""
+UNSEEN_EFFECT_EXCESS = 0.5
+"""Minimum excess on held-out runs that shows something the fitted runs do not."""
+EARLY_STOP_MEANINGS: Mapping[VerdictName, str] = {
+    "partial": "the causes are real, and what else is missing was not asked to the end",
+    "unknown": "the search was ended before it could say what is missing",
+}
+"""Meaning of each verdict of a search that ended early; such a search has no other verdicts."""
+OPEN: str = "a cause is found, but a number of it lies at a bound or has no finite interval"
+"""Meaning of `partial` if a coefficient of a cause is at a bound or has no finite interval."""
+BORDERING: str = (
+    "a cause is found, but a base parameter ends at a bound of its range, "
+    "and the cause may stand for a value beyond it"
+)
+"""Meaning of `partial` if a base parameter is at a bound of its range."""
+FAULTY: str = "the recording states a unit or a sign wrongly; correct it before causes are searched"
+"""Meaning of `make_unknown_name_error` for a recording with a wrong unit or sign."""
+REQUIRED_QUESTIONS: Collection[str] = frozenset({"structure", "alternatives"})
+"""Questions that need not be answered for a cause to be accepted."""
+
+
+def is_motionless(ranges: Array, left: Array, sigma: Array, touched: bool) -> bool:
+    """Return whether a recording shows no motion and the model expects none.
+
+    Both are required, because a body that rests where it should fall is a discrepancy.
+
+    Args:
+        ranges: (C,) maximum minus minimum of each channel.
+        left: (C,) standard deviation of the residual of the base model, in the unit of the channel.
+        sigma: (C,) noise floor in the unit of the channel.
+        touched: whether any base parameter changes the simulated runs.
+    """
+    still = bool(
+        (ranges < MIN_MOTION_SIGMAS * sigma).all()
+        and (left < MAX_RESIDUAL_SIGMAS_AT_REST * sigma).all()
+    )
+    # A completely constant recording contains no information, whatever the model expects.
+    return (still and not touched) or not ranges.any()
+
+
+def is_identified(sd: float, low: float, high: float) -> bool:
+    """Return whether the data determine a base parameter.
+
+    Bounds are what is physically possible, so a standard error of half their width means almost no
+    information.
+
+    Args:
+        sd: standard error of the parameter.
+        low: lower bound.
+        high: upper bound.
+    """
+    return sd < MAX_RELATIVE_STANDARD_ERROR * (high - low)
+
+
+def exceeds_noise(excess: float, error: float, stated: bool) -> bool:
+    """Return whether the residual of a channel exceeds its noise significantly.
+
+    Args:
+        excess: RMS residual in units of the noise floor.
+        error: relative standard error of this RMS.
+        stated: whether the recording specifies the noise; an estimated floor assumes white noise
+            and may be several times too small.
+    """
+    return excess > (
+        1.0 + NOISE_TOLERANCE + EXCESS_STANDARD_ERRORS * error
+        if stated
+        else MAX_AUTOCORRELATED_NOISE_RATIO
+    )
+
+
+def get_structure_threshold(stated: bool) -> float:
+    """Return the p-value threshold of the lack-of-fit test.
+
+    Args:
+        stated: whether the noise of all channels is specified.
+    """
+    return STRUCTURE_P_VALUE_THRESHOLD if stated else STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE
+
+
+def has_structure(p_value: float, level: float, loud: Sequence[str]) -> bool:
+    """Return whether the residual has structure, by the lack-of-fit test or by its size.
+
+    Each test misses something: a cause that is not a force may not resemble one, and a small force
+    does not exceed the noise.
+
+    Args:
+        p_value: p-value of the best force of any shape.
+        level: threshold of this p-value.
+        loud: names of channels whose residual exceeds their noise.
+    """
+    return p_value < level or len(loud) > 0
+
+
+def is_unexplained(structure: bool, chance: float) -> bool:
+    """Return whether a model lacks something: a structure in the residual, or a library effect.
+
+    Args:
+        structure: whether the residual has structure.
+        chance: p-value of the best score of the library.
+    """
+    return structure or chance < EFFECT_P_VALUE_THRESHOLD
+
+
+def improves_held_out(merits: tuple[float, float], excesses: tuple[float, float]) -> bool:
+    """Return whether an effect improves the prediction of held-out runs.
+
+    Far from the noise, the excess must decrease clearly, because a small gain in merit may only
+    mimic another missing effect.
+
+    Args:
+        merits: merit without the effect, and with it.
+        excesses: excess without the effect, and with it.
+    """
+    # Near the noise only the merit decides, because 10 % of a very small excess is meaningless.
+    before, after = excesses
+    return merits[1] > merits[0] and (
+        before < HELD_OUT_EXCESS_THRESHOLD or after < (1.0 - MIN_HELD_OUT_IMPROVEMENT) * before
+    )
+
+
+def is_indistinguishable(behind: float) -> bool:
+    """Return whether a model is indistinguishable from a better one.
+
+    Args:
+        behind: difference in twice the log-likelihood.
+    """
+    return behind < INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+
+
+def convert_excess_ratio(ratios: Sequence[float]) -> float:
+    """Return the distance between two models on the scale of `is_indistinguishable`, from their excesses.
+
+    A ratio of excesses of `INDISTINGUISHABLE_EXCESS_RATIO` is equivalent to
+    `INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO`:
+
+        behind = SWITCH mean(log ratios) / log SIMILAR                                         (1)
+
+    Args:
+        ratios: excess of the model divided by that of the other one, for each part of the data.
+    """
+    return (
+        INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+        * float(np.mean(np.log(ratios)))
+        / float(np.log(INDISTINGUISHABLE_EXCESS_RATIO))
+    )  # (1)
+
+
+def compute_excess_ratio(excess: float, other: float) -> float:
+    """Return the ratio of two excesses, each at least `NEGLIGIBLE_EXCESS`."""
+    # For two models at the noise floor, the ratio is random and may be arbitrarily large.
+    return max(excess, NEGLIGIBLE_EXCESS) / max(other, NEGLIGIBLE_EXCESS)
+
+
+def explains_gap(closed: float) -> bool:
+    """Return whether effects that remove this share of the discrepancy explain it.
+
+    Below the threshold they may be real, but the main cause is not in the library.
+    """
+    return not closed < MIN_GAP_CLOSED
+
+
+def misses_held_out_gap(before: float, after: float) -> bool:
+    """Return whether held-out runs show a discrepancy that the model does not remove.
+
+    In this case something acts there that the fitted runs do not show: the excess is too large, or
+    too little of the excess of the base model is removed.
+
+    Args:
+        before: excess of the base model on held-out runs.
+        after: excess of the extended model on held-out runs.
+    """
+    closed = before - max(after, 0.0)
+    # The comparison is negated, so that the NaN of a failed simulation counts as missed.
+    return not after < UNSEEN_EFFECT_EXCESS or (
+        before > UNSEEN_EFFECT_EXCESS and closed < MIN_GAP_CLOSED * before
+    )
+
+
+@dataclass(frozen=True)
+class DiagnosisState:
+    """Answers to all questions, from which the verdict follows.
+
+    Attributes:
+        fixed: whether the data determine the sensitive base parameters.
+        causes: number of causes found.
+        alternatives: whether at least one cause has an indistinguishable alternative.
+        closed: share of the discrepancy on the fitted runs that the causes remove.
+        unexplained: whether the model with the causes still lacks something on the fitted runs.
+        missed: whether held-out runs show a discrepancy that the model does not remove.
+    """
+
+    fixed: bool = True
+    causes: int = 0
+    alternatives: bool = False
+    closed: float = 0.0
+    unexplained: bool = False
+    missed: bool = False
+
+
+def decide_verdict(state: DiagnosisState) -> VerdictName:
+    """Return the verdict for the given answers; the first rule that applies decides."""
+    # If the base model is not determined, every cause could be a wrong parameter value.
+    if not state.fixed:
+        return "unidentifiable"
+    incomplete = state.unexplained or state.missed
+    if not state.causes:
+        return "unknown" if incomplete else "adequate"
+    # Causes that leave most of the discrepancy mimic what is missing; they are listed, but not
+    # accepted.
+    if not explains_gap(state.closed):
+        return "unknown"
+    # Incompleteness comes before alternatives, because a set of causes is only valid for a complete
+    # answer.
+    if incomplete:
+        return "partial"
+    return "ambiguous" if state.alternatives else "named"
+
+
+def verdict_of_numbers(verdict: VerdictName, results: bool) -> VerdictName:
+    """Return the verdict when the fitted coefficients of the causes are known.
+
+    A coefficient at a bound of its range or without a finite interval is not a result, so its cause
+    is not named.
+
+    Args:
+        verdict: verdict by all other rules.
+        results: whether every coefficient of the causes without alternatives is a result.
+    """
+    return "partial" if verdict == "named" and not results else verdict
+
+
+def decide_early_stop_verdict(causes: int, closed: float, not_asked: Sequence[str]) -> VerdictName:
+    """Return the verdict of a search that ended early, which claims only what was tested.
+
+    If a question is open, the verdict is neither adequate nor named. Causes are accepted if they
+    were compared with their rivals and on held-out runs; otherwise they are listed, but not
+    accepted.
+
+    Args:
+        causes: number of causes found.
+        closed: share of the discrepancy on the fitted runs that they remove, if the residual is
+            counted as structure.
+        not_asked: the open questions.
+    """
+    stood = all(name in REQUIRED_QUESTIONS for name in not_asked)
+    return "partial" if causes and stood and explains_gap(closed) else "unknown"

@@ -1,0 +1,327 @@
+"""Whitened inner products of residuals and directions, with fitted unknowns projected out.
+
+The residual e, the directions D and the Jacobian J are whitened by W(phi), an AR(1) model, run by
+run; phi is common to all channels. W'W is tridiagonal. With samples a_t, b_t of two columns, zero
+where no sample exists, and n_t the number of missing neighbours of t,
+
+    (W a)'(W b) = ((1 + phi^2) sum a_t b_t - phi sum a_t (b_t-1 + b_t+1) - phi^2 sum n_t a_t b_t)
+                  / (1 - phi^2)                                                                (1)
+
+Three sums of products therefore serve every phi; the last one needs only the ends of runs. The part
+of the inner product of two columns a and b that parameters and initial states absorb is projected
+out by a Schur complement, first for the initial states of each run, then for the parameters of all
+runs (Frisch-Waugh-Lovell theorem). With L a root of the inverse, L L' = (J'J)^-1:
+
+    <a, b> = a'b - (L'J'a)'(L'J'b)                                                             (2)
+
+Directions are multiplied with each other only if they act together, so the cost is proportional to
+the number of directions, samples and residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask
+from bench.diagnosis.evaluation.run_evaluator import Indices
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.search.lagged_sums import (
+    LaggedSums,
+    RunSegment,
+    SegmentColumns,
+    add_cross_products,
+    add_self_products,
+    count_missing_neighbours,
+    select_run,
+)
+from sims.core.simulator import Array
+
+MIN_RESIDUAL_SHARE = 1e-12
+"""Minimum share of the sum of squares of a direction that remains after the projection.
+
+A direction with less is absorbed by parameters and initial states.
+"""
+RANK_TOLERANCE = 1e-9
+"""Minimum eigenvalue of scaled products that counts, as a share of the largest eigenvalue."""
+MAX_CHUNK_SIZE = 400_000
+"""Maximum size of an array in one section, in numbers, so that it fits in the CPU cache."""
+MIN_CHUNK_SAMPLES = 64
+"""Minimum number of samples per section, so that the overhead of a section is small."""
+
+
+class _ReducedDesign(NamedTuple):
+    """A design after whitening and projection.
+
+    Attributes:
+        states: (R, s, s) roots of the inverse normal matrices of the initial states.
+        by_states: (R s, q + K) L'J'a of eq. (2) for the initial states, of parameters and
+            directions.
+        own: (q, q) root for the parameters.
+        by_own: (q, K) L'J'a of eq. (2) for the parameters, of directions.
+        grams: (n, k, k) products of directions in each block.
+        acting: (K,) mask of directions that are not absorbed.
+    """
+
+    states: Array
+    by_states: Array
+    own: Array
+    by_own: Array
+    grams: list[Array]
+    acting: Mask
+
+
+class WhiteningDesign:
+    """Jacobian and directions of one model, as needed for products with any residuals.
+
+    Attributes:
+        blocks: as given.
+
+    Args:
+        at: the model.
+        directions: (R, T, C, K) change of the runs by each direction.
+        seen: (R, T, C) mask of available samples.
+        sigma: (C,) weights of the channels.
+        blocks: arrays (n, k) of column indices; the directions in a row act together.
+    """
+
+    def __init__(
+        self,
+        at: TrajectoryFit,
+        directions: Array,
+        seen: Mask,
+        sigma: Array,
+        blocks: Sequence[Indices],
+    ) -> None:
+        self.blocks = list(blocks)
+        self._own = at.free.size
+        self._jacobian = np.moveaxis(at.jacobian, 3, 0)
+        self._directions = np.moveaxis(directions, 3, 0)
+        self._weights = seen / sigma
+        self._lacking = count_missing_neighbours(seen)
+        size, runs, *_ = self._jacobian.shape
+        count = len(self._directions)
+        self._normal = LaggedSums.zeros(runs, size, size)
+        self._mixed = LaggedSums.zeros(runs, size, count)
+        self._powers = LaggedSums.zeros(count)
+        self._grams = [LaggedSums.zeros(*block.shape, block.shape[1]) for block in self.blocks]
+        self._known: dict[float, _ReducedDesign] = {}
+        for place in self._places():
+            self._add(place)
+
+    def _places(self) -> Iterator[RunSegment]:
+        """Yield all runs in sections that fit in the CPU cache."""
+        count, runs, length, channels = self._directions.shape
+        step = max(MAX_CHUNK_SIZE // (max(count, 1) * channels), MIN_CHUNK_SAMPLES)
+        for run in range(runs):
+            for begin in range(0, length, step):
+                end = min(begin + step, length)
+                without = self._lacking[run, begin:end].ravel()
+                edge = np.flatnonzero(without)
+                yield RunSegment(run, begin, end, edge, without[edge])
+
+    def _columns(self, values: Array, place: RunSegment, beside: bool = True) -> SegmentColumns:
+        """Return the columns of values (k, R, T, C); neighbours only if requested."""
+        run, begin, end = place.run, place.begin, place.end
+        rows = len(values)
+        # Include one more sample on either side, as a neighbour of the outermost samples.
+        first, last = (max(begin - 1, 0), end + 1) if beside else (begin, end)
+        around = values[:, run, first:last] * self._weights[run, first:last]
+        now = around[:, begin - first : end - first]
+        near = np.zeros_like(now)
+        if beside:
+            former = around[:, : end - first - 1]
+            near[:, now.shape[1] - former.shape[1] :] += former
+            latter = around[:, begin - first + 1 :]
+            near[:, : latter.shape[1]] += latter
+        # The shape is written out, because -1 is ambiguous if there are no rows.
+        size = rows, now.shape[1] * now.shape[2]
+        flat = now.reshape(size)
+        return SegmentColumns(flat, near.reshape(size), flat[:, place.edge])
+
+    def _add(self, place: RunSegment) -> None:
+        """Add the products of one section."""
+        own = self._columns(self._jacobian, place)
+        some = self._columns(self._directions, place)
+        add_cross_products(select_run(self._normal, place.run), own, own, place)
+        add_cross_products(select_run(self._mixed, place.run), own, some, place)
+        add_self_products(self._powers, some, place)
+        for block, parts in zip(self.blocks, self._grams, strict=True):
+            # The square of a single column is already known.
+            if block.shape[1] > 1:
+                members = SegmentColumns(some.now[block], some.near[block], some.edge[block])
+                add_cross_products(parts, members, members, place)
+
+    def compute_products(self, *residuals: Array) -> tuple[LaggedSums, LaggedSums, LaggedSums]:
+        """Compute products of residuals with themselves, with the Jacobian, and with directions.
+
+        Args:
+            *residuals: arrays (S_i, R, T, C) of residuals, which are concatenated to S residuals.
+
+        Returns:
+            Products of residuals with themselves (S,), with the Jacobian per run (R, q + s, S), and
+            of directions with residuals (K, S).
+        """
+        size, runs, *_ = self._jacobian.shape
+        samples = sum(len(some) for some in residuals)
+        squares = LaggedSums.zeros(samples)
+        shared = LaggedSums.zeros(runs, size, samples)
+        cross = LaggedSums.zeros(len(self._directions), samples)
+        for place in self._places():
+            # Concatenate section by section, because whole copies would double the memory.
+            parts = [self._columns(some, place) for some in residuals]
+            left = SegmentColumns(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
+            own = self._columns(self._jacobian, place)
+            some = self._columns(self._directions, place, beside=False)
+            add_self_products(squares, left, place)
+            add_cross_products(select_run(shared, place.run), own, left, place)
+            add_cross_products(cross, some, left, place)
+        return squares, shared, cross
+
+    def project_out(self, residuals: Array) -> Array:
+        """Return the residuals of a least-squares fit of parameters and initial states.
+
+        Args:
+            residuals: (S, R, T, C) residuals before the fit.
+        """
+        known = self.reduce(0.0)
+        q = self._own
+        weighted = self._jacobian * self._weights
+        shared = np.stack(
+            [
+                _flat(own) @ _flat(residuals[:, run] * self._weights[run]).T
+                for run, own in enumerate(np.moveaxis(weighted, 1, 0))
+            ]
+        )
+        by_states, by_own = _project_residuals(known, shared)
+        # Back substitution: first coefficients of the parameters, then of the initial states of
+        # each run.
+        parameters = known.own @ by_own
+        rest = by_states - known.by_states[:, :q] @ parameters
+        runs, size, _ = known.states.shape
+        states = known.states @ rest.reshape(runs, size, len(residuals))
+        result = np.empty_like(residuals)
+        for run in range(runs):
+            coefficients = np.concatenate([parameters, states[run]])
+            followed = coefficients.T @ _flat(self._jacobian[:, run])
+            result[:, run] = residuals[:, run] - followed.reshape(residuals[:, run].shape)
+        return np.where(self._weights > 0, result, 0.0)
+
+    def reduce(self, phi: float) -> _ReducedDesign:
+        """Return the design whitened with a correlation and projected; the result is cached."""
+        if phi not in self._known:
+            self._known[phi] = self._reduce(phi)
+        return self._known[phi]
+
+    def _reduce(self, phi: float) -> _ReducedDesign:
+        """Whiten and project the design for one correlation."""
+        q = self._own
+        normal = self._normal.combine(phi)
+        mixed = self._mixed.combine(phi)
+        powers = self._powers.combine(phi)
+
+        # Eq. (2) for the initial states of each run, then for the parameters.
+        states = _matrix_root(normal[:, q:, q:])
+        others = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
+        by_states = _project_directions(states, others)
+        by_parameters, by_directions = by_states[:, :q], by_states[:, q:]
+        left = normal[:, :q, :q].sum(axis=0) - by_parameters.T @ by_parameters
+        own = _matrix_root(left)
+        by_own = own.T @ (mixed[:, :q].sum(axis=0) - by_parameters.T @ by_directions)
+
+        # Only rounding remains of absorbed directions, which would explain residuals at random.
+        taken = np.concatenate([by_directions, by_own])
+        remaining = powers - np.einsum("ak,ak->k", taken, taken)
+        acting = remaining > MIN_RESIDUAL_SHARE * powers
+        remaining = np.where(acting, remaining, 0.0)
+        grams = []
+        for block, parts in zip(self.blocks, self._grams, strict=True):
+            if block.shape[1] == 1:
+                grams.append(remaining[block][:, :, None])
+                continue
+            columns = np.moveaxis(taken[:, block], 0, 2)
+            gram = parts.combine(phi) - columns @ columns.transpose(0, 2, 1)
+            # Rounding makes the two halves differ, and the eigensolver reads only one of them.
+            symmetric = (gram + gram.transpose(0, 2, 1)) / 2.0
+            both = acting[block][:, :, None] & acting[block][:, None, :]
+            grams.append(np.where(both, symmetric, 0.0))
+        return _ReducedDesign(states, by_states, own, by_own, grams, acting)
+
+
+class InnerProducts:
+    """Inner products (2) of residuals and directions, with fitted unknowns projected out.
+
+    Args:
+        design: the Jacobian of the model and the directions.
+        *residuals: arrays (S_i, R, T, C) of residuals, zero where no sample exists.
+    """
+
+    def __init__(self, design: WhiteningDesign, *residuals: Array) -> None:
+        self._design = design
+        self._squares, self._shared, self._cross = design.compute_products(*residuals)
+
+    def project(self, phi: float) -> tuple[Array, list[Array], Array]:
+        """Return the products of eq. (2) after whitening with a correlation.
+
+        Args:
+            phi: the AR(1) correlation.
+
+        Returns:
+            Sums of squares (S,) of the residuals, products (n, k, k) of the directions in each
+            block, and products of directions with residuals (K, S).
+        """
+        known = self._design.reduce(phi)
+        q = len(known.own)
+        by_states, by_own = _project_residuals(known, self._shared.combine(phi))
+        taken = np.concatenate([by_states, by_own])
+        total = self._squares.combine(phi) - np.einsum("as,as->s", taken, taken)
+        others = np.concatenate([known.by_states[:, q:], known.by_own])
+        cross = self._cross.combine(phi) - others.T @ taken
+        return np.maximum(total, 0.0), known.grams, np.where(known.acting[:, None], cross, 0.0)
+
+
+def _flat(values: Array) -> Array:
+    """Return rows (k, T, C) with all channels in one row."""
+    return values.reshape(len(values), -1)
+
+
+def _project_residuals(known: _ReducedDesign, shared: Array) -> tuple[Array, Array]:
+    """Return L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S).
+
+    Args:
+        known: the whitened design.
+        shared: (R, q + s, S) products of the Jacobian with residuals.
+    """
+    q = len(known.own)
+    # First the initial states of each run, then the parameters.
+    by_states = _project_directions(known.states, shared[:, q:])
+    left = shared[:, :q].sum(axis=0) - known.by_states[:, :q].T @ by_states
+    return by_states, known.own.T @ left
+
+
+def _project_directions(roots: Array, products: Array) -> Array:
+    """Return L'J'a of eq. (2), (R s, n), from products (R, s, n)."""
+    runs, size, count = products.shape
+    return (roots.transpose(0, 2, 1) @ products).reshape(runs * size, count)
+
+
+def _matrix_root(normal: Array) -> Array:
+    """Return L of eq. (2) for positive semidefinite matrices (..., s, s).
+
+    Eigenvectors with very small eigenvalues are omitted.
+    """
+    if not normal.shape[-1]:
+        return normal
+    # Scale the columns to unit length, so that the cutoff does not depend on their units.
+    powers = np.diagonal(normal, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.maximum(powers, 0.0))
+    # A row of zeros remains zero, because it is divided by infinity.
+    scale = np.where(scale > 0, scale, np.inf)[..., None]
+    values, vectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
+    largest = np.maximum(values[..., -1:], 1e-300)
+    counted = values > RANK_TOLERANCE * largest
+    root = np.where(counted, 1.0 / np.sqrt(np.where(counted, values, 1.0)), 0.0)
+    result: Array = vectors * root[..., None, :] / scale
+    return result

@@ -1,0 +1,177 @@
+"""Cross-validation over runs: refit each model without one run, and predict that run.
+
+Leave-one-out cross-validation with a run as the unit (M. Stone, J. R. Stat. Soc. B 36(2), 111,
+1974, doi:10.1111/j.2517-6161.1974.tb00994.x), because samples of one run depend on each other. It
+replaces held-out runs where a recording has too few runs to spare one: the reported model is fitted
+to all runs, and its error is measured on predictions of runs that were not used in the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import Indices, RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart, KnownJacobian, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.validation.held_out_runs import HeldOutFit, HeldOutRuns, merit_of
+from sims.core.simulator import Array
+
+MAX_STEPS = 8
+"""Maximum number of Levenberg-Marquardt steps of a refit, which starts from the fit to all runs."""
+SHOWN = 1.0
+"""Minimum change of a fold's runs, as the norm over all samples in noise standard deviations, for
+an effect to be supported by these runs.
+"""
+
+
+class CrossValidation:
+    """Validation that predicts each run with models that are refitted to the other runs.
+
+    Args:
+        world: Run evaluator of all runs; each run has the number of its fold.
+        noise: Noise that weights the channels.
+
+    Attributes:
+        world: Run evaluator of all runs.
+        noise: Noise that weights the channels.
+        seen: (R, T, C) mask of the available samples.
+    """
+
+    is_cross_validation = True
+
+    def __init__(self, world: RunEvaluator, noise: NoiseModel) -> None:
+        self.world = world
+        self.noise = noise
+        self.seen: Mask = np.isfinite(world.observed)
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations made for the folds alone."""
+        if "_folds" not in self.__dict__:
+            return 0
+        return sum(fold.fitting.simulations + fold.left_out.simulations for fold in self._folds)
+
+    def close(self) -> None:
+        """Close the simulators of the folds; the run evaluator of all runs stays open."""
+        if "_folds" in self.__dict__:
+            for fold in self._folds:
+                fold.fitting.close()
+                fold.left_out.close()
+
+    def validate(self, fits: Sequence[TrajectoryFit]) -> list[HeldOutFit]:
+        """Predict each run with every model, refitted to the other runs.
+
+        Only the initial states of the predicted run are estimated from it. An effect that the other
+        runs do not support is switched off for the prediction.
+
+        Args:
+            fits: Models as fitted to all runs.
+
+        Returns:
+            Predictions of all runs by each model.
+        """
+        shape = self.world.observed.shape
+        simulated = np.full((len(fits), *shape), np.nan)
+        states = np.stack([fit.states for fit in fits])
+        free = np.zeros(len(fits))
+        for number, fold in enumerate(self._folds):
+            self.world.watch.stage(f"cross-validation, fold {number + 1} of {len(self._folds)}")
+            thetas = self._refitted(fold, fits)
+            predicted = HeldOutRuns(fold.left_out, self.noise).fit_initial_states(thetas)
+            for i, one in enumerate(predicted):
+                simulated[i, fold.rows, : one.simulated.shape[1]] = one.simulated
+                states[i, fold.rows] = one.states
+                free[i] += one.freedom
+        return [
+            self._measured(*result) for result in zip(simulated, states, free.tolist(), strict=True)
+        ]
+
+    def _measured(self, simulated: Array, states: Array, free: float) -> HeldOutFit:
+        if not np.isfinite(simulated[self.seen]).all():
+            return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
+        merit = merit_of(self.world.observed, simulated, free)
+        return HeldOutFit(simulated, merit, states, free)
+
+    @cached_property
+    def _folds(self) -> list[_Fold]:
+        """The folds; each has run evaluators for its own runs, with the parameters of the whole."""
+        numbers = np.array([run.fold for run in self.world.runs])
+        folds = []
+        for number in sorted(set(numbers.tolist())):
+            rows = np.flatnonzero(numbers == number)
+            others = np.flatnonzero(numbers != number)
+            folds.append(_Fold(rows, others, self._of_runs(others), self._of_runs(rows)))
+        return folds
+
+    def _of_runs(self, rows: Indices) -> RunEvaluator:
+        """Make a run evaluator of a subset of the runs."""
+        world = self.world.with_runs([self.world.runs[row] for row in rows])
+        length = world.observed.shape[1]
+        if self.world.correction is not None:
+            world.correction = self.world.correction[rows, :length]
+        if self.world.derivatives is not None:
+            world.derivatives = self.world.derivatives[rows, :length]
+        # Workers that are started for one fold also know the other folds.
+        world.crew.register(world)
+        return world
+
+    def _refitted(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
+        """Refit each model to the runs that a fold keeps, and return its parameters (P,)."""
+        base = set(self.world.base.tolist())
+        # All models of a search keep the same parameters fixed at their nominal values.
+        frozen = frozenset(base - set(fits[0].free.tolist()))
+        length = fold.fitting.observed.shape[1]
+        starts = []
+        for fit in fits:
+            jacobian = fit.jacobian[fold.others, :length, :, : fit.free.size]
+            known = KnownJacobian(fit.free, jacobian)
+            starts.append(FitStart(fit.effects, fit.theta, fit.states[fold.others], known))
+        refits = TrajectoryFitter(fold.fitting, self.noise, frozen).fit_models(starts, MAX_STEPS)
+        return self._without_unsupported(fold.fitting, refits)
+
+    def _without_unsupported(
+        self, world: RunEvaluator, fits: Sequence[TrajectoryFit]
+    ) -> list[Array]:
+        """Return parameters (P,) of each model, with unsupported effects set to zero."""
+        thetas = [fit.theta.copy() for fit in fits]
+        trials = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
+        if not trials:
+            return thetas
+        runs = len(world.tracks)
+        lanes = np.stack([fits[i].theta for i, _ in trials])
+        for lane, (_, name) in zip(lanes, trials, strict=True):
+            lane[world.get_coefficient_indices(name)] = 0.0
+        without = world.simulate(
+            np.repeat(lanes, runs, axis=0),
+            np.tile(np.arange(runs), len(trials)),
+            np.concatenate([fits[i].states for i, _ in trials]),
+        ).reshape(len(trials), *world.observed.shape)
+        seen = np.isfinite(world.observed)
+        for (i, name), simulated in zip(trials, without, strict=True):
+            change = ((fits[i].simulated - simulated) / self.noise.sigma)[seen]
+            # If the simulation fails without the effect, the change is NaN and the effect is kept.
+            if np.linalg.norm(change) < SHOWN:
+                thetas[i][world.get_coefficient_indices(name)] = 0.0
+        return thetas
+
+
+@dataclass(frozen=True)
+class _Fold:
+    """Fold: the runs that are left out of the fits and predicted, and the runs that are fitted.
+
+    Attributes:
+        rows: Indices of the runs that are left out.
+        others: Indices of the runs that are fitted.
+        fitting: Run evaluator of the fitted runs.
+        left_out: Run evaluator of the runs that are left out.
+    """
+
+    rows: Indices
+    others: Indices
+    fitting: RunEvaluator
+    left_out: RunEvaluator

@@ -1,0 +1,392 @@
+"""Gain of an extended model on held-out runs, and confidence intervals of fitted parameters.
+
+The share of the gap closed is, for the RMS errors b before and a after and the noise floor n,
+
+    closed = (b - max(a, n)) / (b - n)                                                         (1)
+
+The covariance of the fitted parameters is the inverse of the curvature of the sum of squares after
+the initial states of every run r are eliminated (W. H. Greene, Econometric Analysis, chapter 9;
+generalised least squares). With the whitened Jacobian J_r = [A_r B_r] by parameters and initial
+states, and the prior standard deviation sigma_0 of the initial states,
+
+    covariance = (sum_r A_r' A_r - A_r' B_r (B_r' B_r + diag sigma_0^-2)^-1 B_r' A_r)^-1       (2)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel, whiten
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.finite_differences import compute_difference_steps
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.fitting.gauss_newton import compute_schur_complement, hold_known_states
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
+from sims.core.simulator import Array
+
+Z95 = 1.959964
+"""Half the width of the 95 % interval of a normal distribution, in standard deviations."""
+BOOTSTRAP_RESAMPLES = 2000
+"""Number of bootstrap samples."""
+SINGLE_RUN_SEGMENTS = 10
+"""Number of segments into which a run is divided for resampling if there are too few runs."""
+MAX_INTERVAL_WIDTH = 4.0
+"""Maximum width of an interval, as a multiple of the parameter's range or value; a wider interval
+means that the data do not bound the parameter.
+"""
+MIN_CURVATURE = 1e-200
+"""Minimum curvature of a parameter, for parameters to which the data are insensitive. It is small,
+but division by it does not overflow.
+"""
+STATE_REGULARISATION = 1e-12
+"""Ridge added to the curvature of each initial state, as a fraction of it, so that collinear
+initial states remain solvable.
+"""
+MIN_REPORTED_GAIN = -9.0
+"""Lower limit of the reported share of the gap closed; for a failed model the exact value has no
+meaning.
+"""
+
+
+def compute_central_jacobian(
+    world: RunEvaluator, fit: TrajectoryFit, noise: NoiseModel
+) -> TrajectoryFit:
+    """Compute the Jacobian of a fit by central differences.
+
+    One-sided differences suffice for the steps of a fit, but their curvature makes parameters look
+    distinguishable that are not.
+
+    Args:
+        world: Run evaluator of the runs.
+        fit: Fit with a one-sided Jacobian.
+        noise: Noise that weights the channels.
+
+    Returns:
+        The fit with the new Jacobian.
+    """
+    q = fit.free.size
+    runs, size = fit.states.shape
+    bounds = _bounds_around(world, fit)
+    ranges = bounds[:, 1] - bounds[:, 0]
+    steps = compute_difference_steps(fit.jacobian, noise, ranges)
+    # Derivatives by initial states from a linearisation are not one-sided differences.
+    if world.has_linearisation:
+        steps = steps[:q]
+    theta, states = _both_sides(fit, steps, bounds)
+
+    # One call simulates both sides and all runs, because the engine steps a batch at once.
+    vectors = theta.reshape(-1, fit.theta.size)
+    rows = np.repeat(vectors, runs, axis=0)
+    lanes = np.tile(np.arange(runs), len(vectors))
+    simulated = world.simulate(rows, lanes, states.reshape(-1, size))
+    below, above = simulated.reshape(2, steps.size, *fit.simulated.shape)
+
+    # Row j has changed parameter j, so the widths are on the diagonal.
+    lower, upper = theta[:, :q, fit.free]
+    moved = np.diagonal(upper - lower)
+    widths = np.concatenate([moved, 2.0 * steps[q:]])
+    jacobian = np.moveaxis(above - below, 0, -1) / widths
+    # A simulation that failed on one side gives no slope.
+    jacobian = np.nan_to_num(jacobian, nan=0.0, posinf=0.0, neginf=0.0)
+    own = fit.jacobian[..., q:] if world.has_linearisation else jacobian[..., q:]
+    return replace(fit, jacobian=np.concatenate([jacobian[..., :q], own], axis=3))
+
+
+def get_central_jacobian(models: ModelSet, fit: TrajectoryFit) -> TrajectoryFit:
+    """Return the result of `compute_central_jacobian` for a fit; it is computed once and cached.
+
+    Args:
+        models: Models with the run evaluator, the noise and the cache.
+        fit: Fit with a one-sided Jacobian.
+    """
+    known = models.derived.get(id(fit))
+    # An id can be reused after an object is deleted, so the object itself is compared.
+    if known is None or known[0] is not fit:
+        known = models.derived[id(fit)] = (
+            fit,
+            compute_central_jacobian(models.world, fit, models.noise),
+        )
+    return known[1]
+
+
+def _both_sides(fit: TrajectoryFit, steps: Array, bounds: Array) -> tuple[Array, Array]:
+    """Build the parameters (2, n, P) and initial states (2, n, R, s) of the central differences.
+
+    The first axis is the lower and the upper side. Row j of the first n parameters and states has
+    number j moved by its step.
+    """
+    q = fit.free.size
+    theta = np.tile(fit.theta, (2, len(steps), 1))
+    states = np.tile(fit.states, (2, len(steps), 1, 1))
+    for side, sign in enumerate((-1.0, 1.0)):
+        shifts = sign * steps
+        for j, place in enumerate(fit.free):
+            moved = fit.theta[place] + shifts[j]
+            # At a bound the step is one-sided, so the actual difference is used as the divisor.
+            theta[side, j, place] = np.clip(moved, *bounds[j])
+        for j, shift in enumerate(shifts[q:]):
+            states[side, q + j, :, j] += shift
+    return theta, states
+
+
+def _bounds_around(world: RunEvaluator, fit: TrajectoryFit) -> Array:
+    """Return the bounds (q, 2) of the fitted parameters, widened to contain the fit.
+
+    Coefficients may be outside their plausible range.
+    """
+    values = fit.theta[fit.free]
+    bounds = [world.parameters[i].bounds for i in fit.free]
+    # The shape is set explicitly because there may be no parameters.
+    table = np.array(bounds).reshape(-1, 2)
+    low, high = table.T
+    lowest = np.minimum(low, values)
+    highest = np.maximum(high, values)
+    return np.stack([lowest, highest], 1)
+
+
+def compute_covariance(models: ModelSet, model: FittedModel) -> Array:
+    """Compute the covariance (q, q) of the fitted parameters, (2), with autocorrelated noise."""
+    found = compute_fisher_blocks(models, model)
+    own = found.own.sum(axis=0)
+    # The Schur complement that solves a step of the fit also eliminates the initial states here.
+    left, _ = compute_schur_complement(own, found.cross, found.inner)
+    return invert_scaled(own, left)
+
+
+def invert_scaled(own: Array, left: Array) -> Array:
+    """Invert the curvature after elimination of the initial states.
+
+    Directions that the data do not identify get a huge variance.
+
+    Args:
+        own: (q, q) curvature by the parameters alone, the first sum of (2); it scales the
+            inversion.
+        left: (q, q) curvature after elimination of the initial states.
+    """
+    # Parameters of any unit are scaled alike, so that the cut-off below means the same for each.
+    powers = np.diagonal(own)
+    scale = np.sqrt(np.maximum(powers, MIN_CURVATURE))
+    units = np.outer(scale, scale)
+    scaled = left / units
+    inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
+    values, vectors = np.linalg.eigh(scaled)
+    lost = values < 1e-12
+    # The pseudo-inverse of an unidentified direction is zero, which would look certain.
+    if lost.any():
+        free = vectors[:, lost]
+        inverse = inverse + (free * 1e12) @ free.T
+    result: Array = inverse / units  # (2)
+    return result
+
+
+class FisherBlocks(NamedTuple):
+    """Blocks of (2) for each run.
+
+    Attributes:
+        noise: Noise used for whitening: the residual of the model.
+        jacobian: (R, n, q + s) whitened derivatives by parameters and by initial states.
+        own: (R, q, q) A' A.
+        cross: (R, q, s) A' B, zero where an initial state is known.
+        inner: (R, s, s) B' B with the prior.
+    """
+
+    noise: NoiseModel
+    jacobian: Array
+    own: Array
+    cross: Array
+    inner: Array
+
+
+def compute_fisher_blocks(models: ModelSet, model: FittedModel) -> FisherBlocks:
+    """Compute the curvature blocks of a fitted model, run by run.
+
+    Args:
+        models: Models with the run evaluator.
+        model: Fitted model; its residual gives the noise.
+    """
+    fit = get_central_jacobian(models, model.fit)
+    # The residual of the model is taken as the noise, whatever the recording specifies.
+    sigma = np.maximum(model.likelihood.sigma, 1e-300)
+    noise = NoiseModel(sigma, model.likelihood.phi)
+    return compute_fisher_blocks_from_jacobian(
+        models.world, fit.jacobian, model.fit.free.size, noise
+    )
+
+
+def compute_fisher_blocks_from_jacobian(
+    world: RunEvaluator, jacobian: Array, q: int, noise: NoiseModel
+) -> FisherBlocks:
+    """Compute the curvature blocks from a Jacobian.
+
+    Args:
+        world: Run evaluator of the runs.
+        jacobian: (R, T, C, q + s) derivatives, those by initial states last.
+        q: Number of parameters in the Jacobian.
+        noise: Noise for whitening.
+    """
+    seen = np.isfinite(world.observed)
+    jacobian = whiten(np.where(seen[..., None], jacobian, 0.0), seen, noise)
+    runs, *_, size = jacobian.shape
+    j = jacobian.reshape(runs, -1, size)
+    normal = np.matmul(j.transpose(0, 2, 1), j)
+    precision = 1.0 / compute_state_prior(world) ** 2
+    # In an unstable motion the derivatives by all initial states may be collinear.
+    powers = np.einsum("rii->ri", normal[:, q:, q:])
+    ridge = STATE_REGULARISATION * powers[:, :, None] * np.eye(powers.shape[1])
+    # A known initial state is not fitted, so it is not eliminated.
+    inner, cross = hold_known_states(
+        normal[:, q:, q:] + np.diag(precision) + ridge,
+        normal[:, :q, q:],
+        world.known,
+    )
+    return FisherBlocks(noise, j, normal[:, :q, :q], cross, inner)
+
+
+def compute_intervals(
+    models: ModelSet, model: FittedModel
+) -> dict[int, tuple[float, float, float]]:
+    """Compute the 95 % interval of each fitted parameter.
+
+    Args:
+        models: Models with the run evaluator.
+        model: Fitted model.
+
+    Returns:
+        Value, low and high by index in the parameter vector; low and high are NaN if the data do
+        not bound the parameter.
+    """
+    variances = np.diagonal(compute_covariance(models, model))
+    # Rounding may make a variance negative.
+    spread = np.sqrt(np.maximum(variances, 0.0))
+    places = model.fit.free.tolist()
+    result = {}
+    for place, sd in zip(places, spread.tolist(), strict=True):
+        value = float(model.fit.theta[place])
+        low, high = models.world.parameters[place].bounds
+        # A value may be far outside its plausible range, and is then the scale itself.
+        size = max(high - low, abs(value))
+        known = np.isfinite(sd) and 2.0 * Z95 * sd < MAX_INTERVAL_WIDTH * size
+        reach = Z95 * sd if known else np.nan
+        result[place] = (
+            value,
+            value - reach,
+            value + reach,
+        )
+    return result
+
+
+@dataclass(frozen=True)
+class HeldOutGain:
+    """Held-out errors and the share of the gap closed.
+
+    Attributes:
+        base: RMS error of the base model, in the unit of the channels.
+        extended: RMS error of the extended model.
+        floor: RMS of the noise.
+        gap_closed: Share of the gap closed (1).
+        low: Lower end of its 95 % interval; NaN if there is none.
+        high: Upper end of its 95 % interval; NaN if there is none.
+    """
+
+    base: float
+    extended: float
+    floor: float
+    gap_closed: float
+    low: float
+    high: float
+
+
+def compute_held_out_gain(
+    world: RunEvaluator,
+    before: Array,
+    after: Array,
+    channels: Sequence[int],
+    floor: float,
+    rng: np.random.Generator,
+    by_stretches: bool = False,
+) -> HeldOutGain:
+    """Compute the share of the gap closed (1), with a bootstrap interval over runs.
+
+    With a single run, or on request, segments of the runs are resampled (D. N. Politis, J. P.
+    Romano 1992).
+
+    Args:
+        world: Run evaluator of the held-out runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+        channels: Indices of the channels that count; they share a unit.
+        floor: RMS of the noise over these channels.
+        rng: Random generator of the resampling.
+        by_stretches: Resample segments of the runs; two or three runs are too few to resample.
+    """
+    sums = _sums(world, before, after, channels, by_stretches)
+    whole = sums.sum(axis=0)
+    before_sum, after_sum, count = whole
+    base = float(np.sqrt(before_sum / count))
+    extended = float(np.sqrt(after_sum / count))
+    # Whole runs are drawn, because samples of one run depend on each other.
+    parts = len(sums)
+    rows = rng.integers(parts, size=(BOOTSTRAP_RESAMPLES, parts))
+    resampled = sums[rows].sum(axis=1)
+    shares = _closed(resampled, floor)
+    low = high = np.nan
+    # All resamples of a single part are equal, and would look certain.
+    if parts > 1:
+        low, high = np.quantile(shares, [0.025, 0.975]).tolist()
+    closed = float(_closed(whole[None], floor)[0])
+    return HeldOutGain(base, extended, floor, closed, low, high)
+
+
+def _sums(
+    world: RunEvaluator, before: Array, after: Array, channels: Sequence[int], by_stretches: bool
+) -> Array:
+    """Sum up each run or segment (n, 3): squared errors before and after, and sample counts."""
+    rows = []
+    for run, part in _parts(world, by_stretches):
+        observed = world.observed[run, part][:, channels]
+        seen = np.isfinite(observed)
+        # A part without samples would be a row of zeros with an undefined error.
+        if not seen.any():
+            continue
+        row = []
+        for simulated in (before, after):
+            there = simulated[run, part][:, channels]
+            error = (observed - there)[seen]
+            row.append(float(error @ error))
+        row.append(float(seen.sum()))
+        rows.append(row)
+    return np.array(rows)
+
+
+def _parts(world: RunEvaluator, by_stretches: bool) -> list[tuple[int, slice]]:
+    """List the parts that are resampled: whole runs, or segments if there are too few runs."""
+    count = len(world.tracks)
+    if count > 1 and not by_stretches:
+        return [(run, slice(None)) for run in range(count)]
+    parts = []
+    for run, length in enumerate(world.lengths.tolist()):
+        samples = np.linspace(0, length, SINGLE_RUN_SEGMENTS + 1).astype(int).tolist()
+        # A run of few samples has empty segments.
+        parts += [(run, slice(a, b)) for a, b in pairwise(samples) if b > a]
+    return parts
+
+
+def _closed(sums: Array, floor: float) -> Array:
+    """Compute the share of the gap closed of each row (n, 3); 0 without a gap."""
+    before, after, counts = sums.T
+    base = np.sqrt(before / counts)
+    extended = np.sqrt(after / counts)
+    gap = base - floor
+    # A model cannot reduce the error below the noise floor.
+    reached = np.maximum(extended, floor)
+    with np.errstate(all="ignore"):
+        share = (base - reached) / gap  # (1)
+    # A gap below rounding errors would give an arbitrary share, and a resample may have no gap.
+    shares = np.where(gap > 1e-3 * floor, share, 0.0)
+    return np.clip(shares, MIN_REPORTED_GAIN, 1.0)

@@ -1,0 +1,252 @@
+"""Held-out runs: predict them with fitted models, and fit only their initial states.
+
+For n samples with f effective initial states, the penalised log-likelihood of a model with
+log-likelihood L is that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136):
+
+    M = 2 log L - f log n                                                                      (1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel, maximise_likelihood
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.model_set import count_identified_states
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from sims.core.simulator import Array
+
+HORIZON_STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
+"""Stages of the fit of initial states: fraction of each run, and maximum number of steps."""
+FOLLOWED = ((1.0, 6),)
+"""Stages of the fit of initial states, as in `HORIZON_STAGES`, for a robot whose runs are filtered. These
+runs begin near their best states.
+"""
+FAR = 1.5
+"""Minimum mean square residual of the nearest model, in noise variances, for which models that
+start from filtered states are also fitted in stages.
+"""
+LINEARISATION_ERROR_TOLERANCE = 0.3
+"""Maximum RMS linearisation error of a motion in units of the noise. Above it, the derivatives by
+the initial states are computed again.
+"""
+MIN_SQUARES_DECREASE = 3.0
+"""Minimum decrease of the sum of squares, in noise variances, by fresh derivatives, for which the
+fits are repeated with derivatives that are computed again before each stage.
+"""
+REFIT_SQUARES_RATIO = 2.0
+"""Ratio of a model's sum of squares to that of the nearest model from which it is refitted on the
+held-out runs.
+"""
+
+
+@dataclass(frozen=True)
+class HeldOutFit:
+    """Prediction of runs with parameters that were fitted to other runs.
+
+    Attributes:
+        simulated: (R, T, C) prediction; NaN if the simulation failed.
+        penalised_log_likelihood: Penalised log-likelihood (1); minus infinity if the simulation
+            failed.
+        states: (R, s) initial states, fitted to these runs.
+        freedom: Effective number of initial states, f in (1).
+    """
+
+    simulated: Array
+    penalised_log_likelihood: float
+    states: Array
+    freedom: float = 0.0
+
+
+class Validation(Protocol):
+    """Protocol for the prediction of runs with models that were fitted to other runs.
+
+    The runs are held-out runs, or all runs in turn (`bench.diagnosis.validation.cross_validation`).
+
+    Attributes:
+        world: Run evaluator of the predicted runs.
+        noise: Noise that weights the channels.
+        seen: (R, T, C) mask of the available samples.
+        is_cross_validation: Whether the reported model is fitted to these runs too.
+    """
+
+    world: RunEvaluator
+    noise: NoiseModel
+    seen: Mask
+    is_cross_validation: bool
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations made for the validation alone."""
+        ...
+
+    def validate(self, fits: Sequence[TrajectoryFit]) -> list[HeldOutFit]:
+        """Predict the runs with each model, given by its fit to the runs for fitting."""
+        ...
+
+    def close(self) -> None:
+        """Release the resources of the simulators."""
+        ...
+
+
+class HeldOutRuns:
+    """Validation on held-out runs, of which only the initial states are fitted.
+
+    Args:
+        world: Run evaluator of the runs, with the effects at the same indices as in the fit.
+        noise: Noise that weights the channels.
+    """
+
+    is_cross_validation = False
+
+    def __init__(self, world: RunEvaluator, noise: NoiseModel) -> None:
+        self.world = world
+        self.noise = noise
+        self.seen: Mask = np.isfinite(world.observed)
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations of the held-out runs."""
+        return self.world.simulations
+
+    def close(self) -> None:
+        """Release the resources of the simulator."""
+        self.world.close()
+
+    def validate(self, fits: Sequence[TrajectoryFit]) -> list[HeldOutFit]:
+        """Predict the held-out runs with each model; see `fit_initial_states`."""
+        return self.fit_initial_states([fit.theta for fit in fits])
+
+    def fit_initial_states(self, thetas: Sequence[Array]) -> list[HeldOutFit]:
+        """Simulate the runs with each parameter vector (P,) and fit their initial states.
+
+        Least squares may converge to a different minimum for similar models, and chance would then
+        decide between them. Models far from the nearest one are therefore fitted again from its
+        initial states, and the better fit counts.
+        """
+        guess = self.world.guess
+        begun = [FitStart((), theta, guess) for theta in thetas]
+        followed = self.world.followed is not None
+        fits = self._fitted(begun, FOLLOWED if followed else HORIZON_STAGES)
+        count = max(int(self.seen.sum()), 1)
+        # Runs that amplify differences of the initial state need a fit in stages.
+        if followed and not _nearest(fits).cost < FAR * count:
+            fits = _each_nearer(fits, self._fitted(begun, HORIZON_STAGES))
+            followed = False
+        if not followed and self._bends(_nearest(fits)):
+            fits = self._led(begun, fits)
+        nearest = _nearest(fits)
+        # The comparison is negated because the cost of a failed fit may be NaN.
+        limit = REFIT_SQUARES_RATIO * nearest.cost
+        apart = [i for i, fit in enumerate(fits) if not fit.cost < limit]
+        starts = [replace(fits[i].make_start(), states=nearest.states) for i in apart]
+        # These initial states are good over the first fraction of the runs already.
+        again = self._fitted(starts, FOLLOWED if followed else HORIZON_STAGES[1:])
+        for i, fit in zip(apart, again, strict=True):
+            fits[i] = _nearest([fits[i], fit])
+        return [self._measured(fit) for fit in fits]
+
+    def _fitted(
+        self, starts: Sequence[FitStart], stages: Sequence[tuple[float, int]]
+    ) -> list[TrajectoryFit]:
+        """Fit initial states over increasing parts of the runs."""
+        fits: list[TrajectoryFit] = []
+        if not starts:
+            return fits
+        watch = self.world.watch
+        models = "one model" if len(starts) == 1 else f"{len(starts)} models"
+        watch.stage(f"simulating held-out runs with {models}", len(stages))
+        for share, iterations in stages:
+            fitter = TrajectoryFitter(self.world, self.noise, share=share, parameters=False)
+            fits = fitter.fit_models(starts, iterations)
+            starts = [fit.make_start() for fit in fits]
+            watch.advance()
+        return fits
+
+    def _bends(self, fit: TrajectoryFit) -> bool:
+        """Return whether the motion has left the range of its linearisation by the initial states.
+
+        For a robot this linearisation is computed once for all models. A chaotic motion leaves its
+        range even if the initial guess is off by no more than the noise.
+        """
+        world = self.world
+        if not world.has_linearisation or not np.isfinite(fit.cost):
+            return False
+        runs = len(world.guess)
+        lanes = np.tile(fit.theta, (runs, 1))
+        begun = world.simulate(lanes, np.arange(runs), world.guess)
+        moved = fit.states - world.guess
+        # A diverging simulation from the guess is infinite or NaN.
+        with np.errstate(over="ignore", invalid="ignore"):
+            missed = fit.simulated - begun - np.einsum("rtcs,rs->rtc", fit.jacobian, moved)
+            sizes = (missed / self.noise.sigma)[self.seen]
+            rms = float(np.sqrt(np.square(sizes).mean()))
+        # The comparison is negated because NaN compares as false.
+        return not rms < LINEARISATION_ERROR_TOLERANCE
+
+    def _led(
+        self, starts: Sequence[FitStart], fits: Sequence[TrajectoryFit]
+    ) -> list[TrajectoryFit]:
+        """Continue the fits with derivatives at the nearest of them.
+
+        If that reduces the nearest sum of squares enough, the fits are repeated from the starts
+        with derivatives that are computed again before each stage.
+        """
+        found = _each_nearer(fits, self._about(fits, HORIZON_STAGES[-1:]))
+        if _nearest(fits).cost - _nearest(found).cost < MIN_SQUARES_DECREASE:
+            return found
+        led = self._fitted(starts, HORIZON_STAGES[:1])
+        for stage in (*HORIZON_STAGES[1:], HORIZON_STAGES[-1]):
+            led = self._about(led, [stage])
+        return _each_nearer(found, led)
+
+    def _about(
+        self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
+    ) -> list[TrajectoryFit]:
+        """Continue the fits with derivatives at the nearest of them."""
+        # This import is needed for robots only.
+        from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+
+        nearest = _nearest(fits)
+        compute_state_jacobian(self.world, nearest.theta, nearest.states, anew=True)
+        return self._fitted([fit.make_start() for fit in fits], stages)
+
+    def _measured(self, fit: TrajectoryFit) -> HeldOutFit:
+        if not np.isfinite(fit.cost):
+            nothing = np.full_like(self.world.observed, np.nan)
+            return HeldOutFit(nothing, -np.inf, fit.states)
+        # Only initial states were fitted here, so only they count as free.
+        free = count_identified_states(self.world, fit, self.noise)
+        merit = merit_of(self.world.observed, fit.simulated, free)
+        return HeldOutFit(fit.simulated, merit, fit.states, free)
+
+
+def merit_of(observed: Array, simulated: Array, free: float) -> float:
+    """Compute the penalised log-likelihood (1) of predictions.
+
+    Args:
+        observed: (R, T, C) observations; NaN where missing.
+        simulated: (R, T, C) predictions.
+        free: Effective number of free initial states.
+    """
+    seen = np.isfinite(observed)
+    residual = np.where(seen, observed - simulated, 0.0)
+    price = float(np.log(max(int(seen.sum()), 2)))
+    return maximise_likelihood(residual, seen, free).value - free * price  # (1)
+
+
+def _nearest(fits: Iterable[TrajectoryFit]) -> TrajectoryFit:
+    """Return the fit with the smallest cost."""
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def _each_nearer(
+    fits: Sequence[TrajectoryFit], others: Sequence[TrajectoryFit]
+) -> list[TrajectoryFit]:
+    """Return the better of two fits of each model."""
+    return [_nearest(pair) for pair in zip(fits, others, strict=True)]

@@ -1,0 +1,359 @@
+"""Run consistency: test whether runs, logs or loads agree on each parameter.
+
+The test works at the joint fit. J_r = [A_r B_r] are the whitened derivatives of run r with respect
+to the parameters and to the initial states of the run, e_r is the residual, and sigma_0 is the
+prior standard deviation of the initial states:
+
+    H_r = A_r' A_r - A_r' B_r S_r^-1 B_r' A_r,    S_r = B_r' B_r + diag sigma_0^-2
+    g_r = A_r' e_r - A_r' B_r S_r^-1 (B_r' e_r + prior)                                          (1)
+
+A group G of runs alone would change the parameters by one Gauss-Newton step,
+
+    d_G = H_G^-1 g_G,    cov_G = H_G^-1,    H_G = sum_r H_r,  g_G = sum_r g_r                    (2)
+
+The groups that identify a parameter x agree on it according to Cochran's Q (W. Cochran, Biometrics
+10, 101, 1954), which follows a chi-squared distribution with one degree of freedom less than the
+number n of groups:
+
+    Q = sum_G w_G (x_G - mean)^2,    w_G = 1 / var_G,    Q ~ chi^2 with n - 1                    (3)
+
+The variance between groups beyond their errors is (R. DerSimonian, N. Laird, Control. Clin. Trials
+7, 177, 1986)
+
+    tau^2 = (Q - (n - 1)) / (sum w - sum w^2 / sum w)                                            (4)
+
+The variance of a parameter for a run that is not yet recorded is therefore
+
+    var = var_joint + tau^2                                                                      (5)
+
+The trend with a covariate z of the groups, such as a load or the order of logs, is the slope of
+weighted least squares. Its error is enlarged by the scatter about the line (R. Birge, Phys. Rev.
+40, 207, 1932).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import erfc, sqrt
+
+import numpy as np
+
+from bench.benchmark.statistics.chi_squared import chi_squared_tail
+from bench.diagnosis.evaluation.noise_model import whiten
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
+from bench.diagnosis.validation.gain_and_intervals import Z95, compute_fisher_blocks
+from bench.diagnosis.validation.run_covariates import (
+    CovariateKind,
+    classify_constant,
+    compute_run_covariates,
+)
+from sims.core.simulator import Array
+from sims.recording.recording import Run
+
+SIGNIFICANCE_LEVEL = 0.01
+"""Significance level of test (3), divided by the number of tests for all parameters together."""
+MIN_RELEVANT_SCATTER = 1e-3
+"""Scatter below which groups count as consistent at any p-value, as a fraction of the value."""
+MIN_GROUPS_FOR_TREND = 4
+"""Minimum number of groups for which a trend covariate is searched."""
+COVARIATE_TIE_FACTOR = 2.0
+"""Maximum ratio of the mean square about the line to the smallest one, for a covariate that counts
+as indistinguishable from the best.
+"""
+MAX_INTERVAL_WIDTH = 4.0
+"""Maximum width of a group's 95 % interval, as a multiple of the parameter's range or value, for
+the group to be used.
+"""
+
+
+@dataclass(frozen=True)
+class GroupEstimate:
+    """Estimate of one parameter from one group of runs: its value and its standard error."""
+
+    group: str
+    value: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Linear trend of a parameter over the groups: slope, its standard error and its p-value."""
+
+    slope: float
+    error: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class TrendCovariate:
+    """Covariate with which a parameter moves between groups.
+
+    Attributes:
+        kind: Category of the covariate (`bench.diagnosis.validation.run_covariates`).
+        name: Name of the covariate.
+        trend: Trend of the parameter with the covariate.
+        indistinguishable_covariates: Names of other covariates that explain the trend about as
+            well.
+    """
+
+    kind: CovariateKind
+    name: str
+    trend: Trend
+    indistinguishable_covariates: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ParameterConsistency:
+    """Consistency of one parameter between groups of runs.
+
+    Attributes:
+        number: Name of the parameter; for a coefficient of a cause, it includes the effect.
+        unit: Unit of the parameter.
+        by: Criterion of the groups: ``run``, ``log`` or a constant that differs between runs.
+        value: Estimate of the joint fit.
+        error: Standard error of the joint estimate, from the curvature.
+        group_estimates: Estimates of the groups that identify the parameter.
+        scatter: Tau of (4), the standard deviation between groups beyond their errors.
+        p_value: P-value of test (3).
+        is_consistent: Whether the groups are consistent.
+        trend: Trend with a constant or with the order of logs; None by run or with fewer than three
+            groups.
+        trend_covariate: Significant trend covariate; None if there is none or the groups agree.
+    """
+
+    number: str
+    unit: str
+    by: str
+    value: float
+    error: float
+    group_estimates: tuple[GroupEstimate, ...]
+    scatter: float
+    p_value: float
+    is_consistent: bool
+    trend: Trend | None = None
+    trend_covariate: TrendCovariate | None = None
+
+    @property
+    def prediction_sigma(self) -> float:
+        """Standard error for a run that is not yet recorded, (5)."""
+        return float(np.hypot(self.error, self.scatter))
+
+
+@dataclass(frozen=True)
+class ConsistencySummary:
+    """Consistency of parameters between groups of runs.
+
+    Attributes:
+        before: Parameters of the base model.
+        after: Parameters of the extended model.
+        alternative_effect: Coefficients of the best single effect that is not part of the
+            diagnosis.
+    """
+
+    before: tuple[ParameterConsistency, ...] = ()
+    after: tuple[ParameterConsistency, ...] = ()
+    alternative_effect: tuple[ParameterConsistency, ...] = ()
+
+
+@dataclass(frozen=True)
+class _RunGrouping:
+    """Runs in groups: the criterion, names and run indices, and the value of each group if any."""
+
+    by: str
+    names: tuple[str, ...]
+    runs: tuple[tuple[int, ...], ...]
+    numbers: tuple[float, ...] | None = None
+
+
+def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterConsistency, ...]:
+    """Assess the consistency of each parameter of a fitted model between runs, logs and loads.
+
+    Args:
+        models: Models of the runs.
+        model: Model that is fitted to all runs.
+
+    Returns:
+        One entry for each parameter and grouping; empty without groups or free parameters.
+    """
+    world = models.world
+    groupings = list(_list_groupings(world.runs))
+    if not groupings or not model.fit.free.size:
+        return ()
+    curvatures, gradients = _compute_run_normal_equations(models, model)
+    found = [
+        (by, one) for by in groupings for one in _spreads(world, model, by, curvatures, gradients)
+    ]
+    level = SIGNIFICANCE_LEVEL / max(len(found), 1)
+    judged = [(by, _assess_parameter(one, level)) for by, one in found]
+    return tuple(
+        one
+        if one.is_consistent
+        else replace(one, trend_covariate=_find_trend_covariate(world, model, by, one))
+        for by, one in judged
+    )
+
+
+def _find_trend_covariate(
+    world: RunEvaluator, model: FittedModel, by: _RunGrouping, one: ParameterConsistency
+) -> TrendCovariate | None:
+    """Find the covariate with which the group estimates of a parameter move."""
+    if by.by not in ("run", "log"):
+        if one.trend is None or one.trend.p_value >= SIGNIFICANCE_LEVEL:
+            return None
+        return TrendCovariate(classify_constant(world, by.by), by.by, one.trend)
+    places = {name: list(runs) for name, runs in zip(by.names, by.runs, strict=True)}
+    tried = []
+    for about in compute_run_covariates(world, model, one.number):
+        values = np.array([about.values[places[part.group]].mean() for part in one.group_estimates])
+        trend = (
+            _fit_trend(one.group_estimates, values)
+            if len(one.group_estimates) >= MIN_GROUPS_FOR_TREND
+            else None
+        )
+        if trend is not None:
+            tried.append((_compute_residual_mean_square(one.group_estimates, values), about, trend))
+    sure = [entry for entry in tried if entry[2].p_value < SIGNIFICANCE_LEVEL / len(tried)]
+    if not sure:
+        return None
+    least, best, trend = min(sure, key=lambda entry: entry[0])
+    # A covariate that fits about as well cannot be distinguished from the best one.
+    also = [
+        about.name
+        for rest, about, _ in sure
+        if about is not best and rest < COVARIATE_TIE_FACTOR * least
+    ]
+    return TrendCovariate(best.kind, best.name, trend, tuple(also))
+
+
+def _compute_residual_mean_square(parts: Sequence[GroupEstimate], numbers: Array) -> float:
+    """Compute the weighted mean square about the line of `_fit_trend`; at least 1, its expectation."""
+    values = np.array([part.value for part in parts])
+    weights = np.array([part.error for part in parts]) ** -2.0
+    rest = values - np.polyval(np.polyfit(numbers, values, 1, w=np.sqrt(weights)), numbers)
+    return max(float(weights @ rest**2) / (len(parts) - 2), 1.0)
+
+
+def _assess_parameter(one: ParameterConsistency, level: float) -> ParameterConsistency:
+    slight = one.scatter < MIN_RELEVANT_SCATTER * abs(one.value)
+    return replace(one, is_consistent=slight or one.p_value >= level)
+
+
+def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
+    """Yield the groupings by log, by each constant that differs between runs, and by run."""
+    logs = tuple(dict.fromkeys(run.log for run in runs))
+    if len(logs) > 1:
+        places = tuple(tuple(i for i, run in enumerate(runs) if run.log == log) for log in logs)
+        yield _RunGrouping("log", logs, places, tuple(map(float, range(len(logs)))))
+    for name in dict.fromkeys(name for run in runs for name in run.constants):
+        values = [run.constants.get(name, np.nan) for run in runs]
+        each = sorted(set(values))
+        if len(each) > 1 and np.isfinite(each).all():
+            places = tuple(tuple(i for i, v in enumerate(values) if v == one) for one in each)
+            yield _RunGrouping(name, tuple(f"{one:g}" for one in each), places, tuple(each))
+    if len(runs) > 1:
+        yield _RunGrouping(
+            "run", tuple(run.name for run in runs), tuple((i,) for i in range(len(runs)))
+        )
+
+
+def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple[Array, Array]:
+    """Compute the normal equations of each run: H (R, q, q) and g (R, q) of (1)."""
+    world, fit = models.world, model.fit
+    q = fit.free.size
+    found = compute_fisher_blocks(models, model)
+    residual = whiten(models.compute_residual(fit), models.observed_mask, found.noise)
+    pull = np.einsum("rnk,rn->rk", found.jacobian, residual.reshape(len(residual), -1))
+    pull[:, q:] += compute_state_prior(world) ** -2.0 * (world.guess - fit.states)
+    pull[:, q:] *= ~world.known
+    right = np.concatenate([found.cross.transpose(0, 2, 1), pull[:, q:, None]], 2)
+    solved = np.linalg.solve(found.inner, right)
+    curvatures = found.own - np.matmul(found.cross, solved[..., :-1])
+    gradients = pull[:, :q] - np.matmul(found.cross, solved[..., -1:])[..., 0]  # (1)
+    return curvatures, gradients
+
+
+def _spreads(
+    world: RunEvaluator, model: FittedModel, by: _RunGrouping, curvatures: Array, gradients: Array
+) -> Iterator[ParameterConsistency]:
+    joint = _regularised_inverse(curvatures.sum(axis=0))
+    steps, errors = [], []
+    for runs in by.runs:
+        own = _regularised_inverse(curvatures[list(runs)].sum(axis=0))
+        steps.append(own @ gradients[list(runs)].sum(axis=0))  # (2)
+        errors.append(np.sqrt(np.maximum(np.diagonal(own), 0.0)))
+    for column, place in enumerate(model.fit.free.tolist()):
+        parameter, value = world.parameters[place], float(model.fit.theta[place])
+        low, high = parameter.bounds
+        size = max(high - low, abs(value))
+        parts, numbers = [], []
+        for group, name in enumerate(by.names):
+            error = float(errors[group][column])
+            if error > 0 and 2.0 * Z95 * error < MAX_INTERVAL_WIDTH * size:
+                parts.append(GroupEstimate(name, value + float(steps[group][column]), error))
+                numbers.append(by.numbers[group] if by.numbers else 0.0)
+        if len(parts) < 2:
+            continue
+        error = float(np.sqrt(max(joint[column, column], 0.0)))
+        scatter, chance = _estimate_heterogeneity(parts)
+        trend = _fit_trend(parts, np.array(numbers)) if by.numbers else None
+        yield ParameterConsistency(
+            parameter.name,
+            parameter.unit,
+            by.by,
+            value,
+            error,
+            tuple(parts),
+            scatter,
+            chance,
+            True,
+            trend,
+        )
+
+
+def _regularised_inverse(curvature: Array) -> Array:
+    """Invert a curvature matrix; directions that the runs do not identify get a huge variance."""
+    scale = np.sqrt(np.maximum(np.diagonal(curvature), 1e-200))
+    values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
+    result: Array = (vectors / np.maximum(values, 1e-12)) @ vectors.T / np.outer(scale, scale)
+    return result
+
+
+def _estimate_heterogeneity(parts: Sequence[GroupEstimate]) -> tuple[float, float]:
+    """Compute tau of (4) and the p-value of (3)."""
+    values = np.array([part.value for part in parts])
+    weights = np.array([part.error for part in parts]) ** -2.0
+    mean = float(weights @ values / weights.sum())
+    q = float(weights @ (values - mean) ** 2)  # (3)
+    freedom = len(parts) - 1
+    left = float(weights.sum() - (weights @ weights) / weights.sum())
+    tau = np.sqrt(max(q - freedom, 0.0) / left) if left > 0 else 0.0  # (4)
+    return float(tau), chi_squared_tail(freedom, q)
+
+
+def _fit_trend(parts: Sequence[GroupEstimate], numbers: Array) -> Trend | None:
+    """Fit a weighted least-squares line to the groups; None for fewer than three groups."""
+    if len(parts) < 3 or not np.ptp(numbers) > 0:
+        return None
+    values = np.array([part.value for part in parts])
+    weights = np.array([part.error for part in parts]) ** -2.0
+    apart = numbers - weights @ numbers / weights.sum()
+    power = float(weights @ apart**2)
+    slope = float(weights @ (apart * values)) / power
+    rest = values - weights @ values / weights.sum() - slope * apart
+    freedom = len(parts) - 2
+    ratio = float(weights @ rest**2) / freedom
+    error = float(np.sqrt(max(ratio, 1.0) / power))
+    # If the scatter agrees with the errors, these are known; otherwise they are estimated.
+    size = abs(slope) / error
+    return Trend(slope, error, erfc(size / sqrt(2.0)) if ratio <= 1.0 else _student(size, freedom))
+
+
+def _student(size: float, freedom: int) -> float:
+    """Return the two-sided p-value of Student's t."""
+    # Importing scipy.special takes 0.1 s, and this is the only place of most diagnoses to need it.
+    from scipy.special import stdtr
+
+    return float(2.0 * stdtr(freedom, -size))

@@ -1,0 +1,116 @@
+"""Run covariates: quantities that differ between runs and may explain a parameter trend.
+
+They are the amplitude, speed, direction and position of the motion, the size of each input, the
+order of the runs, and the extra columns of the recording, such as a temperature.
+
+A parameter of a joint is compared with the motion of that joint, any other parameter with the
+primary coordinate of the system. The motion is taken from the fitted model because it has no noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.model_set import FittedModel
+from sims.core.simulator import Array
+
+CovariateKind = Literal[
+    "load", "supply", "amplitude", "speed", "direction", "position", "command", "time", "other"
+]
+
+LOAD_UNITS = ("kg", "kg*m^2", "N", "N*m")
+"""Units by which a constant is recognised as a load."""
+MIN_RELATIVE_VARIATION = 1e-3
+"""Minimum variation of a covariate between runs, as a fraction of its largest magnitude."""
+
+
+class RunCovariate(NamedTuple):
+    """Quantity that differs between runs.
+
+    Attributes:
+        kind: Category of the quantity.
+        name: Quantity in words; for an extra column its name.
+        values: (R,) value of each run, in any unit.
+    """
+
+    kind: CovariateKind
+    name: str
+    values: Array
+
+
+def compute_run_covariates(
+    world: RunEvaluator, model: FittedModel, number: str
+) -> list[RunCovariate]:
+    """List the quantities that differ between the runs and may explain a trend of a parameter.
+
+    Args:
+        world: Run evaluator with the runs.
+        model: Fitted model whose simulated motion is used.
+        number: Name of the parameter, ``parameter`` or ``parameter@joint``.
+    """
+    everything = [
+        *_list_non_motion_covariates(world),
+        *_compute_motion_covariates(world, model, number),
+    ]
+    return [one for one in everything if _varies_between_runs(one.values)]
+
+
+def classify_constant(world: RunEvaluator, name: str) -> CovariateKind:
+    """Return the category of a constant that differs between runs, from its unit.
+
+    Args:
+        world: Run evaluator; its simulator declares the constants.
+        name: Name of the constant.
+    """
+    units = {constant.name: constant.unit for constant in world.kind.constants}
+    unit = units.get(name, "")
+    if unit in LOAD_UNITS:
+        return "load"
+    return "supply" if unit == "V" else "other"
+
+
+def _list_non_motion_covariates(world: RunEvaluator) -> Iterator[RunCovariate]:
+    yield RunCovariate("time", "the order of runs", np.arange(len(world.runs), dtype=np.float64))
+    for name in world.runs[0].inputs:
+        sizes = [float(np.sqrt(np.mean(np.square(run.inputs[name])))) for run in world.runs]
+        yield RunCovariate("command", f"the size of {name}", np.array(sizes))
+    for name in world.runs[0].extra:
+        columns = [run.extra.get(name, np.empty(0)) for run in world.runs]
+        means = [float(np.nanmean(v)) if np.isfinite(v).any() else np.nan for v in columns]
+        yield RunCovariate("other", name, np.array(means))
+
+
+def _compute_motion_covariates(
+    world: RunEvaluator, model: FittedModel, number: str
+) -> Iterator[RunCovariate]:
+    """Yield amplitude, speed, direction and position of the coordinate of a parameter."""
+    system = world.simulator.system
+    if not system.coordinates:
+        return
+    joint = f"q.{number.partition('@')[2]}"
+    name = joint if joint in system.coordinates else system.coordinates[system.primary]
+    if name not in world.channels:
+        return
+    column = world.channels.index(name)
+    rows = []
+    for track, simulated in zip(world.tracks, model.fit.simulated, strict=True):
+        times = track.scenario.times
+        place = simulated[: times.size, column]
+        rate = np.gradient(place, times)
+        way = float(rate.sum() / max(np.abs(rate).sum(), 1e-300))
+        rows.append((float(place.std()), float(np.sqrt(np.mean(rate**2))), way, place.mean()))
+    amplitude, speed, direction, position = np.array(rows).T
+    yield RunCovariate("amplitude", "the amplitude", amplitude)
+    yield RunCovariate("speed", "the speed", speed)
+    yield RunCovariate("direction", "the direction of motion", direction)
+    yield RunCovariate("position", "the position", position)
+
+
+def _varies_between_runs(values: Array) -> bool:
+    return bool(
+        np.isfinite(values).all() and np.ptp(values) > MIN_RELATIVE_VARIATION * np.abs(values).max()
+    )

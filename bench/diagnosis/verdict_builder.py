@@ -1,0 +1,467 @@
+"""Build the verdict from a finding: intervals, held-out gain and ranked candidates."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from bench.core.random_streams import make_rng
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    bound_of,
+    compute_coefficient_bounds,
+    is_unusual,
+)
+from bench.diagnosis.evaluation.noise_floor import NoiseFloor
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.time_scale import is_instant
+from bench.diagnosis.experiment_design.discriminating_run import (
+    DiscriminatingRun,
+    propose_discriminating_run,
+)
+from bench.diagnosis.fitting.model_set import EffectNames, FittedModel
+from bench.diagnosis.friction_form_verdict import form_of, with_solver_parameters
+from bench.diagnosis.search import verdict_rules
+from bench.diagnosis.search.alternative_causes import CauseEvidence
+from bench.diagnosis.search.diagnose import DiagnosisResult
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.search.score_test import estimate_tail_p_value
+from bench.diagnosis.validation.gain_and_intervals import (
+    HeldOutGain,
+    compute_held_out_gain,
+    compute_intervals,
+)
+from bench.diagnosis.validation.held_out_runs import Validation
+from bench.diagnosis.verdict import Candidate, Cause, HeldOutResult, Verdict, to_finite_or_none
+from sims.core.simulator import Array
+from sims.core.system import Effect, members_of
+from sims.extended_simulator import FittedValue
+from sims.recording.recording import Recording
+from sims.robot.fitted_causes import GRAVITY_COMPENSATED, is_gravity_compensated
+
+MIN_REPORTED_GAIN = -9.0
+"""Lower limit of a candidate's reported share of the held-out gap; it only means "worse"."""
+
+
+@dataclass(frozen=True)
+class VerdictBuilder:
+    """Builds the verdict and its numbers from a finding.
+
+    Attributes:
+        recording: Recording that is explained.
+        fitting_evaluator: Run evaluator of the runs for fitting.
+        validation: Validation on held-out runs or by cross-validation; None without either.
+        noise_floor: Noise floor of each channel.
+        engine: Name of the engine; None for a simulator with its own integrator.
+        before: Base prediction of the held-out runs with the model file's own step, if that step
+            was found too coarse; otherwise None.
+    """
+
+    recording: Recording
+    fitting_evaluator: RunEvaluator
+    validation: Validation | None
+    noise_floor: NoiseFloor
+    engine: str | None
+    before: Array | None = None
+
+    @property
+    def held_out_evaluator(self) -> RunEvaluator | None:
+        """Return the runs that the validation predicts; all runs if it is cross-validation."""
+        return None if self.validation is None else self.validation.world
+
+    @property
+    def _by_stretches(self) -> bool:
+        """Return whether gains are resampled by segments, because cross-validated runs are few."""
+        return self.validation is not None and self.validation.is_cross_validation
+
+    def build_verdict(
+        self,
+        search: EffectSearch,
+        finding: DiagnosisResult,
+        rng: np.random.Generator,
+        started: float,
+    ) -> Verdict:
+        """Build the verdict for a finding.
+
+        Args:
+            search: Search that produced the finding.
+            finding: Outcome of the search.
+            rng: Random generator of the bootstrap.
+            started: Value of `time.perf_counter` at the start of the diagnosis.
+        """
+        world = self.fitting_evaluator
+        numbers = self.collect_parameter_estimates(search, finding.model)
+        causes = self.causes(search, finding)
+        parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
+        # Simulations for the proposal of an experiment are not part of the answer.
+        simulations = world.simulations
+        if self.validation is not None:
+            simulations += self.validation.simulations
+        heldout = self._heldout(finding, rng)
+        candidates = self._candidates(search, finding)
+        proposed = self._next(search, finding)
+        return Verdict(
+            finding.verdict,
+            self.recording.system,
+            self.engine or "its own",
+            causes,
+            parameters,
+            heldout,
+            candidates,
+            proposed,
+            int(simulations),
+            time.perf_counter() - started,
+            finding.early_stop,
+        )
+
+    def causes(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[Cause, ...]:
+        """Return the causes of a finding with their fitted numbers.
+
+        Args:
+            search: Search that produced the finding.
+            finding: Outcome of the search.
+        """
+        numbers = self.collect_parameter_estimates(search, finding.model)
+        return tuple(self._cause(cause, numbers) for cause in finding.causes)
+
+    def collect_parameter_estimates(
+        self, search: EffectSearch, model: FittedModel
+    ) -> dict[int, FittedValue]:
+        """Collect the estimates of all parameters and coefficients by index.
+
+        Args:
+            search: Search that produced the model.
+            model: Fitted model.
+
+        Returns:
+            Estimates by index in the parameter vector; those that were not fitted have no interval.
+        """
+        fitted = compute_intervals(search, model)
+        ranges = self._ranges(model)
+        result = {}
+        for place, parameter in enumerate(self.fitting_evaluator.parameters):
+            # Insensitive parameters stay nominal; effects that are not in the model are zero.
+            given = float(model.fit.theta[place]), np.nan, np.nan
+            value, low, high = fitted.get(place, given)
+            if is_instant(parameter):
+                # The time of an event is only known to one sample spacing.
+                low, high = (
+                    low - self.fitting_evaluator.sample_interval / 2,
+                    high + self.fitting_evaluator.sample_interval / 2,
+                )
+            at_bound = bound_of(value, *ranges[place]) if place in fitted else None
+            # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
+            bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
+            ends = (low, high) if bounded else (None, None)
+            usual = self._usual(place) if place in fitted else parameter.bounds
+            unusual = usual if not is_instant(parameter) and is_unusual(value, *usual) else None
+            unit = parameter.unit
+            low_end, high_end = ends
+            result[place] = FittedValue(
+                value, unit, low_end, high_end, at_bound, usual_range=unusual
+            )
+        return self._with_totals(model, result)
+
+    def _usual(self, place: int) -> tuple[float, float]:
+        """Return the plausible range, narrower than the bounds for a robot's free numbers."""
+        parameter = self.fitting_evaluator.parameters[place]
+        free = self.fitting_evaluator.kind.has_model and place in self.fitting_evaluator.base
+        return parameter.training or parameter.bounds if free else parameter.bounds
+
+    def _with_totals(
+        self, model: FittedModel, numbers: dict[int, FittedValue]
+    ) -> dict[int, FittedValue]:
+        """Add specified and resulting values to the numbers that a robot's model file contains."""
+        kind: Any = self.fitting_evaluator.kind
+        if not kind.has_model:
+            return numbers
+        # This import is needed for robots only.
+        from sims.robot.export.model_file_totals import totals
+
+        placed = list(self._placed(model))
+        fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed]
+        for (effect, places), made in zip(placed, totals(kind.robot, fitted), strict=True):
+            # The model file keeps its gravity if the bodies are gravity-compensated.
+            keeps = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
+            if keeps or not any(numbers[i].value for i in places):
+                continue
+            for i, found in zip(places, made, strict=True):
+                if found is not None:
+                    unit = found.unit if found.unit != numbers[i].unit else ""
+                    stated, total = found.stated, found.total
+                    numbers[i] = replace(numbers[i], stated=stated, total=total, total_unit=unit)
+        return numbers
+
+    def _placed(self, model: FittedModel) -> Iterator[tuple[type[Effect], list[int]]]:
+        """Yield the fitted effects with a single place, and the indices of their coefficients."""
+        world, kind = self.fitting_evaluator, cast(Any, self.fitting_evaluator.kind)
+        # The free numbers of the user come first, in the order of their effects.
+        places = iter(range(world.own))
+        for effect in kind.system.freed_effects:
+            yield effect, [next(places) for _ in effect.coefficients]
+        for name in model.effects:
+            effect = world.available_effects[name]
+            members = members_of(effect)
+            places = iter(world.get_coefficient_indices(name))
+            # A family with one coefficient for all places changes no number of the file.
+            if sum(len(member.coefficients) for member in members) == len(
+                world.get_coefficient_indices(name)
+            ):
+                for member in members:
+                    yield type(member), [next(places) for _ in member.coefficients]
+
+    def _ranges(self, model: FittedModel) -> dict[int, tuple[float, float]]:
+        """Return the range of each fitted number, by index in the parameter vector."""
+        world = self.fitting_evaluator
+        ranges = {i: world.parameters[i].bounds for i in world.base.tolist()}
+        for name in model.effects:
+            ranges |= dict(
+                zip(
+                    world.get_coefficient_indices(name),
+                    compute_coefficient_bounds(world, name),
+                    strict=True,
+                )
+            )
+        return ranges
+
+    def judged(self, search: EffectSearch, finding: DiagnosisResult) -> DiagnosisResult:
+        """Return the finding with the verdict that its numbers and the fitted models allow.
+
+        Args:
+            search: Search that produced the finding.
+            finding: Outcome of the search.
+        """
+        if finding.verdict == "unknown" and self._refutes(search, finding):
+            return replace(finding, verdict="adequate")
+        numbers = self.collect_parameter_estimates(search, finding.model)
+        certain = [cause for cause in finding.causes if not cause.alternatives]
+        places = [
+            i
+            for cause in certain
+            for i in self.fitting_evaluator.get_coefficient_indices(cause.effect)
+        ]
+        results = all(numbers[i].is_result for i in places) and not self._ends_at_bound(numbers)
+        return replace(finding, verdict=verdict_rules.verdict_of_numbers(finding.verdict, results))
+
+    def _refutes(self, search: EffectSearch, finding: DiagnosisResult) -> bool:
+        """Return whether fitted models refute a missing effect that only the linear score suggests.
+
+        This is so if no fitted model with effects has a higher penalised log-likelihood than the
+        base model, or none predicts the held-out runs better. In closed loops and at rest,
+        derivatives may predict a gain that no fit achieves.
+        """
+        if finding.causes or finding.lack_of_fit.has_structure or finding.early_stop is not None:
+            return False
+        tried = [model for model in search.models.values() if model.effects]
+        better = [
+            model.effects
+            for model in tried
+            if model.penalised_log_likelihood > search.base_model.penalised_log_likelihood
+        ]
+        held_out = finding.held_out_fits or {}
+        excess = self._held_out_excess(finding)
+        if not tried or (excess is not None and verdict_rules.misses_held_out_gap(excess, excess)):
+            return False
+        return not any(
+            names not in held_out
+            or held_out[names].penalised_log_likelihood > held_out[()].penalised_log_likelihood
+            for names in better
+        )
+
+    def _held_out_excess(self, finding: DiagnosisResult) -> float | None:
+        """Return the excess RMS residual of the base model on held-out runs; None without them."""
+        runs, measured = self.held_out_evaluator, finding.held_out_fits
+        if runs is None or measured is None or () not in measured:
+            return None
+        left = (runs.observed - measured[()].simulated) / self.noise_floor.sigma
+        return float(np.sqrt(np.square(left[np.isfinite(runs.observed)]).mean())) - 1.0
+
+    def _ends_at_bound(self, numbers: Mapping[int, FittedValue]) -> bool:
+        """Return whether a base parameter of the extended model is at a bound of its range.
+
+        A cause may then compensate for a value beyond the bound.
+        """
+        fitted = [numbers[i] for i in self.fitting_evaluator.base.tolist()]
+        return any(n.at_bound is not None and not n.is_result for n in fitted)
+
+    def estimate_noise_sigma(self, finding: DiagnosisResult) -> Array:
+        """Return the noise floor (C,).
+
+        It is the specified noise, or else the residual of a model without lack of fit.
+        """
+        left = finding.model.likelihood.sigma
+        # The noise estimate assumes white noise, so the residual of a good model may exceed it.
+        usable = ~self.noise_floor.is_stated & np.isfinite(left) & (left > self.noise_floor.sigma)
+        return np.where(
+            usable & (not finding.lack_of_fit.has_structure), left, self.noise_floor.sigma
+        )
+
+    def _cause(self, evidence: CauseEvidence, numbers: dict[int, FittedValue]) -> Cause:
+        world = self.fitting_evaluator
+        # The coefficients of an effect are contiguous in the parameter vector, in the effect's
+        # order.
+        effect = world.available_effects[evidence.effect]
+        coefficients = effect.on(world.simulator.system)
+        places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
+        # A coefficient that cannot be observed is fixed at zero and is not a result.
+        by_name = {
+            c.name: numbers[i]
+            for c, i in zip(coefficients, places, strict=True)
+            if c.least is None or c.least != c.most
+        }
+        form = form_of(world, evidence.effect)
+        says = effect.says
+        if form is not None:
+            says = with_solver_parameters(world, evidence.effect, says)
+        if world.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
+            says = GRAVITY_COMPENSATED
+        return Cause(evidence.effect, evidence.alternatives, says, by_name, evidence.p_value, form)
+
+    def _counted(self) -> list[int]:
+        """List the channels with the same unit as the channel that sensor effects act on."""
+        world = self.fitting_evaluator
+        units = [channel.unit for channel in world.simulator.channels]
+        reading = world.simulator.system.reading(world.channels)
+        # Errors of different units cannot be added.
+        unit = units[world.channels.index(reading)]
+        return [c for c, other in enumerate(units) if other == unit]
+
+    def _floor_of(self, finding: DiagnosisResult) -> float:
+        """Compute the RMS of the noise floor over the channels that count."""
+        return float(np.sqrt(np.square(self.estimate_noise_sigma(finding)[self._counted()]).mean()))
+
+    def _heldout(self, finding: DiagnosisResult, rng: np.random.Generator) -> HeldOutResult | None:
+        runs, measured, names = (
+            self.held_out_evaluator,
+            finding.held_out_fits,
+            finding.model.effects,
+        )
+        if runs is None or measured is None or names not in measured:
+            return None
+        before, after = measured[()].simulated, measured[names].simulated
+        before = before if self.before is None else self.before
+        # Without a prediction of the base model there is no gap to measure.
+        if not np.isfinite(before[np.isfinite(runs.observed)]).all():
+            return None
+        counted = self._counted()
+        given = counted, self._floor_of(finding), rng, self._by_stretches
+        result = compute_held_out_gain(runs, before, after, *given)
+        return _build_held_out_result(
+            result, self.fitting_evaluator.simulator.channels[counted[0]].unit
+        )
+
+    def _candidates(self, search: EffectSearch, finding: DiagnosisResult) -> tuple[Candidate, ...]:
+        """List all effects of the library with their scores about the base model, best first.
+
+        A score is reduced by the price of each coefficient beyond the first, so that an effect
+        precedes more general effects that contain it.
+        """
+        scores = search.base_scores
+        if scores is None:
+            return ()
+        base = search.base_model.likelihood.value
+        rows = []
+        for i, effect in enumerate(scores.effects):
+            score = float(scores.score[i])
+            # A fit may gain more than the linear score predicts, in particular far from the data.
+            alone = search.models.get(frozenset({effect}))
+            if alone is not None:
+                score = max(score, float(alone.likelihood.value - base))
+            beyond_chance = np.array([score - scores.null_quantiles[i]])
+            p_value = float(
+                np.clip(estimate_tail_p_value(scores.null_scores, beyond_chance), 0.0, 1.0)
+            )
+            share = self._share(finding, (effect,))
+            slot = search.world.slots[effect]
+            score -= search.parameter_penalty * (slot.stop - slot.start - 1)
+            rows.append(Candidate(effect, max(score, 0.0), p_value, share))
+        return tuple(sorted(rows, key=lambda row: -row.score))
+
+    def _share(self, finding: DiagnosisResult, names: EffectNames) -> float | None:
+        """Return the share of the held-out gap that a model closes; None if it is not measured."""
+        runs, measured = self.held_out_evaluator, finding.held_out_fits
+        if runs is None or measured is None or names not in measured:
+            return None
+        counted = self._counted()
+        floor = self._floor_of(finding)
+        # As for the gain of the whole model, an error below the noise floor is not a gain.
+        before = _rmse(runs, measured[()].simulated, counted)
+        after = _rmse(runs, measured[names].simulated, counted)
+        share = 0.0
+        # At the noise floor there is no gap, and the quotient would be a rounding error.
+        if before > floor * 1.001:
+            share = (before - max(after, floor)) / (before - floor)
+        return float(np.clip(share, MIN_REPORTED_GAIN, 1.0)) if np.isfinite(share) else None
+
+    def share_intervals(self, finding: DiagnosisResult) -> dict[str, tuple[float, float]]:
+        """Compute 95 % intervals of the share of the held-out gap that single effects close.
+
+        Args:
+            finding: Outcome of the search, with the simulated held-out runs.
+
+        Returns:
+            Low and high end by effect, for effects that were simulated alone on held-out runs.
+        """
+        runs, measured = self.held_out_evaluator, finding.held_out_fits
+        if runs is None or measured is None:
+            return {}
+        before = measured[()].simulated
+        found = {}
+        for names, simulated in measured.items():
+            share = self._share(finding, names)
+            if len(names) != 1 or share is None or share <= MIN_REPORTED_GAIN:
+                continue
+            # Each effect has its own random stream, so that its interval does not depend on the
+            # others.
+            rng = make_rng("held-out share", *names)
+            given = self._counted(), self._floor_of(finding), rng, self._by_stretches
+            result = compute_held_out_gain(runs, before, simulated.simulated, *given)
+            if np.isfinite(result.low) and np.isfinite(result.high):
+                found[names[0]] = result.low, result.high
+        return found
+
+    def _next(self, search: EffectSearch, finding: DiagnosisResult) -> DiscriminatingRun | None:
+        """Propose the next experiment; None if nothing is open or the search was stopped early."""
+        if finding.early_stop is not None:
+            return None
+        if finding.verdict == "unidentifiable":
+            return _propose_identifying_run(finding.unidentified_parameters)
+        # Causes come strongest first, and alternatives most plausible first.
+        for cause in finding.causes:
+            for other in cause.alternatives:
+                rest = {name for name in finding.model.effects if name != cause.effect}
+                rival = search.models.get(frozenset({*rest, other}))
+                if rival is not None:
+                    return propose_discriminating_run(search, finding.model, rival)
+        return None
+
+
+def _rmse(world: RunEvaluator, simulated: Array, channels: list[int]) -> float:
+    """Compute the RMS error over the channels that count, in their unit."""
+    seen = np.isfinite(world.observed)[..., channels]
+    error = (world.observed - simulated)[..., channels][seen]
+    return float(np.sqrt(np.square(error).mean()))
+
+
+def _propose_identifying_run(vague: tuple[str, ...]) -> DiscriminatingRun:
+    """Propose how to identify parameters that the data do not identify."""
+    several = len(vague) > 1
+    how = "they act differently from each other" if several else "it makes a difference"
+    names = " and ".join(vague)
+    return DiscriminatingRun(f"Measure {names} apart, or record runs in which {how}")
+
+
+def _build_held_out_result(found: HeldOutGain, unit: str) -> HeldOutResult:
+    """Convert a gain to the form of the verdict; an interval that the data do not give is None."""
+    return HeldOutResult(
+        to_finite_or_none(found.base),
+        to_finite_or_none(found.extended),
+        to_finite_or_none(found.floor),
+        to_finite_or_none(found.gap_closed),
+        to_finite_or_none(found.low),
+        to_finite_or_none(found.high),
+        unit,
+    )

@@ -1,0 +1,85 @@
+"""Result rows: one row per answer with its case, truth, answer and grade."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+
+from bench.diagnosis_benchmark.answer_store import AnswersByCase
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.grading import grade_answer
+
+CASE_COLUMNS = ("noise", "stated", "rate", "seconds", "runs", "source", "driven", "size", "beyond")
+"""Attributes of a case that are columns of a result row."""
+SKIPPED_STATUS = "skipped"
+"""Status and outcome of a case that the diagnoser does not support."""
+RUN_SECONDS_COLUMN = "run_seconds"
+"""Column of the length of a run; the column `seconds` is the time of an answer."""
+
+
+def build_answer_rows(answered: AnswersByCase, diagnosers: Sequence[str]) -> pd.DataFrame:
+    """Build the result rows, ordered by diagnoser and then by case.
+
+    Args:
+        answered: stored answers.
+        diagnosers: names of the diagnosers.
+    """
+    rows = [row for name in diagnosers for row in _of(name, answered)]
+    return pd.DataFrame(rows)
+
+
+def _of(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str, Any]]:
+    for question, one in sorted(answered.items()):
+        # The case could not be drawn, or its worker was lost before it was drawn.
+        if "effects" not in one["item"] or diagnoser not in one["rows"]:
+            continue
+        yield build_answer_row(
+            question, BenchmarkCase.from_json(one["item"]), one["rows"][diagnoser]
+        )
+
+
+def build_answer_row(
+    question: str, item: BenchmarkCase, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Build the result row of one answer.
+
+    Args:
+        question: name of the case.
+        item: the case with its truth.
+        given: stored answer of one diagnoser.
+    """
+    answer = given["answer"]
+    mark = grade_answer(item, answer)
+    held = [holds for holds in mark.covered.values() if holds is not None]
+    causes = answer["causes"] if answer else []
+    about = {name: getattr(item, name) for name in CASE_COLUMNS}
+    about[RUN_SECONDS_COLUMN] = about.pop("seconds")
+    return {
+        "question": question,
+        "diagnoser": given["diagnoser"],
+        "kind": item.kind,
+        "system": item.system,
+        "hidden": " + ".join(item.effects),
+        **about,
+        "channels": " ".join(item.channels),
+        "status": given["status"],
+        "reason": (given["reason"].strip().splitlines() or [""])[-1][:200],
+        "verdict": answer["verdict"] if answer else "",
+        "named": mark.named,
+        "outcome": SKIPPED_STATUS if given["status"] == SKIPPED_STATUS else mark.outcome,
+        "set_size": mark.set_size,
+        "class_size": mark.class_size,
+        "largest_set": max((1 + len(c["alternatives"]) for c in causes), default=0),
+        "found": mark.is_correct,
+        "found_class": mark.is_correct_up_to_equivalence,
+        "alarm": answer is None or answer["verdict"] != "adequate",
+        "p_value": answer["p_value"] if answer else None,
+        "intervals": len(held),
+        "holding": sum(held),
+        "simulations": given["simulations"],
+        "seconds": given["seconds"],
+        "processor_seconds": given["processor_seconds"],
+        "trusted": given["trusted"],
+    }

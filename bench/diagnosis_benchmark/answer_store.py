@@ -1,0 +1,96 @@
+"""Append-only store of answers: one line of JSON per case, written when all its answers exist."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from sims.core.simulator import InputError
+
+ANSWERS_FILE = "answers.jsonl"
+"""File of the answers. It also contains the truth of every case, where no diagnoser can read it."""
+
+
+class AnswerStore:
+    """Store of the answers in a result folder, opened for appending.
+
+    Args:
+        folder: result folder of the study.
+
+    Attributes:
+        answered: by case name, the case ({} if it could not be drawn) and one row per diagnoser.
+
+    Raises:
+        InputError: another process is working in the folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / ANSWERS_FILE
+        self._file: IO[str] = self._path.open("a", encoding="utf-8")
+        try:
+            _lock(self._file)
+        except OSError:
+            self._file.close()
+            raise InputError(
+                f"{folder}: another simgap is at work there; wait for it, or end it"
+            ) from None
+        self._end_last_line()
+        self.answered = read_answers(folder)
+
+    def _end_last_line(self) -> None:
+        """Terminate a line that was cut off when a process was killed; the reader skips it."""
+        data = self._path.read_bytes()
+        if data and not data.endswith(b"\n"):
+            self._file.write("\n")
+            self._file.flush()
+
+    def append(self, one: Mapping[str, Any]) -> None:
+        """Append the answers to a case; they survive a kill of the process after this call."""
+        self._file.write(json.dumps(one) + "\n")
+        self._file.flush()
+        _enter(self.answered, one)
+
+    def close(self) -> None:
+        """Close the file and release its lock."""
+        self._file.close()
+
+
+AnswersByCase = dict[str, dict[str, Any]]
+
+
+def read_answers(folder: Path) -> AnswersByCase:
+    """Read all answers of a result folder.
+
+    Returns:
+        By case name, ``item`` (the case) and ``rows`` by diagnoser.
+    """
+    answered: AnswersByCase = {}
+    path = folder / ANSWERS_FILE
+    if not path.exists():
+        return answered
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            try:
+                one = json.loads(line)
+            except ValueError:
+                continue  # incomplete line of a killed process
+            _enter(answered, one)
+    return answered
+
+
+def _enter(answered: AnswersByCase, one: Mapping[str, Any]) -> None:
+    held = answered.setdefault(one["question"], {"item": one["item"], "rows": {}})
+    held["item"] = one["item"]
+    for row in one["rows"]:
+        held["rows"][row["diagnoser"]] = row
+
+
+def _lock(file: IO[str]) -> None:
+    """Lock the file until it is closed or this process ends."""
+    try:
+        import fcntl
+    except ImportError:  # no file locks on this operating system
+        return
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

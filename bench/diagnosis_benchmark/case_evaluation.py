@@ -1,0 +1,295 @@
+"""Evaluation of one case with several diagnosers, each in its own process; runs in a worker.
+
+The worker draws the case and writes its recording. The process of a diagnoser receives the texts of
+the recording's files through a pipe, and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.isolation.message_channel import (
+    MAX_STATE_BYTES,
+    ProtocolError,
+    pack_arrays,
+    unpack_arrays,
+)
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.isolation.tuner_processes import START_TIMEOUT_SECONDS, IsolatedProcess
+from bench.benchmark.runner.sandboxed_tuner import get_fork_server, retry_if_killed
+from bench.core.diagnoser import Answer
+from bench.core.random_streams import make_seed_words
+from bench.diagnosis_benchmark import diagnoser_process
+from bench.diagnosis_benchmark.case_catalogue import render_recording
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_set import CaseSpec
+from sims.core.simulator import Array, InputError
+
+PRELOAD_MODULE = "bench.diagnosis_benchmark.preload"
+"""Module that is preloaded in the fork server."""
+_MAX_ANSWER_BYTES = 1 << 20
+"""Maximum size of an answer, bytes."""
+_REASON = 200
+"""Maximum length of the reason why a diagnoser does not support a case, characters."""
+BUDGET_EXCEEDED_REASON = "it asked for more simulations than are allowed"
+"""Reason of a missing answer when the diagnoser exceeded its simulation budget."""
+
+
+@dataclass(frozen=True)
+class AnswerLimits:
+    """Limits of one answer.
+
+    Attributes:
+        simulations: maximum number of simulations with simgap's simulators.
+        seconds: maximum elapsed time.
+        memory: maximum memory, MiB; 0 for no limit.
+    """
+
+    simulations: int
+    seconds: float
+    memory: int = 0
+
+
+@dataclass(frozen=True)
+class EvaluatedDiagnoser:
+    """Diagnoser that is evaluated.
+
+    Attributes:
+        label: name in tables.
+        code: where its code is.
+        learned: files with trained arrays, by system.
+        trusted: whether it runs in this process.
+    """
+
+    label: str
+    code: TunerSpec
+    learned: Mapping[str, Path]
+    trusted: bool = False
+
+
+def evaluate_case(
+    question: dict[str, Any],
+    seed: int,
+    salt: str,
+    known: dict[str, Any] | None,
+    examined: Sequence[EvaluatedDiagnoser],
+    limits: AnswerLimits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """Draw a case and evaluate it with several diagnosers.
+
+    Args:
+        question: case specification as JSON.
+        seed: seed of the public case set.
+        salt: salt from which cases are drawn.
+        known: the case as JSON if it was already drawn, {} if its cause was found to be
+            unobservable, None if it was not drawn yet.
+        examined: diagnosers to evaluate.
+        limits: limits of each answer.
+        hidden: folders that no diagnoser may read.
+
+    Returns:
+        JSON document with the name of the case, the case, and one row per diagnoser.
+    """
+    asked = CaseSpec.from_json(question)
+    item = (
+        asked.draw_case(seed, salt)
+        if known is None
+        else BenchmarkCase.from_json(known)
+        if known
+        else None
+    )
+    if item is None:
+        return {"question": asked.name, "item": {}, "rows": []}
+    written = render_recording(item)
+    rows = []
+    for one in examined:
+        given = {
+            "wanted": {"name": one.code.name, "module": one.code.module, "file": one.code.file},
+            "table": written.table,
+            "description": written.description,
+            "beside": written.beside,
+            "system": item.system,
+            "budget": limits.simulations,
+            "seconds": limits.seconds,
+            "seed": make_seed_words("diagnosis", one.label, asked.name).tolist(),
+        }
+        rows.append(_row(one, given, asked.name, limits, hidden))
+    return {"question": asked.name, "item": item.to_json(), "rows": rows}
+
+
+def _row(
+    one: EvaluatedDiagnoser,
+    given: dict[str, Any],
+    question: str,
+    limits: AnswerLimits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """Run one diagnoser and return its row, with the reason if it gave no answer."""
+    row: dict[str, Any] = {"question": question, "diagnoser": one.label, "trusted": one.trusted}
+    learned = _learned(one.learned.get(given["system"]))
+    begun = perf_counter()
+    try:
+        if one.trusted:
+            said = _diagnose_in_process(given, learned)
+        else:
+            said = retry_if_killed(
+                lambda: _diagnose_isolated(one.code, given, learned, limits, hidden)
+            )
+        skipped = said.pop("skipped", "")
+        end = {"status": "skipped" if skipped else "done", "reason": skipped, **said}
+    except RunEndedError as ended:
+        end = {"status": ended.status, "reason": _reason(ended.reason)}
+    nothing = {"answer": None, "simulations": 0, "processor_seconds": None, "seconds": None}
+    return {**row, **nothing, "seconds": perf_counter() - begun, **end}
+
+
+def _reason(text: str) -> str:
+    return (
+        f"{BUDGET_EXCEEDED_REASON}\n{text}"
+        if "sims.core.simulation_counter.SimulationBudgetExceededError" in text
+        else text
+    )
+
+
+def _diagnose_in_process(given: dict[str, Any], learned: Mapping[str, Array]) -> dict[str, Any]:
+    """Run a trusted diagnoser in this process.
+
+    Raises:
+        EndedError: the diagnoser failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            return diagnoser_process.diagnose_case(given, Path(folder), learned)
+        except Exception:
+            traceback.print_exc()
+            raise RunEndedError("crashed", traceback.format_exc()) from None
+
+
+def _diagnose_isolated(
+    code: TunerSpec,
+    given: dict[str, Any],
+    learned: Mapping[str, Array],
+    limits: AnswerLimits,
+    hidden: tuple[str, ...],
+) -> dict[str, Any]:
+    """Run a diagnoser in an isolated process and validate its answer.
+
+    Raises:
+        EndedError: the diagnoser failed.
+    """
+    robots = ("mujoco",) if given["beside"] else ()
+    child = _started(code, limits.memory, hidden, robots)
+    try:
+        if learned:
+            deadline = perf_counter() + START_TIMEOUT_SECONDS
+            child.send(b"L", *pack_arrays(learned), deadline=deadline)
+            child.receive(deadline=deadline)
+        begun = perf_counter()
+        deadline = begun + limits.seconds
+        child.send(b"Q", json.dumps(given).encode(), deadline=deadline)
+        message = child.receive(_MAX_ANSWER_BYTES, deadline)
+        seconds = perf_counter() - begun
+        try:
+            if message.kind != b"A":
+                raise ProtocolError("it gave no answer")
+            said = _validate_answer(message.to_document(_MAX_ANSWER_BYTES), limits)
+        except (ProtocolError, InputError, KeyError, TypeError, ValueError) as error:
+            raise child.fail_with_protocol_error(f"{error}"[:500]) from None
+        return {**said, "seconds": seconds}
+    finally:
+        child.end()
+
+
+def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
+    """Validate the message of an isolated diagnoser.
+
+    Raises:
+        FoulError: the reported costs are impossible.
+    """
+    simulations, seconds = int(said["simulations"]), float(said["processor_seconds"])
+    if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
+        raise ProtocolError("it said what it cannot have used")
+    if skipped := str(said.get("skipped", ""))[:_REASON]:
+        nothing = {"answer": None, "simulations": 0, "processor_seconds": 0.0}
+        return {**nothing, "skipped": skipped}
+    answer = Answer.of(said["answer"]).document()
+    return {"answer": answer, "simulations": simulations, "processor_seconds": seconds}
+
+
+def _started(
+    code: TunerSpec, memory: int, hidden: tuple[str, ...], more: tuple[str, ...] = ()
+) -> IsolatedProcess:
+    house = get_fork_server()
+    own = code.module.startswith("bench.")
+    # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
+    house.preload_modules(
+        [PRELOAD_MODULE, *more, *code.modules, *([code.module] if own and not code.file else [])]
+    )
+    files = [code.file] if code.file else []
+    child = house.start_process(
+        "bench.diagnosis_benchmark.diagnoser_process:serve_requests", files, memory, hidden
+    )
+    try:
+        child.wait_until_ready()
+    except BaseException:
+        child.end()
+        raise
+    return child
+
+
+def _learned(path: Path | None) -> dict[str, Array]:
+    """Load trained arrays; return an empty dictionary if there is no file."""
+    if path is None:
+        return {}
+    with np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def train_isolated(
+    code: TunerSpec, lesson: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
+) -> tuple[dict[str, Array], int, float]:
+    """Train a diagnoser for a system, in an isolated process unless it is trusted.
+
+    Args:
+        code: where its code is.
+        lesson: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+        seconds: maximum time.
+        hidden: folders that the diagnoser must not read.
+        trusted: whether it runs in this process.
+
+    Returns:
+        The trained arrays, the number of simulations and the seconds used.
+
+    Raises:
+        EndedError: the training failed.
+    """
+    begun = perf_counter()
+    if trusted:
+        arrays, used = diagnoser_process.train_diagnoser(lesson)
+        return dict(arrays), used, perf_counter() - begun
+    child = _started(code, 0, hidden)
+    try:
+        deadline = begun + seconds
+        child.send(b"F", json.dumps(lesson).encode(), deadline=deadline)
+        message = child.receive(MAX_STATE_BYTES, deadline)
+        try:
+            if message.kind != b"L":
+                raise ProtocolError("it learned nothing")
+            learned = unpack_arrays(message.body)
+            used = int(learned.pop("simulations")[0])
+        except (ProtocolError, KeyError, ValueError) as error:
+            raise child.fail_with_protocol_error(f"{error}") from None
+        return learned, used, perf_counter() - begun
+    finally:
+        child.end()

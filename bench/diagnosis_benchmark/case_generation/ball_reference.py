@@ -1,0 +1,198 @@
+"""Reference simulation of the ball with scipy, with any effect, from impact to impact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import cos, hypot, pi, sin, sqrt, tanh
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from bench.diagnosis_benchmark.case_generation.joint_reference import (
+    SOLVER_TOLERANCES,
+    compute_region_indicator,
+)
+from bench.diagnosis_benchmark.case_generation.true_system import TrueSystem
+from sims.core.simulator import Array, Scenario
+
+REST_SPEED = 1e-5  # m/s: after slower rebounds the ball rests
+UNMODELLED_CAUSES = ("updraft", "gust", "wear", "layer")
+Acceleration = tuple[float, float, float]
+STATES = ("x", "y", "z", "vx", "vy", "vz")
+
+
+class FlightDynamics:
+    """Accelerations of a ball in flight.
+
+    Args:
+        world: the true system.
+        number: index of the run in the recording.
+    """
+
+    def __init__(self, world: TrueSystem, number: int) -> None:
+        self.g, self.acting = world.constants["gravity"], {**world.effects, **world.foreign}
+        self.laws = [
+            (ACCELERATION_LAWS[name], c)
+            for name, c in self.acting.items()
+            if name in ACCELERATION_LAWS
+        ]
+        self.gust = None
+        if "gust" in self.acting:
+            along, up, lasting, *begins = self.acting["gust"]
+            self.gust = along, up, begins[number], begins[number] + lasting
+        self.breaks = list(self.gust[2:]) if self.gust else []
+
+    def compute_acceleration(self, t: float, y: Any, middle: float) -> Acceleration:
+        """Compute the acceleration.
+
+        Args:
+            t: time.
+            y: position and velocity, (6,).
+            middle: a time within the integrated interval, which decides whether a gust acts.
+        """
+        ax, ay, az = 0.0, 0.0, -self.g
+        for law, c in self.laws:
+            bx, by, bz = law(c, self.g, t, *y)
+            ax, ay, az = ax + bx, ay + by, az + bz
+        if self.gust and self.gust[2] <= middle < self.gust[3]:
+            ax, az = ax + self.gust[0], az + self.gust[1]
+        return ax, ay, az
+
+
+def _drag(c: float, u: float, v: float, w: float, speed: float = 1.0) -> Acceleration:
+    return -c * speed * u, -c * speed * v, -c * speed * w
+
+
+def _wind(
+    c: Sequence[float],
+    g: float,
+    t: float,
+    x: float,
+    y: float,
+    z: float,
+    u: float,
+    v: float,
+    w: float,
+) -> Acceleration:
+    u, v = u - c[1], v - c[2]
+    return _drag(c[0], u, v, w, sqrt(u * u + v * v + w * w))
+
+
+def _periodic(c: Sequence[float], g: float, t: float, *state: float) -> Acceleration:
+    return 0.0, 0.0, c[0] * sin(2 * pi * c[2] * t) + c[1] * cos(2 * pi * c[2] * t)
+
+
+def _layer_drag(
+    c: Sequence[float],
+    g: float,
+    t: float,
+    x: float,
+    y: float,
+    z: float,
+    u: float,
+    v: float,
+    w: float,
+) -> Acceleration:
+    share = 0.5 * (1 + tanh((z - c[1]) / 0.02))
+    return _drag(c[0] * share, u, v, w, sqrt(u * u + v * v + w * w))
+
+
+ACCELERATION_LAWS: dict[str, Callable[..., Acceleration]] = {
+    "drag.linear": lambda c, g, t, x, y, z, u, v, w: _drag(c[0], u, v, w),
+    "drag.quadratic": lambda c, g, t, x, y, z, u, v, w: _drag(
+        c[0], u, v, w, sqrt(u * u + v * v + w * w)
+    ),
+    "wind": _wind,
+    "gravity.scale": lambda c, g, *s: (0.0, 0.0, -c[0] * g),
+    "gravity.tilt": lambda c, g, *s: (c[0] * g, c[1] * g, 0.0),
+    "force.bias": lambda c, g, *s: (0.0, 0.0, c[0]),
+    "force.periodic": _periodic,
+    "lift.magnus": lambda c, g, t, x, y, z, u, v, w: (-c[0] * w - c[1] * v, c[1] * u, c[0] * u),
+    "updraft": lambda c, g, t, x, *s: (
+        0.0,
+        0.0,
+        c[0] * compute_region_indicator(x, c[1], c[2]),
+    ),  # unmodelled: rising air within a region of x
+    "layer": _layer_drag,  # unmodelled: quadratic drag above a height
+}
+
+
+def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: Array) -> Array:
+    """Simulate a run.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        number: index of the run in the recording.
+        instants: increasing times >= 0, (T,).
+
+    Returns:
+        Positions and velocities, (T, 6).
+    """
+    air, until = FlightDynamics(world, number), float(instants[-1])
+    state = np.array([scenario.initial[name] for name in STATES])
+    out = np.empty((instants.size, 6))
+    out[instants <= 0] = state
+    now, rising, resting = 0.0, 0.0, False
+    while now < until:
+        end = min([until, *(b for b in air.breaks if b > now)], default=until)
+        looks = not (rising or resting)
+        if rising:  # the ground, where the rise after a bounce begins, is no event
+            end = min(end, now + rising)
+        solved = _fly(air, now, end, state, world.constants["radius"] if looks else None, resting)
+        reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
+        first, last = np.searchsorted(instants, [now, reached], side="right")
+        if last > first:
+            out[first:last] = solved.sol(instants[first:last]).T
+        now, rising = reached, 0.0
+        if looks and solved.t_events[0].size:
+            state, resting = _bounce(world, now, state)
+            state[2] = world.constants["radius"]
+            rising = (
+                0.0
+                if resting
+                else 0.4 * state[5] / max(-air.compute_acceleration(now, state, now)[2], 1e-3)
+            )
+    return out
+
+
+def _fly(
+    air: FlightDynamics, now: float, end: float, state: Array, floor: float | None, resting: bool
+) -> Any:
+    middle = 0.5 * (now + end)
+
+    def rate(t: float, y: Array) -> tuple[float, ...]:
+        ax, ay, az = air.compute_acceleration(t, y.tolist(), middle)
+        return (y[3], y[4], y[5], ax, ay, max(az, 0.0) if resting else az)
+
+    def meets(t: float, y: Array) -> float:
+        return float(y[2] - floor)
+
+    stops: Any = meets
+    stops.terminal, stops.direction = True, -1
+    events = None if floor is None else stops
+    settings: dict[str, Any] = {
+        "dense_output": True,
+        "first_step": min(0.02, end - now),
+        **SOLVER_TOLERANCES,
+    }
+    solved = solve_ivp(rate, (now, end), state, "DOP853", events=events, **settings)
+    if not solved.success:
+        raise RuntimeError(solved.message)
+    return solved
+
+
+def _bounce(world: TrueSystem, t: float, state: Array) -> tuple[Array, bool]:
+    """Compute the state after an impact, and whether the ball stays at rest."""
+    speed, e = -state[5], world.parameters["restitution"]
+    if "restitution.speed" in world.effects:
+        e = min(e * speed ** world.effects["restitution.speed"][0], 1.0)
+    if "wear" in world.foreign:  # unmodelled: restitution that decreases with time
+        e = min(max(e * (1.0 - world.foreign["wear"][0] * t), 0.0), 1.0)
+    along = hypot(state[3], state[4])
+    lost = world.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed
+    after = state.copy()
+    after[3:5] *= max(1.0 - lost / along, 0.0) if along > 0 else 1.0
+    after[5] = e * speed if e * speed > REST_SPEED else 0.0
+    return after, after[5] == 0.0

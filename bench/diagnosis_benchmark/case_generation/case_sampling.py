@@ -1,0 +1,366 @@
+"""Sampling of cases for ball, pendulum and slider.
+
+`draw_case` chooses what is hidden and how strongly. `write_case` writes the recording and, in a
+separate
+file, the truth. Everything that is drawn follows from the name of the case; a case is a recipe
+without data.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation import (
+    competing_effects,
+    effect_coefficients,
+    effect_sizing,
+)
+from bench.diagnosis_benchmark.case_generation.benchmark_case import CASE_KINDS as CASE_KINDS
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase as BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    ANY_CONDITIONS,
+    RecordingConditions,
+    RequestedConditions,
+)
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    draw_conditions as drawn_setting,
+)
+from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+    SIMULATORS,
+    UNMODELLED_CAUSES,
+    simulate_with_mujoco,
+    simulate_with_scipy,
+)
+from sims import effects as library
+from sims.core.simulator import Array
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_writer import write_recording
+
+SYSTEMS = ("ball", "pendulum", "slider")
+SUBTHRESHOLD_SIZES = (0.1, 0.2, 0.3, 0.5)  # sizes for the power curve only
+
+# Minimum RMS residual, in units of the noise, if only one of two effects or no unmodelled cause is
+# in the model.
+MIN_DISTINCT_SIZE = 1.0
+# Minimum RMS residual, in units of the noise, with the simpler form of an effect; below it, the
+# simpler form is a correct answer.
+MIN_SIMPLER_RESIDUAL = 0.4
+SIMPLER_EFFECTS = {
+    "friction.direction": ("drag.linear",),
+    "friction.load_direction": ("friction.load",),
+    "friction.load_quadratic": ("friction.load",),
+    "friction.position": ("friction.coulomb",),
+    "friction.stribeck": ("friction.coulomb",),
+    "input.power": ("input.gain",),
+    "friction.warming": ("friction.coulomb", "drag.linear"),
+    "wind": (
+        "drag.linear",
+        "drag.quadratic",
+        "force.bias",
+        "gravity.tilt",
+    ),  # fast air is a steady push
+}
+
+EQUIVALENT_EFFECTS: tuple[tuple[str, bool, frozenset[str]], ...] = (
+    ("slider", True, frozenset({"gravity.tilt", "force.bias", "input.bias"})),
+    ("pendulum", True, frozenset({"force.bias", "input.bias"})),
+    ("pendulum", True, frozenset({"input.gain", "gravity.scale"})),  # the inertia absorbs the rest
+    ("pendulum", False, frozenset({"force.bias", "input.bias"})),
+    ("pendulum", False, frozenset({"gravity.tilt", "sensor.bias"})),  # gravity rotated and scaled
+    (
+        "ball",
+        False,
+        frozenset({"force.bias", "gravity.scale", "clock.skew"}),
+    ),  # no accelerometer is recorded
+)
+"""Effects that are exactly equivalent: they give the same motion for some parameters.
+
+Each entry is a system, whether it has an input, and the effects. The initial states may differ too.
+"""
+
+
+def find_equivalent_effects(system: str, driven: bool, effect: str) -> frozenset[str]:
+    """Return an effect and all effects that are equivalent to it.
+
+    Args:
+        system: name of the system.
+        driven: whether there is an input.
+        effect: name of the effect.
+    """
+    classes = (
+        names
+        for *where, names in EQUIVALENT_EFFECTS
+        if where == [system, driven] and effect in names
+    )
+    return frozenset({effect}).union(*classes)
+
+
+def draw_case(
+    kind: str,
+    system: str,
+    seed: int,
+    effect: str | None = None,
+    size: float | None = None,
+    wanted_so: RequestedConditions = ANY_CONDITIONS,
+) -> BenchmarkCase | None:
+    """Draw a case.
+
+    Args:
+        kind: clean, single, double or foreign.
+        system: ball, pendulum or slider.
+        seed: seed from which everything else follows.
+        effect: hidden effect (the first one of a double case); None to draw it.
+        size: size in units of the noise; None to draw it.
+        wanted_so: recording conditions that are not drawn.
+
+    Returns:
+        The case, or None if the sensors cannot show the effect at this size with a strength up to
+        `effect_coefficients.MAX_STRENGTH`, or if another answer explains it too well.
+    """
+    asked = effect or "any"
+    name = "-".join(
+        [
+            kind,
+            system,
+            *([asked] if kind != "clean" else []),
+            *([f"{size:g}"] if size else []),
+            *(str(part) for part in wanted_so if part is not None),
+            str(seed),
+        ]
+    )
+    rng = _rng(name, "cause")
+    hidden = _hidden(kind, system, effect, rng)
+    setting = _setting(name, system, hidden, wanted_so)
+    item = BenchmarkCase(
+        name, system, kind, {}, 0.0, setting.noise.kind, setting.noise.stated, setting.rate,
+        setting.seconds,
+        len(setting.scenarios), str(rng.choice(["scipy", "mujoco"])), setting.is_driven,
+        setting.channels, seed,
+        setting.parameters, asked=wanted_so,
+    )  # fmt: skip
+    wanted = size or float(
+        np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0)))
+    )
+    # The effect must be observable in the runs for fitting, because the held-out runs are not
+    # fitted.
+    shown = replace(setting, scenarios=setting.scenarios[: item.runs - count_held_out_runs(item)])
+    return {
+        "clean": _draw_clean,
+        "single": _draw_single,
+        "double": _draw_pair,
+        "foreign": _draw_unmodelled,
+    }[kind](item, shown, hidden, wanted, rng)
+
+
+def count_held_out_runs(item: BenchmarkCase) -> int:
+    """Return the number of held-out runs; they are the last runs of the recording."""
+    return max(1, item.runs // 3)
+
+
+def _rng(name: str, purpose: str) -> np.random.Generator:
+    return np.random.default_rng(list(f"{name} {purpose}".encode()))
+
+
+@lru_cache(maxsize=16)
+def _setting(
+    name: str, system: str, hidden: tuple[str, ...], asked: RequestedConditions = ANY_CONDITIONS
+) -> RecordingConditions:
+    return drawn_setting(system, _rng(name, "setting"), hidden, asked=asked)
+
+
+def restore_conditions(item: BenchmarkCase) -> RecordingConditions:
+    """Restore the recording conditions of a case."""
+    return _setting(item.name, item.system, tuple(item.effects), item.asked)
+
+
+def _hidden(
+    kind: str, system: str, effect: str | None, rng: np.random.Generator
+) -> tuple[str, ...]:
+    if kind == "clean":
+        return ()
+    names = (
+        list(UNMODELLED_CAUSES[system])
+        if kind == "foreign"
+        else sorted(library.list_effects_for(SIMULATORS[system].system))
+    )
+    first = effect or str(rng.choice(names))
+    if kind != "double":
+        return (first,)
+    alike = find_equivalent_effects(system, True, first) | find_equivalent_effects(
+        system, False, first
+    )
+    return first, str(rng.choice([n for n in names if n not in alike]))
+
+
+def _draw_clean(
+    item: BenchmarkCase,
+    setting: RecordingConditions,
+    hidden: tuple[str, ...],
+    wanted: float,
+    rng: np.random.Generator,
+) -> BenchmarkCase | None:
+    return item
+
+
+def _draw_single(
+    item: BenchmarkCase,
+    setting: RecordingConditions,
+    hidden: tuple[str, ...],
+    wanted: float,
+    rng: np.random.Generator,
+) -> BenchmarkCase | None:
+    (name,) = hidden
+    c = find_coefficients(name, setting, wanted, rng)
+    if c is None:
+        return None
+    beyond = None
+    if name in SIMPLER_EFFECTS and wanted >= 1.0:
+        observed = effect_sizing.simulate_observations(setting, {name: c})
+        beyond = min(
+            competing_effects.compute_refitted_residual(setting, observed, simpler)
+            for simpler in SIMPLER_EFFECTS[name]
+        )
+        if beyond < MIN_SIMPLER_RESIDUAL:
+            return None
+    return replace(item, effects={name: c}, size=wanted, beyond=beyond)
+
+
+def find_coefficients(
+    name: str, setting: RecordingConditions, wanted: float, rng: np.random.Generator
+) -> tuple[float, ...] | None:
+    """Find coefficients of an effect at which the residual has the requested size.
+
+    Args:
+        name: name of the effect.
+        setting: recording conditions.
+        wanted: size in units of the noise.
+        rng: random generator for the shape of the effect.
+
+    Returns:
+        Coefficients, or None if there are none.
+    """
+    of = effect_coefficients.draw_effect_shape(name, setting, rng)
+    left = effect_sizing.make_gap_function(
+        setting, lambda strength: effect_sizing.simulate_observations(setting, {name: of(strength)})
+    )
+    strength = effect_sizing.find_strength_for_size(
+        left, wanted, effect_coefficients.get_max_strength(name)
+    )
+    return None if strength is None else of(strength)
+
+
+def _draw_pair(
+    item: BenchmarkCase,
+    setting: RecordingConditions,
+    hidden: tuple[str, ...],
+    wanted: float,
+    rng: np.random.Generator,
+) -> BenchmarkCase | None:
+    """Hide two effects, each of the requested size alone.
+
+    The case is rejected if one of them explains both.
+    """
+    found = {name: find_coefficients(name, setting, wanted, rng) for name in hidden}
+    effects = _order_input_effects({name: c for name, c in found.items() if c is not None})
+    if len(effects) < len(found):
+        return None
+    observed = effect_sizing.simulate_observations(setting, effects)
+    if not np.isfinite(observed).all():
+        return None
+    beyond = min(
+        competing_effects.compute_refitted_residual(setting, observed, name, effects[name])
+        for name in effects
+    )
+    return (
+        replace(item, effects=effects, size=wanted, beyond=beyond)
+        if beyond >= MIN_DISTINCT_SIZE
+        else None
+    )
+
+
+def _order_input_effects(effects: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
+    """Put a lag of the input last: nonlinear input effects act on the command."""
+    return dict(sorted(effects.items(), key=lambda pair: pair[0] == "input.lag"))
+
+
+def _draw_unmodelled(
+    item: BenchmarkCase,
+    setting: RecordingConditions,
+    hidden: tuple[str, ...],
+    wanted: float,
+    rng: np.random.Generator,
+) -> BenchmarkCase | None:
+    """Hide an unmodelled cause, which the library explains only in part."""
+    (name,) = hidden
+    of = effect_coefficients.draw_unmodelled_cause(name, setting, rng)
+
+    def observed(strength: float) -> Array:
+        world = setting.make_true_system(foreign={name: of(strength)})
+        return np.array(
+            [
+                simulate_with_scipy(world, s, setting.channels, i)
+                for i, s in enumerate(setting.scenarios)
+            ]
+        )
+
+    strength = effect_sizing.find_strength_for_size(
+        effect_sizing.make_gap_function(setting, observed), wanted, effect_coefficients.MAX_STRENGTH
+    )
+    if strength is None:
+        return None
+    _, beyond = competing_effects.find_best_effect(setting, observed(strength))
+    hides = replace(item, effects={name: of(strength)}, size=wanted, beyond=beyond, source="scipy")
+    return hides if beyond >= MIN_DISTINCT_SIZE else None
+
+
+def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> Path:
+    """Write the recording of a case as NAME.csv and NAME.toml.
+
+    Args:
+        item: the case.
+        folder: folder for the files.
+        truth: whether to write NAME.truth.json too.
+
+    Returns:
+        Path of the CSV file.
+    """
+    setting = restore_conditions(item)
+    runs = _runs(item, setting)
+    system = SIMULATORS[item.system].system
+    noise = setting.noise.sigma if item.stated else {}
+    constants = {} if item.system == "slider" else setting.constants
+    path = Path(folder) / f"{item.name}.csv"
+    beside = (
+        {path.with_suffix(".truth.json"): json.dumps(item.to_json(), indent=1) + "\n"}
+        if truth
+        else {}
+    )
+    write_recording(
+        path,
+        Recording(path, item.system, "", constants, noise, runs),
+        system,
+        digits=9,
+        beside=beside,
+    )
+    return path
+
+
+def _runs(item: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
+    rng, held_out = _rng(item.name, "noise"), count_held_out_runs(item)
+    hidden = {"foreign": item.effects} if item.kind == "foreign" else {"effects": item.effects}
+    world, runs = setting.make_true_system(**hidden), []
+    for number, scenario in enumerate(setting.scenarios):
+        if item.source == "mujoco":
+            observed = simulate_with_mujoco(world, scenario, setting.channels)
+        else:
+            observed = simulate_with_scipy(world, scenario, setting.channels, number)
+        recorded = setting.noise.add_to(observed, rng)
+        channels = dict(zip(setting.channels, recorded.T, strict=True))
+        last = number >= item.runs - held_out
+        runs.append(Run(str(number), scenario.times, channels, scenario.inputs, {}, {}, last))
+    return tuple(runs)

@@ -1,0 +1,148 @@
+"""Competing effects: effects of the library refitted to the observations of a case.
+
+Cases that a competing effect explains too well are rejected as ambiguous. Only the most promising
+effects are refitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.effect_sizing import NuisanceFitter, ResidualFit
+from bench.diagnosis_benchmark.case_generation.recording_conditions import RecordingConditions
+from bench.diagnosis_benchmark.case_generation.reference_simulation import SIMULATORS
+from sims import effects as library
+from sims.core.simulator import Array
+
+MAX_REFITTED_EFFECTS = 4  # number of effects refitted, those with the smallest first-order residual
+STARTS_PER_EFFECT = 3  # number of starting points from which one effect is refitted
+SHAPE_GRIDS: dict[
+    str, list[tuple[float, ...]]
+] = {  # initial guesses of shape parameters, in the units of the library
+    "force.periodic": [(f,) for f in (0.2, 0.4, 0.7, 1.2, 2.0, 3.5)],
+    "force.ripple": [(p,) for p in (0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 6.0)],
+    "friction.position": [(p,) for p in (0.3, 0.6, 1.2, 2.5, 5.0)],
+    "friction.warming": [(s,) for s in (0.7, 2.0, 6.0)],
+    "friction.stribeck": [(s,) for s in (0.05, 0.2, 1.0)],
+    "sensor.slip": [(s,) for s in (0.3, 0.7, 1.2, 2.0, 3.0, 4.0)],
+    "wind": [(u, v) for u in (-4.0, 0.0, 4.0) for v in (-4.0, 0.0, 4.0)],
+}
+
+
+def compute_refitted_residual(
+    setting: RecordingConditions,
+    observed: Array,
+    name: str,
+    coefficients: Sequence[float] | None = None,
+) -> float:
+    """Compute the residual after base parameters, initial states and an effect are refitted.
+
+    Args:
+        setting: recording conditions with the true parameters, where the fit starts.
+        observed: noise-free observations, (R, T, C).
+        name: name of the effect.
+        coefficients: starting values of its coefficients; None for several guesses.
+
+    Returns:
+        RMS residual in units of the noise.
+    """
+    fit = NuisanceFitter(setting, [name])
+    if coefficients is not None:
+        return fit(observed, [*setting.parameters.values(), *coefficients]).left
+    guesses = _rank_starts(setting, observed, name, NuisanceFitter(setting)(observed))
+    return min(fit(observed, guess).left for _, guess in guesses[:STARTS_PER_EFFECT])
+
+
+def find_best_effect(setting: RecordingConditions, observed: Array) -> tuple[str, float]:
+    """Find the effect of the library that leaves the smallest residual.
+
+    Args:
+        setting: recording conditions.
+        observed: noise-free observations, (R, T, C).
+
+    Returns:
+        Name of the effect and RMS residual in units of the noise.
+    """
+    bare = NuisanceFitter(setting)(observed)
+    usable = library.list_effects_for(SIMULATORS[setting.system].system)
+    names = [
+        n for n in usable if setting.is_driven or not (n.startswith("input.") or n == "backlash")
+    ]
+    first = {n: _rank_starts(setting, observed, n, bare)[0] for n in names}
+    promising = sorted(first, key=lambda n: first[n][0])[:MAX_REFITTED_EFFECTS]
+    left = {
+        n: NuisanceFitter(setting, [n])(observed, first[n][1], bare.starts).left for n in promising
+    }
+    name = min(left, key=lambda n: left[n])
+    return name, min(left[name], bare.left)
+
+
+def _rank_starts(
+    setting: RecordingConditions, observed: Array, name: str, bare: ResidualFit
+) -> list[tuple[float, Array]]:
+    """List starting points for refitting an effect, the best first.
+
+    Args:
+        setting: recording conditions.
+        observed: noise-free observations, (R, T, C).
+        name: name of the effect.
+        bare: fit without the effect.
+
+    Returns:
+        Pairs of RMS residual (to first order where that is possible) and theta.
+    """
+    fit = NuisanceFitter(setting, [name])
+    if name == "input.saturation":  # starts below the peak: at the peak the derivative is zero
+        peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+        guesses = [np.array([*bare.theta, share * peak]) for share in (0.9, 0.6)]
+        result = [(_compute_residual(fit, observed, guess, bare), guess) for guess in guesses]
+    elif name == "state.limit":  # an end stop that is not reached has no derivative either
+        guesses = [np.array([*bare.theta, *stop]) for stop in _stops(setting, observed[..., 0])]
+        result = [(_compute_residual(fit, observed, guess, bare), guess) for guess in guesses]
+    else:
+        result = [
+            _linear_least_squares_step(fit, observed, shape, bare)
+            for shape in SHAPE_GRIDS.get(name, [()])
+        ]
+    return sorted(result, key=lambda pair: pair[0])
+
+
+def _stops(setting: RecordingConditions, path: Array) -> Iterator[tuple[float, float, float]]:
+    """Yield soft and hard end stops at either end of the travel, met late and early."""
+    low, high = float(path.min()), float(path.max())
+    far = 20.0 if setting.system == "pendulum" else 5000.0
+    for share, part in product((0.03, 0.15), (0.001, 0.01, 0.1)):
+        within = share * (high - low)
+        yield part * far, high - within, 0.05
+        yield -part * far, low + within, 0.05
+
+
+def _compute_residual(
+    fit: NuisanceFitter, observed: Array, theta: Array, bare: ResidualFit
+) -> float:
+    rest, _ = fit.linearise(observed, theta, bare.starts)
+    return float(np.sqrt(np.mean(rest**2)))
+
+
+def _linear_least_squares_step(
+    fit: NuisanceFitter, observed: Array, shape: Sequence[float], bare: ResidualFit
+) -> tuple[float, Array]:
+    """Estimate the residual by one least-squares step from a zero effect with a fixed shape.
+
+    Shape parameters that the system does not have are omitted.
+
+    Returns:
+        RMS residual of the linear model, and theta after the step.
+    """
+    base, count = bare.theta.size, fit.theta.size
+    shape = shape[: count - base - 1]
+    scaled = count - len(shape)
+    theta = np.array([*bare.theta, *[0.0] * (scaled - base), *shape])
+    rest, slope = fit.linearise(observed, theta, bare.starts)
+    slope = np.delete(slope, np.s_[scaled:count], axis=1)
+    step = fit.compute_step(rest, slope, 1e-9)
+    theta[:scaled] += step[:scaled] * fit.scales[:scaled]
+    return float(np.sqrt(np.mean((rest - slope @ step) ** 2))), np.clip(theta, fit.low, fit.high)

@@ -1,0 +1,360 @@
+"""Coefficients of hidden causes as functions of a strength.
+
+The shape is drawn at random. The strength s remains free; 1 is the upper end of the plausible
+range. The bounds are those of the effect library. `shape(name, setting, rng)` returns the function
+from strength to coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.effect_sizing import simulate_observations
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    MAX_RUNS,
+    RecordingConditions,
+)
+from bench.diagnosis_benchmark.case_generation.reference_simulation import SIMULATORS
+from sims import effects as library
+from sims.core.simulator import Array
+
+CoefficientFunction = Callable[[float], tuple[float, ...]]
+"""Function from strength to coefficients."""
+SIGNED_EFFECTS: tuple[str, ...] = (
+    "force.bias",
+    "gravity.scale",
+    "input.gain",
+    "input.bias",
+    "sensor.gain",
+    "sensor.bias",
+    "sensor.drift",
+)
+SIGNED_EFFECTS += ("clock.skew", "spring.cubic", "restitution.speed")
+MAX_STRENGTH = 2.0  # maximum strength: twice the plausible range
+
+
+def draw_effect_shape(
+    name: str, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw the shape of an effect of the library.
+
+    Args:
+        name: name of the effect.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Coefficients as a function of the strength.
+    """
+    kind = SIMULATORS[setting.system].system.kind
+    far = max(abs(bound) for bound in library.get_effect(name).coefficients[0].range(kind))
+    if name in SHAPE_SAMPLERS:
+        return SHAPE_SAMPLERS[name](far, setting, rng)
+    sign = float(rng.choice([-1, 1])) if name in SIGNED_EFFECTS else 1.0
+    return lambda s: (sign * far * s,)
+
+
+def get_max_strength(name: str) -> float:
+    """Return the maximum strength of an effect."""
+    return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, MAX_STRENGTH)
+
+
+def _direction(
+    far: float, setting: RecordingConditions, rng: np.random.Generator, *behind: float
+) -> CoefficientFunction:
+    angle = rng.uniform(0, 2 * np.pi)
+    along, across = far * float(np.cos(angle)), far * float(np.sin(angle))
+    return lambda s: (along * s, across * s, *behind)
+
+
+def _level(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw a horizontal direction: along x, and along y if the system has it."""
+    if setting.system == "ball":
+        return _direction(far, setting, rng)
+    sign = float(rng.choice([-1, 1]))
+    return lambda s: (sign * far * s,)
+
+
+def _ripple(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw a ripple whose period the motion passes several times."""
+    travel = np.median(_ranges(setting))
+    period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
+    return _direction(far, setting, rng, float(period))
+
+
+def _periodic(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw a periodic force with at least 1.5 periods in a run."""
+    low, high = 1.5 / setting.seconds, 4.0
+    return _direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+
+
+def _wind(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    if setting.system == "slider":
+        speed = float(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0))
+        return lambda s: (far * s, speed)
+    speed, angle = rng.uniform(2.0, 8.0), rng.uniform(0, 2 * np.pi)
+    return lambda s: (far * s, float(speed * np.cos(angle)), float(speed * np.sin(angle)))
+
+
+def _stribeck(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw Stribeck friction with a large static part, at speeds that often occur in the motion."""
+    extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_speeds(setting)))
+    speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
+    return lambda s: (far * s, extra * far * s, speed)
+
+
+def _saturation(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Return an input limit: at strength 0 the peak of the input, at strength 1 zero."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    return lambda s: (float(peak * (1 - s)),)
+
+
+def _one_way(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw friction that is several times larger in one direction."""
+    shares = [1.0, float(rng.uniform(0.0, 0.3))]
+    rng.shuffle(shares)
+    return lambda s: (far * shares[0] * s, far * shares[1] * s)
+
+
+def _power(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Return a power law of the input that keeps the peak of the input unchanged."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    return lambda s: (float(peak**-s - 1), s)
+
+
+def _rate(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    return lambda s: (float(peak / (0.8 * s)),)
+
+
+def _quadratic(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw friction whose quadratic part exceeds the linear one at the peak force."""
+    peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
+    square = float(far * rng.uniform(2.0, 6.0) / peak)
+    return lambda s: (0.5 * far * s, square * s)
+
+
+def _draw_position_friction(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw position-dependent friction whose period the motion passes one to four times."""
+    travel = float(np.median(_ranges(setting)))
+    low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
+    period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
+    angle, share = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95)
+    sine, cosine = far * share * float(np.sin(angle)), far * share * float(np.cos(angle))
+    return lambda s: (far * (1 - share) * s, sine * s, cosine * s, period)
+
+
+def _warming(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous."""
+    time = float(setting.seconds * rng.uniform(0.2, 0.8))
+    viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_speeds(setting))))
+    return lambda s: (far * s, viscous * s, max(time, 0.5))
+
+
+def _slip(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw a sensor slip at a time well within each run."""
+    sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * setting.seconds)
+    return lambda s: (sign * far * s, instant)
+
+
+def _flexibility(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw a flexible load: from four oscillations per run to a fifth of the sampling rate."""
+    low, high = 2 * np.pi * 4 / setting.seconds, 2 * np.pi * min(0.2 * setting.rate, 40.0)
+    frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    ratio = float(np.exp(rng.uniform(np.log(0.01), np.log(0.3))))
+    return lambda s: (min(far * s, 0.95), float(np.clip(frequency, 6, 300)), ratio)
+
+
+def _play(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw backlash: at strength 1 the gap is 0.3 of the travel."""
+    share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_ranges(setting)))
+    return lambda s: (0.3 * travel * s, share)
+
+
+def _hysteresis(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw hysteresis with a deflection of 0.02 to 0.2 of the travel."""
+    travel = float(np.median(_ranges(setting)))
+    deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
+    return lambda s: (far * s, deflection)
+
+
+def _stop(
+    far: float, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw an end stop within the travel, near its upper or lower end."""
+    side, within = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
+    place = float(
+        np.quantile(
+            np.concatenate(_simulate_base_motion(setting)), 1 - within if side > 0 else within
+        )
+    )
+    loss = float(rng.uniform(0.0, 0.4)) / (5.0 if setting.system == "pendulum" else 1.0)
+    return lambda s: (side * far * s, place, loss)
+
+
+SHAPE_SAMPLERS: dict[str, Callable[..., CoefficientFunction]] = {
+    "state.limit": _stop,
+    "sensor.slip": _slip,
+    "friction.hysteresis": _hysteresis,
+    "joint.backlash": _play,
+    "joint.flexibility": _flexibility,
+    "friction.direction": _one_way,
+    "friction.load_direction": _one_way,
+    "friction.load_quadratic": _quadratic,
+    "friction.position": _draw_position_friction,
+    "friction.warming": _warming,
+    "input.power": _power,
+    "input.rate": _rate,
+    "sensor.eccentricity": _direction,
+    "gravity.tilt": _level,
+    "lift.magnus": _direction,
+    "force.ripple": _ripple,
+    "force.periodic": _periodic,
+    "wind": _wind,
+    "friction.stribeck": _stribeck,
+    "input.saturation": _saturation,
+}
+
+
+def _simulate_base_motion(setting: RecordingConditions) -> list[Array]:
+    """Simulate the noise-free motion without hidden causes: the first channel (T,) of every run."""
+    return list(simulate_observations(setting, {})[:, :, 0])
+
+
+def _ranges(setting: RecordingConditions) -> list[float]:
+    return [np.ptp(path) for path in _simulate_base_motion(setting)]
+
+
+def _speeds(setting: RecordingConditions) -> Array:
+    return np.concatenate([np.diff(path) for path in _simulate_base_motion(setting)]) * setting.rate
+
+
+def draw_unmodelled_cause(
+    name: str, setting: RecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw the shape of an unmodelled cause; see `case_generation.reference_simulation`.
+
+    Args:
+        name: name of the cause.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Numbers of the cause as a function of the strength.
+    """
+    return UNMODELLED_SAMPLERS[(setting.system == "ball", name)](setting, rng)
+
+
+def _draw_onsets(
+    setting: RecordingConditions, lasting: float, rng: np.random.Generator
+) -> list[float]:
+    """Draw a start time for each run, held-out runs included."""
+    return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in range(MAX_RUNS)]
+
+
+def _patch(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw a region of dry friction, 0.14 to 0.3 of the central 80 % of positions wide."""
+    low, high = np.quantile(np.concatenate(_simulate_base_motion(setting)), [0.1, 0.9])
+    half = float((high - low) * rng.uniform(0.07, 0.15))
+    centre = float(rng.uniform(low + half, high - half))
+    return lambda s: (_force(setting) * s, centre, half)
+
+
+def _force(setting: RecordingConditions) -> float:
+    return 0.5 if setting.system == "pendulum" else 5.0
+
+
+def _gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    lasting, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
+    begins = _draw_onsets(setting, lasting, rng)
+    return lambda s: (sign * _force(setting) * s, lasting, *begins)
+
+
+def _ageing(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    far = (0.1 if setting.system == "pendulum" else 5.0) / setting.seconds
+    return lambda s: (far * s,)
+
+
+def _latch(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw a soft stop in every other run, which the motion reaches for a short time."""
+    place = float(
+        np.quantile(np.concatenate(_simulate_base_motion(setting)), rng.uniform(0.7, 0.85))
+    )
+    far = 10.0 if setting.system == "pendulum" else 2000.0
+    return lambda s: (far * s, place)
+
+
+def _updraft(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    where = np.concatenate(_simulate_base_motion(setting))
+    half = float(rng.uniform(0.3, 0.8))
+    centre = float(rng.uniform(*np.quantile(where, [0.1, 0.9])))
+    return lambda s: (10.0 * s, centre, half)
+
+
+def _ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    lasting, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
+    begins = _draw_onsets(setting, lasting, rng)
+    return lambda s: (
+        20.0 * s * float(np.cos(angle)),
+        20.0 * s * float(np.sin(angle)),
+        lasting,
+        *begins,
+    )
+
+
+def _wear(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    sign = float(rng.choice([-1, 1]))
+    return lambda s: (sign * s / setting.seconds,)
+
+
+def _draw_drag_layer(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw a height above most bounces and below most drops, from which drag acts."""
+    height = float(min(s.initial["z"] for s in setting.scenarios) * rng.uniform(0.55, 0.8))
+    return lambda s: (2.0 * s, height)
+
+
+UNMODELLED_SAMPLERS: dict[tuple[bool, str], Callable[..., CoefficientFunction]] = {
+    (False, "patch"): _patch,
+    (False, "gust"): _gust,
+    (False, "ageing"): _ageing,
+    (False, "latch"): _latch,
+    (True, "updraft"): _updraft,
+    (True, "gust"): _ball_gust,
+    (True, "wear"): _wear,
+    (True, "layer"): _draw_drag_layer,
+}

@@ -1,0 +1,256 @@
+"""Sizing of hidden effects: strength at which an effect leaves a residual of the requested size.
+
+The size is the RMS residual after base parameters and initial states are refitted. The batch engine
+is used here to choose sizes. Recordings of the benchmark come from other integrators, except for
+hidden-state effects (`reference_simulation.simulate_with_mujoco`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.recording_conditions import RecordingConditions
+from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+    SIMULATORS,
+    EffectCoefficients,
+)
+from sims.core.simulator import Array
+
+SIZE_TOLERANCE = 0.03  # relative tolerance of the size
+MAX_STRENGTH_FACTOR = 8.0  # maximum factor of the strength per step, so that the fit can follow
+FINITE_DIFFERENCE_STEP = 1e-5  # finite-difference step, as a fraction of a parameter's scale
+DIVERGED_VALUE = 1e30  # in units of the noise: larger values count as diverged
+
+
+@dataclass(frozen=True)
+class ResidualFit:
+    """Result of a fit.
+
+    Attributes:
+        left: RMS residual over all samples and channels, in units of the noise.
+        theta: base parameters, then coefficients of effects.
+        starts: initial states, (R, S).
+    """
+
+    left: float
+    theta: Array
+    starts: Array
+
+
+class NuisanceFitter:
+    """Damped least-squares fit of base parameters, effect coefficients and initial states.
+
+    Args:
+        setting: recording conditions with the true parameters and initial states.
+        effects: names of the effects whose coefficients are fitted.
+    """
+
+    def __init__(self, setting: RecordingConditions, effects: Sequence[str] = ()) -> None:
+        kind = SIMULATORS[setting.system]
+        self.simulator = kind(setting.constants, setting.channels, engine="batch", effects=effects)
+        self.scenarios, self.sigma, self.states = (
+            list(setting.scenarios),
+            setting.noise_sigmas,
+            list(kind.states),
+        )
+        base = [setting.parameters[p.name] for p in kind.system.parameters]
+        self.theta = np.array([*base, *(p.nominal for p in self.simulator.parameters[len(base) :])])
+        self.starts = np.array(
+            [[s.initial[name] for name in self.states] for s in setting.scenarios]
+        )
+        low, high = np.array([p.bounds for p in self.simulator.parameters]).T
+        self.low, self.high = (
+            low,
+            np.where(np.arange(low.size) < len(base), high, low + 2 * (high - low)),
+        )
+        self.scales = np.where(np.arange(low.size) < len(base), self.theta, 0.1 * (high - low))
+
+    def __call__(
+        self,
+        observed: Array,
+        theta: Array | Sequence[float] | None = None,
+        starts: Array | None = None,
+        rounds: int = 12,
+    ) -> ResidualFit:
+        """Fit observations.
+
+        Args:
+            observed: observations, (R, T, C).
+            theta: starting values of parameters and coefficients; None for those of the conditions.
+            starts: starting values of the initial states, (R, S); None for those of the conditions.
+            rounds: maximum number of iterations.
+        """
+        theta = self.theta if theta is None else np.asarray(theta, dtype=float)
+        starts, damping = self.starts if starts is None else starts, 1e-6
+        rest, slope = self.linearise(observed, theta, starts)
+        if not np.isfinite(rest).all():
+            return ResidualFit(np.inf, theta, starts)
+        for _ in range(rounds):
+            step = self.compute_step(rest, slope, damping)
+            count = theta.size
+            new = np.clip(theta + step[:count] * self.scales, self.low, self.high)
+            begun = starts + step[count:].reshape(starts.shape)
+            tried, steeper = self.linearise(observed, new, begun)
+            if not tried @ tried < rest @ rest:  # a NaN is no improvement
+                damping *= 30.0
+                if damping > 1e3:
+                    break
+                continue
+            gained = 1.0 - np.sqrt((tried @ tried) / (rest @ rest))
+            theta, starts, rest, slope, damping = new, begun, tried, steeper, damping / 10.0
+            if gained < 1e-3:
+                break
+        return ResidualFit(float(np.sqrt(np.mean(rest**2))), theta, starts)
+
+    @staticmethod
+    def compute_step(rest: Array, slope: Array, damping: float) -> Array:
+        """Solve the damped normal equations.
+
+        Args:
+            rest: residual, (N,).
+            slope: Jacobian in units of the scales, (N, P).
+            damping: damping factor of the diagonal.
+
+        Returns:
+            Step in units of the scales, (P,).
+        """
+        gram = slope.T @ slope
+        diagonal = np.diag(gram)
+        gram = gram + np.diag(damping * diagonal + 1e-9 * diagonal.max())
+        return np.asarray(np.linalg.solve(gram, slope.T @ rest), dtype=np.float64)
+
+    def linearise(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
+        """Compute the residual and its Jacobian by finite differences.
+
+        Args:
+            observed: observations, (R, T, C).
+            theta: parameters and coefficients.
+            starts: initial states, (R, S).
+
+        Returns:
+            The residual (N,) in units of the noise, infinite if the simulation diverges, and the
+            Jacobian (N, P) of the simulation in units of the scales.
+        """
+        runs, states, count = len(starts), len(self.states), theta.size
+        moved = 1 + count + states
+        thetas, begun = np.tile(theta, (runs, moved, 1)), np.tile(starts[:, None], (1, moved, 1))
+        for i in range(count):
+            thetas[:, 1 + i, i] += FINITE_DIFFERENCE_STEP * self.scales[i]
+        for i in range(states):
+            begun[:, 1 + count + i, i] += FINITE_DIFFERENCE_STEP
+        initial = {name: begun[:, :, i].ravel() for i, name in enumerate(self.states)}
+        scenarios = [s for s in self.scenarios for _ in range(moved)]
+        seen = (
+            self.simulator.simulate_batch(thetas.reshape(runs * moved, count), scenarios, initial)
+            / self.sigma
+        )
+        seen = seen.reshape(runs, moved, -1)
+        rest = (observed / self.sigma).reshape(runs, -1) - seen[:, 0]
+        slopes = (seen[:, 1:] - seen[:, :1]) / FINITE_DIFFERENCE_STEP
+        slope = np.zeros((*rest.shape, count + runs * states))
+        for r in range(runs):
+            slope[r, :, :count] = slopes[r, :count].T
+            slope[r, :, count + r * states : count + (r + 1) * states] = slopes[r, count:].T
+        good = (np.abs(seen) < DIVERGED_VALUE).all()
+        return rest.ravel() if good else np.full(rest.size, np.inf), slope.reshape(rest.size, -1)
+
+
+def simulate_observations(setting: RecordingConditions, effects: EffectCoefficients) -> Array:
+    """Simulate noise-free observations (R, T, C) with given effects.
+
+    Args:
+        setting: recording conditions.
+        effects: coefficients by name of the effect.
+    """
+    kind = SIMULATORS[setting.system]
+    fixed = {name: list(c) for name, c in effects.items()}
+    simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed)
+    theta = np.array(
+        [[setting.parameters[p.name] for p in kind.system.parameters]] * len(setting.scenarios)
+    )
+    return simulator.simulate_batch(theta, setting.scenarios)
+
+
+def make_gap_function(
+    setting: RecordingConditions, observed: Callable[[float], Array]
+) -> Callable[[float], float]:
+    """Make the function that computes the size of a cause from its strength.
+
+    Args:
+        setting: recording conditions.
+        observed: noise-free observations (R, T, C) as a function of the strength.
+
+    Returns:
+        RMS residual after refitting, in units of the noise, as a function of the strength.
+    """
+    fit = NuisanceFitter(setting)
+    last: list[tuple[float, ResidualFit]] = []
+
+    def left(strength: float) -> float:
+        theta, starts = fit.theta, fit.starts
+        if last:  # fitted parameters and states change about in proportion to the strength
+            before, found = last[-1]
+            share = strength / before
+            theta = np.clip(theta + share * (found.theta - theta), fit.low, fit.high)
+            starts = starts + share * (found.starts - starts)
+        found = fit(observed(strength), theta, starts)
+        if np.isfinite(found.left):
+            last.append((strength, found))
+        return found.left
+
+    return left
+
+
+def find_strength_for_size(
+    left: Callable[[float], float], wanted: float, largest: float, first: float = 1e-3
+) -> float | None:
+    """Find the strength at which the size has the requested value.
+
+    The method is the secant method on logarithmic scales, within a bracket as soon as there is one.
+
+    Args:
+        left: size as a function of the strength, increasing from zero.
+        wanted: requested size.
+        largest: maximum strength.
+        first: first strength to try.
+
+    Returns:
+        The strength, or None if it is not below `largest`.
+    """
+    low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
+    for _ in range(12):
+        now = left(strength)
+        if abs(now / wanted - 1) < SIZE_TOLERANCE:
+            return strength
+        if now < wanted:
+            if strength >= largest or now * (largest / strength) ** 2 < wanted:
+                return None
+            low = strength, now
+        else:  # also if it is NaN or infinite
+            high = strength, now
+        strength = float(min(_between(low, high, wanted), largest))
+    return None
+
+
+def _between(low: tuple[float, float], high: tuple[float, float], wanted: float) -> float:
+    """Return the next strength to try.
+
+    Args:
+        low: strength and size below the requested size.
+        high: strength and size above it.
+        wanted: requested size.
+    """
+    if not low[0]:
+        return (
+            high[0] * min(max(wanted / high[1], 1e-2), 0.9) if np.isfinite(high[1]) else high[0] / 5
+        )
+    if not np.isfinite(high[0]):
+        return low[0] * min(wanted / max(low[1], 1e-9), MAX_STRENGTH_FACTOR)
+    if not np.isfinite(high[1]) or high[0] / low[0] > MAX_STRENGTH_FACTOR**2:
+        return float(np.sqrt(low[0] * high[0]))
+    share = float(np.log(wanted / low[1]) / np.log(high[1] / low[1]))
+    part = min(max(share, 0.05), 0.95)
+    return float(low[0] * (high[0] / low[0]) ** part)

@@ -1,0 +1,641 @@
+"""Reference simulation of pendulum and slider with scipy, with any effect or unmodelled cause.
+
+The model has one coordinate, and events where dry friction stops it. Hidden-state effects add a
+driven mass or an internal state that no sensor shows.
+
+Every law is written here again in plain numbers. Nothing is shared with the effect library, which
+the benchmark tests.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import copysign, cos, exp, hypot, inf, pi, sin, tanh
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from bench.diagnosis_benchmark.case_generation.true_system import EffectCoefficients, TrueSystem
+from sims.core.simulator import Array, Scenario
+
+SOLVER_TOLERANCES: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}
+INTERPOLATION_INTERVAL = 0.011  # seconds: for shorter intervals, order 5 is cheaper than order 8
+# Width of a region's soft border as a fraction of its half width; a smooth border preserves the
+# order of the solver.
+REGION_EDGE_WIDTH = 0.05
+SLEW_STEP = 2e-3  # seconds for which an input with limited rate is held constant
+SUBDIVISIONS = 10  # number of parts of an interval in which a linear command is held constant
+
+NONLINEAR_INPUT_EFFECTS = (
+    "input.deadband",
+    "input.saturation",
+    "backlash",
+    "input.rate",
+    "input.power",
+)
+
+ResistanceLaw = Callable[[float, float, float], float]
+GravityForce = Callable[[float], float]
+SegmentResult = tuple[float, Array, Any]
+
+
+@dataclass(frozen=True)
+class InputSegment:
+    """Time interval in which the applied input approaches `target` from `start`.
+
+    With `lag` zero, the input jumps to `target` at once.
+    """
+
+    begin: float
+    end: float
+    start: float
+    target: float
+    lag: float
+
+    def evaluate(self, t: float) -> float:
+        """Return the applied input at time t."""
+        return self.target + (
+            (self.start - self.target) * exp((self.begin - t) / self.lag) if self.lag > 0 else 0.0
+        )
+
+    def slice(self, begin: float, end: float) -> InputSegment:
+        """Return the part of this interval from `begin` to `end`."""
+        return InputSegment(begin, end, self.evaluate(begin), self.target, self.lag)
+
+
+def compute_applied_input(
+    scenario: Scenario, effects: EffectCoefficients, until: float
+) -> list[InputSegment]:
+    """Compute the first input as applied to the plant, from time 0 to `until`.
+
+    A lag must follow the nonlinear input effects.
+
+    Args:
+        scenario: the run.
+        effects: the hidden effects.
+        until: end time.
+
+    Raises:
+        NotImplementedError: a nonlinear input effect follows a lag.
+    """
+    if "u" not in scenario.inputs:
+        return [InputSegment(0.0, until, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
+    levels, edges, lag = np.array(scenario.inputs["u"]), scenario.times - scenario.times[0], 0.0
+    if "input.hold" in effects:
+        levels, edges = _straight(levels, edges, effects["input.hold"][0])
+    for name, c in effects.items():
+        if name in NONLINEAR_INPUT_EFFECTS and lag:
+            raise NotImplementedError(f"{name} behind input.lag")
+        if name == "input.delay":
+            edges = edges + c[0]
+        elif name == "input.lag":
+            lag = c[0]
+        elif name == "input.rate":
+            levels, edges = _slewed(levels, edges, c[0])
+        elif name in STEPWISE_INPUT_EFFECTS:
+            levels = STEPWISE_INPUT_EFFECTS[name](levels, *c)
+    changes = np.flatnonzero(np.diff(levels)) + 1
+    begins, targets = [0.0, *edges[changes]], [levels[0], *levels[changes]]
+    pieces, state = [], levels[0]
+    for begin, end, target in zip(begins, [*begins[1:], inf], targets, strict=True):
+        if begin < until:
+            pieces.append(
+                InputSegment(float(begin), float(min(end, until)), float(state), float(target), lag)
+            )
+            state = pieces[-1].evaluate(pieces[-1].end)
+    return pieces
+
+
+def _straight(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
+    """Divide each interval into parts, to approximate an input between hold and linear.
+
+    Args:
+        levels: input at each sample.
+        edges: time of each sample.
+        share: 0 for a zero-order hold, 1 for linear interpolation.
+
+    Returns:
+        Levels and begins of the parts.
+    """
+    parts = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS
+    fine = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
+    begins = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(SUBDIVISIONS) / SUBDIVISIONS
+    return np.append(fine.ravel(), levels[-1]), np.append(begins.ravel(), edges[-1])
+
+
+def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
+    """Limit the rate of an input to `most` per second, in short parts of constant level.
+
+    Returns:
+        Levels and begins of the parts.
+    """
+    ends = [*edges[1:].tolist(), edges[-1] + 1.0]
+    values, begins, state = [], [], float(levels[0])
+    for level, begin, end in zip(levels.tolist(), edges.tolist(), ends, strict=True):
+        while begin < end and state != level:
+            last = min(begin + SLEW_STEP, end)
+            away = level - state
+            lasting = min(abs(away) / most, last - begin)
+            after = level if lasting >= abs(away) / most else state + copysign(most * lasting, away)
+            # mean over the part, in which the rise may end
+            values.append(0.5 * (state + after) * lasting / (last - begin))
+            values[-1] += after * (1 - lasting / (last - begin))
+            begins.append(begin)
+            state, begin = after, last
+        if begin < end:
+            values.append(level)
+            begins.append(begin)
+    return np.array(values), np.array(begins)
+
+
+def _play(levels: Array, width: float) -> Array:
+    result, state = [], levels[0]
+    for level in levels:
+        if abs(level - state) > width / 2:
+            state = level - copysign(width / 2, level - state)
+        result.append(state)
+    return np.array(result)
+
+
+STEPWISE_INPUT_EFFECTS: dict[str, Callable[..., Array]] = {
+    "input.gain": lambda u, c: u * (1 + c),
+    "input.bias": lambda u, c: u + c,
+    "input.deadband": lambda u, c: np.sign(u) * np.maximum(np.abs(u) - c, 0.0),
+    "input.saturation": lambda u, c: np.minimum(np.maximum(u, -c), c),
+    "input.power": lambda u, gain, power: (1 + gain) * np.sign(u) * np.abs(u) ** (1 + power),
+    "backlash": _play,
+}
+
+
+class JointDynamics:
+    """Equation of motion of one coordinate with effects and unmodelled causes.
+
+    Attributes:
+        inertia: generalised inertia of the drive side.
+        weight: gravity force as a function of position.
+        forces: laws of the acting forces.
+        limits: laws of the dry friction limits.
+        behind: hidden-state effects: driven loads and hysteresis.
+    """
+
+    def __init__(self, world: TrueSystem, number: int) -> None:
+        k, p = world.constants, world.parameters
+        self.weight: GravityForce
+        self.sideways: GravityForce
+        self.latched = number % 2 == 0
+        if world.system == "pendulum":
+            arm = k["mass"] * k["length"]
+            self.inertia, gravity = p["inertia"], k["gravity"]
+            self.weight = lambda x: -arm * gravity * sin(x)
+            self.sideways = lambda x: arm * cos(x)
+        else:
+            self.inertia, gravity = p["mass"], 9.80665
+            self.weight = lambda x: 0.0
+            self.sideways = lambda x: self.inertia
+        self.gravity = gravity
+        acting = {**world.effects, **world.foreign}
+        self.forces = [
+            FORCE_EFFECTS[name](self, list(c))
+            for name, c in acting.items()
+            if name in FORCE_EFFECTS
+        ]
+        self.limits = [
+            DRY_FRICTION_EFFECTS[name](self, list(c))
+            for name, c in acting.items()
+            if name in DRY_FRICTION_EFFECTS
+        ]
+        self.breaks: list[float] = []
+        if "gust" in acting:
+            push, lasting, *begins = acting["gust"]
+            begin = begins[number]
+            self.breaks = [begin, begin + lasting]
+            self.forces.append(
+                lambda t, x, v: push if begin <= self.middle < begin + lasting else 0.0
+            )
+        self.restless = bool({"force.periodic", "input.lag", "friction.warming"} & set(acting))
+        whole, gravity_of_all = self.inertia, self.weight
+        self.behind: list[Any] = [
+            HIDDEN_STATE_EFFECTS[name](whole, gravity_of_all, *c)
+            for name, c in acting.items()
+            if name in HIDDEN_STATE_EFFECTS
+        ]
+        self.inertia = whole - sum(part.inertia for part in self.behind)
+
+    def set_input_segment(self, piece: InputSegment) -> None:
+        """Set the input interval in which the motion is integrated."""
+        self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
+
+    def compute_force(self, t: float, x: float, v: float, *z: float) -> float:
+        """Compute the force on the coordinate, without dry friction.
+
+        Args:
+            t: time.
+            x: position.
+            v: velocity.
+            *z: states of the hidden-state effects.
+        """
+        total = self.piece.evaluate(t) + self.weight(x)
+        for force in self.forces:
+            total += force(t, x, v)
+        for part, own in zip(self.behind, pair_up(z), strict=True):
+            total += part.force(x, v, *own)
+        return total
+
+    def compute_hidden_rates(self, x: float, v: float, *z: float) -> list[float]:
+        """Compute the time derivatives of the states of the hidden-state effects.
+
+        Args:
+            x: position.
+            v: velocity.
+            *z: states of the hidden-state effects.
+        """
+        parts = zip(self.behind, pair_up(z), strict=True)
+        return [rate for part, own in parts for rate in part.rates(x, v, *own)]
+
+    def compute_friction_limit(self, t: float, x: float, v: float) -> float:
+        """Compute the dry friction limit.
+
+        Args:
+            t: time.
+            x: position.
+            v: velocity.
+        """
+        return sum(limit(t, x, v) for limit in self.limits)
+
+
+def pair_up(z: Sequence[float]) -> list[tuple[float, float]]:
+    """Group values in pairs."""
+    return list(zip(z[::2], z[1::2], strict=True))
+
+
+class ReferenceLoad(ABC):
+    """Load behind a transmission: `share` of the inertia and of the weight.
+
+    The sensor shows the motion of the drive side, x and v; the load has the states y and w.
+    """
+
+    def __init__(self, inertia: float, weight: GravityForce, share: float) -> None:
+        self.whole, self.inertia, self.weight = inertia, share * inertia, weight
+        self.share = share
+
+    @abstractmethod
+    def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
+        """Compute the acceleration of the load by the drive side.
+
+        Args:
+            x: position of the drive side.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
+        """
+
+    def force(self, x: float, v: float, y: float, w: float) -> float:
+        """Compute the force of the load on the drive side.
+
+        Args:
+            x: position of the drive side.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
+        """
+        return -self.inertia * self.compute_load_acceleration(
+            x, v, y, w
+        ) - self.share * self.weight(x)
+
+    def rates(self, x: float, v: float, y: float, w: float) -> tuple[float, float]:
+        """Compute the time derivatives of the load's states.
+
+        Args:
+            x: position of the drive side.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
+        """
+        return w, self.compute_load_acceleration(x, v, y, w) + self.weight(y) / self.whole
+
+
+class FlexibleReferenceLoad(ReferenceLoad):
+    """Load on a spring, with `frequency` rad/s when the drive side is fixed."""
+
+    def __init__(
+        self, inertia: float, weight: GravityForce, share: float, frequency: float, ratio: float
+    ) -> None:
+        super().__init__(inertia, weight, share)
+        self.frequency, self.ratio = frequency, ratio
+
+    def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
+        """Return the initial state of the load, with the static deflection of the spring."""
+        return x + self.weight(x) / self.whole / self.frequency**2, v
+
+    def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
+        """Compute the acceleration of the load by spring and damper; see `ReferenceLoad`."""
+        return self.frequency**2 * (x - y) + 2 * self.ratio * self.frequency * (v - w)
+
+
+class BacklashReferenceLoad(ReferenceLoad):
+    """Load behind backlash, with stiff damped flanks that never pull."""
+
+    def __init__(self, inertia: float, weight: GravityForce, gap: float, share: float) -> None:
+        super().__init__(inertia, weight, share)
+        self.gap = gap
+
+    def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
+        """Return the initial state of the load, centred in the gap."""
+        return x, v
+
+    def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
+        """Compute the acceleration of the load by the flank in contact; see `ReferenceLoad`."""
+        over = abs(x - y) - self.gap / 2
+        if over <= 0:
+            return 0.0
+        side = copysign(1.0, x - y)
+        damped = 600 * (v - w) * over / (over + self.gap / 100)
+        push = side * (1 - self.share) * (22500 * side * over + damped)
+        return side * max(push, 0.0)
+
+
+class DahlReferenceFriction:
+    """Dahl friction: the surfaces yield over `deflection`; its state is a fraction of the limit."""
+
+    inertia = 0.0
+
+    def __init__(
+        self, inertia: float, weight: GravityForce, limit: float, deflection: float
+    ) -> None:
+        self.most, self.deflection = limit, deflection
+
+    def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
+        """Return the initial state, without strain."""
+        return 0.0, 0.0
+
+    def force(self, x: float, v: float, _: float, strain: float) -> float:
+        """Compute the friction force on the mass.
+
+        Args:
+            x: position.
+            v: velocity.
+            strain: friction force as a fraction of its limit.
+        """
+        return -self.most * strain
+
+    def rates(self, x: float, v: float, _: float, strain: float) -> tuple[float, float]:
+        """Compute the time derivatives of the two states.
+
+        Args:
+            x: position.
+            v: velocity.
+            strain: friction force as a fraction of its limit.
+        """
+        speed = min(abs(v) / self.deflection, 400.0)
+        return 0.0, speed * (copysign(1.0, v) - strain)
+
+
+HIDDEN_STATE_EFFECTS: dict[str, Callable[..., Any]] = {
+    "joint.flexibility": FlexibleReferenceLoad,
+    "joint.backlash": BacklashReferenceLoad,
+    "friction.hysteresis": DahlReferenceFriction,
+}
+
+
+def _wave(c: Sequence[float], cycles: float) -> float:
+    return c[0] * sin(2 * pi * cycles) + c[1] * cos(2 * pi * cycles)
+
+
+FORCE_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] = {
+    "drag.linear": lambda j, c: lambda t, x, v: -c[0] * v,
+    "drag.quadratic": lambda j, c: lambda t, x, v: -c[0] * abs(v) * v,
+    "friction.direction": lambda j, c: lambda t, x, v: -c[0] * max(v, 0.0) - c[1] * min(v, 0.0),
+    "wind": lambda j, c: lambda t, x, v: -c[0] * abs(v - c[1]) * (v - c[1]),
+    "gravity.scale": lambda j, c: lambda t, x, v: c[0] * j.weight(x),
+    "gravity.tilt": lambda j, c: lambda t, x, v: c[0] * j.gravity * j.sideways(x),
+    "supply.sag": lambda j, c: (
+        lambda t, x, v: j.piece.evaluate(t) * (1 / (1 + c[0] * abs(j.piece.evaluate(t))) - 1)
+    ),
+    "supply.braking": lambda j, c: (
+        lambda t, x, v: -c[0] * j.piece.evaluate(t) * (j.piece.evaluate(t) * v < 0)
+    ),
+    "spring.linear": lambda j, c: lambda t, x, v: -c[0] * x,
+    "spring.cubic": lambda j, c: lambda t, x, v: -c[0] * x**3,
+    "force.bias": lambda j, c: lambda t, x, v: c[0],
+    "force.ripple": lambda j, c: lambda t, x, v: _wave(c, x / c[2]),
+    "force.periodic": lambda j, c: lambda t, x, v: _wave(c, t * c[2]),
+    "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # unmodelled: damping grows with time
+    "state.limit": lambda j, c: (
+        lambda t, x, v: -copysign(1.0, c[0]) * compute_end_stop_force(x, v, *c)
+    ),
+    "latch": lambda j, c: (
+        lambda t, x, v: -c[0] * max(x - c[1], 0.0) if j.latched else 0.0
+    ),  # unmodelled: a soft end stop in every other run
+}
+DRY_FRICTION_EFFECTS: dict[str, Callable[[JointDynamics, list[float]], ResistanceLaw]] = {
+    "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
+    "friction.stribeck": lambda j, c: lambda t, x, v: c[0] + c[1] * exp(-((v / c[2]) ** 2)),
+    "friction.load": lambda j, c: lambda t, x, v: c[0] * abs(j.piece.evaluate(t) - j.weight(x)),
+    "friction.load_direction": lambda j, c: (
+        lambda t, x, v: abs(c[0] * j.piece.evaluate(t) - c[1] * j.weight(x))
+    ),
+    "friction.load_quadratic": lambda j, c: (
+        lambda t, x, v: (
+            c[0] * abs(j.piece.evaluate(t) - j.weight(x))
+            + c[1] * compute_transmitted_force(j.piece.evaluate(t), -j.weight(x)) ** 2
+        )
+    ),
+    "friction.position": lambda j, c: (
+        lambda t, x, v: c[0] + hypot(c[1], c[2]) + _wave(c[1:], x / c[3])
+    ),
+    "friction.warming": lambda j, c: lambda t, x, v: (c[0] + c[1] * abs(v)) * exp(-t / c[2]),
+    "patch": lambda j, c: (
+        lambda t, x, v: c[0] * compute_region_indicator(x, c[1], c[2])
+    ),  # unmodelled: dry friction from c1 - c2 to c1 + c2
+}
+UNMODELLED_CAUSES = ("patch", "gust", "ageing", "latch")
+
+
+def compute_transmitted_force(drive: float, against: float) -> float:
+    """Return the smaller force that gears transmit; zero if both forces have the same direction."""
+    return min(abs(drive), abs(against)) if drive * against > 0 else 0.0
+
+
+def compute_end_stop_force(
+    x: float, v: float, stiffness: float, place: float, loss: float
+) -> float:
+    """Compute the magnitude of the force of an end stop, by Hertz's contact law.
+
+    Args:
+        x: position.
+        v: velocity.
+        stiffness: force at a depth of 0.01, divided by that depth; its sign is the side of the
+            stop.
+        place: position of the stop.
+        loss: damping, as a factor of the approach velocity.
+    """
+    side = copysign(1.0, stiffness)
+    depth = max(side * (x - place), 0.0)
+    push: float = depth**1.5
+    return abs(stiffness) * push / 0.1 * max(1.0 + loss * side * v, 0.0)
+
+
+def compute_region_indicator(x: float, centre: float, half: float) -> float:
+    """Return 1 inside a region and 0 outside, with soft borders.
+
+    The integral over x is the width of the region.
+
+    Args:
+        x: position.
+        centre: centre of the region.
+        half: half width of the region.
+    """
+    return 0.5 * (
+        tanh((x - centre + half) / (REGION_EDGE_WIDTH * half))
+        - tanh((x - centre - half) / (REGION_EDGE_WIDTH * half))
+    )
+
+
+def simulate_joint(world: TrueSystem, scenario: Scenario, number: int, instants: Array) -> Array:
+    """Simulate a run.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        number: index of the run in the recording.
+        instants: increasing times >= 0, (T,).
+
+    Returns:
+        Positions and velocities, (T, 2).
+    """
+    joint, until = JointDynamics(world, number), float(instants[-1])
+    names = ("q", "qd") if world.system == "pendulum" else ("x", "v")
+    state = np.array([scenario.initial[name] for name in names])
+    hidden = [value for part in joint.behind for value in part.begin(*state)]
+    state = np.concatenate([state, hidden])
+    out = np.empty((instants.size, 2))
+    out[instants <= 0] = state[:2]
+    for piece in compute_applied_input(scenario, world.effects, until):
+        marks = [
+            piece.begin,
+            *(b for b in sorted(joint.breaks) if piece.begin < b < piece.end),
+            piece.end,
+        ]
+        for begin, end in pairwise(marks):
+            joint.set_input_segment(piece.slice(begin, end))
+            state = _integrate_segment(joint, state, instants, out)
+    return out
+
+
+def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, out: Array) -> Array:
+    """Integrate to the end of the input interval, from one standstill to the next.
+
+    Args:
+        joint: the equation of motion.
+        state: state at the begin of the interval.
+        instants: times of the samples, (T,).
+        out: receives positions and velocities, (T, 2).
+
+    Returns:
+        State at the end.
+    """
+    now, end = joint.piece.begin, joint.piece.end
+    for _ in range(10_000):
+        if now >= end:
+            return state
+        reached, after, solution = _integrate_until_stop(joint, now, state)
+        first, last = np.searchsorted(instants, [now, reached], side="right")
+        if last > first:
+            out[first:last] = solution(instants[first:last]).T[:, :2] if solution else state[:2]
+        now, state = reached, after
+    raise RuntimeError("it never gets through: too many standstills")
+
+
+def _integrate_until_stop(joint: JointDynamics, now: float, state: Array) -> SegmentResult:
+    """Integrate until the next standstill, break-away or end of the input interval.
+
+    Returns:
+        End time, state at that time, and the dense solution (None without motion).
+    """
+    (x, v, *z), end = state, joint.piece.end
+    way = copysign(1.0, v) if v else 0.0
+    if joint.limits and v == 0.0:
+        pull = joint.compute_force(now, x, 0.0, *z)
+        if abs(pull) <= joint.compute_friction_limit(now, x, 0.0):
+            return (
+                _integrate_stuck(joint, now, state)
+                if z
+                else (_find_break_away(joint, now, x), state, None)
+            )
+        way = copysign(1.0, pull)
+
+    def rate(t: float, y: Array) -> list[float]:
+        rubbing = way * joint.compute_friction_limit(t, *y[:2]) if joint.limits else 0.0
+        return [
+            y[1],
+            (joint.compute_force(t, *y) - rubbing) / joint.inertia,
+            *joint.compute_hidden_rates(*y),
+        ]
+
+    def turns(t: float, y: Array) -> float:
+        return float(way * y[1])
+
+    stops: Any = turns
+    stops.terminal, stops.direction = True, -1
+    events, first = (stops, min(0.01, end - now)) if joint.limits else (None, min(0.02, end - now))
+    settings: dict[str, Any] = {
+        "dense_output": True,
+        "max_step": 0.05,
+        "first_step": first,
+        **SOLVER_TOLERANCES,
+    }
+    method: Any = "RK45" if end - now < INTERPOLATION_INTERVAL else "DOP853"
+    solved = solve_ivp(rate, (now, end), state, method, events=events, **settings)
+    if not solved.success:
+        raise RuntimeError(solved.message)
+    after = solved.y[:, -1].copy()
+    if joint.limits and solved.t_events is not None and solved.t_events[0].size:
+        after[1] = 0.0
+    return float(solved.t[-1]), after, solved.sol
+
+
+def _integrate_stuck(joint: JointDynamics, now: float, state: Array) -> SegmentResult:
+    """Integrate the hidden states while dry friction holds the coordinate, until it breaks away."""
+    end = joint.piece.end
+
+    def rate(t: float, y: Array) -> list[float]:
+        return [0.0, 0.0, *joint.compute_hidden_rates(*y)]
+
+    def excess(t: float, y: Array) -> float:
+        return abs(joint.compute_force(t, *y)) - joint.compute_friction_limit(t, *y[:2]) * (
+            1 + 1e-9
+        )
+
+    stops: Any = excess
+    stops.terminal, stops.direction = True, 1
+    settings: dict[str, Any] = {"dense_output": True, "max_step": 0.01, **SOLVER_TOLERANCES}
+    solved = solve_ivp(rate, (now, end), state, "RK45", events=stops, **settings)
+    return float(solved.t[-1]), solved.y[:, -1].copy(), solved.sol
+
+
+def _find_break_away(joint: JointDynamics, now: float, x: float) -> float:
+    """Find the time at which the coordinate breaks away, or the end of the input interval.
+
+    Within an input interval only time-dependent forces and limits change while the coordinate
+    rests.
+    """
+    end = joint.piece.end
+    if not joint.restless:
+        return end
+
+    def excess(t: float) -> float:
+        return abs(joint.compute_force(t, x, 0.0)) - joint.compute_friction_limit(t, x, 0.0)
+
+    grid: Sequence[float] = np.linspace(now, end, max(3, int(500 * (end - now)))).tolist()
+    for before, after in pairwise(grid):
+        if excess(after) > 0:
+            return min(
+                brentq(excess, before, after, xtol=1e-13) + 1e-12 if excess(before) < 0 else after,
+                end,
+            )
+    return end

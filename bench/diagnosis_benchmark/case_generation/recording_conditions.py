@@ -1,0 +1,288 @@
+"""Recording conditions of a case, drawn from a seed.
+
+They are parameters, runs, inputs, channels and noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.reference_simulation import (
+    EffectCoefficients,
+    TrueSystem,
+    get_constants,
+)
+from sims.core.simulator import Array, Scenario
+from sims.systems.pendulum import Pendulum
+
+GROUND_PARALLEL_EFFECTS = (
+    "gravity.tilt",
+    "lift.magnus",
+    "wind",
+    "contact.friction",
+    "drag.quadratic",
+    "updraft",
+    "gust",
+)
+NOISE_RANGES = {
+    "ball": (2e-3, 2e-2),
+    "pendulum": (1e-3, 1e-2),
+    "slider": (1e-3, 1e-2),
+}  # sigma, m or rad
+FREQUENCY_RANGES = {
+    "pendulum": (3.0, 10.0),
+    "slider": (2.0, 5.0),
+}  # ratio of the noise of the rate to that of the position, 1/s
+PENDULUM = Pendulum(
+    observe=["q"], engine="batch"
+)  # used to estimate the swing of a drawn pendulum; generates no data
+DrawnConditions = tuple[dict[str, float], tuple[str, ...], list[Scenario]]
+MAX_RUNS = 6
+NOISE_KINDS = ("white", "ar1", "quantised")
+INPUT_DEPENDENT_EFFECTS = (
+    "input.",
+    "backlash",
+    "supply.",
+    "friction.load_",
+)  # effects that only an input shows
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Sensor noise.
+
+    Attributes:
+        sigma: standard deviation by channel.
+        kind: white, ar1 or quantised.
+        phi: AR(1) coefficient.
+        dither: standard deviation of the white noise before rounding, in units of a rounding step.
+        stated: whether the recording states the noise.
+    """
+
+    sigma: dict[str, float]
+    kind: str
+    phi: float
+    dither: float
+    stated: bool = True
+
+    def add_to(self, observed: Array, rng: np.random.Generator) -> Array:
+        """Add noise to observations.
+
+        Args:
+            observed: noise-free observations, (T, C).
+            rng: random generator.
+        """
+        sigma = np.array(list(self.sigma.values()))
+        white = rng.standard_normal(observed.shape)
+        if self.kind == "quantised":  # rounding has the standard deviation step / sqrt(12)
+            step = sigma / np.sqrt(1 / 12 + self.dither**2)
+            rounded: Array = np.round((observed + self.dither * step * white) / step) * step
+            return rounded
+        if self.kind == "ar1":
+            for k in range(1, len(white)):
+                white[k] = self.phi * white[k - 1] + np.sqrt(1 - self.phi**2) * white[k]
+        recorded: Array = observed + sigma * white
+        return recorded
+
+
+@dataclass(frozen=True)
+class RecordingConditions:
+    """Recording conditions of a case, without the hidden cause.
+
+    Attributes:
+        system: name of the system.
+        parameters: true base parameters.
+        constants: constants of the system.
+        channels: names of the recorded channels.
+        scenarios: the runs.
+        noise: sensor noise.
+        rate: sampling rate, Hz.
+        seconds: length of a run.
+    """
+
+    system: str
+    parameters: dict[str, float]
+    constants: dict[str, float]
+    channels: tuple[str, ...]
+    scenarios: tuple[Scenario, ...]
+    noise: SensorNoise
+    rate: int
+    seconds: float
+
+    @property
+    def noise_sigmas(self) -> Array:
+        """Standard deviation of the noise by channel, (C,)."""
+        return np.array([self.noise.sigma[name] for name in self.channels])
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether there is an input."""
+        return bool(self.scenarios[0].inputs)
+
+    def make_true_system(
+        self, effects: EffectCoefficients | None = None, foreign: EffectCoefficients | None = None
+    ) -> TrueSystem:
+        """Make the true system with hidden causes.
+
+        Args:
+            effects: hidden effects of the library.
+            foreign: hidden unmodelled causes.
+        """
+        return TrueSystem(
+            self.system, self.parameters, self.constants, effects or {}, foreign or {}
+        )
+
+
+class RequestedConditions(NamedTuple):
+    """Requested recording conditions; those that are None are drawn.
+
+    Attributes:
+        rate: sampling rate, Hz.
+        runs: number of runs.
+        noise: one of `NOISE_KINDS`.
+    """
+
+    rate: int | None = None
+    runs: int | None = None
+    noise: str | None = None
+
+
+ANY_CONDITIONS = RequestedConditions()
+"""Conditions of which all are drawn."""
+
+
+def draw_conditions(
+    system: str,
+    rng: np.random.Generator,
+    hidden: Sequence[str] = (),
+    short: bool = False,
+    asked: RequestedConditions = ANY_CONDITIONS,
+) -> RecordingConditions:
+    """Draw recording conditions in which the hidden effects can be observed.
+
+    Args:
+        system: name of the system.
+        rng: random generator.
+        hidden: names of the hidden effects.
+        short: whether there are always three runs.
+        asked: conditions that are not drawn.
+    """
+    rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
+    seconds = float(rng.choice([2.0, 3.0, 4.0, 5.0, 6.0], p=[0.1, 0.2, 0.4, 0.2, 0.1]))
+    runs = 3 if short else int(rng.choice([3, 4, 5, MAX_RUNS], p=[0.25, 0.4, 0.2, 0.15]))
+    # These values are drawn in any case, so that later draws do not depend on the request.
+    rate, runs = asked.rate or rate, asked.runs or runs
+    times = np.arange(round(rate * seconds)) / rate
+    draw = {"ball": _ball, "pendulum": _pendulum, "slider": _slider}[system]
+    parameters, channels, scenarios = draw(rng, times, runs, hidden)
+    noise = _noise(rng, system, channels)
+    noise = replace(noise, kind=asked.noise or noise.kind)
+    return RecordingConditions(
+        system, parameters, get_constants(system), channels, tuple(scenarios), noise, rate, seconds
+    )
+
+
+def _noise(rng: np.random.Generator, system: str, channels: Sequence[str]) -> SensorNoise:
+    sigma = float(np.exp(rng.uniform(*np.log(NOISE_RANGES[system]))))
+    faster = float(rng.uniform(*FREQUENCY_RANGES[system])) if system in FREQUENCY_RANGES else 1.0
+    by_channel = {name: sigma * (faster if name in ("qd", "v") else 1.0) for name in channels}
+    kind = str(rng.choice(NOISE_KINDS))
+    return SensorNoise(
+        by_channel,
+        kind,
+        float(rng.uniform(0.3, 0.9)),
+        float(rng.uniform(0.3, 0.6)),
+        bool(rng.random() < 0.5),
+    )
+
+
+def _ball(
+    rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]
+) -> DrawnConditions:
+    upright = not set(hidden) & set(GROUND_PARALLEL_EFFECTS) and rng.random() < 0.3
+    speed = 0.0 if upright else 3.0
+    parameters, scenarios = {"restitution": float(rng.uniform(0.5, 0.9))}, []
+    for _ in range(runs):
+        vx, vy = rng.uniform(-speed, speed, 2)
+        z, vz = rng.uniform(2.0, 5.0), rng.choice([0.0, rng.uniform(-2.0, 3.0)])
+        scenarios.append(
+            Scenario(times, {"x": 0.0, "y": 0.0, "z": z, "vx": vx, "vy": vy, "vz": vz})
+        )
+    return parameters, ("z",) if upright else ("x", "y", "z"), scenarios
+
+
+def _pendulum(
+    rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]
+) -> DrawnConditions:
+    parameters = {"inertia": float(rng.uniform(2e-3, 6e-3))}
+    driven = any(name.startswith(INPUT_DEPENDENT_EFFECTS) for name in hidden) or rng.random() < 0.5
+    channels = ("q",) if rng.random() < 0.6 else ("q", "qd")
+    form = str(rng.choice(["steps", "sine", "chirp"]))
+    scenarios: list[Scenario] = []
+    while len(scenarios) < runs:
+        inputs = (
+            {"u": rng.uniform(0.05, 0.2) * draw_input_signal(form, times, rng, (0.3, 3.0))}
+            if driven
+            else {}
+        )
+        rates = rng.choice([0.0, rng.uniform(-5.0, 5.0)])
+        start = {"q": rng.choice([-1, 1]) * rng.uniform(0.3, 2.5), "qd": rates}
+        scenario = Scenario(times, start, inputs)
+        swing = PENDULUM.simulate(np.array([[parameters["inertia"]]]), scenario)
+        if (
+            0.25 < np.abs(swing).max() < 2.8
+        ):  # beyond the top, the smallest force decides on which side it falls
+            scenarios.append(scenario)
+    return parameters, channels, scenarios
+
+
+def _slider(
+    rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[str]
+) -> DrawnConditions:
+    parameters = {"mass": float(rng.uniform(0.5, 2.0))}
+    channels = ("x",) if rng.random() < 0.6 else ("x", "v")
+    form, scenarios = str(rng.choice(["steps", "sine", "chirp"])), []
+    for _ in range(runs):
+        start = {
+            "x": rng.choice([0.0, rng.uniform(-0.5, 0.5)]),
+            "v": rng.choice([0.0, rng.uniform(-0.3, 0.3)]),
+        }
+        u = draw_input_signal(form, times, rng, (0.3, 2.0))
+        u -= u.mean()  # otherwise the slider drifts away
+        travel = np.ptp(np.cumsum(np.cumsum(u))) * times[1] ** 2 / parameters["mass"]
+        scenarios.append(
+            Scenario(times, start, {"u": u * np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)})
+        )
+    return parameters, channels, scenarios
+
+
+def draw_input_signal(
+    form: str, times: Array, rng: np.random.Generator, hertz: tuple[float, float]
+) -> Array:
+    """Generate an input signal of amplitude one.
+
+    Args:
+        form: steps (between random levels), sine or chirp.
+        times: sample times, (T,).
+        rng: random generator.
+        hertz: range of frequency, Hz.
+
+    Returns:
+        Signal, (T,).
+    """
+    if form == "steps":
+        lasting = rng.uniform(0.25, 1.0)
+        place = np.floor(times / lasting).astype(int)
+        levels: Array = rng.uniform(-1.0, 1.0, place[-1] + 1)[place]
+        return levels
+    bottom, top = np.log(hertz)
+    low, high = np.sort(np.exp(rng.uniform(bottom, top, 2)))
+    turns = (
+        low * times if form == "sine" else low * times + (high - low) * times**2 / (2 * times[-1])
+    )
+    signal: Array = np.sin(2 * np.pi * (turns + rng.random()))
+    return signal

@@ -1,0 +1,181 @@
+"""Noise-free reference recordings of ball, pendulum or slider, with effects or unmodelled causes.
+
+They are solved with scipy or simulated by MuJoCo, not by the engine that `explain` uses (except
+`simulate_with_mujoco` with hidden-state effects). sims/effects/README.md defines the coefficients
+of the effects. The unmodelled causes, which the library does not contain, are:
+
+| cause | numbers | meaning |
+|---|---|---|
+| `patch` | friction, centre, half width | pendulum, slider: dry friction in a region of position |
+| `gust` | force, seconds, begin in run 0, in run 1, ... | pendulum, slider: temporary force |
+| `gust` | along x, upward, seconds, begin in run 0, ... | ball: temporary acceleration |
+| `ageing` | growth | pendulum, slider: damping -c t v, which grows with time |
+| `latch` | stiffness, place | pendulum, slider: spring beyond a place, in every other run |
+| `updraft` | acceleration, centre, half width | ball: upward within a region of x |
+| `wear` | rate | ball: restitution e0 (1 - c t) |
+| `layer` | drag, height | ball: quadratic drag above a height |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import exp
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.diagnosis_benchmark.case_generation import ball_reference, joint_reference
+from bench.diagnosis_benchmark.case_generation.true_system import EffectCoefficients, TrueSystem
+from sims import effects as library
+from sims.core.simulator import Array, Scenario
+from sims.system_simulator import SystemSimulator
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from sims.systems.slider import Slider
+
+__all__ = [
+    "CHANNELS",
+    "SIMULATORS",
+    "UNMODELLED_CAUSES",
+    "EffectCoefficients",
+    "TrueSystem",
+    "get_constants",
+    "simulate_with_mujoco",
+    "simulate_with_scipy",
+]
+
+SIMULATORS: dict[str, type[SystemSimulator]] = {
+    "ball": Ball,
+    "pendulum": Pendulum,
+    "slider": Slider,
+}
+UNMODELLED_CAUSES = {
+    "ball": ball_reference.UNMODELLED_CAUSES,
+    "pendulum": joint_reference.UNMODELLED_CAUSES,
+    "slider": joint_reference.UNMODELLED_CAUSES,
+}
+CHANNELS = {"ball": ("x", "y", "z"), "pendulum": ("q", "qd"), "slider": ("x", "v")}
+FINE_STEP_SECONDS = 5e-4  # seconds: maximum step in which a lagging sensor is integrated
+MUJOCO_STEP_SECONDS = (
+    1e-3  # seconds: at MuJoCo's default step its error would be a tenth of the noise
+)
+
+
+def get_constants(system: str, **changed: float) -> dict[str, float]:
+    """Return the constants of a system by name.
+
+    Args:
+        system: name of the system.
+        **changed: constants with other values.
+    """
+    return {c.name: c.value for c in SIMULATORS[system].constants} | changed
+
+
+def simulate_with_scipy(
+    world: TrueSystem, scenario: Scenario, channels: Sequence[str], number: int = 0
+) -> Array:
+    """Simulate a run with scipy and return noise-free sensor readings.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        channels: names of the C channels.
+        number: index of the run in the recording.
+
+    Returns:
+        Readings, (T, C).
+    """
+    times = scenario.times - scenario.times[0]
+    instants = times
+    for name, c in world.effects.items():
+        if name == "sensor.delay":
+            instants = instants - c[0]
+        elif name == "clock.skew":
+            instants = instants * (1 + c[0])
+    instants = np.maximum.accumulate(np.maximum(instants, 0.0))
+    grid, rows = (
+        _refine_time_grid(instants)
+        if "sensor.lag" in world.effects
+        else (instants, np.arange(instants.size))
+    )
+    move = (
+        ball_reference.simulate_ball if world.system == "ball" else joint_reference.simulate_joint
+    )
+    states = move(world, scenario, number, grid)
+    observed = states[:, [CHANNELS[world.system].index(name) for name in channels]]
+    reads = _get_read_column(world.system, channels)
+    for name, c in world.effects.items():
+        if name == "sensor.gain":
+            observed[:, reads] *= 1 + c[0]
+        elif name == "sensor.bias":
+            observed[:, reads] += c[0]
+        elif name == "sensor.drift":
+            observed[:, reads] += c[0] * grid
+        elif name == "sensor.eccentricity":
+            angle = observed[:, reads].copy()
+            observed[:, reads] += c[0] * np.sin(angle) + c[1] * np.cos(angle)
+        elif name == "sensor.slip":
+            observed[:, reads] += np.where(scenario.times[0] + grid >= c[1], c[0], 0.0)
+        elif name == "sensor.lag":
+            observed = _apply_lag(observed, grid, c[0])
+    return observed[rows]
+
+
+def simulate_with_mujoco(world: TrueSystem, scenario: Scenario, channels: Sequence[str]) -> Array:
+    """Simulate a run with MuJoCo, without unmodelled causes, and return noise-free sensor readings.
+
+    Hidden-state effects move more than one coordinate, so they are simulated by the batch engine,
+    with a step of 2.5 ms.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        channels: names of the C channels.
+
+    Returns:
+        Readings, (T, C).
+    """
+    assert not world.foreign
+    more = any(library.get_effect(name).hook == "hidden" for name in world.effects)
+    engine, step = ("batch", 2.5e-3) if more else ("mujoco", MUJOCO_STEP_SECONDS)
+    effects = {name: list(c) for name, c in world.effects.items()}
+    kind = SIMULATORS[world.system]
+    simulator = kind(world.constants, channels, engine=engine, fixed=effects, time_step=step)
+    theta = np.array([[world.parameters[p.name] for p in kind.system.parameters]])
+    try:
+        observed: Array = simulator.simulate(theta, scenario)[0]
+        return observed
+    finally:
+        simulator.close()
+
+
+def _get_read_column(system: str, channels: Sequence[str]) -> int:
+    """Return the index of the channel on which sensor effects act."""
+    preferred = {"ball": ("z", "x", "y"), "pendulum": ("q", "qd"), "slider": ("x", "v")}[system]
+    return next(channels.index(name) for name in preferred if name in channels)
+
+
+def _refine_time_grid(instants: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Refine a time grid from 0 through all sample times.
+
+    Returns:
+        The grid, and the index of each sample time in it.
+    """
+    grid, rows = [0.0], []
+    for instant in instants.tolist():
+        if instant > grid[-1]:
+            parts = int(np.ceil((instant - grid[-1]) / FINE_STEP_SECONDS))
+            grid += np.linspace(grid[-1], instant, parts + 1)[1:].tolist()
+        rows.append(len(grid) - 1)
+    return np.array(grid), np.array(rows)
+
+
+def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
+    """Solve y' = (x - y) / lag with y = x at the start, for x linear between grid points."""
+    result, y = values.copy(), values[0].copy()
+    for k, h in enumerate(np.diff(grid).tolist()):
+        slope = (values[k + 1] - values[k]) / h
+        ahead = values[k] - slope * lag  # particular solution: `lag` seconds behind the line
+        y = ahead + slope * h + (y - ahead) * exp(-h / lag)
+        result[k + 1] = y
+    return result

@@ -1,0 +1,124 @@
+"""Confusion matrices of cause families."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from bench.diagnosis_benchmark.wrong_answers import is_correct, select_graded_answers
+from bench.figures import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_FAMILY_LABELS = ("several", "unknown", "nothing", "no answer")
+"""Answers that are not the name of a family; `nothing` means that the simulation is adequate."""
+_PANELS_PER_ROW = 4
+"""Maximum number of panels in a row."""
+_MIN_LABELLED_PERCENT = 10.0
+"""Minimum percentage of its row for which a cell shows its number."""
+
+
+def draw_confusion_matrices(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
+    """Draw one confusion matrix of cause families for each diagnoser.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+        title: title of the figure.
+    """
+    asked = select_graded_answers(rows[rows["kind"] != "double"])
+    asked = asked.assign(family=_hidden(asked), answer=_answers(asked))
+    hidden = sorted(set(asked["family"]), key=lambda name: (name in _LAST, name))
+    said = [name for name in hidden if name not in _LAST]
+    said += sorted(set(asked["answer"]) - {*said, *_FAMILY_LABELS})
+    said += [name for name in _FAMILY_LABELS if (asked["answer"] == name).any()]
+    across = min(_PANELS_PER_ROW, len(order))
+    down = -(-len(order) // across)
+    size = 1.6 + across * max(2.2, 0.16 * len(said)), 1.4 + down * max(1.4, 0.17 * len(hidden))
+    figure, axes = style.make_panel_grid(down, across, size, sharex=True, sharey=True)
+    for place, axis in enumerate(axes.flat):
+        if place >= len(order):
+            axis.set_axis_off()
+            continue
+        own = asked[asked["diagnoser"] == order[place]]
+        counts = pd.crosstab(own["family"], own["answer"]).reindex(
+            index=hidden, columns=said, fill_value=0
+        )
+        _panel(axis, counts, order[place])
+    figure.suptitle(title, fontsize=11)
+    figure.supylabel("hidden", fontsize=9)
+    many = asked.drop_duplicates("question")
+    style.add_caption(
+        figure,
+        f"{len(many)} recordings with nothing hidden, one effect of at least one noise or a "
+        "foreign cause. Per cent of a row. Black frames: right. A cause that is found alone or in "
+        "a set of at most two counts as its family, else the leading name does.",
+        letters=16,
+    )
+    return figure
+
+
+_LAST = ("(foreign)", "(clean)")
+"""Row labels that follow below those of the effect families."""
+_RIGHT = {"(clean)": ("nothing",), "(foreign)": ("unknown",)}
+"""Correct answers for the rows of clean recordings and unmodelled causes."""
+
+
+def _hidden(rows: pd.DataFrame) -> pd.Series[str]:
+    family = rows["hidden"].astype(str).str.partition(".")[0]
+    return family.where(rows["kind"] == "single", "(" + rows["kind"] + ")")
+
+
+def _answers(rows: pd.DataFrame) -> list[str]:
+    good = is_correct(rows)
+    return [
+        _answer(row, is_right) for row, is_right in zip(rows.to_dict("records"), good, strict=True)
+    ]
+
+
+def _answer(row: dict[Any, Any], is_right: bool) -> str:
+    """Return the family that an answer names, or the label of an answer without a family."""
+    if row["status"] != "done":
+        return "no answer"
+    if row["verdict"] == "adequate":
+        return "nothing"
+    if is_right and row["kind"] == "single":
+        return str(row["hidden"]).partition(".")[0]
+    if row["verdict"] in ("unknown", "unidentifiable") or (is_right and row["kind"] == "foreign"):
+        return "unknown"
+    named = str(row["named"] or "")
+    if not named:
+        return "unknown"
+    return "several" if " + " in named else named.partition("|")[0].partition(".")[0]
+
+
+def _panel(axis: Axes, counts: pd.DataFrame, name: str) -> None:
+    """Draw the confusion matrix of one diagnoser."""
+    from matplotlib.patches import Rectangle
+
+    totals = counts.sum(axis=1).to_numpy()
+    shares = 100.0 * counts.to_numpy() / np.maximum(totals, 1)[:, None]
+    axis.imshow(shares, cmap="Greys", vmin=0, vmax=100, aspect="auto")
+    said = list(counts.columns)
+    for i, family in enumerate(counts.index):
+        for right_answer in _RIGHT.get(family, (family,)):
+            if right_answer in said:
+                at = said.index(right_answer) - 0.5, i - 0.5
+                axis.add_patch(
+                    Rectangle(at, 1, 1, fill=False, edgecolor=style.NEUTRAL_MARK, linewidth=1.0)
+                )
+        for j, share in enumerate(shares[i]):
+            if share >= _MIN_LABELLED_PERCENT:
+                ink = "white" if share > 55 else style.NEUTRAL_MARK
+                axis.text(j, i, f"{share:.0f}", ha="center", va="center", fontsize=5.5, color=ink)
+    axis.set_title(name, fontsize=9)
+    axis.set_xticks(range(len(said)), said, rotation=90, fontsize=6.5)
+    labels = [f"{family} {n}" for family, n in zip(counts.index, totals, strict=True)]
+    axis.set_yticks(range(len(labels)), labels, fontsize=6.5)
+    axis.spines[:].set_visible(False)
+    axis.tick_params(length=0)

@@ -1,0 +1,176 @@
+"""Server side of an isolated diagnoser: write the recording, call the diagnoser, send its answer.
+
+The harness cannot trust anything from this process once the code of a plugin has run in it. The
+simulations are counted in this process, so a malicious plugin could change their number. It cannot
+obtain the truth, because no process of a diagnoser ever contains it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.isolation.isolation_layers import AccessPolicy
+from bench.benchmark.isolation.message_channel import (
+    MAX_TEXT_BYTES,
+    MessageChannel,
+    PeerClosedError,
+    pack_arrays,
+    unpack_arrays,
+)
+from bench.benchmark.isolation.tuner_server import load_class
+from bench.core.diagnoser import (
+    Answer,
+    Diagnoser,
+    DiagnoserTrainingTask,
+    DiagnosisCase,
+    list_observable_effects,
+)
+from bench.core.plugin_registries import simulators
+from bench.logs.inspection import get_simulator_class
+from sims import effects
+from sims.core.simulation_counter import SIMULATION_COUNTER
+from sims.core.simulator import Array
+from sims.recording.recording import read_recording
+from sims.system_simulator import SystemSimulator
+
+_LIMIT = 1 << 40
+"""Maximum size in bytes of a message from the harness; large, because the harness is trusted."""
+_DOCUMENT = 1 << 30
+"""Maximum size in bytes of a case document."""
+
+
+def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]) -> None:
+    """Answer requests of the harness until the channel is closed.
+
+    Args:
+        channel: message channel to the harness.
+        reach: access policy of this process, with its own writable folder.
+        held: sent in the first message of this process.
+    """
+    channel.send_document(b"R", held)
+    learned: Mapping[str, Array] = {}
+    with suppress(PeerClosedError):
+        while True:
+            message = channel.receive(_LIMIT)
+            try:
+                match message.kind:
+                    case b"L":
+                        learned = unpack_arrays(message.body)
+                        channel.send(b"K")
+                    case b"Q":
+                        question = message.to_document(_DOCUMENT)
+                        channel.send_document(
+                            b"A", diagnose_case(question, Path(reach.folder), learned)
+                        )
+                    case b"F":
+                        arrays, used = train_diagnoser(message.to_document(_DOCUMENT))
+                        channel.send(b"L", *pack_arrays({**arrays, _USED: np.array([used])}))
+            except PeerClosedError:
+                return
+            except BaseException:
+                said = traceback.format_exc().encode("utf-8", "replace")
+                # BaseException includes SystemExit: the diagnoser caused it. Of a long text, only
+                # the end is sent.
+                channel.send(b"D", said[-MAX_TEXT_BYTES // 2 :])
+
+
+_USED = "simulations"
+"""Name of the array with the number of simulations that a training used."""
+
+
+def load_diagnoser(wanted: Mapping[str, Any]) -> Diagnoser:
+    """Load a diagnoser from its module or file, and create it."""
+    kind: type[Diagnoser] = load_class(dict(wanted), Diagnoser)
+    return kind()
+
+
+def get_simulator(system: str) -> type[SystemSimulator]:
+    """Return the simulator class of a system."""
+    kind = simulators.get(system)
+    assert inspect.isclass(kind)
+    assert issubclass(kind, SystemSimulator)
+    return kind
+
+
+def diagnose_case(
+    question: Mapping[str, Any],
+    folder: Path,
+    learned: Mapping[str, Array],
+    diagnoser: Diagnoser | None = None,
+) -> dict[str, Any]:
+    """Diagnose one case.
+
+    Args:
+        question: request with ``wanted`` (name, module, file), ``table`` and ``description`` of the
+            recording, ``budget``, ``seconds``, ``seed``, and ``beside``, texts of further files in
+            the folder of the recording.
+        folder: folder to which the recording is written.
+        learned: trained arrays of the diagnoser.
+        diagnoser: the diagnoser if it already exists.
+
+    Returns:
+        JSON document with the answer, the number of simulations and the processor time; with a
+        reason in ``skipped`` if the diagnoser does not support the simulator.
+    """
+    diagnoser = diagnoser or load_diagnoser(question["wanted"])
+    path = folder / "recording.csv"
+    path.write_text(question["table"], encoding="utf-8")
+    path.with_suffix(".toml").write_text(question["description"], encoding="utf-8")
+    for name, text in question.get("beside", {}).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    kind = get_simulator_class(path, path)
+    assert issubclass(kind, SystemSimulator)
+    if reason := diagnoser.cannot(kind):
+        return {"answer": None, "simulations": 0, "processor_seconds": 0.0, "skipped": str(reason)}
+    recording = read_recording(path, kind)
+    case = DiagnosisCase(
+        path,
+        recording,
+        kind,
+        list_observable_effects(kind, recording),
+        np.random.default_rng(question["seed"]),
+        int(question["budget"]),
+        float(question["seconds"]),
+        learned,
+    )
+    SIMULATION_COUNTER.reset(case.budget)
+    begun = time.process_time()
+    try:
+        answer = Answer.of(diagnoser.diagnose(case))
+    finally:
+        used, spent = SIMULATION_COUNTER.used, time.process_time() - begun
+        SIMULATION_COUNTER.reset()
+    return {"answer": answer.document(), "simulations": used, "processor_seconds": spent}
+
+
+def train_diagnoser(lesson: Mapping[str, Any]) -> tuple[Mapping[str, Array], int]:
+    """Train a diagnoser for a system.
+
+    Args:
+        lesson: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+
+    Returns:
+        The trained arrays by name, and the number of simulations used.
+    """
+    kind = get_simulator(lesson["system"])
+    SIMULATION_COUNTER.reset(int(lesson["budget"]))
+    try:
+        arrays = load_diagnoser(lesson["wanted"]).train(
+            DiagnoserTrainingTask(
+                kind,
+                effects.list_effects_for(kind.system),
+                np.random.default_rng(lesson["seed"]),
+                int(lesson["budget"]),
+            )
+        )
+        return {name: np.asarray(array) for name, array in arrays.items()}, SIMULATION_COUNTER.used
+    finally:
+        SIMULATION_COUNTER.reset()

@@ -1,0 +1,211 @@
+"""Write the tables, figures and HTML report of a comparison of diagnosers and print a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.results_report import REPORT_FILE
+from bench.benchmark.storage.result_folder import FolderConfiguration
+from bench.diagnosis_benchmark import diagnoser_figures
+from bench.diagnosis_benchmark.answer_rows import SKIPPED_STATUS, build_answer_rows
+from bench.diagnosis_benchmark.answer_store import AnswersByCase
+from bench.diagnosis_benchmark.case_set import CaseSpec
+from bench.diagnosis_benchmark.confusion_figure import draw_confusion_matrices
+from bench.diagnosis_benchmark.report_page.diagnoser_conclusion import summarise_unsupported
+from bench.diagnosis_benchmark.report_page.diagnoser_page import render_page
+from bench.diagnosis_benchmark.report_page.diagnoser_page_data import DiagnoserReportData
+from bench.diagnosis_benchmark.result_tables import (
+    PRIMARY_METRIC,
+    build_all_tables,
+    index_by_diagnoser,
+    select_fully_answered_cases,
+    select_single_effects,
+)
+from bench.diagnosis_benchmark.training_costs import read_training_costs
+from bench.diagnosis_benchmark.wrong_answers import build_failure_table
+from bench.figures.style import FigureFiles, add_trust_note, render_all_formats, write_figure_files
+from sims.core.atomic_files import write_atomically
+
+ANSWERS_TABLE_FILE = "items.csv"
+"""File with one row per answer."""
+
+
+class ReportableDiagnosisStudy(Protocol):
+    """Protocol of the studies that can be reported; see `diagnoser_study.DiagnosisStudy`."""
+
+    folder: Path
+    configuration: FolderConfiguration
+
+    @property
+    def answers(self) -> AnswersByCase:
+        """All stored answers."""
+
+    @property
+    def cases(self) -> list[CaseSpec]:
+        """All cases of the experiment."""
+
+    @property
+    def usable_diagnosers(self) -> list[str]:
+        """Names of the diagnosers that can be used here."""
+
+    @property
+    def skipped_diagnosers(self) -> dict[str, str]:
+        """Diagnosers that cannot be used here, with the reason."""
+
+
+def write_report(study: ReportableDiagnosisStudy, say: Callable[[str], None]) -> int:
+    """Write tables, figures and HTML report from the answers that exist.
+
+    Only cases that every diagnoser has answered are reported.
+
+    Args:
+        study: the study to report.
+        say: prints one line.
+
+    Returns:
+        Number of failed answers.
+    """
+    for name, reason in study.skipped_diagnosers.items():
+        say(f"skipped: {name}: {reason}")
+    order = study.usable_diagnosers
+    whole = build_answer_rows(study.answers, order)
+    if whole.empty:
+        say("no answers yet")
+        return 0
+    rows = select_fully_answered_cases(whole, order)
+    if rows.empty:
+        say("no question has been put to every diagnoser yet")
+        return 0
+    training = read_training_costs(study.folder)
+    write_atomically(study.folder / ANSWERS_TABLE_FILE, format_csv(rows))
+    left_out = rows[rows["status"] == SKIPPED_STATUS]
+    rows = rows[rows["status"] != SKIPPED_STATUS]
+    tables = build_all_tables(rows, order, training)
+    for name, frame in {**tables, "failures": build_failure_table(rows, order)}.items():
+        write_atomically(study.folder / f"{name}.csv", format_csv(frame))
+    pictures = draw_figures(study.configuration.experiment, rows, tables, order)
+    for name, picture in pictures.items():
+        write_figure_files(study.folder / "figures" / name, picture.png, picture.pdf)
+    shown = DiagnoserReportData(
+        study.configuration.experiment,
+        str(study.folder),
+        order,
+        rows,
+        tables,
+        training,
+        pictures,
+        study.skipped_diagnosers,
+        len(study.cases),
+        left_out,
+    )
+    write_atomically(study.folder / REPORT_FILE, render_page(shown))
+    for line in format_summary(tables, order):
+        say(line)
+    for name, reason, count in summarise_unsupported(left_out):
+        say(f"{name} cannot be asked {count} of these: {reason}")
+    asked, planned = rows["question"].nunique(), len(study.cases)
+    hopeless = sum(not one["item"] for one in study.answers.values())
+    say(f"{asked} questions of {planned}; of {hopeless} the sensors cannot show what is hidden")
+    say(
+        f"written: {study.folder}/ with {ANSWERS_TABLE_FILE}, {', '.join(f'{n}.csv' for n in tables)}"
+    )
+    say(f"figures: {', '.join(f'{name}.png' for name in sorted(pictures))}")
+    say(f"report: {study.folder / REPORT_FILE}")
+    failed = rows[rows["status"] != "done"]
+    for _, row in failed.head(_MAX_LISTED_FAILURES).iterrows():
+        say(f"{row['status']}: {row['diagnoser']} on {row['question']}: {row['reason']}")
+    if len(failed) > _MAX_LISTED_FAILURES:
+        say(f"({len(failed)} answers failed; see {ANSWERS_TABLE_FILE})")
+    return len(failed)
+
+
+_MAX_LISTED_FAILURES = 5
+"""Maximum number of failed answers that are printed."""
+
+
+def format_csv(frame: pd.DataFrame) -> str:
+    """Format a table as CSV text."""
+    text: str = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    return text
+
+
+def draw_figures(
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    tables: Mapping[str, pd.DataFrame],
+    order: Sequence[str],
+) -> dict[str, FigureFiles]:
+    """Draw every figure for which there is data.
+
+    Args:
+        experiment: the experiment, for the title.
+        rows: one row per answer.
+        tables: tables by name.
+        order: names of the diagnosers, in the order of their colours.
+
+    Returns:
+        Figures by name.
+    """
+    title = experiment.title or experiment.name
+    made = {}
+    counted = (
+        index_by_diagnoser(tables["table"], what) for what in ("false alarms", "named, alone")
+    )
+    if all(any(line["of"] for line in lines.values()) for lines in counted):
+        made["board"] = diagnoser_figures.draw_leaderboard(tables["table"], order, title)
+        made["outcomes"] = diagnoser_figures.draw_outcomes(
+            select_single_effects(rows), order, title
+        )
+        made["confusion"] = draw_confusion_matrices(rows, order, title)
+        made["cost"] = diagnoser_figures.draw_cost(tables["costs"], tables["table"], order, title)
+    if not tables["power"].empty:
+        made["power"] = diagnoser_figures.draw_power(tables["power"], order, title)
+    if not tables["calibration"].empty:
+        made["calibration"] = diagnoser_figures.draw_p_value_calibration(
+            tables["calibration"], order, title
+        )
+    return {
+        name: render_all_formats(add_trust_note(figure, experiment.trusted))
+        for name, figure in made.items()
+    }
+
+
+def format_summary(tables: Mapping[str, pd.DataFrame], order: Sequence[str]) -> list[str]:
+    """Format the leaderboard as aligned text lines.
+
+    Args:
+        tables: tables by name.
+        order: names of the diagnosers.
+
+    Returns:
+        A header line and one line per diagnoser with its false alarms, diagnosed single causes,
+        pairs, unmodelled causes and median cost.
+    """
+    columns = (
+        ("false alarms", "false alarms"),
+        ("named, alone", "named alone"),
+        (PRIMARY_METRIC, "in a set of 2"),
+        ("pairs: both named", "both of two"),
+        ("foreign causes: unknown or partial", "foreign"),
+    )
+    held = {metric: index_by_diagnoser(tables["table"], metric) for metric, _ in columns}
+    costs = index_by_diagnoser(tables["costs"])
+    head = ["diagnoser", *(says for _, says in columns), "simulations", "seconds"]
+    lines = [head]
+    for name in order:
+        cells = [name]
+        for metric, _ in columns:
+            line = held[metric][name]
+            ends = f"{100 * line['low']:.0f}-{100 * line['high']:.0f}"
+            cells.append(f"{100 * line['share']:.0f} % ({ends})" if line["of"] else "-")
+        cost = costs[name]
+        cells += [f"{cost['simulations_median']:.0f}", f"{cost['processor_seconds_median']:.2f}"]
+        lines.append(cells)
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    padded = [[c.ljust(w) for c, w in zip(line, widths, strict=True)] for line in lines]
+    return ["  ".join(cells).rstrip() for cells in padded]

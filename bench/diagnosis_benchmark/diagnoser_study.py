@@ -1,0 +1,465 @@
+"""Comparison of diagnosers in its result folder: draw cases, run diagnosers, store answers."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from bench.benchmark.isolation.linux_syscalls import not_dumpable
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.salt import PUBLIC_SALT
+from bench.benchmark.runner.code_digest import (
+    compute_digest,
+    hash_class_source,
+    hash_package_versions,
+    hash_plugin_files,
+    hash_source_folders,
+)
+from bench.benchmark.runner.experiment_runner import ProgressFactory, no_progress, unreachable
+from bench.benchmark.runner.plugin_discovery import (
+    inspect_installed_part,
+    is_external_part,
+    load_plugins_for_experiment,
+    register_plugins,
+)
+from bench.benchmark.runner.run_ids import check_unchanged
+from bench.benchmark.runner.sandboxed_tuner import find_preloadable_packages
+from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.tuner_training import get_weights_folder as trained
+from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
+from bench.benchmark.storage.result_folder import read_configuration
+from bench.benchmark.storage.salt_file import read_salt as kept_salt
+from bench.benchmark.storage.salt_file import reveal_salt
+from bench.benchmark.storage.study_progress import (
+    MISSING_STATUS,
+    RunEnd,
+    StudyOutcome,
+    StudyProgress,
+)
+from bench.core.plugin_registries import PartUnavailableError, diagnosers, simulators
+from bench.core.random_streams import make_rng
+from bench.diagnosis_benchmark.answer_store import AnswersByCase, AnswerStore, read_answers
+from bench.diagnosis_benchmark.benchmark_config import BenchmarkConfig, read_config
+from bench.diagnosis_benchmark.case_evaluation import (
+    AnswerLimits,
+    EvaluatedDiagnoser,
+    evaluate_case,
+)
+from bench.diagnosis_benchmark.case_set import CaseSpec, build_case_set
+from bench.diagnosis_benchmark.diagnoser_training import TrainedDiagnoser, train_or_load
+from bench.diagnosis_benchmark.training_costs import TrainingCost, write_training_costs
+from sims.core.simulator import InputError
+
+PrintLine = Callable[[str], None]
+BASE_SOURCE_FOLDERS = (
+    "sims",
+    "bench/benchmark/problem",
+    "bench/benchmark/runner",
+    "bench/benchmark/isolation",
+    "bench/diagnosis",
+    "bench/logs",
+)
+"""Source folders that determine the answers, except those of the diagnosis benchmark itself."""
+SOURCE_FOLDERS = (
+    *BASE_SOURCE_FOLDERS,
+    "bench/diagnosis_benchmark/case_generation",
+    "bench/diagnosis_benchmark/diagnosers",
+)
+MAX_TRAINING_SECONDS = 3600.0
+"""Maximum training time of a diagnoser for one system, seconds."""
+_CASE_DRAW_SECONDS = 300.0
+"""Maximum time to draw one case, seconds."""
+
+
+class DiagnosisStudy:
+    """Comparison of diagnosers on cases, stored in a folder; implements `study.Study`.
+
+    Args:
+        folder: result folder of a comparison of diagnosers.
+
+    Attributes:
+        folder: result folder.
+        configuration: stored configuration of the study.
+        plugins: plugin files that the diagnosers need.
+
+    Raises:
+        InputError: the folder does not contain such a comparison, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.configuration = read_configuration(folder)
+        self.plugins = self.configuration.plugins
+        self._kept: AnswerStore | None = None
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+        salt: str | None = None,
+    ) -> DiagnosisStudy:
+        """Create a comparison in a new folder, without running it; see `bench.studies.study.Study`.
+
+        Args:
+            experiment: experiment with a ``[diagnosis]`` table.
+            plugins: plugin files that the diagnosers need.
+            folder: new result folder; None for the default one.
+            jobs: number of worker processes that will be used; 0 runs everything in this process.
+            salt: random string from which cases are drawn; see `bench.studies.study.Study.begin`.
+        """
+        settings = read_config(experiment)
+        new = prepare_study(experiment, folder, jobs, salt)
+        build_case_set(settings)
+        if jobs:
+            _refuse_unreachable(settings.diagnosers)
+        for name in settings.diagnosers:
+            _announced(name, new.experiment.trusted)
+        return cls(new.create_folder(plugins, _fingerprint(new.experiment, plugins)))
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> DiagnosisStudy:
+        """Open an interrupted comparison in order to run it; see `Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: further plugin files.
+        """
+        study = cls(folder)
+        held = study.configuration
+        given = {str(Path(p).resolve()) for p in plugins}
+        study.plugins = held.plugins + sorted(given - set(held.plugins))
+        load_plugins_for_experiment(study.plugins, held.experiment)
+        for name in study.config.diagnosers:
+            _announced(name, held.experiment.trusted)
+        check_unchanged(folder, held.fingerprint, _fingerprint(held.experiment, study.plugins))
+        return study
+
+    @cached_property
+    def config(self) -> BenchmarkConfig:
+        """The validated ``[diagnosis]`` table."""
+        return read_config(self.configuration.experiment)
+
+    @cached_property
+    def cases(self) -> list[CaseSpec]:
+        """All cases of the experiment."""
+        return build_case_set(self.config)
+
+    @cached_property
+    def skipped_diagnosers(self) -> dict[str, str]:
+        """Diagnosers that cannot be used here, by name, with the reason."""
+        reasons = {}
+        # A diagnoser of a plugin is registered only where the plugin was loaded. Reading the folder
+        # does not require the plugin, so an unregistered name is no reason to skip.
+        known = set(diagnosers.names())
+        for name in self.config.diagnosers:
+            if name not in known:
+                continue
+            try:
+                diagnosers.get(name)
+            except PartUnavailableError as error:
+                reasons[name] = error.reason
+        return reasons
+
+    @property
+    def usable_diagnosers(self) -> list[str]:
+        """Names of the diagnosers that can be used here."""
+        return [name for name in self.config.diagnosers if name not in self.skipped_diagnosers]
+
+    def run(
+        self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
+    ) -> StudyOutcome:
+        """Collect the missing answers; see `bench.studies.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes.
+            progress: makes progress callbacks; None for no progress output.
+            pool: worker pool; None to create one.
+        """
+        self._kept = AnswerStore(self.folder)
+        try:
+            _EvaluationRun(self, self._kept, progress or no_progress).run(jobs, pool)
+        except KeyboardInterrupt:
+            return self._made(interrupted=True)
+        except PoolLostError as error:
+            return self._made(stopped=str(error))
+        finally:
+            self.close()
+        return self._made()
+
+    def _made(self, **why: Any) -> StudyOutcome:
+        ends = self.status().ends
+        missing = sum(end.status == MISSING_STATUS for end in ends)
+        if not missing and not why:
+            reveal_salt(self.folder, kept_salt(self.folder, self.configuration.experiment))
+            self.configuration = read_configuration(self.folder)
+        return StudyOutcome(len(ends) - missing, len(ends), **why)
+
+    def close(self) -> None:
+        """Close the answer file and release its lock."""
+        if self._kept is not None:
+            self._kept.close()
+            self._kept = None
+
+    @property
+    def answers(self) -> AnswersByCase:
+        """All stored answers, by case."""
+        return read_answers(self.folder)
+
+    def status(self) -> StudyProgress:
+        """Return which answers are stored and which are missing."""
+        held = self.answers
+        ends = []
+        for question in self.cases:
+            one = held.get(question.name)
+            for name in self.config.diagnosers:
+                label = f"{question.name} {name}"
+                if name in self.skipped_diagnosers:
+                    ends.append(RunEnd(label, name, "skipped", self.skipped_diagnosers[name]))
+                elif one is not None and not one["item"]:
+                    ends.append(RunEnd(label, name, "done", "the sensors cannot show it"))
+                elif one is None or name not in one["rows"]:
+                    ends.append(RunEnd(label, name, MISSING_STATUS))
+                else:
+                    row = one["rows"][name]
+                    ends.append(RunEnd(label, name, row["status"], row["reason"]))
+        configured = self.configuration
+        name = configured.experiment.name
+        return StudyProgress(name, "answers given", configured.fingerprint, tuple(ends))
+
+    def report(self, say: PrintLine) -> int:
+        """Write tables, figures and HTML report, and print a summary.
+
+        Args:
+            say: prints one line.
+
+        Returns:
+            Number of failed answers.
+        """
+        from bench.diagnosis_benchmark.diagnoser_report import write_report
+
+        return write_report(self, say)
+
+
+class _EvaluationRun:
+    """Execution of the cases that have missing answers."""
+
+    def __init__(self, study: DiagnosisStudy, kept: AnswerStore, progress: ProgressFactory) -> None:
+        self._study, self._kept, self._progress = study, kept, progress
+        self._experiment = study.configuration.experiment
+        self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
+        self._salt = (
+            kept_salt(study.folder, self._experiment) or self._experiment.salt or PUBLIC_SALT
+        )
+        self._limits = AnswerLimits(
+            self._experiment.budget, self._experiment.timeout, self._experiment.memory
+        )
+
+    def run(self, jobs: int, pool: Pool | None) -> None:
+        """Train the diagnosers and collect the missing answers.
+
+        Args:
+            jobs: number of worker processes.
+            pool: worker pool; None to create one.
+
+        Raises:
+            LostError: the workers are no longer available.
+        """
+        open_questions = [q for q in self._mixed() if self._open(q)]
+        if not open_questions:
+            return
+        # The truths are in the memory of this process, and a diagnoser's process may run as the
+        # same user.
+        trusted = self._experiment.trusted
+        with nullcontext() if trusted else not_dumpable(), pool or make_pool(jobs) as workers:
+            examined, taught = self._learn(workers)
+            write_training_costs(self._study.folder, taught)
+            self._ask(workers, open_questions, examined)
+
+    def _mixed(self) -> list[CaseSpec]:
+        """Return the cases in a fixed random order, so that a partial result is a fair sample."""
+        questions = self._study.cases
+        order = make_rng("diagnosis", "order", len(questions)).permutation(len(questions))
+        return [questions[place] for place in order.tolist()]
+
+    def _open(self, question: CaseSpec) -> list[str]:
+        """Return the names of the diagnosers that have not answered a case."""
+        one = self._kept.answered.get(question.name)
+        if one is not None and not one["item"]:
+            return []
+        rows = one["rows"] if one else {}
+        return [name for name in self._study.usable_diagnosers if name not in rows]
+
+    def _learn(self, workers: Pool) -> tuple[dict[str, EvaluatedDiagnoser], list[TrainingCost]]:
+        """Train the diagnosers.
+
+        Returns:
+            The diagnosers to evaluate, by name, and the costs of their training.
+        """
+        trusted = self._experiment.trusted
+        # The model file of a robot is not known before its case, so no diagnoser can train for it.
+        wanted = {question.system for question in self._study.cases}
+        systems = sorted(wanted & set(simulators.names()))
+        codes = {name: make_diagnoser_spec(name) for name in self._study.usable_diagnosers}
+        learned = [name for name in codes if diagnosers.get(name).learned]
+        pairs = [(name, system) for name in learned for system in systems]
+        budget = self._experiment.training_budget
+        calls: list[Call] = [
+            (
+                train_or_load,
+                (
+                    codes[name],
+                    hash_class_source(diagnosers.get(name)),
+                    system,
+                    budget,
+                    MAX_TRAINING_SECONDS,
+                    self._hidden,
+                    trusted,
+                ),
+            )
+            for name, system in pairs
+        ]
+        files: dict[str, dict[str, Path]] = {name: {} for name in codes}
+        taught = []
+        step = self._progress("training", len(calls)) if calls else None
+        for place, result in workers.iterate_results(calls, math.inf) if calls else ():
+            name, system = pairs[place]
+            if isinstance(result, TrainedDiagnoser):
+                files[name][system] = result.path
+                taught.append(TrainingCost(name, system, result.simulations, result.seconds))
+            elif isinstance(result, RunEndedError | TimeoutError):
+                # An untrained diagnoser is evaluated all the same; its answer states what it lacks.
+                taught.append(TrainingCost(name, system, 0, 0.0, str(result)))
+            else:
+                raise result
+            if step:
+                step()
+        examined = {n: EvaluatedDiagnoser(n, code, files[n], trusted) for n, code in codes.items()}
+        return examined, taught
+
+    def _ask(
+        self, workers: Pool, questions: Sequence[CaseSpec], examined: dict[str, EvaluatedDiagnoser]
+    ) -> None:
+        calls: list[Call] = []
+        for question in questions:
+            one = self._kept.answered.get(question.name)
+            asked = [examined[name] for name in self._open(question)]
+            known = one["item"] if one else None
+            given = (question.to_json(), self._study.config.seed, self._salt, known, asked)
+            calls.append((evaluate_case, (*given, self._limits, self._hidden)))
+        step = self._progress("asking", len(calls))
+        longest = _CASE_DRAW_SECONDS + len(examined) * (self._limits.seconds + _CASE_DRAW_SECONDS)
+        for place, result in workers.iterate_results(calls, longest):
+            if isinstance(result, BaseException):
+                result = _lost(questions[place], [one.label for one in calls[place][1][4]], result)
+            self._kept.append(result)
+            step()
+
+
+def _lost(question: CaseSpec, labels: Sequence[str], error: BaseException) -> dict[str, Any]:
+    """Make failed answers for a case whose worker died or exceeded its time limit.
+
+    Raises:
+        InputError: the worker failed with this error.
+    """
+    if isinstance(error, InputError):
+        raise error
+    status = "timeout" if isinstance(error, TimeoutError) else "crashed"
+    rows = [
+        {
+            "question": question.name,
+            "diagnoser": label,
+            "status": status,
+            "reason": str(error),
+            "answer": None,
+            "simulations": 0,
+            "processor_seconds": None,
+            "seconds": None,
+            "trusted": False,
+        }
+        for label in labels
+    ]
+    return {"question": question.name, "item": {"name": question.name}, "rows": rows}
+
+
+def make_diagnoser_spec(name: str) -> TunerSpec:
+    """Return the code location of a diagnoser and the modules to preload for it."""
+    kind, place = diagnosers.get(name), diagnosers.place(name)
+    module = getattr(kind, "module", "") or kind.__module__
+    file = str(place) if place else ""
+    own = importlib.util.find_spec(module) if module.startswith("bench.") else None
+    # Without preloading, packages that a diagnoser imports would be imported again for each answer.
+    ahead = (
+        find_preloadable_packages(file or (own.origin or "" if own else "")) if file or own else ()
+    )
+    return TunerSpec(name, module, file, {}, ahead)
+
+
+def _refuse_unreachable(names: Sequence[str]) -> None:
+    """Reject diagnosers that exist in this process alone: worker processes cannot load them.
+
+    Raises:
+        InputError: a diagnoser is a class of a script or notebook.
+    """
+    for name in names:
+        added = diagnosers.snapshot().get(name)
+        if added is not None and added.path is None:
+            raise unreachable("diagnoser", name, added.part)
+
+
+def _announced(name: str, trusted: bool) -> None:
+    """Register a stub for a diagnoser of another package, without importing its code here.
+
+    Args:
+        name: registered name of the diagnoser.
+        trusted: whether diagnosers run in this process.
+
+    Raises:
+        InputError: the diagnoser does not exist, or its code is already in this process.
+    """
+    if not trusted and is_external_part(name, diagnosers):
+        try:
+            register_plugins([inspect_installed_part(name, "diagnoser")])
+        except PartUnavailableError:
+            return
+    try:
+        kind = diagnosers.get(name)
+    except PartUnavailableError:
+        return
+    added = diagnosers.snapshot().get(name)
+    if not trusted and added is not None:
+        raise InputError(
+            f"diagnoser {name}: class {kind.__qualname__} is in this process, where the truths "
+            "are: put it into a plugin file, or trust the diagnosers (--trust)"
+        )
+
+
+def _fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
+    """Compute hashes of everything that must not change while the study is incomplete.
+
+    Returns:
+        Hashes by a description for the user.
+    """
+    public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
+    sources = []
+    for name in read_config(experiment).diagnosers:
+        try:
+            sources.append(hash_class_source(diagnosers.get(name)))
+        except PartUnavailableError:
+            sources.append("skipped")
+    return {
+        "configuration": compute_digest(experiment.name, public.document()),
+        "plugins": hash_plugin_files(plugins),
+        "code": hash_source_folders(SOURCE_FOLDERS),
+        "package versions": hash_package_versions(),
+        "diagnosers": compute_digest(sources),
+    }

@@ -1,0 +1,114 @@
+"""Train diagnosers and cache the result in the user's cache folder.
+
+The cache key contains everything that the result depends on.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.runner.code_digest import (
+    compute_digest,
+    hash_package_versions,
+    hash_source_folders,
+)
+from bench.benchmark.runner.sandboxed_tuner import retry_if_killed
+from bench.benchmark.runner.tuner_training import get_weights_folder
+from bench.core.random_streams import make_seed_words
+from bench.diagnosis_benchmark.case_evaluation import train_isolated
+from sims.core.atomic_files import atomic_replacement
+
+CACHE_SUBFOLDER = "diagnosers"
+"""Subfolder of the cache of trained weights."""
+TRAINING_SOURCE_FOLDERS = (
+    "sims",
+    "bench/benchmark/isolation",
+    "bench/diagnosis",
+    "bench/logs",
+    "bench/diagnosis_benchmark/diagnosers",
+)
+"""Source folders that determine the result of a training."""
+
+
+class TrainedDiagnoser(NamedTuple):
+    """Result of training a diagnoser for a system.
+
+    Attributes:
+        path: file with the trained arrays.
+        simulations: number of simulations that the training used.
+        seconds: time that the training took.
+        found: whether the result was already in the cache.
+    """
+
+    path: Path
+    simulations: int
+    seconds: float
+    found: bool
+
+
+def train_or_load(
+    code: TunerSpec,
+    source: str,
+    system: str,
+    budget: int,
+    seconds: float,
+    hidden: tuple[str, ...],
+    trusted: bool,
+) -> TrainedDiagnoser:
+    """Train a diagnoser for a system, or load the cached result.
+
+    Args:
+        code: where its code is.
+        source: hash of its code.
+        system: name of the system.
+        budget: maximum number of simulations.
+        seconds: maximum time.
+        hidden: folders that the diagnoser's process must not read.
+        trusted: whether the diagnoser runs in this process.
+
+    Raises:
+        EndedError: the training failed.
+    """
+    key = compute_digest(
+        code.name,
+        source,
+        system,
+        budget,
+        hash_source_folders(TRAINING_SOURCE_FOLDERS),
+        hash_package_versions(),
+        length=20,
+    )
+    path = get_weights_folder() / CACHE_SUBFOLDER / f"{code.name}-{system}-{key}.npz"
+    told = path.with_suffix(".json")
+    if (cost := _cost(told)) is not None and zipfile.is_zipfile(path):
+        return TrainedDiagnoser(path, *cost, found=True)
+    lesson: dict[str, Any] = {
+        "wanted": {"name": code.name, "module": code.module, "file": code.file},
+        "system": system,
+        "budget": budget,
+        "seed": make_seed_words("diagnosis", "lesson", code.name, system).tolist(),
+    }
+    arrays, used, spent = retry_if_killed(
+        lambda: train_isolated(code, lesson, seconds, hidden, trusted)
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_replacement(path, keep_ending=True) as partial:
+        named: dict[str, Any] = dict(arrays)
+        np.savez_compressed(partial, **named)
+    with atomic_replacement(told) as partial:
+        partial.write_text(json.dumps([used, spent]), encoding="utf-8")
+    return TrainedDiagnoser(path, used, spent, found=False)
+
+
+def _cost(path: Path) -> tuple[int, float] | None:
+    try:
+        used, seconds = json.loads(path.read_text(encoding="utf-8"))
+        return int(used), float(seconds)
+    except (OSError, ValueError, TypeError):
+        return None

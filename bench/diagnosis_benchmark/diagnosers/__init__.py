@@ -1,0 +1,1 @@
+"""Built-in diagnosers, one per module; see `bench.core.diagnoser`."""

@@ -1,0 +1,334 @@
+"""Forward selection: add one effect at a time, refitted with parameters and initial states.
+
+A criterion decides when to stop. BIC (G. Schwarz, Ann. Stat. 6(2), 461, 1978,
+doi:10.1214/aos/1176344136), with n samples and k numbers,
+
+    BIC = n log(S / n) + k log n,    S the sum of squares in units of the noise               (1)
+
+does not need the noise level; effects within 2 of the best are indistinguishable (R. E. Kass, A. E.
+Raftery, JASA 90, 773, 1995). Chi squared uses the stated or estimated noise: a model is sufficient
+if noise alone makes S as large in more than one of a hundred recordings (P. R. Bevington, D. K.
+Robinson, Data Reduction and Error Analysis, chapter 11). Both assume white noise.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
+from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.search.candidate_directions import compute_directions
+from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
+    EffectColumn,
+    RegressionEvidence,
+    compute_base_jacobian,
+    find_strongest_columns,
+)
+from sims.core.simulator import Array
+
+MAX_EFFECTS = 3
+"""Maximum number of effects."""
+REFITS_PER_ROUND = 8
+"""Number of effects refitted per round: those with the best first-order prediction."""
+MAX_FIT_ITERATIONS = 15
+"""Maximum number of iterations of a fit."""
+MIN_GAP_CLOSED = 0.7
+"""Minimum fraction of the gap that must be closed before its causes are named."""
+FALSE_ALARM_RATE = 0.01
+"""False-alarm probability."""
+CHI_SQUARED_TOLERANCE = 6.63
+"""Chi-squared difference up to which two models are indistinguishable: 1 %, one free parameter."""
+BIC_TOLERANCE = 2.0
+"""BIC difference up to which two models are indistinguishable."""
+Z95 = 1.96
+"""Half width of a 95 % interval in standard errors."""
+
+
+class RefittedModel(NamedTuple):
+    """Fitted model.
+
+    Attributes:
+        fit: the fit.
+        squares: sum of squares of the residual, in units of the noise.
+        numbers: number of fitted parameters, including initial states.
+    """
+
+    fit: TrajectoryFit
+    squares: float
+    numbers: int
+
+
+class _ForwardSelection(Diagnoser):
+    """Base class of the forward selections."""
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Name the selected effects, with alternatives of equal quality."""
+        evidence = RegressionEvidence(case)
+        try:
+            return self._selected(evidence)
+        finally:
+            evidence.close()
+
+    def _selected(self, evidence: RegressionEvidence) -> Answer:
+        samples = int(evidence.observed_mask.sum())
+        best = _add_refit(evidence, evidence.base.fit)
+        first, rivals = best, list[RefittedModel]()
+        causes: list[tuple[str, tuple[str, ...]]] = []
+        while len(causes) < MAX_EFFECTS and not self.is_sufficient(best, samples):
+            rivals = [
+                _add_refit(evidence, fit) for fit in _refit_with_one_more_effect(evidence, best.fit)
+            ]
+            rivals = [one for one in rivals if np.isfinite(one.squares)]
+            if not rivals:
+                break
+            rivals.sort(key=lambda one: self.compute_criterion(one, samples))
+            if self.compute_criterion(rivals[0], samples) >= self.compute_criterion(best, samples):
+                break
+            near = self.compute_criterion(rivals[0], samples) + self.near
+            alike = [
+                one.fit.effects[-1]
+                for one in rivals[1:]
+                if self.compute_criterion(one, samples) <= near
+            ]
+            best = rivals[0]
+            causes.append((best.fit.effects[-1], tuple(alike)))
+        return self._answer(evidence, first, best, causes, samples)
+
+    def _answer(
+        self,
+        evidence: RegressionEvidence,
+        first: RefittedModel,
+        best: RefittedModel,
+        causes: Sequence[tuple[str, tuple[str, ...]]],
+        samples: int,
+    ) -> Answer:
+        ends = _intervals(evidence, best)
+        parameters = {n: e for n, e in ends.items() if "." not in n}
+        chance = self.compute_p_value(first, samples)
+        if not causes:
+            verdict = "adequate" if self.is_sufficient(best, samples) else "unknown"
+            return Answer(verdict, (), parameters, chance)
+        floor = float(samples - best.numbers)
+        gap = max(first.squares - floor, 1e-9)
+        named = tuple(NamedCause(name, others, _of(ends, name), chance) for name, others in causes)
+        if (
+            not self.is_sufficient(best, samples)
+            and (first.squares - best.squares) / gap < MIN_GAP_CLOSED
+        ):
+            return Answer("unknown", (), parameters, chance)
+        if not self.is_sufficient(best, samples):
+            return Answer("partial", named, parameters, chance)
+        open_sets = any(others for _, others in causes)
+        return Answer("ambiguous" if open_sets else "named", named, parameters, chance)
+
+    near: float
+
+    @abstractmethod
+    def compute_criterion(self, one: RefittedModel, samples: int) -> float:
+        """Compute the criterion, which is minimised.
+
+        Args:
+            one: a fitted model.
+            samples: number of samples.
+        """
+
+    @abstractmethod
+    def is_sufficient(self, one: RefittedModel, samples: int) -> bool:
+        """Return whether a model is sufficient, so that the search can stop.
+
+        Args:
+            one: a fitted model.
+            samples: number of samples.
+        """
+
+    @abstractmethod
+    def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
+        """Compute the p-value of the base model under the hypothesis that nothing is missing.
+
+        Args:
+            first: the fitted base model.
+            samples: number of samples.
+
+        Returns:
+            The p-value, or None if the criterion gives none.
+        """
+
+
+class ForwardBIC(_ForwardSelection):
+    """Forward selection of refitted effects by BIC."""
+
+    name = "forward-bic"
+    near = BIC_TOLERANCE
+
+    def compute_criterion(self, one: RefittedModel, samples: int) -> float:
+        """Compute BIC, equation (1).
+
+        Args:
+            one: a fitted model.
+            samples: number of samples.
+        """
+        return float(samples * np.log(one.squares / samples) + one.numbers * np.log(samples))
+
+    def is_sufficient(self, one: RefittedModel, samples: int) -> bool:
+        """Return False: BIC only compares models; the search continues while a model is better."""
+        return False
+
+    def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
+        """Return None: BIC gives no p-value."""
+        return None
+
+    def _answer(
+        self,
+        evidence: RegressionEvidence,
+        first: RefittedModel,
+        best: RefittedModel,
+        causes: Sequence[tuple[str, tuple[str, ...]]],
+        samples: int,
+    ) -> Answer:
+        ends = _intervals(evidence, best)
+        parameters = {n: e for n, e in ends.items() if "." not in n}
+        named = tuple(NamedCause(name, others, _of(ends, name)) for name, others in causes)
+        sets = any(others for _, others in causes)
+        verdict = "ambiguous" if sets else "named" if named else "adequate"
+        return Answer(verdict, named, parameters)
+
+
+class ForwardChi2(_ForwardSelection):
+    """Forward selection of refitted effects by chi squared, with stated or estimated noise."""
+
+    name = "forward-chi2"
+    near = CHI_SQUARED_TOLERANCE
+
+    def compute_criterion(self, one: RefittedModel, samples: int) -> float:
+        """Return the sum of squares."""
+        return one.squares
+
+    def is_sufficient(self, one: RefittedModel, samples: int) -> bool:
+        """Return whether the chi-squared p-value of the model is above `FALSE_ALARM_RATE`."""
+        return self._chance(one, samples) > FALSE_ALARM_RATE
+
+    def compute_p_value(self, first: RefittedModel, samples: int) -> float | None:
+        """Compute the chi-squared p-value of the base model."""
+        return self._chance(first, samples)
+
+    @staticmethod
+    def _chance(one: RefittedModel, samples: int) -> float:
+        from scipy.special import chdtrc
+
+        return float(chdtrc(max(samples - one.numbers, 1), one.squares))
+
+
+def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedModel:
+    left = (evidence.world.observed - fit.simulated) / evidence.noise.sigma
+    squares = float(np.square(left[evidence.observed_mask]).sum())
+    numbers = fit.free.size + int((~evidence.world.known).sum())
+    return RefittedModel(fit, squares if np.isfinite(squares) else np.inf, numbers)
+
+
+def _refit_with_one_more_effect(
+    evidence: RegressionEvidence, at: TrajectoryFit
+) -> list[TrajectoryFit]:
+    """Add each of the most promising effects to a model, and refit.
+
+    Returns:
+        The best fit for each effect.
+    """
+    world = evidence.world
+    names = [name for name in world.library if name not in at.effects]
+    evidence = _with_model(evidence, at)
+    found = compute_directions(world, at, names)
+    evidence.__dict__["directions"] = found
+    left, effects = evidence.build_trajectory_regression().project_out_base()
+    best = find_strongest_columns(left, effects, evidence.effect_columns)
+    order = sorted(best, key=lambda name: -best[name][0])[:REFITS_PER_ROUND]
+    starts = [
+        start
+        for name in order
+        for start in _starts(evidence, at, name, best[name][1], left, effects)
+    ]
+    if not starts:
+        return []
+    fits = TrajectoryFitter(world, evidence.noise, evidence.base.fixed_parameters).fit_models(
+        starts, MAX_FIT_ITERATIONS, race=True
+    )
+    by_name: dict[str, TrajectoryFit] = {}
+    for fit in fits:
+        name = fit.effects[-1]
+        if name not in by_name or fit.cost < by_name[name].cost:
+            by_name[name] = fit
+    return list(by_name.values())
+
+
+def _with_model(evidence: RegressionEvidence, at: TrajectoryFit) -> RegressionEvidence:
+    """Copy the evidence, with another fitted model as the base model."""
+    other = object.__new__(RegressionEvidence)
+    kept = ("world", "noise", "stated", "base", "fitted", "held_out")
+    other.__dict__.update({name: evidence.__dict__[name] for name in kept})
+    other.base = type(evidence.base)(
+        at, evidence.base.insensitive_parameters, evidence.base.unidentified_parameters
+    )
+    return other
+
+
+def _starts(
+    evidence: RegressionEvidence,
+    at: TrajectoryFit,
+    name: str,
+    column: EffectColumn,
+    left: Array,
+    effects: Array,
+) -> list[FitStart]:
+    """Choose starting values for a fit with one more effect.
+
+    They are the size predicted by the linear model, and 0.3 of it because the linear model holds
+    for small sizes only.
+    """
+    world = evidence.world
+    probes = [evidence.sensitivity_directions.candidates[place] for place in column.places]
+    bounds = compute_coefficient_bounds(world, name)
+    sizes = np.linalg.lstsq(effects[:, list(column.places)], left, rcond=1e-9)[0]
+    starts = []
+    for share in (1.0,) if probes[0].fixed else (1.0, 0.3):
+        c = probes[0].coefficients.copy()
+        for probe, size in zip(probes, sizes.tolist(), strict=True):
+            if not probe.fixed:
+                c[probe.place] = np.clip(share * size, *bounds[probe.place])
+        theta = at.theta.copy()
+        theta[world.slots[name]] = c
+        starts.append(FitStart((*at.effects, name), theta, at.states))
+    return starts
+
+
+def _intervals(
+    evidence: RegressionEvidence, one: RefittedModel
+) -> dict[str, tuple[float | None, float | None]]:
+    """Compute 95 % intervals of the fitted parameters, by name, from the curvature at the fit."""
+    world, fit = evidence.world, one.fit
+    columns = compute_base_jacobian(world, fit) / evidence.noise.sigma[:, None]
+    rows = columns[evidence.observed_mask]
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    scale = np.sqrt(np.square(rows).sum(axis=0))
+    scale[scale == 0] = 1.0
+    inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=1e-12)
+    spread = np.sqrt(np.abs(np.diag(inverse))) / scale
+    left = one.squares / max(len(rows) - one.numbers, 1)
+    spread = spread * np.sqrt(max(left, 1e-12))
+    ends: dict[str, tuple[float | None, float | None]] = {}
+    for i, place in enumerate(fit.free.tolist()):
+        value, half = float(fit.theta[place]), Z95 * float(spread[i])
+        ends[world.parameters[place].name] = value - half, value + half
+    return ends
+
+
+def _of(
+    ends: dict[str, tuple[float | None, float | None]], effect: str
+) -> dict[str, tuple[float | None, float | None]]:
+    """Select the intervals of one effect's coefficients, by the name of the coefficient."""
+    begin = f"{effect}."
+    return {name.removeprefix(begin): e for name, e in ends.items() if name.startswith(begin)}

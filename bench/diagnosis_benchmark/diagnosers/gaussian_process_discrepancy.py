@@ -1,0 +1,77 @@
+"""Gaussian-process discrepancy model: detects that something is missing, names no cause.
+
+The discrepancy is a function of time, state and input with a Gaussian process as its prior (M. C.
+Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63, 425, 2001, doi:10.1111/1467-9868.00294), here of
+accelerations, as in residual models of robots. It is fitted on the runs for fitting. If it predicts
+the residual of the held-out runs better than zero does, something is missing.
+"""
+
+from __future__ import annotations
+
+import warnings
+from itertools import pairwise
+
+import numpy as np
+
+from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase
+from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
+    RegressionData,
+    RegressionEvidence,
+)
+
+FALSE_ALARM_RATE = 0.01
+"""False-alarm probability."""
+TRAINING_SAMPLE_COUNT = 160
+"""Maximum number of samples on which the process is conditioned."""
+HELD_OUT_BLOCK_COUNT = 12
+"""Number of blocks of the held-out runs whose improvements are compared."""
+
+
+class GaussianProcessDiscrepancy(Diagnoser):
+    """Gaussian process of the acceleration residuals: detects a discrepancy, names no cause."""
+
+    name = "gp"
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Return "unknown" if the process predicts held-out runs better than zero does."""
+        evidence = RegressionEvidence(case)
+        try:
+            rows = evidence.build_acceleration_regression()
+        finally:
+            evidence.close()
+        chance = _compute_gain_p_value(
+            rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out), case.rng
+        )
+        return Answer("adequate" if chance >= FALSE_ALARM_RATE else "unknown", p_value=chance)
+
+
+def _compute_gain_p_value(
+    fitted: RegressionData, held_out: RegressionData, rng: np.random.Generator
+) -> float:
+    """Compute the p-value of the improvement on held-out runs: one-sided t-test over blocks."""
+    from scipy.stats import t as students
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    if min(len(fitted.left), len(held_out.left)) < 2 * HELD_OUT_BLOCK_COUNT:
+        return 1.0
+    centre, scale = fitted.state.mean(axis=0), fitted.state.std(axis=0)
+    moving = scale > 0
+    seen = (fitted.state - centre)[:, moving] / scale[moving]
+    unseen = (held_out.state - centre)[:, moving] / scale[moving]
+    chosen = np.sort(rng.choice(len(seen), min(TRAINING_SAMPLE_COUNT, len(seen)), replace=False))
+    kernel = ConstantKernel(1.0, (1e-3, 1e3)) * RBF(
+        np.ones(seen.shape[1]), (0.05, 100.0)
+    ) + WhiteKernel(1.0, (1e-2, 1e2))
+    process = GaussianProcessRegressor(kernel, normalize_y=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        process.fit(seen[chosen], fitted.left[chosen])
+    predicted = process.predict(unseen)
+    gains = np.square(held_out.left) - np.square(held_out.left - predicted)
+    ends = np.linspace(0, len(gains), HELD_OUT_BLOCK_COUNT + 1).astype(int)
+    means = np.array([gains[a:b].mean() for a, b in pairwise(ends.tolist())])
+    spread = float(means.std(ddof=1) / np.sqrt(HELD_OUT_BLOCK_COUNT))
+    if spread == 0:
+        return 1.0
+    return float(students.sf(means.mean() / spread, HELD_OUT_BLOCK_COUNT - 1))

@@ -1,0 +1,340 @@
+"""Neural classifier, trained on simulated recordings with every effect of the library.
+
+This is amortised inference, as in learned tuners (A. Allevato et al., TuneNet, CoRL 2019): all
+simulations are made before a recording is available, and an answer costs only a base fit. The input
+of the network is, for each run, the residual of the base fit in units of the noise with the motion
+and the inputs, on a fixed grid. Convolutions process a run; the mean over runs makes their order
+and number irrelevant. The classes are the effects of the library, and no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from itertools import count
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.core.diagnoser import Answer, Diagnoser, DiagnoserTrainingTask, DiagnosisCase, NamedCause
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.logs.synthetic_recording import SimulationSpec, simulate_recording
+from sims.core.simulation_counter import SimulationBudgetExceededError
+from sims.core.simulator import Array, InputError
+from sims.effects import list_effects_for as library_of
+from sims.recording.recording import Recording
+from sims.system_simulator import SystemSimulator, make_effect_parameters
+
+GRID_POINT_COUNT = 64
+"""Number of grid points over a run."""
+LAYER_WIDTH = 48
+"""Number of channels of the network's layers."""
+EPOCHS = 60
+"""Number of training epochs."""
+BATCH_SIZE = 64
+"""Number of recordings per training step."""
+CLEAN_EXAMPLE_SHARE = 0.25
+"""Fraction of examples without an effect."""
+TRAINING_RESIDUAL_RANGE = (1.15, 20.0)
+"""Range of the residual RMS of training examples, in units of the noise."""
+MIN_EXAMPLES = 8
+"""Minimum number of training examples; with fewer, nothing is trained."""
+CLEAN_PROBABILITY_THRESHOLD = 0.05
+"""Probability of no effect below which something is missing."""
+ALTERNATIVE_PROBABILITY_RATIO = 0.4
+"""Minimum probability of an alternative, as a fraction of that of the most probable effect."""
+MIN_NAMED_PROBABILITY = 0.25
+"""Minimum total probability of the named effects; below it, the verdict is unknown."""
+VALIDATION_SHARE = 0.15
+"""Fraction of the examples used for validation, by which the epoch is selected."""
+_RESIDUAL_CLIP = 30.0
+"""Absolute value at which residuals are clipped, in units of the noise."""
+_NOISES = {"point": (2e-3, 2e-2), "linear": (1e-3, 1e-2), "rotary": (1e-3, 1e-2)}
+"""Noise range of the first channel by kind of system, SI units."""
+
+
+class NeuralClassifier(Diagnoser):
+    """Neural network trained on simulated effects; it names the most probable ones (torch)."""
+
+    name = "classifier"
+    learned: ClassVar[bool] = True
+
+    def cannot(self, kind: type[SystemSimulator]) -> str:
+        """Reject robots: the training precedes the case, so their model file is not available."""
+        return "nobody knows a robot's file before it is asked" if kind.has_model else ""
+
+    def train(self, lesson: DiagnoserTrainingTask) -> Mapping[str, Array]:
+        """Simulate recordings until the budget is used up, and train the network."""
+        classes = ["", *sorted(lesson.library)]
+        images, labels = [], []
+        for number in count():
+            name = (
+                ""
+                if lesson.rng.random() < CLEAN_EXAMPLE_SHARE
+                else str(lesson.rng.choice(classes[1:]))
+            )
+            try:
+                image = _example(lesson, name, number)
+            except SimulationBudgetExceededError:
+                break
+            except InputError:
+                continue  # a simulation specification that is not possible
+            if image is not None:
+                images.append(image)
+                labels.append(classes.index(name))
+        if len(labels) < MIN_EXAMPLES:
+            return {}
+        return _train_network(
+            images, np.array(labels), len(classes), int(lesson.rng.integers(1 << 31))
+        )
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Name the most probable effects."""
+        if not case.learned:
+            return Answer("unidentifiable")
+        classes = ["", *sorted(library_of(case.kind.system))]
+        image, _ = _compute_network_input(case.kind, case.recording)
+        odds = _predict_probabilities(case.learned, image, len(classes))
+        # Effects that the recorded signals cannot show are excluded.
+        possible = np.array([not name or name in case.library for name in classes])
+        odds = np.where(possible, odds, 0.0)
+        odds = odds / odds.sum()
+        nothing = float(odds[0])
+        if nothing >= CLEAN_PROBABILITY_THRESHOLD:
+            return Answer("adequate", p_value=None)
+        order = [int(i) for i in np.argsort(-odds) if i]
+        top = float(odds[order[0]])
+        named = [i for i in order if odds[i] >= ALTERNATIVE_PROBABILITY_RATIO * top]
+        if float(odds[named].sum()) < MIN_NAMED_PROBABILITY:
+            return Answer("unknown")
+        first, *others = (classes[i] for i in named)
+        return Answer("ambiguous" if others else "named", (NamedCause(first, tuple(others)),))
+
+
+def _example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | None:
+    """Simulate one recording with an effect, as input of the network.
+
+    Args:
+        lesson: the training task.
+        name: name of the effect; empty for none.
+        number: number of the example, added to the random seed.
+
+    Returns:
+        The input of the network; None if the residual is outside the range
+        `TRAINING_RESIDUAL_RANGE`.
+
+    Raises:
+        SpentError: the budget is used up.
+    """
+    rng, kind = lesson.rng, lesson.kind
+    system = kind.system
+    low, high = _NOISES[system.kind]
+    sigma = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    noise = {c.name: sigma * (5.0 if c.name in system.rates else 1.0) for c in kind.channels}
+    effects = {name: _coefficients(lesson, name)} if name else {}
+    parameters = {p.name: float(rng.uniform(*p.training_range)) for p in system.parameters}
+    channels = [c.name for c in kind.channels if not c.name.startswith("accel")]
+    usual = system.usual_recording
+    observe = list(usual.observe) or (channels if rng.random() < 0.4 else channels[:1])
+    forms = ("steps:{a}:{b}", "sine:{a}:{c}", "chirp:{a}:0.3:{c}")
+    inputs = dict(usual.inputs)
+    if kind.inputs and not system.servo and (system.kind != "rotary" or rng.random() < 0.5):
+        size = rng.uniform(0.05, 0.2) if system.kind == "rotary" else rng.uniform(0.5, 4.0)
+        text = str(rng.choice(forms)).format(
+            a=f"{size:.3g}", b=f"{rng.uniform(0.25, 1.0):.3g}", c=f"{rng.uniform(0.3, 2.5):.3g}"
+        )
+        inputs[kind.inputs[0].name] = text
+    wish = SimulationSpec(
+        system=kind.name,
+        parameters=parameters,
+        effects=effects,
+        noise={channel: noise[channel] for channel in observe},
+        inputs=inputs,
+        observe=tuple(observe),
+        runs=int(rng.integers(3, 6)),
+        seconds=float(rng.choice([2.0, 3.0, 4.0, 5.0])),
+        rate=float(rng.choice([50, 100])),
+        engine="batch",
+        seed=int(rng.integers(1 << 31)) + number,
+        force=True,
+    )
+    image, left = _compute_network_input(kind, simulate_recording(wish).recording)
+    shown = (
+        TRAINING_RESIDUAL_RANGE[0] <= left <= TRAINING_RESIDUAL_RANGE[1]
+        if name
+        else left <= TRAINING_RESIDUAL_RANGE[1]
+    )
+    return image if shown else None
+
+
+def _coefficients(lesson: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
+    """Draw coefficients of an effect: sizes log-uniformly, shape parameters uniformly."""
+    rng = lesson.rng
+    values = []
+    for place, parameter in enumerate(
+        make_effect_parameters(lesson.library[name], lesson.kind.system)
+    ):
+        low, high = parameter.bounds
+        if low > 0:
+            values.append(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
+            continue
+        # The first coefficient scales the effect and may be small; the others only modify it.
+        share = 10 ** rng.uniform(-2.5, 0.0) if place == 0 else rng.uniform(0.1, 1.0)
+        sign = rng.choice([-1.0, 1.0]) if low < 0 else 1.0
+        values.append(float(sign * share * high))
+    return tuple(values)
+
+
+def _compute_network_input(
+    kind: type[SystemSimulator], recording: Recording
+) -> tuple[Array, float]:
+    """Compute the network's input from a recording.
+
+    Returns:
+        Residuals in units of the noise, motion, inputs, and masks of the present channels, (R, F,
+        POINTS); and the RMS of the residuals.
+    """
+    with closing(
+        RunEvaluator(kind, recording, list(recording.runs), "batch", candidates=())
+    ) as world:
+        noise = NoiseModel(
+            compute_noise_floor(world, recording).sigma, np.zeros(len(world.channels))
+        )
+        fit = fit_base_model(world, noise).fit
+        left = (world.observed - fit.simulated) / noise.sigma
+        rms = float(np.sqrt(np.nanmean(np.square(left))))
+        names = [c.name for c in kind.channels]
+        inputs = [c.name for c in kind.inputs]
+        image = np.zeros((len(world.tracks), 3 * len(names) + len(inputs) + 1, GRID_POINT_COUNT))
+        grid = np.linspace(0.0, 1.0, GRID_POINT_COUNT)
+        for r, track in enumerate(world.tracks):
+            size = int(world.lengths[r])
+            clock = np.linspace(0.0, 1.0, size)
+            for c, name in enumerate(world.channels):
+                place = names.index(name)
+                seen = np.isfinite(left[r, :size, c])
+                path = np.clip(np.nan_to_num(left[r, :size, c]), -_RESIDUAL_CLIP, _RESIDUAL_CLIP)
+                image[r, place] = np.arcsinh(np.interp(grid, clock[seen], path[seen]))
+                motion = fit.simulated[r, :size, c]
+                spread = float(motion.std()) or 1.0
+                image[r, len(names) + place] = np.interp(
+                    grid, clock, (motion - motion.mean()) / spread
+                )
+                image[r, 2 * len(names) + place] = 1.0
+            for i, name in enumerate(inputs):
+                signal = np.asarray(track.scenario.inputs.get(name, np.zeros(size)))[:size]
+                spread = float(np.abs(signal).max()) or 1.0
+                image[r, 3 * len(names) + i] = np.interp(grid, clock, signal / spread)
+            image[r, -1] = np.log(track.duration)
+    return np.nan_to_num(image), rms
+
+
+def _network(features: int, classes: int) -> Any:
+    """Make the network: convolutions over a run, mean over runs, and dense layers."""
+    import torch
+    from torch import nn
+
+    class Network(nn.Module):
+        """Network described in this module."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.run = nn.Sequential(
+                nn.Conv1d(features, LAYER_WIDTH, 5, padding=2),
+                nn.ReLU(),
+                nn.MaxPool1d(2),
+                nn.Conv1d(LAYER_WIDTH, LAYER_WIDTH, 5, padding=2),
+                nn.ReLU(),
+                nn.MaxPool1d(2),
+                nn.Conv1d(LAYER_WIDTH, LAYER_WIDTH, 3, padding=1),
+                nn.ReLU(),
+            )
+            self.decide = nn.Sequential(
+                nn.Linear(2 * LAYER_WIDTH, 2 * LAYER_WIDTH),
+                nn.ReLU(),
+                nn.Dropout(0.2),
+                nn.Linear(2 * LAYER_WIDTH, classes),
+            )
+
+        def forward(self, images: Any, weights: Any) -> Any:
+            """Compute class scores.
+
+            Args:
+                images: inputs, (B, R, F, POINTS).
+                weights: 1 for runs that exist, otherwise 0, (B, R).
+
+            Returns:
+                Logits, (B, classes).
+            """
+            batch, runs = images.shape[:2]
+            read = self.run(images.flatten(0, 1))
+            read = torch.cat([read.mean(dim=2), read.amax(dim=2)], dim=1)
+            read = read.reshape(batch, runs, -1) * weights[..., None]
+            return self.decide(read.sum(dim=1) / weights.sum(dim=1, keepdim=True))
+
+    return Network()
+
+
+def _stack_with_mask(images: Sequence[Array]) -> tuple[Any, Any]:
+    """Stack inputs with different numbers of runs into one tensor, with a mask of the runs."""
+    import torch
+
+    most = max(len(image) for image in images)
+    whole = np.zeros((len(images), most, *images[0].shape[1:]), dtype=np.float32)
+    there = np.zeros((len(images), most), dtype=np.float32)
+    for row, weights, image in zip(whole, there, images, strict=True):
+        row[: len(image)] = image
+        weights[: len(image)] = 1.0
+    return torch.from_numpy(whole), torch.from_numpy(there)
+
+
+def _train_network(
+    images: Sequence[Array], labels: Array, classes: int, seed: int
+) -> dict[str, Array]:
+    """Train the network, and return the weights of the epoch with the best validation loss."""
+    import torch
+    from torch.nn.functional import cross_entropy
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = _network(images[0].shape[1], classes)
+        inputs, weights = _stack_with_mask(images)
+        wanted = torch.from_numpy(labels.astype(np.int64))
+        split = max(1, round(VALIDATION_SHARE * len(labels)))
+        kept, seen = slice(0, split), np.arange(split, len(labels))
+        optimiser = torch.optim.Adam(network.parameters(), lr=2e-3, weight_decay=1e-4)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, EPOCHS)
+        best, state = np.inf, network.state_dict()
+        for _ in range(EPOCHS):
+            network.train()
+            order = seen[torch.randperm(len(seen)).numpy()]
+            for part in np.array_split(order, max(1, len(order) // BATCH_SIZE)):
+                optimiser.zero_grad()
+                loss = cross_entropy(network(inputs[part], weights[part]), wanted[part])
+                loss.backward()  # type: ignore[no-untyped-call]
+                optimiser.step()
+            schedule.step()
+            network.eval()
+            with torch.no_grad():
+                lost = float(cross_entropy(network(inputs[kept], weights[kept]), wanted[kept]))
+            if lost < best:
+                best, state = lost, {k: v.clone() for k, v in network.state_dict().items()}
+    return {name: tensor.numpy() for name, tensor in state.items()}
+
+
+def _predict_probabilities(learned: Mapping[str, Array], image: Array, classes: int) -> Array:
+    """Compute the class probabilities, (classes,)."""
+    import torch
+
+    # Creating the network draws random weights; the global random generator is restored.
+    with torch.random.fork_rng(devices=[]):
+        network = _network(image.shape[1], classes)
+    network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in learned.items()})
+    network.eval()
+    inputs, weights = _stack_with_mask([image])
+    with torch.no_grad():
+        odds: Array = torch.softmax(network(inputs, weights)[0], dim=0).numpy().astype(np.float64)
+    return odds

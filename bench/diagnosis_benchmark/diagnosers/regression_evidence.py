@@ -1,0 +1,390 @@
+"""Base-model residuals and directions of the effects, shared by several diagnosers.
+
+The base model is fitted to a recording. With y the recorded runs and y₀ those of the fitted base
+model, the residual r = y - y₀ is to first order a sum of changes by parameters and initial states
+(J) and by missing effects (D),
+
+    r = J δ + D c + noise                                                                      (1)
+
+The direction D of an effect is computed with the simulator (`search.candidate_directions`), so it
+exists for effects of forces, inputs, sensors and impacts alike. A regression of accelerations
+applies a linear operator to (1): the second derivative of a position, or the first derivative of a
+rate, minus the effect of a displacement through the stiffness A and damping B of the motion,
+
+    L r = r'' - A r - B r'                                                                     (2)
+
+with derivatives by local polynomials (A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627, 1964).
+Both sides pass the same filter, so the filter causes no bias. Samples near an impact are excluded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.core.diagnoser import DiagnosisCase
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import Mask, NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import BaseFit, fit_base_model
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
+from sims.core.simulator import Array
+from sims.core.system import StateSnapshot
+
+POLYNOMIAL_WINDOW_SECONDS = 0.2
+"""Length of the window of a local polynomial, seconds."""
+MIN_WINDOW_SAMPLES = 7
+"""Minimum number of samples in the window of a local polynomial."""
+POLYNOMIAL_DEGREE = 3
+"""Degree of the local polynomials."""
+FINITE_DIFFERENCE_STEP = 1e-5
+"""Finite-difference step of a coordinate and of a rate for A and B in (2), SI units."""
+
+
+@dataclass(frozen=True)
+class EffectColumn:
+    """Column of (1): all directions of an effect at one point of its parameter grid.
+
+    Attributes:
+        effect: name of the effect.
+        places: indices of its directions among all directions.
+    """
+
+    effect: str
+    places: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class RegressionData:
+    """Equation (1) as a linear regression, with each row in units of its noise.
+
+    Attributes:
+        left: residual, (N,).
+        base: columns of parameters and initial states, (N, B).
+        effects: columns of all directions, (N, K).
+        run: index of the run of each row, (N,).
+        state: time, channels of the base model and inputs, (N, F).
+    """
+
+    left: Array
+    base: Array
+    effects: Array
+    run: NDArray[np.intp]
+    state: Array
+
+    def select_runs(self, runs: Sequence[int]) -> RegressionData:
+        """Select the rows of some runs."""
+        chosen = np.isin(self.run, list(runs))
+        return RegressionData(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def project_out_base(self) -> tuple[Array, Array]:
+        """Project out parameters and initial states.
+
+        Returns:
+            The residual (N,) and the effect columns (N, K), without the part that parameters and
+            initial states can explain.
+        """
+        scale = np.sqrt(np.square(self.base).sum(axis=0))
+        basis = self.base[:, scale > 0] / scale[scale > 0]
+        orthonormal, triangle = np.linalg.qr(basis)
+        # Parameters that depend linearly on others have no direction of their own.
+        kept = orthonormal[:, np.abs(np.diag(triangle)) > 1e-10]
+        left: Array = self.left - kept @ (kept.T @ self.left)
+        effects: Array = self.effects - kept @ (kept.T @ self.effects)
+        return left, effects
+
+
+class RegressionEvidence:
+    """Base model fitted to the recording of a case, and the directions of the effects.
+
+    Args:
+        case: the case.
+        every: whether held-out runs are fitted too.
+
+    Attributes:
+        world: the runs and the simulator.
+        noise: noise of each channel, stated or estimated.
+        stated: whether the noise of each channel is stated.
+        base: fitted base model.
+        fitted: indices of the runs for fitting.
+        held_out: indices of the held-out runs.
+    """
+
+    def __init__(self, case: DiagnosisCase, every: bool = True) -> None:
+        recording = case.recording
+        runs = [*recording.training(), *(recording.held_out() if every else ())]
+        # The simulator of a robot uses the step that its model file states.
+        engine = None if case.kind.own_engine else "batch"
+        self.world = RunEvaluator(case.kind, recording, runs, engine, candidates=list(case.library))
+        floor = compute_noise_floor(self.world, recording)
+        self.noise = NoiseModel(floor.sigma, np.zeros(floor.sigma.size))
+        self.stated: Mask = floor.is_stated
+        self.base: BaseFit = fit_base_model(self.world, self.noise)
+        count = len(recording.training())
+        self.fitted = range(count)
+        self.held_out = range(count, len(runs))
+
+    def close(self) -> None:
+        """Release the resources of the engine."""
+        self.world.close()
+
+    @cached_property
+    def observed_mask(self) -> Mask:
+        """Mask of the samples that are not missing, (R, T, C)."""
+        return np.isfinite(self.world.observed)
+
+    @cached_property
+    def residual(self) -> Array:
+        """Observed minus simulated, (R, T, C); zero where a sample is missing."""
+        left = self.world.observed - self.base.fit.simulated
+        residual: Array = np.where(self.observed_mask, left, 0.0)
+        return residual
+
+    @cached_property
+    def sensitivity_directions(self) -> DirectionSet:
+        """Directions of all effects."""
+        return compute_directions(self.world, self.base.fit, self.world.library)
+
+    @cached_property
+    def effect_columns(self) -> list[EffectColumn]:
+        """Columns of all effects, one for each point of their parameter grids."""
+        places: dict[tuple[str, int, int], list[int]] = {}
+        for i, probe in enumerate(self.sensitivity_directions.candidates):
+            # Each direction of a fixed size is a column of its own, because such directions do not
+            # add up.
+            alone = i if probe.fixed else -1
+            places.setdefault((probe.effect, probe.group, alone), []).append(i)
+        return [EffectColumn(effect, tuple(members)) for (effect, *_), members in places.items()]
+
+    def build_trajectory_regression(self) -> RegressionData:
+        """Build the regression (1) with one row per sample."""
+        fit = self.base.fit
+        runs, length, channels, _ = fit.jacobian.shape
+        return self._rows(
+            self.residual,
+            self._base_columns(),
+            self.sensitivity_directions.responses,
+            np.broadcast_to(self.noise.sigma, (runs, length, channels)),
+            self.observed_mask,
+        )
+
+    def build_acceleration_regression(
+        self, seconds: float = POLYNOMIAL_WINDOW_SECONDS
+    ) -> RegressionData:
+        """Build the regression (2) of accelerations, in units of their noise.
+
+        Args:
+            seconds: window of the local polynomials.
+        """
+        left, sigma, seen = self._filtered(self.residual[..., None], seconds)
+        base, _, _ = self._filtered(self._base_columns(), seconds)
+        effects, _, _ = self._filtered(self.sensitivity_directions.responses, seconds)
+        return self._rows(left[..., 0], base, effects, sigma, seen)
+
+    def _base_columns(self) -> Array:
+        return compute_base_jacobian(self.world, self.base.fit)
+
+    def _rows(
+        self, left: Array, base: Array, effects: Array, sigma: Array, seen: Mask
+    ) -> RegressionData:
+        runs = np.broadcast_to(np.arange(len(left))[:, None, None], seen.shape)
+        # An impact makes some entries very large or not finite; rows that are not finite are
+        # excluded.
+        whole = seen & np.isfinite(base).all(axis=3) & np.isfinite(effects).all(axis=3)
+        scale = 1.0 / sigma[whole]
+        states = self._states()
+        states = np.broadcast_to(states[:, :, None], (*seen.shape, states.shape[2]))
+        return RegressionData(
+            left[whole] * scale,
+            base[whole] * scale[:, None],
+            effects[whole] * scale[:, None],
+            runs[whole],
+            states[whole],
+        )
+
+    def _states(self) -> Array:
+        """Return time, channels of the base model and inputs, (R, T, F)."""
+        world = self.world
+        runs, length, channels = world.observed.shape
+        names = [channel.name for channel in world.simulator.inputs]
+        states = np.zeros((runs, length, 1 + channels + len(names)))
+        for r, track in enumerate(world.tracks):
+            size = int(world.lengths[r])
+            times, inputs = track.scenario.times, track.scenario.inputs
+            states[r, :size, 0] = times - times[0]
+            for i, name in enumerate(names):
+                states[r, :size, 1 + channels + i] = inputs.get(name, np.zeros(size))
+        states[..., 1 : 1 + channels] = np.nan_to_num(self.base.fit.simulated)
+        return states
+
+    def _filtered(self, values: Array, seconds: float) -> tuple[Array, Array, Mask]:
+        """Apply the operator (2) to trajectories.
+
+        Args:
+            values: trajectories, (R, T, C, K).
+            seconds: window of the local polynomials.
+
+        Returns:
+            The filtered trajectories, the standard deviation of their noise (R, T, C), and the mask
+            of the samples to use (R, T, C).
+        """
+        from scipy.signal import savgol_coeffs, savgol_filter
+
+        world, system = self.world, self.world.simulator.system
+        runs, length, channels, _ = values.shape
+        result = np.full_like(values, np.nan)
+        sigma = np.ones((runs, length, channels))
+        used = np.zeros((runs, length, channels), dtype=bool)
+        pairs = dict(zip(system.rates, system.coordinates, strict=False))
+        for r, track in enumerate(world.tracks):
+            size = int(world.lengths[r])
+            step = float(np.median(np.diff(track.scenario.times)))
+            window = _odd(min(max(MIN_WINDOW_SAMPLES, round(seconds / step)), size // 2))
+            stiff, damped = self._linear(r)
+            for c, name in enumerate(world.channels):
+                rate = name in pairs
+                if not rate and name not in system.coordinates:
+                    continue
+                part = values[r, :size, c]
+                order = 1 if rate else 2
+
+                def smooth(
+                    deriv: int, part: Array = part, window: int = window, step: float = step
+                ) -> Array:
+                    filtered: Array = savgol_filter(
+                        part, window, POLYNOMIAL_DEGREE, deriv=deriv, delta=step, axis=0
+                    )
+                    return filtered
+
+                place = system.coordinates.index(pairs[name] if rate else name)
+                own = smooth(order)
+                if rate:
+                    own -= damped[:size, place, None] * smooth(0)
+                else:
+                    own -= stiff[:size, place, None] * smooth(0)
+                    own -= damped[:size, place, None] * smooth(1)
+                result[r, :size, c] = own
+                weights = savgol_coeffs(window, POLYNOMIAL_DEGREE, deriv=order, delta=step)
+                sigma[r, :size, c] = self.noise.sigma[c] * np.sqrt(np.square(weights).sum())
+                used[r, :size, c] = self._smooth_at(r, size, window)
+        return result, sigma, used & self.observed_mask
+
+    def _smooth_at(self, run: int, size: int, window: int) -> Mask:
+        """Return a mask (T,) of the samples whose window has no impact and no end of the run."""
+        good = np.ones(size, dtype=bool)
+        half = window // 2
+        good[:half] = good[size - half :] = False
+        system = self.world.simulator.system
+        name = system.coordinates[-1] if system.bounces else ""
+        if name in self.world.channels:
+            c = self.world.channels.index(name)
+            simulated = self.base.fit.simulated[run, :size, c]
+            for path in (simulated, self.world.observed[run, :size, c]):
+                lowest = np.flatnonzero((path[1:-1] < path[:-2]) & (path[1:-1] <= path[2:])) + 1
+                for at in lowest[path[lowest] < _IMPACT_HEIGHT]:
+                    good[max(0, at - half - 1) : at + half + 2] = False
+        return good
+
+    def _linear(self, run: int) -> tuple[Array, Array]:
+        """Compute A and B of (2), each (T, D), by finite differences of the acceleration.
+
+        They are computed for systems of one coordinate. They are zero if the system's own force is
+        uniform, and for systems of several coordinates.
+        """
+        world, system = self.world, self.world.simulator.system
+        track = world.tracks[run]
+        size, dimensions = int(world.lengths[run]), len(system.coordinates)
+        nothing = np.zeros((size, dimensions))
+        if system.uniform or dimensions != 1:
+            return nothing, nothing
+        times = track.scenario.times
+        name = system.coordinates[0]
+        if name not in world.channels:
+            return nothing, nothing
+        x = self.base.fit.simulated[run, :size, world.channels.index(name)][:, None]
+        v = np.gradient(x[:, 0], times)[:, None]
+        given = {c.name: c.value for c in world.kind.constants}
+        given |= {**world.simulator.constant_values, **track.scenario.constants}
+        constants = {key: np.full((size, 1), float(value)) for key, value in given.items()}
+        theta = np.tile(self.base.fit.theta[: world.own], (size, 1))
+        inputs = {
+            channel.name: np.asarray(track.scenario.inputs.get(channel.name, np.zeros(size)))[
+                :size, None
+            ]
+            for channel in world.simulator.inputs
+        }
+        clock = (times - times[0])[:, None]
+
+        def accelerated(x: Array, v: Array) -> Array:
+            moment = StateSnapshot(system(), theta, constants, clock, x, v, inputs)
+            force: Array = moment.system.force(moment) / moment.inertia
+            return force
+
+        still = accelerated(x, v)
+        return (accelerated(x + FINITE_DIFFERENCE_STEP, v) - still) / FINITE_DIFFERENCE_STEP, (
+            accelerated(x, v + FINITE_DIFFERENCE_STEP) - still
+        ) / FINITE_DIFFERENCE_STEP
+
+
+_IMPACT_HEIGHT = 1.0
+"""Height in metres below which a minimum of the last coordinate counts as an impact."""
+
+
+def _odd(samples: int) -> int:
+    return max(samples - 1 + samples % 2, POLYNOMIAL_DEGREE + 2)
+
+
+def compute_base_jacobian(world: RunEvaluator, fit: TrajectoryFit) -> Array:
+    """Compute the columns of a fit's parameters and of each run's own initial states.
+
+    Args:
+        world: the runs and the simulator.
+        fit: a fitted model with its Jacobian.
+
+    Returns:
+        Columns, (R, T, C, q + n).
+    """
+    shared = fit.free.size
+    runs, length, channels, _ = fit.jacobian.shape
+    unknown = [np.flatnonzero(~world.known[r]) for r in range(runs)]
+    width = shared + sum(places.size for places in unknown)
+    columns = np.zeros((runs, length, channels, width))
+    columns[..., :shared] = fit.jacobian[..., :shared]
+    first = shared
+    for r, places in enumerate(unknown):
+        columns[r, :, :, first : first + places.size] = fit.jacobian[r][..., shared + places]
+        first += places.size
+    return columns
+
+
+def find_strongest_columns(
+    left: Array, effects: Array, columns: Sequence[EffectColumn]
+) -> dict[str, tuple[float, EffectColumn]]:
+    """Find for each effect the column that explains most of the residual.
+
+    Args:
+        left: residual after projection, (N,).
+        effects: effect columns after projection, (N, K).
+        columns: columns of the effects.
+
+    Returns:
+        By effect, the decrease of the sum of squares and the column.
+    """
+    best: dict[str, tuple[float, EffectColumn]] = {}
+    for column in columns:
+        part = effects[:, list(column.places)]
+        scale = np.sqrt(np.square(part).sum(axis=0))
+        if not (scale > 1e-9).any():
+            continue
+        part = part[:, scale > 1e-9] / scale[scale > 1e-9]
+        gram = part.T @ part + 1e-9 * np.eye(part.shape[1])
+        cross = part.T @ left
+        gain = float(cross @ np.linalg.solve(gram, cross))
+        if column.effect not in best or gain > best[column.effect][0]:
+            best[column.effect] = gain, column
+    return best

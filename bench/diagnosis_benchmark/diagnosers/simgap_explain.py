@@ -1,0 +1,35 @@
+"""`simgap explain` as a diagnoser (docs/explain.md)."""
+
+from __future__ import annotations
+
+from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
+from sims.extended_simulator import FittedValue
+
+
+class SimgapExplain(Diagnoser):
+    """simgap explain: scores effects in trajectory space, refits the best, validates the result."""
+
+    name = "simgap"
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Return the verdict of `simgap explain` on the recording."""
+        from bench.diagnosis.explain import explain
+
+        verdict = explain(case.path, seed=int(case.rng.integers(1 << 31))).answer
+        # p-value of the best score of the whole library, from surrogate data.
+        chance = min((candidate.p_value for candidate in verdict.candidates), default=None)
+        causes = tuple(
+            NamedCause(
+                cause.effect,
+                cause.alternatives,
+                {name: _ends(number) for name, number in cause.coefficients.items()},
+                cause.p_value,
+            )
+            for cause in verdict.causes
+        )
+        parameters = {name: _ends(number) for name, number in verdict.parameters.items()}
+        return Answer(verdict.verdict, causes, parameters, chance)
+
+
+def _ends(number: FittedValue) -> tuple[float | None, float | None]:
+    return number.low, number.high

@@ -1,0 +1,225 @@
+"""Sparse regression of acceleration residuals on the library of effects.
+
+Two methods of PySINDy select few of many terms: sequentially thresholded least squares (S. L.
+Brunton, J. L. Proctor, J. N. Kutz, PNAS 113(15), 3932, 2016, doi:10.1073/pnas.1517384113) and
+forward regression with orthogonal least squares (S. Chen, S. A. Billings, W. Luo, Int. J. Control
+50(5), 1873, 1989, doi:10.1080/00207178908953472). The held-out runs decide the number of terms: the
+smallest that predicts their accelerations about as well as the best.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import pairwise
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
+from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
+    EffectColumn,
+    RegressionEvidence,
+    find_strongest_columns,
+)
+from sims.core.simulator import Array
+
+POLYNOMIAL_WINDOWS_SECONDS = (0.15, 0.4, 1.0)
+"""Windows of the local polynomials, seconds: long for slow effects, short for fast ones."""
+MIN_IMPROVEMENT_STANDARD_ERRORS = 2.5
+"""Minimum decrease of the held-out error, in standard errors."""
+SAME_CAUSE_CORRELATION = 0.95
+"""Correlation above which two columns count as the same cause."""
+DUPLICATE_COLUMN_CORRELATION = 0.999
+"""Correlation above which one of two columns is excluded from the regression."""
+RIDGE_PENALTY = 1e-6
+"""Ridge penalty of the least squares, for columns with unit variance."""
+HELD_OUT_BLOCK_COUNT = 10
+"""Number of blocks of the held-out runs, from which the standard error is estimated."""
+MAX_TERMS = 3
+"""Maximum number of terms."""
+
+
+class _RegressionResult(NamedTuple):
+    """Significance of the prediction of one regression in standard errors, and its named causes."""
+
+    sigmas: float
+    causes: tuple[NamedCause, ...]
+
+
+class _SparseRegression(Diagnoser):
+    """Base class of the sparse regressions."""
+
+    requires: ClassVar[tuple[str, ...]] = ("pysindy",)
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Name the terms that predict the accelerations of the held-out runs."""
+        evidence = RegressionEvidence(case)
+        try:
+            found = [self._found(evidence, window) for window in POLYNOMIAL_WINDOWS_SECONDS]
+        finally:
+            evidence.close()
+        known = [one for one in found if one is not None]
+        if not known:
+            return Answer("unidentifiable")
+        best = max(known, key=lambda one: one.sigmas)
+        if not best.causes:
+            return Answer("adequate")
+        if len(best.causes) > MAX_TERMS:
+            return Answer("unknown")
+        sets = any(cause.alternatives for cause in best.causes)
+        return Answer("ambiguous" if sets else "named", best.causes)
+
+    def _found(self, evidence: RegressionEvidence, window: float) -> _RegressionResult | None:
+        """Run the regression with one window; return None if there are too few samples."""
+        rows = evidence.build_acceleration_regression(window)
+        fitted, held_out = rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out)
+        if (
+            min(len(fitted.left), len(held_out.left))
+            <= fitted.base.shape[1] + 2 * HELD_OUT_BLOCK_COUNT
+        ):
+            return None
+        left, effects = fitted.project_out_base()
+        best = find_strongest_columns(left, effects, evidence.effect_columns)
+        chosen = [column for _, column in best.values()]
+        terms, library = _drop_duplicate_columns(
+            [(column.effect, place) for column in chosen for place in column.places], effects
+        )
+        if not terms:
+            return _RegressionResult(0.0, ())
+        places = [place for _, place in terms]
+        scale = np.sqrt(np.square(library).mean(axis=0))
+        left_out, effects_out = held_out.project_out_base()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            models = [c for c in self._models(library / scale, left) if np.isfinite(c).all()]
+        model, sigmas = _select_by_one_standard_error(
+            models, left_out, effects_out[:, places] / scale
+        )
+        picked = list(dict.fromkeys(terms[i][0] for i in np.flatnonzero(model)))
+        causes = [
+            NamedCause(name, _find_equivalent_effects(name, picked, chosen, effects))
+            for name in picked
+        ]
+        return _RegressionResult(sigmas, tuple(causes))
+
+    @abstractmethod
+    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        """Yield the coefficients (K,) of models with different numbers of terms."""
+
+
+class SequentialThresholdedLeastSquares(_SparseRegression):
+    """Acceleration residuals on the library: sequentially thresholded least squares (PySINDy)."""
+
+    name = "stlsq"
+
+    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        from pysindy import optimizers
+
+        size = float(np.abs(np.linalg.lstsq(library, left, rcond=1e-6)[0]).max())
+        for threshold in size * np.geomspace(1.0, 1e-3, 16):
+            model = optimizers.STLSQ(threshold=threshold, alpha=RIDGE_PENALTY * len(left))
+            yield model.fit(library, left[:, None]).coef_[0]
+
+
+class ForwardOrthogonalLeastSquares(_SparseRegression):
+    """Acceleration residuals on the library: forward orthogonal least squares (PySINDy)."""
+
+    name = "frols"
+
+    def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        from pysindy import optimizers
+
+        for most in range(min(2 * MAX_TERMS, library.shape[1]), 0, -1):
+            model = optimizers.FROLS(max_iter=most, alpha=RIDGE_PENALTY * len(left))
+            # FROLS raises an error if the rest of all other terms depends linearly on the selected
+            # ones.
+            with suppress(ValueError):
+                model.fit(library, left[:, None])
+                yield from (coefficients[0] for coefficients in model.history_)
+                return
+
+
+def _drop_duplicate_columns(
+    terms: Sequence[tuple[str, int]], effects: Array
+) -> tuple[list[tuple[str, int]], Array]:
+    """Select the terms whose column differs from those of earlier terms.
+
+    Returns:
+        The terms, and their columns.
+    """
+    kept: list[tuple[str, int]] = []
+    columns: list[Array] = []
+    for effect, place in terms:
+        column = effects[:, place]
+        size = float(np.sqrt(column @ column))
+        if size < 1e-9 * max(len(column), 1):
+            continue
+        unit = column / size
+        if all(abs(float(unit @ other)) < DUPLICATE_COLUMN_CORRELATION for other in columns):
+            kept.append((effect, place))
+            columns.append(unit)
+    library = effects[:, [place for _, place in kept]]
+    return kept, library
+
+
+def _select_by_one_standard_error(
+    models: Sequence[Array], left: Array, library: Array
+) -> tuple[Array, float]:
+    """Select the simplest model whose held-out error is within one standard error of the best.
+
+    Returns:
+        Its coefficients (zero if no model is significantly better than none), and the improvement
+        of the best model over no terms in standard errors.
+    """
+    nothing = np.zeros(library.shape[1])
+    every = [nothing, *models]
+    errors = np.array([_block_mean_squares(left - library @ c) for c in every])
+    best = int(errors.mean(axis=1).argmin())
+    gain = errors[0] - errors[best]
+    sigmas = float(gain.mean() / max(_standard_error(gain), 1e-12)) if best else 0.0
+    if sigmas < MIN_IMPROVEMENT_STANDARD_ERRORS:
+        return nothing, sigmas
+    allowed = []
+    for c, error in zip(every[1:], errors[1:], strict=True):
+        worse = error - errors[best]
+        if worse.mean() <= _standard_error(worse):
+            allowed.append(c)
+    return min(allowed or [every[best]], key=np.count_nonzero), sigmas
+
+
+def _block_mean_squares(error: Array) -> Array:
+    """Compute the mean squared errors of consecutive blocks, (BLOCKS,).
+
+    Blocks are used because the errors of neighbouring samples are correlated.
+    """
+    ends = np.linspace(0, len(error), HELD_OUT_BLOCK_COUNT + 1).astype(int)
+    return np.array([np.square(error[a:b]).mean() for a, b in pairwise(ends.tolist())])
+
+
+def _standard_error(differences: Array) -> float:
+    """Compute the standard error of the mean of differences."""
+    return float(differences.std(ddof=1) / np.sqrt(len(differences)))
+
+
+def _find_equivalent_effects(
+    name: str, picked: Sequence[str], columns: Sequence[EffectColumn], effects: Array
+) -> tuple[str, ...]:
+    """List effects that were not selected but are nearly collinear with a selected effect."""
+
+    def units(column: EffectColumn) -> Array:
+        part = effects[:, list(column.places)]
+        scale = np.sqrt(np.square(part).sum(axis=0))
+        unit: Array = part[:, scale > 1e-9] / scale[scale > 1e-9]
+        return unit
+
+    own = next(units(column) for column in columns if column.effect == name)
+    close = {}
+    for column in columns:
+        if column.effect not in picked:
+            other = units(column)
+            close[column.effect] = float(np.abs(own.T @ other).max()) if other.size else 0.0
+    order = sorted(close, key=lambda effect: -close[effect])
+    return tuple(effect for effect in order if close[effect] >= SAME_CAUSE_CORRELATION)

@@ -1,0 +1,75 @@
+"""Whiteness test of the residual, and correlation with the directions of the effects.
+
+The base model is fitted and its residual is tested for whiteness (G. M. Ljung, G. E. P. Box,
+Biometrika 65(2), 297, 1978, doi:10.1093/biomet/65.2.297). The effects that correlate with it are
+named. This is the residual analysis of textbooks (L. Ljung, System Identification, 2nd ed., section
+16.6), and of published agents for system identification, with thresholds of 0.3 to 0.5. The
+correlation is computed with the direction of each effect, after parameters and initial states are
+projected out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.core.diagnoser import Answer, Diagnoser, DiagnosisCase, NamedCause
+from bench.diagnosis_benchmark.diagnosers.regression_evidence import (
+    RegressionEvidence,
+    find_strongest_columns,
+)
+
+FALSE_ALARM_RATE = 0.01
+"""False-alarm probability over all runs and channels."""
+LAG_COUNT = 20
+"""Number of autocorrelations in the Ljung-Box statistic."""
+MIN_CORRELATION = 0.5
+"""Minimum correlation with an effect's direction for which the effect is named."""
+CORRELATION_TIE_TOLERANCE = 0.02
+"""Difference from the highest correlation up to which effects are indistinguishable."""
+
+
+class WhitenessTest(Diagnoser):
+    """Whiteness of the residual (Ljung-Box), and the effects that it correlates with."""
+
+    name = "ljung-box"
+
+    def diagnose(self, case: DiagnosisCase) -> Answer:
+        """Name the effects with the highest correlation if the residual is not white."""
+        evidence = RegressionEvidence(case)
+        try:
+            chance = _compute_whiteness_p_value(evidence)
+            if chance >= FALSE_ALARM_RATE:
+                return Answer("adequate", p_value=chance)
+            rows = evidence.build_trajectory_regression()
+            left, effects = rows.project_out_base()
+            best = find_strongest_columns(left, effects, evidence.effect_columns)
+        finally:
+            evidence.close()
+        total = float(left @ left)
+        correlated = {name: (gain / total) ** 0.5 for name, (gain, _) in best.items()}
+        order = sorted(correlated, key=lambda name: -correlated[name])
+        if not order or correlated[order[0]] < MIN_CORRELATION:
+            return Answer("unknown", p_value=chance)
+        first, *others = order
+        alike = [
+            name
+            for name in others
+            if correlated[first] - correlated[name] <= CORRELATION_TIE_TOLERANCE
+        ]
+        cause = NamedCause(first, tuple(alike), p_value=chance)
+        return Answer("ambiguous" if alike else "named", (cause,), p_value=chance)
+
+
+def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:
+    """Compute the smallest Ljung-Box p-value of all runs and channels, Bonferroni-corrected."""
+    from statsmodels.stats.diagnostic import acorr_ljungbox
+
+    chances = []
+    runs, _, channels = evidence.residual.shape
+    for r in range(runs):
+        for c in range(channels):
+            values = evidence.residual[r][evidence.observed_mask[r, :, c], c]
+            if values.size > 2 * LAG_COUNT and np.ptp(values) > 0:
+                table = acorr_ljungbox(values, lags=[LAG_COUNT])
+                chances.append(float(table["lb_pvalue"].iloc[0]))
+    return min(1.0, len(chances) * min(chances)) if chances else 1.0

@@ -1,0 +1,201 @@
+"""Grade an answer against the hidden truth of its case.
+
+An answer is a dictionary as `explain` writes it (DESIGN §6).
+
+| outcome | kinds of cases | when |
+|---|---|---|
+| right | all | clean: adequate; single, double: all causes, no other; foreign: unknown or partial |
+| set | single, double | the cause is in a set of effects that the data cannot distinguish |
+| class | single, double | an effect is named that is equivalent in any data (`items.EQUIVALENT`) |
+| one | double | one of the two is named (alone or in a set), the other is not |
+| wrong | single, double, foreign | another effect is named; foreign: an effect as full explanation
+|
+| extra | single | the cause is named, and another one in addition |
+| unnamed | single, double | a discrepancy is detected, no cause named |
+| missed | single, double, foreign | nothing is detected |
+| alarm | clean | a discrepancy is detected |
+| undecided | all | the verdict is unidentifiable |
+| failed | all | there is no answer: the diagnoser crashed or took too long |
+| skipped | all | the diagnoser does not support the simulator; not counted |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from bench.diagnosis_benchmark.case_catalogue import find_equivalent_effects, list_coefficient_names
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+
+NamedSets = list[tuple[str, ...]]
+GradedAnswer = tuple[str, int, int]
+CoverageCheck = Callable[[str, tuple[str, ...]], bool]
+MAX_SET_SIZE = 2  # maximum size of a set in which a cause counts as identified
+
+
+@dataclass(frozen=True)
+class Grade:
+    """Grade of an answer.
+
+    Attributes:
+        outcome: see this module.
+        set_size: number of effects in the set that contains the truth (the larger of two); 0 if
+            none does.
+        class_size: number of effects in that set, with effects that are equivalent in any data
+            counted as one.
+        named: named causes, alternatives separated by bars: ``drag.linear|wind + force.bias``.
+        covered: for each coefficient or parameter of a correct answer, whether the 95 % interval
+            contains the truth; None if the interval is open.
+    """
+
+    outcome: str
+    set_size: int
+    class_size: int
+    named: str
+    covered: dict[str, bool | None]
+
+    @property
+    def is_correct(self) -> bool:
+        """Whether the cause is named alone or in a set of at most `MAX_SET_SIZE` effects."""
+        return self.outcome == "right" or (self.outcome == "set" and self.set_size <= MAX_SET_SIZE)
+
+    @property
+    def is_correct_up_to_equivalence(self) -> bool:
+        """Whether the cause is named alone or in a small set, equivalent effects counted once."""
+        return self.outcome == "right" or (
+            self.outcome in ("set", "class") and self.class_size <= MAX_SET_SIZE
+        )
+
+
+def grade_answer(item: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grade:
+    """Grade one answer.
+
+    Args:
+        item: the case with its truth.
+        verdict: the answer as a dictionary; None for a missing answer.
+    """
+    if verdict is None:
+        return Grade("failed", 0, 0, "", {})
+    sets = [(cause["effect"], *cause["alternatives"]) for cause in verdict["causes"]]
+    outcome, strict, loose = GRADERS_BY_KIND[item.kind](item, verdict["verdict"], sets)
+    if verdict["verdict"] == "unidentifiable":
+        outcome = "undecided"
+    covered = (
+        _count_covered_intervals(item, verdict, sets)
+        if outcome in ("right", "set") and item.kind != "foreign"
+        else {}
+    )
+    return Grade(outcome, strict, loose, " + ".join("|".join(names) for names in sets), covered)
+
+
+def _grade_clean(item: BenchmarkCase, verdict: str, sets: NamedSets) -> GradedAnswer:
+    return "right" if verdict == "adequate" else "alarm", 0, 0
+
+
+def _grade_foreign(item: BenchmarkCase, verdict: str, sets: NamedSets) -> GradedAnswer:
+    if verdict == "adequate":
+        return "missed", 0, 0
+    return "right" if verdict in ("unknown", "partial") else "wrong", 0, 0
+
+
+def _grade_library(item: BenchmarkCase, verdict: str, sets: NamedSets) -> GradedAnswer:
+    """Grade an answer on one or two effects of the library.
+
+    An answer is right if each effect is in a set of its own and no set is without an effect.
+    """
+    if verdict == "adequate":
+        return "missed", 0, 0
+    if not sets or verdict == "unknown":  # effects listed with the verdict "unknown" are not named
+        return "unnamed", 0, 0
+    strict = _match_sets_to_effects(item.effects, sets, lambda effect, names: effect in names)
+    loose = _match_sets_to_effects(
+        item.effects,
+        sets,
+        lambda effect, names: bool(_same_up_to_equivalence(item, effect) & set(names)),
+    )
+    if len(loose) < len(item.effects):
+        return "one" if loose else "wrong", 0, 0
+    sizes = max(len(sets[place]) for place in loose.values())
+    classes = max(_classes(item, sets[place]) for place in loose.values())
+    if len(sets) > len(item.effects):
+        return "extra", sizes, classes
+    if len(strict) < len(item.effects):
+        return "class", 0, classes  # only equivalent effects are named
+    sizes = max(len(sets[place]) for place in strict.values())
+    return "right" if sizes == 1 else "set", sizes, classes
+
+
+def _match_sets_to_effects(
+    effects: Iterable[str], sets: NamedSets, holds: CoverageCheck
+) -> dict[str, int]:
+    """Assign effects to sets, each set to at most one effect.
+
+    Args:
+        effects: the hidden effects, at most two.
+        sets: the named sets.
+        holds: returns whether a set contains an effect.
+
+    Returns:
+        Index of the set of each effect, for the assignment with the most effects.
+    """
+    best: dict[str, int] = {}
+    for order in (list(effects), list(effects)[::-1]):
+        for reverse in (False, True):
+            found: dict[str, int] = {}
+            for effect in order:
+                places = [
+                    i
+                    for i, names in enumerate(sets)
+                    if holds(effect, names) and i not in found.values()
+                ]
+                if places:
+                    found[effect] = places[-1 if reverse else 0]
+            best = max(best, found, key=len)
+    return best
+
+
+def _same_up_to_equivalence(item: BenchmarkCase, effect: str) -> frozenset[str]:
+    return find_equivalent_effects(item, effect)
+
+
+def _classes(item: BenchmarkCase, names: Sequence[str]) -> int:
+    """Count the distinct names of a set, equivalent effects counted as one.
+
+    The family of an effect (``effect@*``) is not counted if the set contains one of its places.
+    """
+    placed = {name.partition("@")[0] for name in names if not name.endswith("@*")}
+    counted = [n for n in names if not n.endswith("@*") or n.partition("@")[0] not in placed]
+    return len({min(_same_up_to_equivalence(item, name)) for name in counted})
+
+
+GRADERS_BY_KIND = {
+    "clean": _grade_clean,
+    "foreign": _grade_foreign,
+    "single": _grade_library,
+    "double": _grade_library,
+}
+
+
+def _count_covered_intervals(
+    item: BenchmarkCase, verdict: Mapping[str, Any], sets: NamedSets
+) -> dict[str, bool | None]:
+    """Compare the intervals of base parameters and of leading causes with the truth."""
+    truth, said = dict(item.parameters), dict(verdict["parameters"])
+    led = {names[0] for names in sets}
+    for cause in verdict["causes"]:
+        if cause["effect"] in item.effects:
+            names = list_coefficient_names(item.system, cause["effect"])
+            for name, value in zip(names, item.effects[cause["effect"]], strict=False):
+                truth[f"{cause['effect']}.{name}"] = value
+                said[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)
+    if not set(item.effects) <= led:
+        return {}  # parameters fitted together with a wrong cause are not comparable
+    return {name: _holds(said[name], value) for name, value in truth.items() if said.get(name)}
+
+
+def _holds(estimate: Mapping[str, float | None], value: float) -> bool | None:
+    low, high = estimate["low"], estimate["high"]
+    if low is None or high is None:
+        return None
+    return bool(low <= value <= high)

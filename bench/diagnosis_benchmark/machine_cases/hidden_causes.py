@@ -1,0 +1,218 @@
+"""Causes that can be hidden in a machine: their places, and coefficients by strength.
+
+Strength 1 is the upper end of the plausible range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES
+from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
+    MachineRecordingConditions,
+)
+
+CoefficientFunction = Callable[[float], tuple[float, ...]]
+
+JOINT_EFFECTS = (
+    "drag.linear",
+    "drag.quadratic",
+    "force.bias",
+    "force.ripple",
+    "friction.coulomb",
+    "friction.stribeck",
+    "spring.linear",
+)
+INPUT_EFFECTS = (
+    "input.bias",
+    "input.deadband",
+    "input.delay",
+    "input.gain",
+    "input.lag",
+    "input.saturation",
+)
+SENSOR_EFFECTS = ("sensor.bias", "sensor.delay", "sensor.drift", "sensor.gain")
+GRAVITY_EFFECTS = ("gravity.scale", "gravity.tilt")
+_ABSORBED_BY_PARAMETERS = {"drag.linear", "input.gain", "sensor.gain"}
+"""Effects that the parameters of a servo absorb entirely or almost entirely."""
+EFFECTS_BY_MACHINE = {
+    "servo": tuple(
+        sorted(
+            {*JOINT_EFFECTS, *INPUT_EFFECTS, *SENSOR_EFFECTS, "gravity.tilt", "servo.deadband"}
+            - _ABSORBED_BY_PARAMETERS
+        )
+    ),
+    "arm2": tuple(
+        sorted(
+            {
+                *JOINT_EFFECTS,
+                *INPUT_EFFECTS,
+                *SENSOR_EFFECTS,
+                *GRAVITY_EFFECTS,
+                "inertia.armature",
+                "mass.scale",
+            }
+        )
+    ),
+}
+"""Effects that can be hidden, by machine."""
+UNMODELLED_CAUSES = ("gust", "patch")
+"""Causes that the library does not contain.
+
+They are a temporary force in every run, and dry friction in a part of a joint's travel.
+"""
+SIGNED_EFFECTS = (
+    "force.bias",
+    "gravity.scale",
+    "gravity.tilt",
+    "input.bias",
+    "input.gain",
+    "mass.scale",
+    "sensor.bias",
+    "sensor.drift",
+    "sensor.gain",
+)
+_MAX_COEFFICIENTS = {
+    "gravity.scale": 0.3,
+    "input.delay": 0.1,
+    "input.gain": 0.4,
+    "input.lag": 0.2,
+    "mass.scale": 0.5,
+    "sensor.bias": 0.2,
+    "sensor.delay": 0.1,
+    "sensor.drift": 0.1,
+    "sensor.gain": 0.3,
+}
+"""Coefficient at strength 1 of effects that need no scale of the motion."""
+
+
+def list_effect_places(system: str, effect: str) -> tuple[str, ...]:
+    """List the places of an effect or unmodelled cause, as ``effect@place`` or ``effect`` alone.
+
+    Args:
+        system: servo or arm2.
+        effect: name of the effect or cause.
+    """
+    plant = MACHINES[system]
+    if effect in GRAVITY_EFFECTS or system == "servo":
+        return (effect,)
+    if effect == "mass.scale":
+        at: tuple[str, ...] = plant.bodies
+    elif effect in INPUT_EFFECTS:
+        at = plant.motors
+    elif effect in SENSOR_EFFECTS:
+        at = plant.channels
+    else:
+        at = plant.joints
+    return tuple(f"{effect}@{place}" for place in at)
+
+
+def get_joint(system: str, place: str) -> int:
+    """Return the index of the joint that a place belongs to.
+
+    Args:
+        system: servo or arm2.
+        place: name of a joint, body, motor or channel.
+    """
+    plant = MACHINES[system]
+    for names in (plant.joints, plant.bodies, plant.motors, plant.channels):
+        if place in names:
+            return names.index(place)
+    return 0
+
+
+def draw_effect_shape(
+    name: str, setting: MachineRecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw the shape of an effect at a place.
+
+    Args:
+        name: ``effect@place``, or ``effect`` alone.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Coefficients as a function of the strength.
+    """
+    effect, _, place = name.partition("@")
+    joint = get_joint(setting.system, place)
+    typical = {what: float(values[joint]) for what, values in setting.motion_scales.items()}
+    sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED_EFFECTS else 1.0
+    if effect in _MAX_COEFFICIENTS:
+        return lambda s: (sign * _MAX_COEFFICIENTS[effect] * s,)
+    if effect in _SHAPES:
+        return _SHAPES[effect](typical, rng)
+    if effect == "gravity.tilt":
+        more = (0.0,) if setting.system == "arm2" else ()
+        return lambda s: (0.3 * sign * s, *more)
+    command = setting.fitted_runs.commands[:, :, joint]
+    most = float(np.abs(command).max())
+    return {
+        "input.bias": lambda s: (sign * float(np.ptp(command)) / 2 * s,),
+        "input.deadband": lambda s: (most * s,),
+        # Strength 0 limits the command at its peak, strength 1 at zero.
+        "input.saturation": lambda s: (most * (1 - s),),
+        "servo.deadband": lambda s: (0.3 * s,),
+    }[effect]
+
+
+def _per_force(bottom: Callable[[dict[str, float]], float]) -> Callable[..., CoefficientFunction]:
+    def made(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+        far = 2.0 * typical["force"] / bottom(typical)
+        return lambda s: (far * s,)
+
+    return made
+
+
+def _ripple(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+    angle = rng.uniform(0, 2 * np.pi)
+    period = float(np.clip(typical["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
+    sine, cosine = (2 * typical["force"] * float(of(angle)) for of in (np.sin, np.cos))
+    return lambda s: (sine * s, cosine * s, period)
+
+
+def _stribeck(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+    extra = float(rng.uniform(2.0, 6.0))
+    speed = typical["speed"] * float(rng.uniform(0.15, 0.5))
+    return lambda s: (0.3 * typical["force"] * s, 0.3 * extra * typical["force"] * s, speed)
+
+
+_SHAPES: dict[str, Callable[..., CoefficientFunction]] = {
+    "drag.linear": _per_force(lambda typical: typical["speed"]),
+    "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
+    "force.bias": _per_force(lambda typical: 1.0),
+    "force.ripple": _ripple,
+    "friction.coulomb": _per_force(lambda typical: 2.0),
+    "friction.stribeck": _stribeck,
+    "inertia.armature": lambda typical, rng: lambda s: (2.0 * typical["inertia"] * s,),
+    "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
+}
+
+
+def draw_unmodelled_cause(
+    name: str, setting: MachineRecordingConditions, rng: np.random.Generator
+) -> CoefficientFunction:
+    """Draw the shape of an unmodelled cause.
+
+    Args:
+        name: ``cause@joint``, or ``cause`` alone.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Numbers of the cause as a function of the strength.
+    """
+    cause, _, place = name.partition("@")
+    joint = get_joint(setting.system, place)
+    force = float(setting.motion_scales["force"][joint])
+    if cause == "gust":
+        lasting = float(rng.uniform(0.1, 0.3) * setting.seconds)
+        begin = float(rng.uniform(0.1, 0.6) * setting.seconds)
+        sign = float(rng.choice([-1.0, 1.0]))
+        return lambda s: (2.0 * sign * force * s, begin, lasting)
+    path = setting.base_motion.q[:, :, joint]
+    centre = float(np.quantile(path, rng.uniform(0.3, 0.7)))
+    half = float(np.ptp(path) * rng.uniform(0.08, 0.2))
+    return lambda s: (2.0 * force * s, centre, half)

@@ -1,0 +1,436 @@
+"""Sampling of cases for servo and arm, and their recordings.
+
+Sizes are computed to first order: the RMS of the change that a cause makes to the noise-free
+motion, after the part is projected out that changes of parameters and initial states can explain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.effect_sizing import find_strength_for_size
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    ANY_CONDITIONS,
+    RequestedConditions,
+)
+from bench.diagnosis_benchmark.machine_cases import hidden_causes
+from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES as PLANTS
+from bench.diagnosis_benchmark.machine_cases.machine_dynamics import Effects
+from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
+    MachineRecordingConditions,
+)
+from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
+    draw_conditions as drawn_setting,
+)
+from bench.diagnosis_benchmark.machine_cases.model_file import MODEL_FILE_NAME, render_arm_mjcf
+from bench.diagnosis_benchmark.machine_cases.reference_motion import (
+    MachineRuns,
+    read_encoders,
+    simulate_machine,
+)
+from sims.core.simulator import Array
+
+MACHINES = tuple(PLANTS)
+"""Names of the machines."""
+MIN_DISTINCT_SIZE = 1.0
+"""Minimum RMS residual that a wrong answer must leave, in units of the noise.
+
+A wrong answer is one of two hidden effects alone, or library effects for an unmodelled cause.
+"""
+MIN_SIMPLER_RESIDUAL = 0.4
+"""Minimum RMS residual that the simpler form of an effect must leave, in units of the noise.
+
+Below it, the simpler form is a correct answer.
+"""
+SIMPLER_EFFECTS = {"friction.stribeck": "friction.coulomb"}
+_FINITE_DIFFERENCE_STEP = 1e-4
+"""Finite-difference step: relative for a parameter, rad or rad/s for an initial state."""
+_PROBE_STRENGTH = 0.1
+"""Strength at which the directions of other causes are computed."""
+_COARSE_STEP_FACTOR = 2.0
+"""Factor of the step size when the directions of other causes are computed."""
+
+
+def draw_case(
+    kind: str,
+    system: str,
+    seed: int,
+    effect: str | None = None,
+    size: float | None = None,
+    wanted_so: RequestedConditions = ANY_CONDITIONS,
+) -> BenchmarkCase | None:
+    """Draw a case; see `bench.diagnosis_benchmark.case_generation.case_sampling.draw_case`.
+
+    Args:
+        kind: clean, single, double or foreign.
+        system: servo or arm2.
+        seed: seed from which everything else follows.
+        effect: hidden effect (the first one of a double case); None to draw it.
+        size: size in units of the noise; None to draw it.
+        wanted_so: recording conditions that are not drawn.
+
+    Returns:
+        The case, or None if the encoders cannot show the cause, or if another answer explains it
+        too well.
+    """
+    words = [kind, system, effect or "any", *([f"{size:g}"] if size else [])]
+    words += [str(part) for part in wanted_so if part is not None]
+    name = "-".join([*words, str(seed)])
+    made, rng = restore_conditions(name, system, wanted_so), _rng(name, "cause")
+    item = BenchmarkCase(
+        name,
+        system,
+        kind,
+        {},
+        0.0,
+        made.noise.kind,
+        made.noise.stated,
+        made.rate,
+        made.seconds,
+        len(made.runs.q),
+        "own equations",
+        True,
+        PLANTS[system].channels,
+        seed,
+        made.free_parameters,
+        asked=wanted_so,
+    )
+    if kind == "clean":
+        return item
+    low = 3.0 if kind in ("double", "foreign") else 1.0
+    wanted = size or float(np.exp(rng.uniform(np.log(low), np.log(10.0))))
+    hidden = {"single": _single, "double": _double, "foreign": _foreign}[kind]
+    return hidden(item, made, effect, wanted, rng)
+
+
+def _rng(name: str, purpose: str) -> np.random.Generator:
+    return np.random.default_rng(list(f"{name} {purpose}".encode()))
+
+
+@lru_cache(maxsize=4)
+def restore_conditions(
+    name: str, system: str, asked: RequestedConditions = ANY_CONDITIONS
+) -> MachineRecordingConditions:
+    """Restore the recording conditions of a case.
+
+    Args:
+        name: name of the case.
+        system: servo or arm2.
+        asked: conditions that were not drawn.
+    """
+    return drawn_setting(system, _rng(name, "setting"), asked)
+
+
+def _placed(
+    item: BenchmarkCase, effect: str | None, rng: np.random.Generator, but: str = ""
+) -> str:
+    """Draw the effect, if it is not given, and its place.
+
+    Returns:
+        ``effect@place`` or ``effect``; empty if the only place is excluded by `but`.
+    """
+    chosen = effect or str(rng.choice(hidden_causes.EFFECTS_BY_MACHINE[item.system]))
+    there = [name for name in hidden_causes.list_effect_places(item.system, chosen) if name != but]
+    return str(rng.choice(there)) if there else ""
+
+
+def _single(
+    item: BenchmarkCase,
+    made: MachineRecordingConditions,
+    effect: str | None,
+    wanted: float,
+    rng: np.random.Generator,
+) -> BenchmarkCase | None:
+    name = _placed(item, effect, rng)
+    c = _find_sized_coefficients(name, made, wanted, rng)
+    if c is None:
+        return None
+    effect, _, place = name.partition("@")
+    beyond = None
+    if effect in SIMPLER_EFFECTS and wanted >= 1.0:
+        other = f"{SIMPLER_EFFECTS[effect]}@{place}" if place else SIMPLER_EFFECTS[effect]
+        rivals = [other, f"drag.linear@{place}" if place else "drag.quadratic"]
+        beyond = _compute_unexplained_size(made, {name: c}, {}, rivals, rng)
+        if beyond < MIN_SIMPLER_RESIDUAL:
+            return None
+    return replace(item, effects={name: c}, size=wanted, beyond=beyond)
+
+
+def _find_sized_coefficients(
+    name: str, made: MachineRecordingConditions, wanted: float, rng: np.random.Generator
+) -> tuple[float, ...] | None:
+    """Find coefficients at which a cause has the requested size; None if there are none."""
+    of = hidden_causes.draw_effect_shape(name, made, rng)
+    gauge = _ResidualGauge(made)
+    strength = find_strength_for_size(
+        lambda s: gauge.left(made.simulate_readings({name: of(s)})), wanted, 1.0
+    )
+    return None if strength is None else of(strength)
+
+
+def _double(
+    item: BenchmarkCase,
+    made: MachineRecordingConditions,
+    effect: str | None,
+    wanted: float,
+    rng: np.random.Generator,
+) -> BenchmarkCase | None:
+    """Hide two effects, each of the requested size alone; reject the case if one explains both."""
+    first = _placed(item, effect, rng)
+    second = _placed(item, None, rng, but=first)
+    if not second or second in find_equivalent_causes(item.system, first):
+        return None
+    found = {name: _find_sized_coefficients(name, made, wanted, rng) for name in (first, second)}
+    effects = {name: c for name, c in found.items() if c is not None}
+    if len(effects) < 2:
+        return None
+    beyond = min(_compute_unexplained_size(made, effects, {}, [name], rng) for name in effects)
+    return (
+        replace(item, effects=effects, size=wanted, beyond=beyond)
+        if beyond >= MIN_DISTINCT_SIZE
+        else None
+    )
+
+
+def _foreign(
+    item: BenchmarkCase,
+    made: MachineRecordingConditions,
+    cause: str | None,
+    wanted: float,
+    rng: np.random.Generator,
+) -> BenchmarkCase | None:
+    """Hide an unmodelled cause, which the library explains only in part."""
+    chosen = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
+    joint = str(rng.choice(PLANTS[item.system].joints))
+    name = f"{chosen}@{joint}" if joint else chosen
+    of, gauge = hidden_causes.draw_unmodelled_cause(name, made, rng), _ResidualGauge(made)
+    strength = find_strength_for_size(
+        lambda s: gauge.left(made.simulate_readings(foreign={name: of(s)})), wanted, 1.0
+    )
+    if strength is None:
+        return None
+    hidden = {name: of(strength)}
+    known = [
+        n
+        for e in hidden_causes.EFFECTS_BY_MACHINE[item.system]
+        for n in hidden_causes.list_effect_places(item.system, e)
+    ]
+    beyond = _compute_unexplained_size(made, {}, hidden, known, rng)
+    return (
+        replace(item, effects=hidden, size=wanted, beyond=beyond)
+        if beyond >= MIN_DISTINCT_SIZE
+        else None
+    )
+
+
+def _compute_unexplained_size(
+    made: MachineRecordingConditions,
+    effects: Effects,
+    foreign: Effects,
+    others: Sequence[str],
+    rng: np.random.Generator,
+) -> float:
+    """Compute the RMS residual that the best of other causes leaves, to first order.
+
+    It is in units of the noise.
+    """
+    gauge = _ResidualGauge(made)
+    change = made.simulate_readings(effects, foreign) - gauge.bare
+    bare = made.simulate_readings(coarse=_COARSE_STEP_FACTOR)
+    left = []
+    for name in others:
+        of = hidden_causes.draw_effect_shape(name, made, rng)
+        probe = {name: effects[name]} if name in effects else {name: of(_PROBE_STRENGTH)}
+        direction = made.simulate_readings(probe, coarse=_COARSE_STEP_FACTOR) - bare
+        left.append(gauge.projected(change, direction))
+    return min(left)
+
+
+class _ResidualGauge:
+    """Sizes of changes, in units of the noise, with parameters and initial states projected out.
+
+    Args:
+        made: recording conditions; only the runs for fitting are used.
+
+    Attributes:
+        bare: readings without hidden causes, (R, T, N).
+    """
+
+    def __init__(self, made: MachineRecordingConditions) -> None:
+        self.made = made
+        runs, joints = made.fitted_runs.q.shape
+        numbers = list(made.free_parameters)
+        lanes = 1 + len(numbers) + 2 * joints
+        # Each run once as it is, and once for each fitted parameter and initial state.
+        fitted = MachineRuns(
+            made.fitted_runs.times,
+            np.repeat(made.fitted_runs.commands, lanes, axis=0),
+            np.repeat(made.fitted_runs.q, lanes, axis=0),
+            np.repeat(made.fitted_runs.v, lanes, axis=0),
+        )
+        values = {name: np.full((runs, lanes), value) for name, value in made.numbers.items()}
+        for k, name in enumerate(numbers):
+            values[name][:, 1 + k] *= 1 + _FINITE_DIFFERENCE_STEP
+        q, v = (part.reshape(runs, lanes, joints).copy() for part in (fitted.q, fitted.v))
+        for j in range(joints):
+            q[:, 1 + len(numbers) + j, j] += _FINITE_DIFFERENCE_STEP
+            v[:, 1 + len(numbers) + joints + j, j] += _FINITE_DIFFERENCE_STEP
+        plant = PLANTS[made.system]({n: a.ravel() for n, a in values.items()}, {}, {})
+        begun = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
+        seen = read_encoders(simulate_machine(plant, begun), plant, made.runs.times)
+        seen = seen.reshape(runs, lanes, -1)
+        slopes = (seen[:, 1:] - seen[:, :1]) / _FINITE_DIFFERENCE_STEP
+        shared = np.concatenate(slopes[:, : len(numbers)], axis=1).T
+        own = np.zeros((runs, slopes.shape[2], runs, 2 * joints))
+        for r in range(runs):
+            own[r, :, r] = slopes[r, len(numbers) :].T
+        columns = np.column_stack([shared, own.reshape(runs * slopes.shape[2], -1)])
+        self.bare = seen[:, 0].reshape(runs, len(made.runs.times), joints)
+        self._basis = _orthonormal(columns)
+
+    def left(self, seen: Array) -> float:
+        """Compute the size of the change in readings with a hidden cause."""
+        return self._size((seen - self.bare).ravel())
+
+    def projected(self, change: Array, direction: Array) -> float:
+        """Compute the size of a change after a further direction is projected out.
+
+        Args:
+            change: change of the readings, (R, T, N).
+            direction: direction of another cause, (R, T, N).
+        """
+        rest, way = (self._rest(part.ravel()) for part in (change, direction))
+        if way @ way > 0:
+            rest = rest - way * (way @ rest) / (way @ way)
+        return float(np.sqrt(np.mean(rest**2)) / self.made.noise_sigmas)
+
+    def _size(self, change: Array) -> float:
+        if not np.isfinite(change).all():
+            return float("inf")
+        return float(np.sqrt(np.mean(self._rest(change) ** 2)) / self.made.noise_sigmas)
+
+    def _rest(self, change: Array) -> Array:
+        rest: Array = change - self._basis @ (self._basis.T @ change)
+        return rest
+
+
+def _orthonormal(columns: Array) -> Array:
+    """Compute an orthonormal basis of the span of columns, without nearly dependent directions."""
+    scale = np.sqrt(np.square(columns).sum(axis=0))
+    left, sizes, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    basis: Array = left[:, sizes > 1e-6 * sizes[0]]
+    return basis
+
+
+EQUIVALENT_CAUSES: dict[str, tuple[frozenset[str], ...]] = {
+    # A motor that never reaches its limit converts an offset of the goal into a torque.
+    "servo": (frozenset({"force.bias", "input.bias"}),),
+    "arm2": tuple(
+        frozenset(names)
+        for joint, body in (("shoulder", "upper_arm"), ("elbow", "forearm"))
+        for names in (
+            {f"force.bias@{joint}", f"input.bias@m_{joint}"},
+            *([{f"inertia.armature@{joint}", f"inertia.scale@{body}"}] * (joint == "shoulder")),
+        )
+    ),
+}
+"""Causes that give exactly the same motion, by machine."""
+
+
+def find_equivalent_causes(system: str, name: str) -> frozenset[str]:
+    """Return a cause and all causes that are equivalent to it.
+
+    Args:
+        system: servo or arm2.
+        name: ``effect@place`` or ``effect``.
+    """
+    return frozenset({name}).union(*(names for names in EQUIVALENT_CAUSES[system] if name in names))
+
+
+def record_case(item: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]:
+    """Simulate the recording of a case.
+
+    Returns:
+        The recording conditions and the noisy encoder readings, (R, T, N).
+    """
+    made = restore_conditions(item.name, item.system, item.asked)
+    hidden = item.effects
+    foreign = item.kind == "foreign"
+    plant = made.make_machine({} if foreign else hidden, hidden if foreign else {})
+    seen = read_encoders(simulate_machine(plant, made.runs), plant, made.runs.times)
+    rng = _rng(item.name, "noise")
+    return made, np.array([made.noise.add_to(run, rng) for run in seen])
+
+
+def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> dict[str, object]:
+    """Build the description of the recording, as the document of a TOML file.
+
+    Args:
+        item: the case.
+        made: its recording conditions.
+    """
+    robot = item.system == "arm2"
+    plant = PLANTS[item.system]
+    stated = {"noise": made.noise_sigmas} if item.stated else {}
+    channels = {name: {"unit": "rad", **stated} for name in plant.channels}
+    inputs = (
+        {f"u.{name}": {"unit": "N*m"} for name in plant.motors}
+        if robot
+        else {"goal": {"unit": "rad"}, "torque_enable": {"unit": "1"}}
+    )
+    first = item.runs - made.held_out
+    runs = {str(number): {"held_out": True} for number in range(first, item.runs)}
+    of = {"model": MODEL_FILE_NAME} if robot else {"system": item.system}
+    constants = {} if robot else {"constants": _stated_constants(made)}
+    return {**of, "channels": channels, "inputs": inputs, **constants, "runs": runs}
+
+
+def _stated_constants(made: MachineRecordingConditions) -> dict[str, float]:
+    return {name: v for name, v in made.numbers.items() if name not in made.free_parameters}
+
+
+def format_table(item: BenchmarkCase, made: MachineRecordingConditions, seen: Array) -> str:
+    """Format the recording as CSV text.
+
+    Args:
+        item: the case.
+        made: its recording conditions.
+        seen: encoder readings, (R, T, N).
+    """
+    plant, robot = PLANTS[item.system], item.system == "arm2"
+    inputs = [f"u.{name}" for name in plant.motors] if robot else ["goal", "torque_enable"]
+    lines = [",".join(["run", "t", *inputs, *plant.channels])]
+    for number, run in enumerate(seen):
+        for k, t in enumerate(made.runs.times.tolist()):
+            told = made.runs.commands[number, k].tolist() + ([] if robot else [1.0])
+            cells = [t, *told, *run[k].tolist()]
+            lines.append(",".join([str(number), *(f"{value:.9g}" for value in cells)]))
+    return "\n".join(lines) + "\n"
+
+
+def write_case(item: BenchmarkCase, folder: Path) -> Path:
+    """Write the recording, its description and, for an arm, its model file.
+
+    Args:
+        item: the case.
+        folder: folder for the files.
+
+    Returns:
+        Path of the CSV file.
+    """
+    import tomli_w
+
+    made, seen = record_case(item)
+    if item.system == "arm2":
+        (folder / MODEL_FILE_NAME).write_text(render_arm_mjcf(made.numbers), encoding="utf-8")
+    path = folder / "recording.csv"
+    path.write_text(format_table(item, made, seen), encoding="utf-8")
+    description = tomli_w.dumps(build_description(item, made))
+    path.with_suffix(".toml").write_text(description, encoding="utf-8")
+    return path

@@ -1,0 +1,301 @@
+"""Equations of motion of a servo with a pendulum, and of an arm of two links, for batches of runs.
+
+Every law is written here in plain numbers. Nothing is shared with the simulators and the effect
+library that the cases test. Arrays are (L, N) for L batch elements and N joints; parameters of a
+machine are scalars, or (L,) if they differ between batch elements.
+
+Servo, with the angle q from hanging down and gravity g (R. Krishnan, Electric Motor Drives, 2001,
+chapter 2, for the motor):
+
+    (J + m l^2) q'' = k (d V - k q') / R - m g l sin q,   d = clip(p e (goal - q), -1, 1)     (1)
+
+Arm in a vertical plane, with q2 measured from the line of the first link (M. W. Spong, S.
+Hutchinson, M. Vidyasagar, Robot Modeling and Control, 2006, section 7.4), and with the inertias A
+of the rotors:
+
+    M11 = I1 + m1 c1^2 + I2 + m2 (l^2 + c2^2 + 2 l c2 cos q2) + A1                             (2)
+    M12 = I2 + m2 (c2^2 + l c2 cos q2),   M22 = I2 + m2 c2^2 + A2                              (3)
+    M q'' = u - damping q' - g(q) + m2 l c2 sin q2 (2 q1' q2' + q2'^2, -q1'^2)                 (4)
+    g1 = (m1 c1 + m2 l) g sin q1 + m2 c2 g sin(q1 + q2),   g2 = m2 c2 g sin(q1 + q2)           (5)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+
+MachineParameters = Mapping[str, Any]
+"""Parameters of a machine by name; each is a scalar or (L,)."""
+Effects = Mapping[str, Sequence[float]]
+"""Coefficients by ``effect@place``, or by ``effect`` if a machine has only one place for it."""
+ForceLaw = Callable[[float, Array, Array, Array], Array]
+"""Function from (t, q, v, u) to generalised forces (L, N)."""
+GRAVITY = 9.81
+
+
+class MachineDynamics(ABC):
+    """Machine with hidden causes.
+
+    Args:
+        numbers: parameters, see `MachineParameters`.
+        effects: hidden effects of the library.
+        foreign: hidden causes that the library does not contain.
+
+    Attributes:
+        joints: names of the joints; one empty name if the machine has one place per effect.
+        channels: sensor channel of each joint.
+        motors: input of each joint.
+        acts: additional force laws.
+        dry: Coulomb friction, (N,).
+        extra: additional Stribeck friction at rest, (N,).
+        speed: Stribeck velocity, (N,).
+        has_dry_friction: whether each joint has dry friction, (N,).
+    """
+
+    joints: ClassVar[tuple[str, ...]]
+    bodies: ClassVar[tuple[str, ...]] = ()
+    channels: ClassVar[tuple[str, ...]]
+    motors: ClassVar[tuple[str, ...]]
+
+    def __init__(self, numbers: MachineParameters, effects: Effects, foreign: Effects) -> None:
+        self.numbers = {name: np.asarray(value, dtype=float) for name, value in numbers.items()}
+        self.effects, self.foreign = effects, foreign
+        count = len(self.joints)
+        self.dry, self.extra, self.speed = np.zeros(count), np.zeros(count), np.ones(count)
+        self.added = np.zeros(count)
+        self.patch: tuple[int, float, float, float] | None = None
+        self.dull = 0.0
+        self.heavier = 1.0
+        self.acts: list[ForceLaw] = []
+        for name, c in effects.items():
+            effect, _, place = name.partition("@")
+            self._take(effect, place, list(c))
+        for name, c in foreign.items():
+            cause, _, place = name.partition("@")
+            self._foreign(cause, place, list(c))
+
+    @property
+    def has_dry_friction(self) -> NDArray[np.bool_]:
+        """Whether each joint has dry friction, (N,)."""
+        rubs = (self.dry > 0) | (self.extra > 0)
+        if self.patch:
+            rubs[self.patch[0]] = True
+        return rubs
+
+    def compute_friction_limit(self, q: Array, v: Array) -> Array:
+        """Compute the dry friction limit.
+
+        Args:
+            q: positions, (L, N).
+            v: velocities, (L, N).
+
+        Returns:
+            Friction limits, (L, N).
+        """
+        limit = np.tile(self.dry, (len(q), 1))
+        if self.extra.any():
+            limit += self.extra * np.exp(-((v / self.speed) ** 2))
+        if self.patch:
+            joint, most, centre, half = self.patch
+            inside = (half - np.abs(q[:, joint] - centre)) / (0.1 * half)
+            limit[:, joint] += most * np.clip(inside, 0.0, 1.0)
+        return limit
+
+    def compute_force(self, t: float, q: Array, v: Array, u: Array) -> Array:
+        """Compute the force of drives, gravity and effects, without dry friction.
+
+        Args:
+            t: time.
+            q: positions, (L, N).
+            v: velocities, (L, N).
+            u: applied inputs, (L, N).
+
+        Returns:
+            Forces, (L, N).
+        """
+        total = self.compute_own_force(q, v, u)
+        for act in self.acts:
+            total = total + act(t, q, v, u)
+        return total
+
+    @abstractmethod
+    def compute_mass_matrix(self, q: Array) -> Array:
+        """Compute the mass matrices, (L, N, N)."""
+
+    @abstractmethod
+    def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
+        """Compute all other terms of the equations of motion of the machine without effects.
+
+        Args:
+            q: positions, (L, N).
+            v: velocities, (L, N).
+            u: applied inputs, (L, N).
+
+        Returns:
+            Forces, (L, N).
+        """
+
+    @abstractmethod
+    def compute_base_acceleration_force(self, q: Array) -> Array:
+        """Compute the generalised forces (L, N) of a unit acceleration along x."""
+
+    @abstractmethod
+    def compute_gravity_force(self, q: Array) -> Array:
+        """Compute the generalised forces (L, N) of gravity."""
+
+    def _take(self, effect: str, place: str, c: list[float]) -> None:
+        """Add an effect; effects on commands and sensors are applied elsewhere."""
+        if effect in JOINT_FORCE_LAWS:
+            joint, law = self.joints.index(place), JOINT_FORCE_LAWS[effect]
+
+            def act(t: float, q: Array, v: Array, u: Array) -> Array:
+                pushed = np.zeros_like(q)
+                pushed[:, joint] = law(c, q[:, joint], v[:, joint])
+                return pushed
+
+            self.acts.append(act)
+        elif effect == "friction.coulomb":
+            self.dry[self.joints.index(place)] = c[0]
+        elif effect == "friction.stribeck":
+            joint = self.joints.index(place)
+            self.dry[joint], self.extra[joint], self.speed[joint] = c
+        elif effect == "inertia.armature":
+            self.added[self.joints.index(place)] = c[0]
+        elif effect == "gravity.tilt":
+            self.acts.append(
+                lambda t, q, v, u: c[0] * GRAVITY * self.compute_base_acceleration_force(q)
+            )
+        elif effect == "gravity.scale":
+            self.acts.append(lambda t, q, v, u: c[0] * self.compute_gravity_force(q))
+        elif effect == "servo.deadband":
+            self.dull = c[0]
+        elif effect == "mass.scale":
+            self._heavier(self.bodies.index(place), 1.0 + c[0])
+
+    def _heavier(self, body: int, times: float) -> None:
+        """Multiply the mass and inertia of a body by a factor."""
+        for name in (f"mass{body + 1}", f"inertia{body + 1}"):
+            self.numbers[name] = times * self.numbers[name]
+
+    def _foreign(self, cause: str, place: str, c: list[float]) -> None:
+        joint = self.joints.index(place)
+        if cause == "patch":
+            most, centre, half = c
+            self.patch = joint, most, centre, half
+        elif cause == "gust":
+            push, begin, lasting = c
+
+            def blow(t: float, q: Array, v: Array, u: Array) -> Array:
+                pushed = np.zeros_like(q)
+                pushed[:, joint] = push * (begin <= t < begin + lasting)
+                return pushed
+
+            self.acts.append(blow)
+
+
+JOINT_FORCE_LAWS: dict[str, Callable[[list[float], Array, Array], Array]] = {
+    "drag.linear": lambda c, q, v: -c[0] * v,
+    "drag.quadratic": lambda c, q, v: -c[0] * np.abs(v) * v,
+    "spring.linear": lambda c, q, v: -c[0] * q,
+    "force.bias": lambda c, q, v: c[0] + 0.0 * q,
+    "force.ripple": lambda c, q, v: (
+        c[0] * np.sin(2 * np.pi * q / c[2]) + c[1] * np.cos(2 * np.pi * q / c[2])
+    ),
+}
+"""Forces at a joint as functions of its coefficients, positions (L,) and velocities (L,)."""
+
+
+class ServoDynamics(MachineDynamics):
+    """Servo with a pendulum, equation (1)."""
+
+    joints = ("",)
+    channels = ("q",)
+    motors = ("goal",)
+
+    def compute_mass_matrix(self, q: Array) -> Array:
+        """Compute the mass matrices; see `MachineDynamics`."""
+        n = self.numbers
+        inertia = np.empty((len(q), 1, 1))
+        inertia[:, 0, 0] = n["armature"] + n["mass"] * n["length"] ** 2 + self.added[0]
+        return inertia
+
+    def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
+        """Compute the motor torque and gravity; see `MachineDynamics`."""
+        n = self.numbers
+        error = u[:, 0] - q[:, 0]
+        if self.dull:
+            error = error - np.clip(error, -self.dull, self.dull)
+        duty = np.clip(n["kp"] * n["error_gain"] * error, -1.0, 1.0)
+        k = n["torque_constant"]
+        torque = k * (duty * n["voltage"] - k * v[:, 0]) / n["resistance"]
+        total: Array = torque[:, None] + self.compute_gravity_force(q)
+        return total
+
+    def compute_gravity_force(self, q: Array) -> Array:
+        """Compute the gravity force; see `MachineDynamics`."""
+        n = self.numbers
+        weight: Array = -n["mass"] * n["gravity"] * n["length"] * np.sin(q[:, 0])
+        return weight[:, None]
+
+    def compute_base_acceleration_force(self, q: Array) -> Array:
+        """Compute the force of a unit acceleration along x, to the right where q is positive."""
+        n = self.numbers
+        sideways: Array = n["mass"] * n["length"] * np.cos(q[:, 0])
+        return sideways[:, None]
+
+
+class ArmDynamics(MachineDynamics):
+    """Arm of two links, equations (2) to (5).
+
+    Both joints turn about y, so that a positive angle is on the negative side of x.
+    """
+
+    joints = ("shoulder", "elbow")
+    bodies = ("upper_arm", "forearm")
+    channels = ("q.shoulder", "q.elbow")
+    motors = ("m_shoulder", "m_elbow")
+
+    def compute_mass_matrix(self, q: Array) -> Array:
+        """Compute the mass matrices; see `MachineDynamics`."""
+        n = self.numbers
+        across = n["mass2"] * n["length"] * n["centre2"] * np.cos(q[:, 1])
+        outer = n["inertia2"] + n["mass2"] * n["centre2"] ** 2
+        inner = n["inertia1"] + n["mass1"] * n["centre1"] ** 2 + n["mass2"] * n["length"] ** 2
+        inertia = np.empty((len(q), 2, 2))
+        inertia[:, 0, 0] = inner + outer + 2 * across + n["armature1"] + self.added[0]
+        inertia[:, 0, 1] = inertia[:, 1, 0] = outer + across
+        inertia[:, 1, 1] = outer + n["armature2"] + self.added[1]
+        return inertia
+
+    def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
+        """Compute inputs, gravity, Coriolis forces and damping; see `MachineDynamics`."""
+        n = self.numbers
+        turning = n["mass2"] * n["length"] * n["centre2"] * np.sin(q[:, 1])
+        total = u + self.compute_gravity_force(q)
+        total[:, 0] += turning * (2 * v[:, 0] * v[:, 1] + v[:, 1] ** 2) - n["damping1"] * v[:, 0]
+        total[:, 1] += -turning * v[:, 0] ** 2 - n["damping2"] * v[:, 1]
+        return total
+
+    def compute_gravity_force(self, q: Array) -> Array:
+        """Compute the gravity forces; see `MachineDynamics`."""
+        return -GRAVITY * self._lever(np.sin, q)
+
+    def compute_base_acceleration_force(self, q: Array) -> Array:
+        """Compute the forces of a unit acceleration along x; see `MachineDynamics`."""
+        return -self._lever(np.cos, q)
+
+    def _lever(self, of: Callable[[Array], Array], q: Array) -> Array:
+        n = self.numbers
+        outer = n["mass2"] * n["centre2"] * of(q[:, 0] + q[:, 1])
+        inner = (n["mass1"] * n["centre1"] + n["mass2"] * n["length"]) * of(q[:, 0])
+        return np.stack([inner + outer, outer], axis=1)
+
+
+MACHINES: dict[str, type[MachineDynamics]] = {"servo": ServoDynamics, "arm2": ArmDynamics}
+"""Classes of machines by the name of their system."""

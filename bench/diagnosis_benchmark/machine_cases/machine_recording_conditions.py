@@ -1,0 +1,239 @@
+"""Recording conditions of a machine case, drawn from a seed.
+
+They are the machine's parameters, runs, commands and noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    ANY_CONDITIONS,
+    NOISE_KINDS,
+    RequestedConditions,
+    SensorNoise,
+    draw_input_signal,
+)
+from bench.diagnosis_benchmark.machine_cases.machine_dynamics import (
+    MACHINES,
+    Effects,
+    MachineDynamics,
+)
+from bench.diagnosis_benchmark.machine_cases.reference_motion import (
+    MachineMotion,
+    MachineRuns,
+    read_encoders,
+    simulate_machine,
+)
+from sims.core.simulator import Array
+from sims.systems.servo import Servo as ServoSimulator
+
+ENCODER_NOISE_RANGE = (1e-3, 3e-3)
+"""Range of the encoder noise, rad."""
+FITTED_RUN_COUNTS = (3, 4, 5)
+"""Numbers of runs from which one is drawn."""
+RUN_LENGTHS_SECONDS = (2.0, 3.0, 4.0)
+"""Lengths of a run from which one is drawn, seconds."""
+SAMPLING_RATES_HZ = (50, 100)
+"""Sampling rates from which one is drawn, Hz."""
+MAX_JOINT_ANGLE = 1.4
+"""Maximum joint angle from hanging down, rad; beyond it a small force decides the motion."""
+MAX_COMMAND_ATTEMPTS = 8
+"""Maximum number of attempts to scale commands down until the joints keep their angle limit."""
+
+
+@dataclass(frozen=True)
+class MachineRecordingConditions:
+    """Recording conditions of a machine case, without the hidden cause.
+
+    Attributes:
+        system: servo or arm2.
+        numbers: parameters of the machine, by name.
+        runs: the runs.
+        noise: encoder noise.
+        rate: sampling rate, Hz.
+        seconds: length of a run.
+        held_out: number of held-out runs; they are the last ones.
+    """
+
+    system: str
+    numbers: Mapping[str, float]
+    runs: MachineRuns
+    noise: SensorNoise
+    rate: int
+    seconds: float
+    held_out: int
+
+    @property
+    def noise_sigmas(self) -> float:
+        """Standard deviation of the noise, equal for all channels."""
+        return next(iter(self.noise.sigma.values()))
+
+    @property
+    def free_parameters(self) -> dict[str, float]:
+        """Parameters that the user does not know: none for a robot, whose model file states all."""
+        names = SERVO_PARAMETERS if self.system == "servo" else ()
+        return {name: self.numbers[name] for name in names}
+
+    @property
+    def fitted_runs(self) -> MachineRuns:
+        """The runs for fitting."""
+        return self.take_first_runs(len(self.runs.q) - self.held_out)
+
+    def take_first_runs(self, count: int) -> MachineRuns:
+        """Return the first runs."""
+        commands, q, v = (part[:count] for part in self.runs[1:])
+        return MachineRuns(self.runs.times, commands, q, v)
+
+    def make_machine(
+        self, effects: Effects | None = None, foreign: Effects | None = None
+    ) -> MachineDynamics:
+        """Make the machine with hidden causes.
+
+        Args:
+            effects: hidden effects of the library.
+            foreign: hidden unmodelled causes.
+        """
+        return MACHINES[self.system](self.numbers, effects or {}, foreign or {})
+
+    def simulate_readings(
+        self, effects: Effects | None = None, foreign: Effects | None = None, coarse: float = 1.0
+    ) -> Array:
+        """Simulate noise-free encoder readings of the runs for fitting.
+
+        Args:
+            effects: hidden effects of the library.
+            foreign: hidden unmodelled causes.
+            coarse: factor of the step size.
+
+        Returns:
+            Readings, (R, T, N).
+        """
+        plant = self.make_machine(effects, foreign)
+        return read_encoders(
+            simulate_machine(plant, self.fitted_runs, coarse), plant, self.runs.times
+        )
+
+    @cached_property
+    def base_motion(self) -> MachineMotion:
+        """Motion of the runs for fitting without hidden causes."""
+        return simulate_machine(self.make_machine(), self.fitted_runs)
+
+    @cached_property
+    def motion_scales(self) -> dict[str, Array]:
+        """Scales of the motion without hidden causes, by quantity; one value per joint, (N,)."""
+        q, v = self.base_motion.q, self.base_motion.v
+        a = np.gradient(v, self.base_motion.times, axis=0)
+        lanes, joints = q.shape[1:]
+        inertia = (
+            self.make_machine()
+            .compute_mass_matrix(q.reshape(-1, joints))
+            .reshape(len(q), lanes, joints, joints)
+        )
+        force = np.einsum("klij,klj->kli", inertia, a)
+        force = force - self.make_machine().compute_gravity_force(q.reshape(-1, joints)).reshape(
+            q.shape
+        )
+        return {
+            "force": np.sqrt(np.mean(force**2, axis=(0, 1))),
+            "speed": np.sqrt(np.mean(v**2, axis=(0, 1))),
+            "travel": np.mean(np.ptp(q, axis=0), axis=0),
+            "position": np.sqrt(np.mean(q**2, axis=(0, 1))),
+            "inertia": np.mean(inertia, axis=(0, 1)).diagonal(),
+        }
+
+
+SERVO_PARAMETERS = ("torque_constant", "resistance", "armature")
+"""Names of a servo's parameters, in the order of the simulator."""
+
+
+def draw_conditions(
+    system: str, rng: np.random.Generator, asked: RequestedConditions = ANY_CONDITIONS
+) -> MachineRecordingConditions:
+    """Draw recording conditions.
+
+    Args:
+        system: servo or arm2.
+        rng: random generator.
+        asked: conditions that are not drawn.
+    """
+    rate, seconds = int(rng.choice(SAMPLING_RATES_HZ)), float(rng.choice(RUN_LENGTHS_SECONDS))
+    count = int(rng.choice(FITTED_RUN_COUNTS))
+    # These values are drawn in any case, so that later draws do not depend on the request.
+    rate, count = asked.rate or rate, asked.runs or count
+    times = np.arange(round(rate * seconds)) / rate
+    numbers = _servo(rng) if system == "servo" else _arm(rng)
+    plant = MACHINES[system](numbers, {}, {})
+    runs = _runs(plant, times, count, rng)
+    sigma = float(np.exp(rng.uniform(*np.log(ENCODER_NOISE_RANGE))))
+    noise = SensorNoise(
+        dict.fromkeys(plant.channels, sigma),
+        asked.noise or str(rng.choice(NOISE_KINDS)),
+        float(rng.uniform(0.3, 0.9)),
+        float(rng.uniform(0.3, 0.6)),
+        bool(rng.random() < 0.5),
+    )
+    return MachineRecordingConditions(
+        system, numbers, runs, noise, rate, seconds, max(1, count // 3)
+    )
+
+
+def _servo(rng: np.random.Generator) -> dict[str, float]:
+    drawn = {
+        "torque_constant": float(rng.uniform(0.3, 0.8)),
+        "resistance": float(rng.uniform(2.5, 6.0)),
+        "armature": float(rng.uniform(1e-3, 6e-3)),
+    }
+    return {c.name: c.value for c in ServoSimulator.constants} | drawn
+
+
+def _arm(rng: np.random.Generator) -> dict[str, float]:
+    length, outer = rng.uniform(0.25, 0.45), rng.uniform(0.2, 0.35)
+    mass1, mass2 = rng.uniform(0.8, 2.0), rng.uniform(0.4, 1.0)
+    numbers = {
+        "mass1": mass1,
+        "centre1": length * rng.uniform(0.4, 0.55),
+        "inertia1": mass1 * length**2 * rng.uniform(0.08, 0.11),
+        "damping1": rng.uniform(0.1, 0.4),
+        "armature1": rng.uniform(0.005, 0.02),
+        "length": length,
+        "mass2": mass2,
+        "centre2": outer * rng.uniform(0.4, 0.55),
+        "inertia2": mass2 * outer**2 * rng.uniform(0.08, 0.11),
+        "damping2": rng.uniform(0.03, 0.12),
+        "armature2": rng.uniform(0.002, 0.01),
+    }
+    # Rounded as the model file states them.
+    return {name: float(f"{value:.4g}") for name, value in numbers.items()}
+
+
+def _runs(
+    plant: MachineDynamics, times: Array, count: int, rng: np.random.Generator
+) -> MachineRuns:
+    """Draw runs whose commands keep the joints within the angle limit."""
+    form = str(rng.choice(["steps", "sine", "chirp"]))
+    joints = len(plant.joints)
+    waves = np.array(
+        [
+            [draw_input_signal(form, times, rng, (0.3, 2.0)) for _ in range(joints)]
+            for _ in range(count)
+        ]
+    )
+    commands = np.moveaxis(waves, 1, 2)
+    begun = rng.uniform(-0.4, 0.4, (count, joints))
+    turned = 0.4 * np.ones((1, joints))
+    size = (
+        0.7 if plant.motors == ("goal",) else np.abs(plant.compute_gravity_force(turned))[0] * 1.5
+    )
+    commands = commands * size * rng.uniform(0.5, 1.0, (count, 1, joints))
+    for _ in range(MAX_COMMAND_ATTEMPTS):
+        runs = MachineRuns(times, commands, begun, np.zeros_like(begun))
+        farthest = np.abs(simulate_machine(plant, runs, coarse=2.0).q).max(axis=(0, 2))
+        if (farthest <= MAX_JOINT_ANGLE).all():
+            break
+        commands = commands * np.minimum(1.0, 0.7 * MAX_JOINT_ANGLE / farthest)[:, None, None]
+    return runs

@@ -1,0 +1,50 @@
+"""Model file of the arm as a user would have it: correct, but without the hidden cause."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+MODEL_FILE_NAME = "robot.xml"
+"""Name of the model file, in the folder of the recording."""
+
+
+def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
+    """Render the MJCF text of an arm.
+
+    Args:
+        numbers: parameters; see `machine_dynamics.ArmDynamics`.
+    """
+    links = [
+        (body, joint, {k.removesuffix(end): v for k, v in numbers.items() if k.endswith(end)})
+        for body, joint, end in (("upper_arm", "shoulder", "1"), ("forearm", "elbow", "2"))
+    ]
+    inner, outer = (_link(*link) for link in links)
+    return f"""<mujoco model="arm2">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="RK4" gravity="0 0 -9.81">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <body name="upper_arm">
+      {inner}
+      <body name="forearm" pos="0 0 {-numbers["length"]!r}">
+        {outer}
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="m_shoulder" joint="shoulder" gear="1"/>
+    <motor name="m_elbow" joint="elbow" gear="1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def _link(body: str, joint: str, n: Mapping[str, float]) -> str:
+    """Render the inertia and joint of a link; it is slender along its own axis."""
+    moments = f"{n['inertia']!r} {n['inertia']!r} {0.1 * n['inertia']!r}"
+    return (
+        f'<inertial pos="0 0 {-n["centre"]!r}" mass="{n["mass"]!r}" diaginertia="{moments}"/>\n'
+        f'      <joint name="{joint}" type="hinge" axis="0 1 0" damping="{n["damping"]!r}" '
+        f'armature="{n["armature"]!r}"/>'
+    )

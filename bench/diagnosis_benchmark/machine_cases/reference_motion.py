@@ -1,0 +1,286 @@
+"""Integration of machine motion by Runge-Kutta 4 with dry friction; applied inputs and encoders.
+
+Within a step, each joint with dry friction either keeps its direction of motion or is stuck. If a
+joint comes to rest within a step, the rest of that step is computed separately: the joint sticks,
+or continues with friction in the other direction (E. Hairer, S. P. Norsett, G. Wanner, Solving
+Ordinary Differential Equations I, 1993, section II.6, for steps up to a change of the law).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.diagnosis_benchmark.machine_cases.machine_dynamics import Effects, MachineDynamics
+from sims.core.simulator import Array
+
+SMOOTH_STEP_SECONDS = 1e-3
+"""Step size without dry friction, seconds."""
+FRICTION_STEP_SECONDS = 5e-4
+"""Step size with dry friction, seconds."""
+_BREAK_AWAY_TOLERANCE = 1e-9
+"""Relative amount by which a force must exceed the dry friction limit to break a joint away."""
+
+
+class MachineRuns(NamedTuple):
+    """Runs of equal length, simulated together.
+
+    Attributes:
+        times: evenly spaced times from the first sample, seconds, (T,).
+        commands: commands, each held until the next sample, (L, T, N).
+        q: initial positions, (L, N).
+        v: initial velocities, (L, N).
+    """
+
+    times: Array
+    commands: Array
+    q: Array
+    v: Array
+
+
+class MachineMotion(NamedTuple):
+    """Simulated motion.
+
+    Attributes:
+        times: times of the steps, (K,).
+        q: positions, (K, L, N).
+        v: velocities, (K, L, N).
+    """
+
+    times: Array
+    q: Array
+    v: Array
+
+
+def simulate_machine(
+    plant: MachineDynamics, runs: MachineRuns, coarse: float = 1.0
+) -> MachineMotion:
+    """Simulate the motion of a machine.
+
+    Args:
+        plant: the machine.
+        runs: initial states and commands.
+        coarse: factor of the step size.
+    """
+    rate = runs.times[1] - runs.times[0]
+    wanted = coarse * (
+        FRICTION_STEP_SECONDS if plant.has_dry_friction.any() else SMOOTH_STEP_SECONDS
+    )
+    parts = int(np.ceil(rate / wanted - 1e-9))
+    times = np.linspace(0.0, runs.times[-1], (len(runs.times) - 1) * parts + 1)
+    felt = compute_applied_inputs(runs, plant, times)
+    mover = _MachineIntegrator(plant, runs.q, runs.v)
+    q, v = [mover.q], [mover.v]
+    for k, t in enumerate(times[:-1].tolist()):
+        mover.step(t, float(times[k + 1]) - t, felt[:, k])
+        q.append(mover.q)
+        v.append(mover.v)
+    return MachineMotion(times, np.array(q), np.array(v))
+
+
+class _MachineIntegrator:
+    def __init__(self, plant: MachineDynamics, q: Array, v: Array) -> None:
+        self.plant, self.q, self.v = plant, q.copy(), v.copy()
+        self.rubs = plant.has_dry_friction
+        self.dry = bool(self.rubs.any())
+        self.way = np.zeros_like(q)
+        self.held = np.zeros(q.shape, dtype=bool)
+
+    def step(self, t: float, h: float, u: Array) -> None:
+        if self.dry:
+            self._decide(t, u)
+        q, v = self.q, self.v
+        a1 = self._acceleration(t, q, v, u)
+        v2 = v + 0.5 * h * a1
+        a2 = self._acceleration(t + 0.5 * h, q + 0.5 * h * v, v2, u)
+        v3 = v + 0.5 * h * a2
+        a3 = self._acceleration(t + 0.5 * h, q + 0.5 * h * v2, v3, u)
+        v4 = v + h * a3
+        a4 = self._acceleration(t + h, q + h * v3, v4, u)
+        self.q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
+        self.v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        if self.dry:
+            self._turn(t, h, u, v)
+
+    def _acceleration(self, t: float, q: Array, v: Array, u: Array) -> Array:
+        force = self.plant.compute_force(t, q, v, u)
+        if self.dry:
+            force = force - self.way * self.plant.compute_friction_limit(q, v)
+        return self._solved(q, force)
+
+    def _solved(self, q: Array, force: Array) -> Array:
+        """Compute the accelerations (L, N); those of stuck joints are zero."""
+        free = ~self.held
+        inertia = self.plant.compute_mass_matrix(q)
+        if self.held.any():
+            inertia = np.where(free[:, :, None] & free[:, None], inertia, 0.0)
+            inertia += np.eye(q.shape[1]) * self.held[:, :, None]
+            force = np.where(free, force, 0.0)
+        one = q.shape[1] == 1
+        solved = (
+            force / inertia[:, 0] if one else np.linalg.solve(inertia, force[:, :, None])[..., 0]
+        )
+        return np.asarray(solved, dtype=np.float64)
+
+    def _decide(self, t: float, u: Array) -> None:
+        """Decide which joints at rest are stuck, and in which direction the others move."""
+        resting = self.rubs & (self.v == 0.0)
+        self.way = np.where(self.rubs & ~resting, np.sign(self.v), 0.0)
+        self.held = resting
+        if not resting.any():
+            return
+        limit = self.plant.compute_friction_limit(self.q, self.v)
+        force = self.plant.compute_force(t, self.q, self.v, u) - self.way * limit
+        accelerations = self._solved(self.q, force)
+        # Force needed to hold a joint still while the others move.
+        need = force - np.einsum(
+            "lij,lj->li", self.plant.compute_mass_matrix(self.q), accelerations
+        )
+        loose = resting & (np.abs(need) > limit * (1 + _BREAK_AWAY_TOLERANCE))
+        self.way = np.where(loose, np.sign(need), self.way)
+        self.held = resting & ~loose
+
+    def _turn(self, t: float, h: float, u: Array, before: Array) -> None:
+        """Recompute the rest of the step for joints that came to rest within it."""
+        turned = (self.way * self.v < 0.0) & (self.way * before >= 0.0)
+        if not turned.any():
+            return
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = np.where(turned, self.v / (self.v - before), 0.0) * h
+        q = self.q - np.where(turned, 0.5 * self.v * left, 0.0)
+        v = np.where(turned, 0.0, self.v)
+        self.q, self.v = q, v
+        self._decide(t + h, u)
+        onward = np.where(turned, self._acceleration(t + h, q, v, u), 0.0)
+        self.q, self.v = q + 0.5 * onward * left**2, v + onward * left
+
+
+def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Array) -> Array:
+    """Compute the mean applied input over each step.
+
+    Args:
+        runs: the runs with their commands.
+        plant: the machine with its effects.
+        times: times of the steps, (K + 1,).
+
+    Returns:
+        Applied inputs, (L, K, N).
+    """
+    lanes, _, joints = runs.commands.shape
+    felt = np.empty((lanes, len(times) - 1, joints))
+    for joint, motor in enumerate(plant.motors):
+        own = {
+            name.partition("@")[0]: c
+            for name, c in plant.effects.items()
+            if name.startswith("input.") and name.partition("@")[2] in ("", motor)
+        }
+        for lane in range(lanes):
+            levels: Array = runs.commands[lane, :, joint]
+            for name, c in own.items():
+                levels = np.asarray(_apply_static_effects(name, c[0], levels), dtype=np.float64)
+            late = own.get("input.delay", (0.0,))[0]
+            lag = own.get("input.lag", (0.0,))[0]
+            felt[lane, :, joint] = _means(runs.times, levels, times, late, lag)
+    return felt
+
+
+def _apply_static_effects(name: str, c: float, u: Array) -> Array:
+    """Apply an effect without memory to a command."""
+    match name:
+        case "input.gain":
+            return (1 + c) * u
+        case "input.bias":
+            return u + c
+        case "input.deadband":
+            return np.sign(u) * np.maximum(np.abs(u) - c, 0.0)
+        case "input.saturation":
+            return np.clip(u, -c, c)
+    return u
+
+
+def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) -> Array:
+    """Average levels over each step, with a zero-order hold, a delay and a lag."""
+    # The first level holds before the first sample, the last one after the last sample.
+    ends = np.append(stamps[1:], times[-1] + 1.0)
+    area = np.concatenate([[0.0], np.cumsum(levels * (ends - stamps))])
+    at = times - late
+
+    def integral(t: Array) -> Array:
+        held: Array = np.interp(t, np.append(stamps, ends[-1]), area)
+        return np.where(t < 0, levels[0] * t, held)
+
+    over = integral(at)
+    if lag > 0:
+        # x' = (u - x) / lag, so the integral of x is that of u minus lag times the change of x.
+        over = over - lag * _apply_lag(stamps, levels, at, lag)
+    return np.diff(over) / np.diff(times)
+
+
+def _apply_lag(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
+    """Evaluate a first-order lag of the levels at given times; it starts at the first level."""
+    reached = np.empty_like(levels)
+    reached[0] = levels[0]
+    decay = np.exp(-np.diff(stamps) / lag)
+    for k in range(len(stamps) - 1):
+        reached[k + 1] = levels[k] + (reached[k] - levels[k]) * decay[k]
+    place = np.clip(np.searchsorted(stamps, at, side="right") - 1, 0, None)
+    since = np.maximum(at - stamps[place], 0.0)
+    followed: Array = levels[place] + (reached[place] - levels[place]) * np.exp(-since / lag)
+    return followed
+
+
+def read_encoders(motion: MachineMotion, plant: MachineDynamics, times: Array) -> Array:
+    """Compute the encoder readings at the sample times.
+
+    Args:
+        motion: simulated motion.
+        plant: the machine with its effects.
+        times: sample times, (T,).
+
+    Returns:
+        Readings, (L, T, N).
+    """
+    lanes, joints = motion.q.shape[1:]
+    seen = np.empty((lanes, len(times), joints))
+    for joint, channel in enumerate(plant.channels):
+        own = select_sensor_effects(plant.effects, channel)
+        at = np.maximum(times - own.get("sensor.delay", (0.0,))[0], 0.0)
+        values = _interpolate_positions(motion, at)[:, :, joint].T
+        values = values * (1 + own.get("sensor.gain", (0.0,))[0])
+        values = values + own.get("sensor.bias", (0.0,))[0]
+        seen[:, :, joint] = values + own.get("sensor.drift", (0.0,))[0] * times
+    return seen
+
+
+def select_sensor_effects(effects: Effects, channel: str) -> dict[str, tuple[float, ...]]:
+    """Select the effects on the sensor of a channel.
+
+    Args:
+        effects: coefficients by name, with or without a place.
+        channel: name of the channel.
+
+    Returns:
+        Coefficients by name without the place.
+    """
+    return {
+        name.partition("@")[0]: tuple(c)
+        for name, c in effects.items()
+        if name.startswith("sensor.") and name.partition("@")[2] in ("", channel)
+    }
+
+
+def _interpolate_positions(motion: MachineMotion, at: Array) -> Array:
+    """Interpolate the positions (T, L, N) by cubic Hermite polynomials."""
+    h = motion.times[1] - motion.times[0]
+    place = np.clip((at / h).astype(int), 0, len(motion.times) - 2)
+    s = ((at - motion.times[place]) / h)[:, None, None]
+    q0, q1 = motion.q[place], motion.q[place + 1]
+    v0, v1 = motion.v[place] * h, motion.v[place + 1] * h
+    found: Array = (
+        q0 * (1 + 2 * s) * (1 - s) ** 2
+        + v0 * s * (1 - s) ** 2
+        + q1 * s**2 * (3 - 2 * s)
+        + v1 * s**2 * (s - 1)
+    )
+    return found

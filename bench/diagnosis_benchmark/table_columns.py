@@ -1,0 +1,125 @@
+"""Columns of all tables of a comparison of diagnosers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+
+from bench.benchmark.storage.csv_reader import CsvTable
+from bench.benchmark.storage.table_schemas import Columns, ColumnSpec, EmptyCellRule
+from bench.diagnosis_benchmark.case_generation.benchmark_case import CASE_KINDS
+from bench.diagnosis_benchmark.result_tables import PRIMARY_METRIC
+from bench.diagnosis_benchmark.wrong_answers import FAILURE_COLUMNS as FAILED
+
+
+def _text(name: str) -> ColumnSpec:
+    return ColumnSpec(name, str, empty=EmptyCellRule.MAY)
+
+
+def _count(name: str) -> ColumnSpec:
+    return ColumnSpec(name, int, low=0)
+
+
+def _size(name: str) -> ColumnSpec:
+    return ColumnSpec(name, float, low=0.0, empty=EmptyCellRule.MAY)
+
+
+def _share(name: str) -> ColumnSpec:
+    return ColumnSpec(name, float, low=0.0, high=1.0, empty=EmptyCellRule.MAY)
+
+
+_COUNTED = (_count("count"), _count("of"), *(_share(name) for name in ("share", "low", "high")))
+_KIND = ColumnSpec("kind", str, words=CASE_KINDS)
+_ITEM: Columns = (
+    *(ColumnSpec(name, str) for name in ("question", "diagnoser")),
+    _KIND,
+    ColumnSpec("system", str),
+    _text("hidden"),
+    ColumnSpec("noise", str),
+    ColumnSpec("stated", bool),
+    _count("rate"),
+    _count("runs"),
+    ColumnSpec("source", str),
+    ColumnSpec("driven", bool),
+    *(_size(name) for name in ("size", "beyond", "run_seconds")),
+    *(_text(name) for name in ("channels", "status", "reason", "verdict", "named")),
+    ColumnSpec("outcome", str),
+    *(_count(name) for name in ("set_size", "class_size", "largest_set")),
+    *(ColumnSpec(name, bool) for name in ("found", "found_class", "alarm")),
+    _share("p_value"),
+    *(_count(name) for name in ("intervals", "holding", "simulations")),
+    *(_size(name) for name in ("seconds", "processor_seconds")),
+    ColumnSpec("trusted", bool),
+)
+_BY_NAME = {column.name: column for column in _ITEM} | {"right_by": ColumnSpec("right_by", str)}
+_QUANTILES = [
+    f"{what}_{part}"
+    for what in ("simulations", "processor_seconds", "seconds")
+    for part in ("median", "p95")
+]
+
+TABLE_COLUMNS: Mapping[str, Columns] = {
+    "table": (ColumnSpec("diagnoser", str), ColumnSpec("metric", str), *_COUNTED),
+    "failures": tuple(_BY_NAME[name] for name in FAILED),
+    "groups": (
+        *(ColumnSpec(name, str) for name in ("diagnoser", "metric", "by", "value")),
+        *_COUNTED,
+    ),
+    "power": (ColumnSpec("diagnoser", str), _size("size"), ColumnSpec("metric", str), *_COUNTED),
+    "confusion": (
+        *(ColumnSpec(name, str) for name in ("diagnoser", "hidden", "said")),
+        _count("count"),
+    ),
+    "calibration": (ColumnSpec("diagnoser", str), _share("level"), *_COUNTED),
+    "sets": (ColumnSpec("diagnoser", str), ColumnSpec("largest_set", str), *_COUNTED),
+    "costs": (
+        ColumnSpec("diagnoser", str),
+        _count("answers"),
+        *(_size(name) for name in _QUANTILES),
+        _count("training_simulations"),
+        _size("training_seconds"),
+    ),
+    "pairs": (
+        ColumnSpec("metric", str),
+        ColumnSpec("diagnoser", str),
+        *(_count(name) for name in ("questions", "only_simgap", "only_other")),
+        *(_share(name) for name in ("p_value", "p_holm")),
+    ),
+    "items": _ITEM,
+}
+"""Columns of each table, by the name of its file."""
+STATUS_COLUMNS = ("question", "diagnoser", "status", "reason", "simulations", "seconds")
+"""Columns of items.csv that describe how an answer was produced."""
+
+
+def read_table(folder: Path, name: str) -> pd.DataFrame:
+    """Read a table of a comparison of diagnosers.
+
+    Args:
+        folder: result folder of the comparison.
+        name: one of `TABLE_COLUMNS`.
+
+    Raises:
+        InputError: the file does not exist or is damaged.
+    """
+    path = folder / f"{name}.csv"
+    remedy = f"simgap plot {folder} writes it again"
+    table: pd.DataFrame = CsvTable(path, TABLE_COLUMNS[name], remedy).table.to_pandas()
+    return table
+
+
+def build_leaderboard(table: pd.DataFrame) -> pd.DataFrame:
+    """Build the leaderboard: one row per diagnoser and one column per metric.
+
+    Args:
+        table: the table of all metrics, see `result_tables.build_metric_table`.
+
+    Returns:
+        Fractions; the diagnoser with the highest primary metric comes first.
+    """
+    wide = table.pivot(index="diagnoser", columns="metric", values="share")
+    wide = wide[list(dict.fromkeys(table["metric"]))]
+    named: pd.DataFrame = wide.sort_values(PRIMARY_METRIC, ascending=False, kind="stable")
+    return named.rename_axis(columns=None).reset_index()

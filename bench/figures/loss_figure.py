@@ -1,0 +1,76 @@
+"""Draw the figure of a training: training loss and held-out loss against epoch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.figures.style import BLUE, ORANGE, make_panel_grid, write_figure
+from sims.core.simulator import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LossRow = tuple[int, str, int, float, float]
+"""Seed, stage, epoch, training loss, held-out loss."""
+_STAGES = {"clean": "Network for targets without noise", "noisy": "Network for noisy targets"}
+
+
+def write_loss_figure(folder: Path, title: str, rows: Sequence[LossRow]) -> Path:
+    """Draw the losses into `folder`/figures.
+
+    Args:
+        folder: Folder of the results.
+        title: Title above the figure.
+        rows: Losses of all epochs.
+
+    Returns:
+        Path of the PNG file.
+
+    Raises:
+        InputError: The folder cannot be made or written to.
+    """
+    return write_figure(draw_loss_figure(title, rows), folder / "figures" / "loss")[0]
+
+
+def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
+    """Draw loss against epoch, one panel per stage.
+
+    Args:
+        title: Title above the figure.
+        rows: Losses of all epochs.
+    """
+    # In the order in which they were trained.
+    stages = list(dict.fromkeys(row[1] for row in rows))
+    seeds = sorted({row[0] for row in rows})
+    figure, axes = make_panel_grid(1, len(stages), (1.0 + 4.0 * len(stages), 3.4), sharey=True)
+    for axis, stage in zip(axes[0], stages, strict=True):
+        for seed in seeds:
+            values = np.array([row[2:] for row in rows if row[:2] == (seed, stage)])
+            # The legend lists the lines of the first seed only.
+            _lines(axis, values.T, named=seed == seeds[0])
+        axis.set(
+            title=_STAGES.get(stage, stage),
+            xlabel="epoch (pass over the training data)",
+            yscale="log",
+        )
+        axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("loss (weighted squared error of\nthe estimated difference)")
+    axes[0, 0].legend()
+    count = f"{len(seeds)} training{'s' * (len(seeds) > 1)}"
+    figure.suptitle(f"{title} (held out: others); {count}", fontsize=11)
+    return figure
+
+
+def _lines(axis: Axes, values: Array, named: bool) -> None:
+    """Draw one training; `values` are (3, epochs): epoch, training loss, held-out loss."""
+    epochs, training, held_out = values
+    for losses, line, colour, name in (
+        (training, "-", BLUE, "training"),
+        (held_out, "--", ORANGE, "held out"),
+    ):
+        axis.plot(epochs, losses, line, color=colour, lw=1.2, label=name if named else None)

@@ -1,0 +1,168 @@
+"""Render a robot without a window, in a separate process that may fail.
+
+A missing or broken OpenGL raises an exception, prints, or ends its process; and its kind is fixed
+when MuJoCo is first imported. Therefore a child process renders, its output is hidden from the
+terminal, and if it fails there is no image.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.figures.robot_view import Projection
+from sims.core.simulator import Array
+
+Image = NDArray[np.uint8]
+MAX_IMAGE_PIXELS = 900
+"""Size of the longer side of an image, in pixels."""
+RENDER_TIMEOUT_SECONDS = 60.0
+"""Time limit for rendering an image, in seconds."""
+CAMERA_DISTANCE_FACTOR = 4.0
+"""Ratio of the camera's distance to the size of the scene; no part reaches behind it."""
+_START = (
+    "import sys; sys.path[:] = {path!r}; "
+    "from bench.figures.offscreen_rendering import render_requested; render_requested(sys.argv[1])"
+)
+_failed: set[str] = set()
+"""OpenGL backends that failed in this process; each is tried only once."""
+
+
+def list_gl_backends() -> tuple[str, ...]:
+    """List the OpenGL backends to try, by MuJoCo's names; none if the user has disabled it."""
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if chosen in ("disable", "disabled", "off", "false", "0"):
+        return ()
+    # On other platforms MuJoCo's default needs no window.
+    usual = ("egl", "osmesa") if sys.platform.startswith("linux") else ("",)
+    return (chosen, *usual) if chosen in ("egl", "osmesa") else usual
+
+
+def render_robot(model: Any, positions: Array, view: Projection) -> Image | None:
+    """Render the robot in grey on white.
+
+    Args:
+        model: mujoco.MjModel.
+        positions: (nq,) positions of its joints.
+        view: Camera view.
+
+    Returns:
+        (H, W, 3) image; None if this machine cannot render it.
+    """
+    for backend in list_gl_backends():
+        if backend in _failed:
+            continue
+        image = _asked(backend, model, positions, view)
+        if image is not None:
+            return image
+        _failed.add(backend)
+    return None
+
+
+def _asked(backend: str, model: Any, positions: Array, view: Projection) -> Image | None:
+    """Render the image with one OpenGL backend; return None if it fails."""
+    import mujoco
+
+    environment = dict(os.environ)
+    # This variable of the user would select another backend.
+    environment.pop("PYOPENGL_PLATFORM", None)
+    if backend:
+        environment["MUJOCO_GL"] = backend
+    with TemporaryDirectory(prefix="simgap-picture-") as name:
+        folder = Path(name)
+        mujoco.mj_saveModel(model, str(folder / "model.mjb"), None)
+        shown = (view.azimuth, view.elevation, view.width, view.height)
+        np.savez(folder / "view.npz", qpos=positions, centre=view.centre, shown=shown)
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", _START.format(path=sys.path), str(folder)],
+                env=environment,
+                capture_output=True,
+                stdin=subprocess.DEVNULL,
+                timeout=RENDER_TIMEOUT_SECONDS,
+                check=False,
+            )
+            image: Image = np.load(folder / "image.npy")
+        except (OSError, ValueError, subprocess.TimeoutExpired):
+            return None
+    return image if done.returncode == 0 else None
+
+
+def render_requested(folder: str) -> None:
+    """Render the request that `_asked` has stored in a folder; any error ends the process."""
+    import mujoco
+
+    place = Path(folder)
+    model = mujoco.MjModel.from_binary_path(str(place / "model.mjb"))
+    asked = np.load(place / "view.npz")
+    azimuth, elevation, width, height = asked["shown"].tolist()
+    view = Projection(azimuth, elevation, asked["centre"], width, height)
+    data = mujoco.MjData(model)
+    data.qpos[:] = asked["qpos"]
+    mujoco.mj_forward(model, data)
+    np.save(place / "image.npy", _drawn(mujoco, model, data, view))
+
+
+def _drawn(mujoco: Any, model: Any, data: Any, view: Projection) -> Image:
+    """Render the robot in grey on a white background."""
+    scale = MAX_IMAGE_PIXELS / max(view.width, view.height)
+    rows, columns = (max(2, round(scale * size)) for size in (view.height, view.width))
+    whole = model.vis.global_
+    whole.offwidth, whole.offheight = columns, rows
+    # In an orthographic projection, fovy is the visible height.
+    whole.orthographic, whole.fovy = 1, view.height
+    size = float(np.hypot(view.width, view.height))
+    model.stat.extent = size
+    model.vis.map.znear, model.vis.map.zfar = 0.01, 3 * CAMERA_DISTANCE_FACTOR
+    # Shadows and reflections give no information about places.
+    model.light_castshadow[:] = 0
+    model.mat_reflectance[:] = 0
+    _without_ground(mujoco, model)
+
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    camera.azimuth, camera.elevation = view.azimuth, view.elevation
+    camera.lookat[:], camera.distance = view.centre, CAMERA_DISTANCE_FACTOR * size
+    with mujoco.Renderer(model, rows, columns) as renderer:
+        renderer.update_scene(data, camera)
+        colours = renderer.render().astype(np.float64)
+        renderer.enable_segmentation_rendering()
+        renderer.update_scene(data, camera)
+        shape = renderer.render()[:, :, 0] >= 0
+    return convert_to_grey(colours, shape)
+
+
+def convert_to_grey(colours: Array, shape: NDArray[np.bool_]) -> Image:
+    """Convert an image to light greys on white, so that marks are clearly visible.
+
+    Args:
+        colours: (H, W, 3) colours from 0 to 255.
+        shape: (H, W) mask of the robot.
+
+    Returns:
+        (H, W, 3) grey image.
+    """
+    # Luma of ITU-R BT.601.
+    luma = colours @ (0.299, 0.587, 0.114)
+    seen = luma[shape]
+    low, high = np.quantile(seen, [0.02, 0.98]) if seen.size else (0.0, 1.0)
+    # The robot's own range of luma is mapped to medium to light grey.
+    share = np.clip((luma - low) / max(high - low, 1.0), 0.0, 1.0)
+    grey = np.where(shape, 120 + 112 * share, 255)
+    return np.repeat(grey.round().astype(np.uint8)[:, :, None], 3, axis=2)
+
+
+def _without_ground(mujoco: Any, model: Any) -> None:
+    """Hide floors, which would fill the image."""
+    endless = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+    for g in range(model.ngeom):
+        if int(model.geom_type[g]) in endless:
+            model.geom_matid[g] = -1
+            model.geom_rgba[g, 3] = 0.0

@@ -1,0 +1,195 @@
+"""Draw a recording: every input and channel over time, runs end to end, held-out runs shaded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bench.figures.style import (
+    BLUE,
+    HELD_OUT_GREY,
+    RUN_SEPARATOR_GREY,
+    RUST,
+    make_panel_grid,
+    write_figure,
+)
+from bench.logs.signal_statistics import list_recorded_signals
+from sims.core.simulator import Array, Simulator
+from sims.recording.recording import Recording, Run
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+_MOST_RUNS = 40
+"""Maximum number of runs that are drawn; of more, evenly spaced ones are drawn."""
+_MOST_POINTS = 4000
+"""Maximum number of points per run; of a longer run the extremes of each part are drawn."""
+_FEW_SAMPLES = 60
+"""Maximum number of samples of a run for which each sample has a marker."""
+_RUN_GAP_SHARE = 0.015
+"""Gap between runs on the time axis, times the root of their number, over their total length."""
+_DPI = 150
+_FITTING = BLUE
+_HELD_OUT = RUST
+
+
+class _PlacedRun(NamedTuple):
+    """A run on the common time axis, where its first sample is drawn at `begin`."""
+
+    run: Run
+    begin: float
+
+    @property
+    def times(self) -> Array:
+        shifted: Array = self.run.times - self.run.times[0] + self.begin
+        return shifted
+
+
+def write_recording_figure(recording: Recording, kind: type[Simulator], folder: Path) -> list[Path]:
+    """Write the figure of a recording into `folder` as PNG, and as PDF if requested.
+
+    Args:
+        recording: Recording to draw.
+        kind: Simulator class of its system.
+        folder: Folder to write.
+
+    Returns:
+        Paths of the files, named after the recording.
+
+    Raises:
+        InputError: The folder cannot be made or written to.
+    """
+    return write_figure(draw_recording_figure(recording, kind), folder / recording.path.stem, _DPI)
+
+
+def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure:
+    """Draw a recording with a panel for each input and channel.
+
+    Args:
+        recording: Recording to draw.
+        kind: Simulator class of its system, which declares names and units.
+    """
+    signals = list_recorded_signals(recording, kind)
+    placed = _placed(recording.runs)
+    width = float(np.clip(3 + 0.8 * len(placed), 9, 16))
+    figure, axes = make_panel_grid(len(signals), 1, (width, 1.2 + 2.0 * len(signals)), sharex=True)
+    for axis, (channel, what) in zip(axes[:, 0], signals, strict=True):
+        unit = "" if channel.unit == "1" else f" [{_pretty(channel.unit)}]"
+        axis.set_ylabel(f"{channel.name}{unit}\n({what})")
+        for part in placed:
+            values = part.run.channels.get(channel.name)
+            _panel(axis, part, part.run.inputs[channel.name] if values is None else values)
+    panels = list(axes[:, 0])
+    _finish(panels, placed)
+    _named(panels[0], placed)
+    _titled(panels[0], recording, placed)
+    figure.legend(
+        handles=_marks(recording, placed),
+        loc="outside lower center",
+        ncols=3,
+        fontsize=8,
+        frameon=False,
+    )
+    return figure
+
+
+def _pretty(unit: str) -> str:
+    return unit.replace("^2", "²").replace("^3", "³").replace("*", "·")
+
+
+def _placed(runs: Sequence[Run]) -> list[_PlacedRun]:
+    """Place runs end to end with small gaps; of too many runs, use evenly spaced ones."""
+    if len(runs) > _MOST_RUNS:
+        chosen = np.linspace(0, len(runs) - 1, _MOST_RUNS).round().astype(int)
+        runs = [runs[i] for i in chosen]
+    # The more runs, the smaller the gaps between them.
+    lengths = [float(run.times[-1] - run.times[0]) for run in runs]
+    apart = _RUN_GAP_SHARE * sum(lengths) / max(1.0, len(runs) ** 0.5)
+    begins = np.concatenate([[0.0], np.cumsum(np.array(lengths) + apart)[:-1]])
+    return [_PlacedRun(run, float(begin)) for run, begin in zip(runs, begins, strict=True)]
+
+
+def _panel(axis: Axes, part: _PlacedRun, values: Array) -> None:
+    """Draw one signal of one run."""
+    times = part.times
+    if part.run.held_out:
+        axis.axvspan(float(times[0]), float(times[-1]), color=HELD_OUT_GREY, linewidth=0)
+    missing = np.isnan(values)
+    t, y = _decimate(times, values)
+    # A sample between two missing ones forms no line and needs a marker to be visible.
+    marked = values.size <= _FEW_SAMPLES or missing.mean() > 0.2
+    colour = _HELD_OUT if part.run.held_out else _FITTING
+    marker = "." if marked else ""
+    axis.plot(t, y, color=colour, linewidth=0.9, marker=marker, markersize=3, linestyle="-")
+    if missing.any():
+        foot = np.full(missing.sum(), 0.02)
+        across = axis.get_xaxis_transform()
+        axis.plot(times[missing], foot, "|", color="black", markersize=5, transform=across)
+
+
+def _decimate(times: Array, values: Array) -> tuple[Array, Array]:
+    """Decimate a signal to about `_MOST_POINTS` points: the extremes of each part."""
+    if values.size <= _MOST_POINTS:
+        return times, values
+    size = -(-values.size // (_MOST_POINTS // 2))
+    keep = set()
+    for begin in range(0, values.size, size):
+        stretch = values[begin : begin + size]
+        if np.isfinite(stretch).any():
+            keep |= {begin + int(np.nanargmin(stretch)), begin + int(np.nanargmax(stretch))}
+        else:
+            # One missing sample keeps the gap open.
+            keep.add(begin)
+    rows = np.array(sorted(keep))
+    return times[rows], values[rows]
+
+
+def _finish(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
+    for axis in axes:
+        axis.grid(visible=True, axis="y", linewidth=0.4, alpha=0.5)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.margins(x=0.01)
+        for part in placed[1:]:
+            axis.axvline(part.begin, color=RUN_SEPARATOR_GREY, linewidth=0.5, linestyle=":")
+    axes[-1].set_xlabel("time, runs end to end [s]; above: their names")
+
+
+def _named(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
+    """Write the names of the runs above the first panel."""
+    for part in placed:
+        middle = float(part.times[[0, -1]].mean())
+        axis.annotate(
+            part.run.name,
+            (middle, 1.0),
+            (0, 2),
+            xycoords=axis.get_xaxis_transform(),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=8 if len(placed) <= 20 else 6,
+            annotation_clip=False,
+        )
+
+
+def _titled(axis: Axes, recording: Recording, placed: Sequence[_PlacedRun]) -> None:
+    total = len(recording.runs)
+    some = f", {len(placed)} of {total} runs" if len(placed) < total else ""
+    axis.set_title(f"{recording.title}{some}", fontsize=11, pad=16)
+
+
+def _marks(recording: Recording, placed: Sequence[_PlacedRun]) -> list[Line2D]:
+    """Make the legend entries for the marks that are present."""
+    from matplotlib.lines import Line2D
+
+    marks = [Line2D([], [], color=_FITTING, label="for fitting")]
+    if recording.held_out():
+        marks.append(Line2D([], [], color=_HELD_OUT, label="held out (grey ground)"))
+    if any(np.isnan(values).any() for part in placed for values in part.run.channels.values()):
+        gap = Line2D([], [], color="black", marker="|", linestyle="", label="missing sample")
+        marks.append(gap)
+    return marks

@@ -1,0 +1,346 @@
+"""Draw a robot at a pose, with the places of a verdict marked.
+
+The robot is rendered if this machine can do so, else drawn as links and joints; places are marked
+identically in both. Labels are arranged in columns at both sides, each connected to its place by a
+line, so that no label covers another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from bench.figures.offscreen_rendering import render_robot
+from bench.figures.robot_skeleton import compute_link_segments, draw_skeleton
+from bench.figures.robot_view import Projection, choose_projection, locate_place, make_posed_data
+from bench.figures.style import BLUE, CAPTION_GREY, NEUTRAL_MARK, make_panel_grid
+from bench.figures.text_layout import break_name
+from sims.core.simulator import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from sims.robot.robot_model import RobotModel
+
+MAX_SIDE_INCHES = 4.4
+"""Length of the longer side of the drawing, in inches."""
+MIN_LABEL_COLUMN_INCHES = 2.1
+"""Minimum width of a column of labels, in inches."""
+LETTER_WIDTH_INCHES = 0.083
+"""Average width of a letter of a label, in inches."""
+SCALE_BAR_HEIGHT_INCHES = 0.55
+"""Height below the drawing for the scale bar, in inches."""
+MAX_NAMED_JOINTS = 12
+"""Maximum number of joints that are all named; with more, only marked joints are named."""
+MAX_LABEL_LINE_LENGTH = 34
+"""Maximum length of a line of a label, in characters."""
+MOST_LETTERS = 120
+"""Maximum length of a text in a label, which may have several lines, in characters."""
+_LINE = 0.155
+"""Distance between lines of a label, in inches."""
+_BETWEEN = 0.09
+"""Distance between labels, in inches."""
+_SIZES: Mapping[str, tuple[str, float]] = {
+    "joint": ("o", 17.0),
+    "actuator": ("s", 22.0),
+    "body": ("D", 17.0),
+    "channel": ("^", 25.0),
+}
+"""Marker shape and size in points by the kind of place.
+
+The sizes differ so that two marks at one place are both visible.
+"""
+
+
+@dataclass(frozen=True)
+class PlaceMark:
+    """A place to mark.
+
+    Attributes:
+        kind: ``joint``, ``actuator``, ``body`` or ``channel``.
+        name: Name of the place.
+        says: Effect at the place, such as ``Coulomb friction``; may be empty.
+        is_certain: Whether the place is certain; it is drawn dashed if it may be another place.
+    """
+
+    kind: str
+    name: str
+    says: str = ""
+    is_certain: bool = True
+
+
+class _Label(NamedTuple):
+    """A label: its lines, its (2,) point in metres, and whether that point is marked."""
+
+    lines: tuple[str, ...]
+    point: Array
+    marked: bool
+
+    @property
+    def height(self) -> float:
+        """Height in inches."""
+        return _LINE * len(self.lines) + _BETWEEN
+
+
+def draw_robot_figure(
+    robot: RobotModel,
+    positions: Mapping[str, float],
+    marks: Sequence[PlaceMark] = (),
+    least: float = 0.0,
+) -> Figure:
+    """Draw the robot at a pose, with places marked.
+
+    Args:
+        robot: Robot to draw.
+        positions: Positions by joint, rad or m; other joints keep the position of the model file.
+        marks: Places to mark; places that the robot does not have are ignored.
+        least: Minimum width of the figure in inches.
+    """
+    data = make_posed_data(robot, dict(positions))
+    seen_from = choose_projection(robot, data)
+    labels = _labels(robot, data, seen_from, marks)
+    sides = _sides(labels)
+    columns = [_breadth(side) for side in sides]
+    scale = MAX_SIDE_INCHES / max(seen_from.width, seen_from.height)
+    needed = max(_height(side) for side in sides)
+    width, height = scale * seen_from.width, scale * seen_from.height
+    tall = max(height, needed)
+    spare = max(0.0, least - sum(columns) - width) / 2
+    columns = [column + spare for column in columns]
+    size = (columns[0] + width + columns[1], tall + SCALE_BAR_HEIGHT_INCHES + 0.15)
+    figure, axes = make_panel_grid(1, 1, size, layout=None)
+    axis = axes[0, 0]
+    below = (SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2) / size[1]
+    axis.set_position((columns[0] / size[0], below, width / size[0], height / size[1]))
+    axis.set_axis_off()
+    across, up = seen_from.width / 2, seen_from.height / 2
+    axis.set(xlim=(-across, across), ylim=(-up, up))
+    axis.set_autoscale_on(False)
+
+    image = (
+        render_robot(robot.compiled, data.qpos.copy(), seen_from) if _has_shapes(robot) else None
+    )
+    if image is None:
+        draw_skeleton(axis, robot, data, seen_from)
+    else:
+        axis.imshow(image, extent=(-across, across, -up, up), zorder=0, aspect="auto")
+        # Shapes may be missing between joints, if their meshes are absent or were never drawn.
+        for ends in compute_link_segments(robot, data):
+            axis.plot(
+                *seen_from.project(np.stack(ends)).T, color=CAPTION_GREY, linewidth=0.7, zorder=3
+            )
+        dots = seen_from.project(np.array([data.xanchor[j.id] for j in robot.joints]))
+        axis.plot(*dots.T, "o", color=NEUTRAL_MARK, markersize=3.5, zorder=4)
+    _draw_place_rings(axis, robot, data, seen_from, marks)
+    for side, ((left, right), begin) in enumerate(
+        zip(((1, 0), (0, 1)), (-0.12, 0.12), strict=True)
+    ):
+        _write(axis, sides[side], left * -across + right * across + begin / scale, scale, tall)
+    _draw_scale_bar(axis, seen_from, scale, tall)
+    return figure
+
+
+def compute_joint_positions(
+    figure: Figure, robot: RobotModel, positions: Mapping[str, float]
+) -> list[tuple[str, float, float]]:
+    """Compute the positions of the joints in a figure of the robot.
+
+    Args:
+        figure: Figure made by `draw_robot_figure`.
+        robot: The robot.
+        positions: Positions by joint of that figure.
+
+    Returns:
+        Name of each joint, and its position as fractions of width and height from the top left.
+    """
+    data = make_posed_data(robot, dict(positions))
+    seen_from = choose_projection(robot, data)
+    axis = figure.axes[0]
+    found = []
+    for joint in robot.joints:
+        point = seen_from.project(data.xanchor[joint.id][None])[0]
+        pixels = axis.transData.transform(point)
+        across, up = (pixels / figure.bbox.size).tolist()
+        found.append((joint.name, across, 1.0 - up))
+    return found
+
+
+def _has_shapes(robot: RobotModel) -> bool:
+    """Return whether there is anything to render; a robot without its meshes has no shapes."""
+    model = robot.compiled
+    return any(int(model.body_weldid[body]) for body in model.geom_bodyid.tolist())
+
+
+def _labels(
+    robot: RobotModel, data: Any, seen_from: Projection, marks: Sequence[PlaceMark]
+) -> list[_Label]:
+    """Make one label for each marked place, and for the other joints if there are few."""
+    said: dict[tuple[str, str], list[str]] = {}
+    for mark in marks:
+        lines = said.setdefault((mark.kind, mark.name), [])
+        lines += [mark.says] if mark.says and mark.says not in lines else []
+    if len(robot.joints) <= MAX_NAMED_JOINTS:
+        for joint in robot.joints:
+            said.setdefault(("joint", joint.name), [])
+    marked = {(mark.kind, mark.name) for mark in marks}
+    labels = []
+    for (kind, name), lines in said.items():
+        place = locate_place(robot, data, kind, name)
+        if place is None:
+            continue
+        # A name without a kind is a joint's.
+        title = name if kind == "joint" else f"{kind} {name}"
+        texts = [line[:MOST_LETTERS] for line in (title, *lines)]
+        lines = [
+            line for text in texts for line in break_name(text, MAX_LABEL_LINE_LENGTH).split("\n")
+        ]
+        point = seen_from.project(place[None])[0]
+        labels.append(_Label(tuple(lines), point, (kind, name) in marked))
+    return labels
+
+
+def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
+    """Divide labels between the left and the right column, each from top to bottom.
+
+    Each label is on the side of its place, as long as there is space.
+    """
+    across = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
+    count = sum(label.point[0] < 0 for label in across)
+    # A column is not longer than the drawing, unless both columns are.
+    while count and _height(across[:count]) > max(MAX_SIDE_INCHES, _height(across[count:])):
+        count -= 1
+    while count < len(across) and _height(across[count:]) > max(
+        MAX_SIDE_INCHES, _height(across[:count])
+    ):
+        count += 1
+    return _downwards(across[:count]), _downwards(across[count:])
+
+
+def _height(labels: Sequence[_Label]) -> float:
+    return sum(label.height for label in labels)
+
+
+def _breadth(labels: Sequence[_Label]) -> float:
+    """Return the width of a column in inches: its longest line and the connecting line."""
+    if not labels:
+        return 0.3
+    longest = max(len(line) for label in labels for line in label.lines)
+    return max(MIN_LABEL_COLUMN_INCHES, 0.3 + LETTER_WIDTH_INCHES * longest)
+
+
+def _downwards(labels: Sequence[_Label]) -> list[_Label]:
+    return sorted(labels, key=lambda label: -label.point[1])
+
+
+def arrange_labels(
+    wanted: Sequence[float], sizes: Sequence[float], low: float, high: float
+) -> Array:
+    """Compute (N,) middles of labels that do not overlap, close to the wanted ones.
+
+    One pass in each direction moves the labels apart.
+
+    Args:
+        wanted: (N,) wanted middles, from top to bottom.
+        sizes: (N,) heights of the labels.
+        low: Lower end of the column.
+        high: Upper end of the column, which has space for all labels.
+    """
+    middles = np.array(wanted, dtype=np.float64)
+    ceiling = high
+    for i, size in enumerate(sizes):
+        middles[i] = min(middles[i], ceiling - size / 2)
+        ceiling = middles[i] - size / 2
+    floor = low
+    for i in reversed(range(len(middles))):
+        middles[i] = max(middles[i], floor + sizes[i] / 2)
+        floor = middles[i] + sizes[i] / 2
+    return middles
+
+
+def _write(axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float) -> None:
+    """Write a column of labels at `x` metres.
+
+    `scale` is in inches per metre, `tall` is the height of the column in inches.
+    """
+    sizes = [label.height / scale for label in labels]
+    half = tall / scale / 2
+    middles = arrange_labels([label.point[1] for label in labels], sizes, -half, half)
+    for label, y in zip(labels, middles.tolist(), strict=True):
+        colour = "black" if label.marked else CAPTION_GREY
+        axis.annotate(
+            "\n".join(label.lines),
+            (label.point[0], label.point[1]),
+            (x, y),
+            ha="right" if x < 0 else "left",
+            va="center",
+            fontsize=9 if label.marked else 8,
+            weight="bold" if label.marked else "normal",
+            color=colour,
+            annotation_clip=False,
+            parse_math=False,
+            zorder=6,
+            arrowprops={
+                "arrowstyle": "-",
+                "color": colour,
+                "linewidth": 0.9 if label.marked else 0.5,
+                "shrinkA": 2,
+                "shrinkB": 9 if label.marked else 3,
+            },
+        )
+
+
+def _draw_place_rings(
+    axis: Axes, robot: RobotModel, data: Any, seen_from: Projection, marks: Sequence[PlaceMark]
+) -> None:
+    """Draw rings around places: solid if the place is certain, dashed otherwise."""
+    sure: dict[tuple[str, str], bool] = {}
+    for mark in marks:
+        key = mark.kind, mark.name
+        sure[key] = sure.get(key, False) or mark.is_certain
+    for (kind, name), whole in sure.items():
+        place = locate_place(robot, data, kind, name)
+        if place is None:
+            continue
+        shape, size = _SIZES.get(kind, _SIZES["joint"])
+        across, up = seen_from.project(place[None])[0].tolist()
+        # Markers cannot be dashed, so a ring is a scatter plot of one point.
+        axis.scatter(
+            across,
+            up,
+            s=size**2,
+            marker=shape,
+            facecolors="none",
+            edgecolors=BLUE,
+            linewidths=2.4,
+            linestyles="-" if whole else (0, (1.6, 1.0)),
+            zorder=5,
+            clip_on=False,
+        )
+
+
+def _draw_scale_bar(axis: Axes, seen_from: Projection, scale: float, tall: float) -> None:
+    """Draw a scale bar below the drawing, at the left."""
+    length = round_down_length(0.3 * seen_from.width)
+    left = -seen_from.width / 2
+    y = -tall / scale / 2 - 0.2 / scale
+    axis.plot(
+        [left, left + length],
+        [y, y],
+        color=NEUTRAL_MARK,
+        linewidth=2.2,
+        solid_capstyle="butt",
+        clip_on=False,
+    )
+    axis.text(
+        left + length / 2, y - 0.06 / scale, f"{length:g} m", ha="center", va="top", fontsize=8
+    )
+
+
+def round_down_length(most: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is at most `most`, in metres."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most))

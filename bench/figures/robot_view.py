@@ -1,0 +1,248 @@
+"""Choose the camera view of a robot that shows most of it, and locate its places.
+
+With f forward, r right and u up (orthogonal unit vectors) and c the centre, a point p is projected
+without perspective to
+
+    ((p - c) . r, (p - c) . u)                                                     (1)
+
+so that a metre has the same length everywhere in the picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError
+
+if TYPE_CHECKING:
+    from sims.robot.robot_model import RobotModel
+
+CANDIDATE_AZIMUTHS_DEG = tuple(range(0, 360, 30))
+"""Azimuths in degrees that are tried for a robot that moves in space."""
+ELEVATION_DEG = -25.0
+"""Elevation of the camera in degrees, slightly from above."""
+PARALLEL_SINE_TOLERANCE = 0.02
+"""Maximum sine of the angle between two axes that count as parallel."""
+STATIC_CONTEXT_SHARE = 0.3
+"""Maximum distance around the robot at which static shapes are shown, relative to its size."""
+MARGIN_SHARE = 0.06
+"""Empty margin at each side, as a fraction of the displayed size."""
+MIN_VIEW_METRES = 0.02
+"""Minimum width and height of a picture in metres."""
+MIN_ASPECT_RATIO = 0.3
+"""Minimum ratio of a picture's width to its height and vice versa, so that labels have space."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A parallel projection.
+
+    Attributes:
+        azimuth, elevation: Angles in degrees, by the convention of MuJoCo's free camera.
+        centre: (3,) point in the middle of the picture, in metres.
+        width, height: Displayed size in metres.
+    """
+
+    azimuth: float
+    elevation: float
+    centre: Array
+    width: float
+    height: float
+
+    @property
+    def axes(self) -> Array:
+        """(3, 3) unit vectors in rows: right, up, forward."""
+        return _axes(self.azimuth, self.elevation)
+
+    def project(self, points: Array) -> Array:
+        """Project points (N, 3) to (N, 2) metres to the right and up from the middle."""
+        seen: Array = (np.asarray(points) - self.centre) @ self.axes[:2].T  # Equation (1).
+        return seen
+
+
+def _axes(azimuth: float, elevation: float) -> Array:
+    a, e = np.deg2rad([azimuth, elevation])
+    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    up = np.array([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)])
+    return np.stack([np.cross(forward, up), up, forward])
+
+
+def make_posed_data(robot: RobotModel, positions: dict[str, float]) -> Any:
+    """Compute the robot's mujoco.MjData at a pose.
+
+    Args:
+        robot: The robot.
+        positions: Positions by joint, rad or m; other joints keep the position of the model file.
+    """
+    import mujoco
+
+    data = mujoco.MjData(robot.compiled)
+    for joint in robot.joints:
+        if joint.has_one_coordinate and joint.name in positions:
+            data.qpos[joint.position] = positions[joint.name]
+    mujoco.mj_forward(robot.compiled, data)
+    return data
+
+
+def choose_projection(robot: RobotModel, data: Any) -> Projection:
+    """Choose the camera view of a robot.
+
+    The camera looks along the common axis of a planar robot, else from the direction in which its
+    joints are furthest apart.
+
+    Args:
+        robot: The robot.
+        data: MuJoCo data at the pose.
+    """
+    azimuth, elevation = _direction(robot, data)
+    axes = _axes(azimuth, elevation)
+    moving, still = compute_bounding_points(robot.compiled, data)
+    points = np.concatenate([data.xanchor, moving, _tips(robot.compiled, data)]) @ axes.T
+    low, high = points.min(axis=0), points.max(axis=0)
+    if len(still):
+        # A floor or a long rail would make the robot too small.
+        around = STATIC_CONTEXT_SHARE * float(np.linalg.norm(high - low))
+        clipped = np.clip(still @ axes.T, low - around, high + around)
+        low = np.minimum(low, clipped.min(axis=0))
+        high = np.maximum(high, clipped.max(axis=0))
+    width, height = np.maximum((high - low)[:2], MIN_VIEW_METRES) * (1 + 2 * MARGIN_SHARE)
+    width, height = max(width, MIN_ASPECT_RATIO * height), max(height, MIN_ASPECT_RATIO * width)
+    return Projection(azimuth, elevation, (low + high) / 2 @ axes, float(width), float(height))
+
+
+def _tips(model: Any, data: Any) -> Array:
+    """Return the (N, 3) drawn ends of bodies that have neither shapes nor child bodies.
+
+    The end is the body's joint mirrored at its centre of mass.
+    """
+    bare = set(range(1, model.nbody)) - {*model.geom_bodyid.tolist(), *model.body_parentid.tolist()}
+    jointed = [body for body in sorted(bare) if int(model.body_jntadr[body]) >= 0]
+    tips: Array = 2 * data.xipos[jointed] - data.xanchor[model.body_jntadr[jointed]]
+    return tips
+
+
+def _direction(robot: RobotModel, data: Any) -> tuple[float, float]:
+    """Return azimuth and elevation of the camera in degrees."""
+    normal = _normal(robot, data)
+    if normal is not None and abs(normal[2]) > 1 - PARALLEL_SINE_TOLERANCE:
+        return 90.0, -90.0
+    if normal is not None:
+        azimuth = float(np.rad2deg(np.arctan2(normal[1], normal[0]))) % 360
+        elevation = float(np.rad2deg(np.arcsin(np.clip(normal[2], -1, 1))))
+        # Of the two sides, use the one where x points to the right, as in a drawing.
+        right = _axes(azimuth, elevation)[0]
+        flipped = right @ (1.0, 1e-3, 0.0) < 0
+        return ((azimuth + 180) % 360, -elevation) if flipped else (azimuth, elevation)
+    moving, _ = compute_bounding_points(robot.compiled, data)
+    points = np.concatenate([data.xanchor, moving.mean(axis=0, keepdims=True)])
+
+    def spread(azimuth: float) -> float:
+        seen = points @ _axes(azimuth, ELEVATION_DEG)[:2].T
+        sizes = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+        return float(np.prod(sizes))
+
+    # Without rounding, numerical errors would decide for a robot that looks the same from two
+    # sides.
+    return max(CANDIDATE_AZIMUTHS_DEG, key=lambda azimuth: round(spread(azimuth), 9)), ELEVATION_DEG
+
+
+def _normal(robot: RobotModel, data: Any) -> Array | None:
+    """Return (3,) the normal of the plane in which a planar robot moves; None for others."""
+    if not all(joint.has_one_coordinate for joint in robot.joints):
+        return None
+    hinges = [data.xaxis[j.id] for j in robot.joints if j.kind == "hinge"]
+    slides = [data.xaxis[j.id] for j in robot.joints if j.kind == "slide"]
+    if not hinges:
+        return None
+    normal: Array = np.array(hinges[0])
+    turned = [float(np.linalg.norm(np.cross(normal, axis))) for axis in hinges]
+    pushed = [abs(float(normal @ axis)) for axis in slides]
+    return normal if max(turned + pushed) < PARALLEL_SINE_TOLERANCE else None
+
+
+def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
+    """Compute the corners of bounding boxes of moving and of static shapes.
+
+    Centres of mass represent bodies without shapes.
+
+    Args:
+        model: mujoco.MjModel.
+        data: MuJoCo data at the pose.
+
+    Returns:
+        (N, 3) corners of moving shapes and (M, 3) of static ones.
+    """
+    import mujoco
+
+    endless = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+    corners = np.array(list(product((-1, 1), repeat=3)))
+    parts: tuple[list[Array], list[Array]] = ([data.xipos[:0]], [data.xipos[:0]])
+    shaped = set()
+    for g in range(model.ngeom):
+        if int(model.geom_type[g]) in endless:
+            continue
+        body = int(model.geom_bodyid[g])
+        shaped.add(body)
+        box = model.geom_aabb[g, :3] + corners * model.geom_aabb[g, 3:]
+        turn = data.geom_xmat[g].reshape(3, 3)
+        parts[_still(model, body)].append(data.geom_xpos[g] + box @ turn.T)
+    for body in range(1, model.nbody):
+        if body not in shaped:
+            parts[_still(model, body)].append(data.xipos[body][None])
+    moving, still = (np.concatenate(part) for part in parts)
+    return moving, still
+
+
+def _still(model: Any, body: int) -> bool:
+    return int(model.body_weldid[body]) == 0
+
+
+def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | None:
+    """Return (3,) the position of a place of the robot in metres.
+
+    Args:
+        robot: The robot.
+        data: MuJoCo data at the pose.
+        kind: ``joint``, ``actuator``, ``body`` or ``channel``.
+        name: Name of the place.
+
+    Returns:
+        The position; None if the robot has no such place.
+    """
+    try:
+        if kind == "body":
+            return np.array(data.xipos[robot.body(name).id])
+        if kind == "actuator":
+            joint = robot.actuator(name).joint
+            return None if joint is None else np.array(data.xanchor[robot.joint(joint).id])
+        if kind == "channel":
+            return _place_of_channel(robot, data, name)
+        return np.array(data.xanchor[robot.joint(name).id])
+    except InputError:
+        return None
+
+
+def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
+    """Return the position of a joint channel's joint, or of a sensor's mounting object."""
+    import mujoco
+
+    kind, _, rest = name.partition(".")
+    if kind != "s":
+        return locate_place(robot, data, "joint", rest)
+    model = robot.compiled
+    row = next((s for s in robot.sensors if s.name == rest), None)
+    if row is None:
+        return None
+    sensor = int(np.searchsorted(model.sensor_adr, row.address, side="right")) - 1
+    on, of = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
+    places = {
+        int(mujoco.mjtObj.mjOBJ_SITE): data.site_xpos,
+        int(mujoco.mjtObj.mjOBJ_JOINT): data.xanchor,
+        int(mujoco.mjtObj.mjOBJ_BODY): data.xipos,
+        int(mujoco.mjtObj.mjOBJ_XBODY): data.xpos,
+    }
+    return np.array(places[of][on]) if of in places else None

@@ -1,0 +1,109 @@
+"""Draw a ball track: the detected positions in the scene, and its height over time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.figures.style import BLUE, RECORDED_PART_GREY, RUST, make_panel_grid, render_png_and_pdf
+from bench.logs.ball_heights import BallHeights
+from sims.core.simulator import Array
+from sims.vision.ball_renderer import RgbImage
+from sims.vision.ball_tracker import BallTrack
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SHOWN = 6
+"""Number of ball outlines that are drawn, evenly spaced along its path."""
+_DPI = 140
+_SEEN = BLUE
+_MISSING = RUST
+
+
+def render_track_figure(
+    track: BallTrack, heights: BallHeights, part: slice, title: str
+) -> tuple[bytes, bytes | None]:
+    """Render the figure of a track as PNG, and as PDF if requested.
+
+    Args:
+        track: Track of the ball, px.
+        heights: Heights of its centre, m.
+        part: Frames that are recorded.
+        title: Title above the figure.
+    """
+    figure = draw_track_figure(track, heights, part, title)
+    return render_png_and_pdf(figure, _DPI)
+
+
+def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title: str) -> Figure:
+    """Draw the track in the scene, and height and radius over time.
+
+    Args:
+        track: Track of the ball, px.
+        heights: Heights of its centre, m.
+        part: Frames that are recorded.
+        title: Title above the figure.
+    """
+    figure, axes = make_panel_grid(1, 3, (13, 4.3), gridspec_kw={"width_ratios": (1, 1.2, 1.2)})
+    scene, above, below = axes[0]
+    _scene(scene, track)
+    _over_time(above, track, part, heights.z, "height of the centre z [m]")
+    _over_time(below, track, part, track.radius, "radius [px]")
+    above.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
+    above.set_title("dotted: ball on the ground", fontsize=9)
+    below.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
+    found, frames = int(np.isfinite(track.u).sum()), len(track.times)
+    # A film's name must not be read as mathematics.
+    figure.suptitle(f"{title}\n{found} of {frames} frames", parse_math=False, fontsize=10)
+    return figure
+
+
+def _scene(axis: Axes, track: BallTrack) -> None:
+    """Draw the track on the background with some outlines, on white for dark scenes."""
+    from matplotlib.patches import Circle
+
+    axis.imshow(_overlaid(track), interpolation="nearest")
+    axis.plot(track.u, track.v, "-", color="white", linewidth=2.4)
+    axis.plot(track.u, track.v, ".-", color=_SEEN, linewidth=0.8, markersize=2.5)
+    for k in _some(track):
+        middle = (track.u[k], track.v[k])
+        for colour, width in (("black", 1.6), ("white", 0.8)):
+            outline = Circle(middle, track.radius[k], fill=False, color=colour, linewidth=width)
+            axis.add_patch(outline)
+    axis.set(xlabel="u [px]", ylabel="v [px]", title="the track; circles: outlines found")
+
+
+def _over_time(axis: Axes, track: BallTrack, part: slice, values: Array, label: str) -> None:
+    times, gone = track.times, ~np.isfinite(track.u)
+    axis.axvspan(times[part][0], times[part][-1], color=RECORDED_PART_GREY, linewidth=0)
+    axis.plot(times, values, ".-", color=_SEEN, markersize=3, linewidth=0.7)
+    foot = np.full(gone.sum(), 0.02)
+    across = axis.get_xaxis_transform()
+    axis.plot(times[gone], foot, "|", color=_MISSING, markersize=7, transform=across)
+    axis.set(xlabel="time [s]", ylabel=label)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _some(track: BallTrack) -> list[int]:
+    """Return the indices of a few frames with the ball, evenly spaced along its path."""
+    seen = track.visible_frames.tolist()
+    steps = np.hypot(np.diff(track.u[seen]), np.diff(track.v[seen]))
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    # Evenly along the path, not in time: outlines of a slow ball would cover each other.
+    places = np.searchsorted(way, np.linspace(0, way[-1], _SHOWN)).clip(0, len(seen) - 1)
+    return [seen[i] for i in np.unique(places)]
+
+
+def _overlaid(track: BallTrack) -> RgbImage:
+    """Return the background with the balls of a few frames copied into it."""
+    picture = track.background.copy()
+    v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
+    # Only the disc of the ball is copied from each stored frame.
+    for k, frame in track.pictures.items():
+        if 0 <= k < len(track.u) and np.isfinite(track.u[k]):
+            ball = np.hypot(u - track.u[k], v - track.v[k]) <= track.radius[k]
+            picture[ball] = frame[ball]
+    return picture

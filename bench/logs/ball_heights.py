@@ -1,0 +1,259 @@
+"""Convert the track of a ball to heights in metres.
+
+If the camera is known, heights follow exactly. Otherwise: along the straight line of a vertical
+fall the inverse depth, and so the ball's radius r in pixels, is linear in the position s in the
+image, and height is a projective function of s. Together they leave one unknown factor S:
+
+    z = radius + S (s_ground - s) / r(s)                (1)
+
+For a level camera, S is the ball's radius in metres. A camera that looks down sees heights
+shortened, but not the ball, so S is larger; then S follows from the fall itself, since the second
+derivative of z must be -g.
+
+With q = s / r(s), and since r is linear in s, (1) becomes, except for a constant factor that the
+unknown S absorbs (g is gravity):
+
+    z = radius + S (q_ground - q)                       (2)
+    q'' = g / S in flight                               (3)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError
+from sims.vision.ball_tracker import BallTrack
+from sims.vision.camera_file import FilmDescription
+
+DEFAULT_GRAVITY = 9.81
+"""Gravity assumed for a film, m/s^2."""
+_MIN_FLIGHT_FRAMES = 7
+"""Minimum number of frames of a flight; fewer do not determine a parabola."""
+_MIN_FLIGHT_EXTENT = 0.3
+"""Minimum extent of a flight, in ball radii, or in metres for heights."""
+_MIN_HOLD_SECONDS = 0.25
+"""Minimum duration in seconds for which a ball is held before its release."""
+_DIFFER = 0.05
+"""Relative difference between the scales from the fall and the diameter that is reported."""
+_MEETING = 0.1
+"""Time in seconds around the end of a flight and the start of the next in which they may meet."""
+_FITS = 3
+"""Number of reweighted line fits to the radius after the first, unweighted fit."""
+
+
+@dataclass(frozen=True)
+class BallHeights:
+    """Heights of a ball's centre over time.
+
+    Attributes:
+        z: (n,) heights in metres.
+        radius: Radius of the ball in metres.
+        method: Method by which heights were found.
+        notes: Notes for the user.
+    """
+
+    z: Array
+    radius: float
+    method: str
+    notes: tuple[str, ...] = ()
+
+
+class _Flight(NamedTuple):
+    """A flight between bounces.
+
+    Attributes:
+        curve: Coefficients of its parabola, highest power first.
+        begin: Time of its first frame, s.
+        end: Time of its last frame, s.
+        weight: Inverse variance of its curvature, up to a constant factor.
+    """
+
+    curve: Array
+    begin: float
+    end: float
+    weight: float
+
+
+def compute_heights_by_camera(track: BallTrack, filmed: FilmDescription) -> BallHeights:
+    """Compute heights with the known camera of the film.
+
+    Args:
+        track: Track of the ball in the image.
+        filmed: Camera, radius and horizontal position of the ball.
+
+    Raises:
+        InputError: The camera's image has another aspect ratio than the film.
+    """
+    camera = filmed.camera
+    if camera.size[0] * track.size[1] != camera.size[1] * track.size[0]:
+        sizes = f"the camera's picture has {camera.size} px, the film {track.size}"
+        raise InputError(f"{sizes}; expected the same shape")
+    # The film may have been resized, so the camera is resized with it.
+    camera = camera.with_size(*track.size)
+    z = camera.estimate_heights(
+        np.stack([track.u, track.v], axis=1), filmed.x, filmed.y, filmed.radius
+    )
+    return BallHeights(z, filmed.radius, "through the known camera")
+
+
+def compute_heights_by_scale(
+    track: BallTrack, diameter: float | None, scale: str | None
+) -> BallHeights:
+    """Compute heights without a camera, scaled by the ball's diameter or by the fall.
+
+    Args:
+        track: Track of the ball in the image.
+        diameter: Diameter of the ball in metres; None to scale by the fall.
+        scale: "fall" to scale by the fall although a diameter is given.
+
+    Raises:
+        InputError: The film does not show what the method needs.
+    """
+    q = _place(track) / _radius(track)
+    arcs = _arcs(track.times, q)
+    ground = _ground(track, q, arcs)
+    fallen = _factor(arcs)
+    notes = []
+    if diameter is None or scale == "fall":
+        if fallen is None:
+            raise InputError(
+                "the scale is unknown: no flight of this film shows gravity clearly; "
+                "give the ball's diameter"
+            )
+        factor = fallen
+        how = f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s^2; a drag would be taken for scale)"
+        # Without a diameter, assume the radius that a level camera would give.
+        ball = diameter / 2 if diameter else factor
+    else:
+        factor = ball = diameter / 2
+        how = "scaled by the ball's diameter, as for a camera that looks level"
+        if fallen is not None and abs(fallen / factor - 1) > _DIFFER:
+            notes.append(
+                f"the fall says {fallen / factor - 1:+.0%} for all heights: the camera looks down "
+                "or up, or gravity is not 9.81 m/s^2; the scale 'fall' uses the fall"
+            )
+    return BallHeights(ball + factor * (ground - q), ball, how, tuple(notes))  # Equation (2).
+
+
+def _place(track: BallTrack) -> Array:
+    """Return the position along the line of the fall, downwards positive, in pixels.
+
+    The perspective along that line is described by `_radius`.
+    """
+    seen = track.visible_frames
+    points = np.stack([track.u[seen], track.v[seen]], axis=1)
+    middle = points.mean(axis=0)
+    # The line of the fall is the first principal axis of the points; v counts downwards.
+    _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
+    axis = axes[0] * (1.0 if axes[0][1] >= 0 else -1.0)
+    if abs(axis[1]) < 0.5:
+        raise InputError(
+            "the ball moves across the picture rather than down; expected a drop filmed upright"
+        )
+    result: Array = (np.stack([track.u, track.v], axis=1) - middle) @ axis
+    return result
+
+
+def _radius(track: BallTrack) -> Array:
+    """Return the radius as a linear function of the position; single frames are too noisy."""
+    s, seen = _place(track), track.visible_frames
+    places, radii = s[seen], track.radius[seen]
+    line = np.polyfit(places, radii, 1)
+    for _ in range(_FITS):
+        rest = np.abs(radii - np.polyval(line, places))
+        # A frame whose outline is far off, as at an impact, gets a small weight.
+        typical = max(float(np.median(rest)), 1e-9)
+        line = np.polyfit(places, radii, 1, w=1 / (1 + (rest / typical) ** 2))
+    # The line may cross zero outside the frames that show the ball; a radius may not.
+    result: Array = np.maximum(np.polyval(line, s), 0.3 * float(np.median(radii)))
+    return result
+
+
+def _arcs(times: Array, q: Array) -> list[_Flight]:
+    """Find flights between the lowest points of the ball, and fit a parabola to each."""
+    seen = np.flatnonzero(np.isfinite(q))
+    last = len(seen) - 1
+    # q counts downwards: the ball is lowest where q is largest.
+    lowest = [i for i in range(1, last) if q[seen[i - 1]] < q[seen[i]] >= q[seen[i + 1]]]
+    arcs = []
+    for a, b in pairwise([0, *lowest, last]):
+        # The frame of the bounce itself belongs to no flight.
+        inside = seen[a + (a > 0) : b - (b < last) + 1]
+        if len(inside) < _MIN_FLIGHT_FRAMES or np.ptp(q[inside]) < _MIN_FLIGHT_EXTENT:
+            continue
+        t = times[inside]
+        curve, rest, *_ = np.polyfit(t, q[inside], 2, full=True)
+        scatter = float(np.sqrt(rest[0] / len(t))) if len(rest) else 0.0
+        # A motion that is not a parabola is not a flight, but a hand, a roll or another ball.
+        if scatter < 0.05 * np.ptp(q[inside]) + 0.02:
+            # The variance of a parabola's curvature goes as 1 / (n T^4), for n samples in T.
+            arcs.append(_Flight(curve, t[0], t[-1], len(t) * float(t[-1] - t[0]) ** 4))
+    return arcs
+
+
+def _factor(arcs: list[_Flight]) -> float | None:
+    """Return the S for which the flights fall with gravity; None without a falling flight."""
+    falling = [arc for arc in arcs if arc.curve[0] > 0]
+    if not falling:
+        return None
+    curvatures = [2 * arc.curve[0] for arc in falling]
+    mean = np.average(curvatures, weights=[arc.weight for arc in falling])
+    return float(DEFAULT_GRAVITY / mean)  # Equation (3).
+
+
+def _ground(track: BallTrack, q: Array, arcs: list[_Flight]) -> float:
+    """Return q at ground contact: where flights meet, or the lowest position."""
+    meets = []
+    for before, after in pairwise(arcs):
+        roots = np.roots(before.curve - after.curve)
+        # Two parabolas have up to two intersections: the bounce, and one outside both flights.
+        begin, end = before.end - _MEETING, after.begin + _MEETING
+        real = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
+        meets += [float(np.polyval(before.curve, r)) for r in real[:1]]
+    if meets:
+        return float(np.median(meets))
+    # Without two flights, use the lowest position, but ignore frames with tracking errors.
+    return float(np.nanpercentile(q, 99.5)) if len(track.visible_frames) else 0.0
+
+
+def estimate_height_noise(times: Array, z: Array) -> float:
+    """Estimate the height noise from the residuals of a cubic fitted to each flight.
+
+    A cubic can represent gravity and a drag. White noise estimated from neighbouring samples alone
+    would miss the errors of a slowly changing outline, which last for several samples.
+
+    Args:
+        times: (n,) times, s.
+        z: (n,) heights, m.
+
+    Returns:
+        Standard deviation (1 sigma) in m; NaN without a flight.
+    """
+    squares, freedom = 0.0, 0
+    for arc in _arcs(times, -z):
+        inside = (times >= arc.begin) & (times <= arc.end) & np.isfinite(z)
+        t = times[inside] - arc.begin
+        if len(t) > _MIN_FLIGHT_FRAMES:
+            cubic = np.polyfit(t, z[inside], 3)
+            squares += float(np.sum((z[inside] - np.polyval(cubic, t)) ** 2))
+            # Four coefficients are fitted.
+            freedom += len(t) - 4
+    return float(np.sqrt(squares / freedom)) if freedom else float("nan")
+
+
+def find_release_frame(track: BallTrack) -> int:
+    """Find the frame at which the ball begins to move; the first one unless it is held before."""
+    s, seen = _place(track), track.visible_frames
+    start = float(np.median(s[seen[:5]]))
+    # Up to a pixel, or four sigmas, is a trembling hand or an error of the outline, not a fall.
+    moved = np.flatnonzero(np.abs(s[seen] - start) > max(1.0, 4 * track.noise))
+    first = int(seen[0])
+    if not len(moved):
+        return first
+    release = int(seen[moved[0]])
+    held = track.times[release] - track.times[first]
+    return first if held < _MIN_HOLD_SECONDS else release

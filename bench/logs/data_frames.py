@@ -1,0 +1,90 @@
+"""Recordings in pandas data frames, for registered systems and for robots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.core.plugin_registries import make_robot_simulator, simulators
+from sims.core.simulator import InputError, Simulator
+from sims.core.toml_validation import check_table
+from sims.recording.recording import Recording, recording_of_frame
+from sims.recording.recording_description import model_in
+from sims.recording.recording_frame import Frame
+
+
+@dataclass(frozen=True)
+class FrameDescription:
+    """Description of a data frame, which has no `NAME.toml` file.
+
+    Attributes:
+        system: Registered name of the system.
+        model: Path of a robot's model file, instead of a system.
+        units: Units of columns, by name.
+        constants: Known numbers of the system, SI units.
+        description: Any further entries, with the keys of `NAME.toml`.
+    """
+
+    system: str | None = None
+    model: str | Path | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    description: Mapping[str, Any] = field(default_factory=dict)
+
+    def refuse_for_files(self, recording: object) -> None:
+        """Reject a description of a data frame if the recording is not a data frame.
+
+        Raises:
+            InputError: units, constants or a description are given.
+        """
+        for name in ("units", "constants", "description"):
+            if getattr(self, name):
+                raise InputError(
+                    f"{name}: expected only with a DataFrame; {recording} has a description, "
+                    "which states them"
+                )
+
+
+def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame") -> Recording:
+    """Read the recording in a data frame; only runs that are marked so are held out.
+
+    Args:
+        frame: Columns ``run`` (if there are several), ``t`` and one for each channel and input.
+        about: Description by the user.
+        name: Name of the recording in messages.
+
+    Raises:
+        InputError: The data frame or its description is malformed; the message is one line.
+    """
+    meta = dict(about.description)
+    if about.system is not None:
+        meta.pop("model", None)
+        meta["system"] = about.system
+    if about.model is not None:
+        meta.pop("system", None)
+        meta["model"] = str(about.model)
+    if about.constants:
+        stated = check_table(name, "constants", meta.get("constants", {}))
+        meta["constants"] = {**stated, **about.constants}
+    kind = _kind(name, meta)
+    meta.setdefault("title", f"{kind.name}, {name}")
+    return recording_of_frame(frame, kind, meta, about.units, name)
+
+
+def _kind(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
+    """Return the simulator of the system or robot that a description names."""
+    file = model_in(Path(name), meta)
+    if file is not None:
+        return make_robot_simulator(file.path, file.actuators, file.engine, file.free)
+    system = meta.get("system")
+    if not isinstance(system, str):
+        raise InputError(
+            f"{name}: expected what it is a recording of: system='NAME' or model='robot.xml'; "
+            f"systems are {', '.join(simulators.names())}"
+        )
+    try:
+        return simulators.get(system)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None

@@ -1,0 +1,175 @@
+"""Track a film: write the recording, its description, and a figure of the track."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.logs import ball_heights
+from sims.core.simulator import InputError, make_read_only
+from sims.core.value_limits import LENGTH_RANGE
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_writer import check_absent, write_recording
+from sims.systems.ball import BallSystem
+from sims.vision.ball_tracker import BallTrack, estimate_roughness, track_ball
+from sims.vision.camera_file import get_camera_file_path, read_camera_file
+from sims.vision.video_files import VideoFile
+
+_DIGITS = 9
+"""Number of significant digits in the table, finer than a pixel's noise."""
+
+
+class TrackingResult(NamedTuple):
+    """Result of tracking a film.
+
+    Attributes:
+        notes: Notes for the user, to be shown first.
+        frames: Number of recorded frames.
+        seen: Number of these frames that show the ball.
+        scale_method: Method by which heights in metres were found.
+        noise_pixels: 1 sigma of one sample in pixels.
+        noise: 1 sigma of a height in metres.
+        lines: The result as text.
+    """
+
+    notes: tuple[str, ...]
+    frames: int
+    seen: int
+    scale_method: str
+    noise_pixels: float
+    noise: float
+    lines: tuple[str, ...]
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the result as a JSON document."""
+        return {
+            "frames": self.frames,
+            "frames_with_ball": self.seen,
+            "metres_from": self.scale_method,
+            "noise_pixels": self.noise_pixels,
+            "noise_metres": self.noise,
+            "notes": self.notes,
+        }
+
+
+TrackFigureWriter = Callable[
+    [BallTrack, ball_heights.BallHeights, slice, str], tuple[bytes, bytes | None]
+]
+"""Draws a track, its heights, the recorded frames and a title, as a PNG and a PDF or None."""
+
+
+def track_film(
+    video: Path,
+    out: Path,
+    draw: TrackFigureWriter,
+    diameter: float | None = None,
+    fps: float | None = None,
+    scale: str | None = None,
+    pdf: bool = False,
+) -> TrackingResult:
+    """Track `video`; write `out`, its description, and a figure of the track in the same folder.
+
+    Args:
+        video: Path of the film.
+        out: Path NAME.csv of a new file.
+        draw: Function that draws the figure, see `bench.figures.track_figure.render_track_figure`.
+        diameter: Diameter of the ball, m.
+        fps: Frames per second, instead of the file's time stamps.
+        scale: "camera", "diameter" or "fall"; None for the best available one.
+        pdf: Whether `draw` makes a PDF, too.
+
+    Raises:
+        InputError: The film cannot be tracked or the files cannot be written; one line.
+    """
+    if out.suffix != ".csv":
+        raise InputError(f"{out}: expected a name that ends in .csv")
+    pictures = [out.with_suffix(ending) for ending in (".png", ".pdf")]
+    # Check this before the work, since tracking a film takes a while.
+    check_absent([out, out.with_suffix(".toml"), *pictures[: 2 if pdf else 1]])
+    if diameter is not None and not LENGTH_RANGE[0] <= diameter <= LENGTH_RANGE[1]:
+        wanted = f"more than 0 m, from {LENGTH_RANGE[0]:g} to {LENGTH_RANGE[1]:g} m"
+        raise InputError(f"ball diameter {diameter:g}: expected {wanted}")
+
+    film = VideoFile(video, fps)
+    try:
+        seen = track_ball(film)
+        heights = _heights(seen, video, diameter, scale)
+    except InputError as error:
+        # Some error messages already name the film, others do not.
+        text = str(error)
+        raise InputError(text if text.startswith(str(video)) else f"{video}: {text}") from None
+
+    first, last = ball_heights.find_release_frame(seen), int(seen.visible_frames[-1])
+    part = slice(first, last + 1)
+    notes = [*film.notes, *seen.notes, *heights.notes]
+    if first > seen.visible_frames[0]:
+        until = f"the ball is held until {seen.times[first]:.2f} s"
+        notes.append(f"{until}; what is before that is left out")
+    noise = _noise(seen, heights, part)
+
+    # The recording and its figures are published together, so that none exists without the others.
+    drawn = draw(seen, heights, part, f"{video.name}: {heights.method}")
+    shown = {
+        path: content for path, content in zip(pictures, drawn, strict=True) if content is not None
+    }
+    recording = _recording(seen, heights, noise, part, video)
+    write_recording(out, recording, BallSystem, digits=_DIGITS, beside=shown)
+
+    count, frames = int(np.isfinite(heights.z[part]).sum()), part.stop - part.start
+    lines = (
+        f"{out}: {count} of {frames} frames with the ball, z in metres {heights.method}",
+        f"noise of one sample: {seen.noise:.2g} px, {1e3 * noise:.2g} mm",
+        f"{pictures[0]}: the track",
+    )
+    return TrackingResult(
+        tuple(notes), frames, count, heights.method, float(seen.noise), noise, lines
+    )
+
+
+def _noise(seen: BallTrack, heights: ball_heights.BallHeights, part: slice) -> float:
+    """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights."""
+    z = heights.z[part]
+    noise = float(
+        np.nanmax(
+            [estimate_roughness(z), ball_heights.estimate_height_noise(seen.times[part], z), 0.0]
+        )
+    )
+    if noise > 0:
+        return noise
+    # A few frames give neither estimate: use the noise in pixels, scaled by the median radius.
+    return seen.noise * heights.radius / float(np.nanmedian(seen.radius))
+
+
+def _heights(
+    seen: BallTrack, video: Path, diameter: float | None, scale: str | None
+) -> ball_heights.BallHeights:
+    known = get_camera_file_path(video)
+    if scale == "camera" or (scale is None and known.is_file()):
+        return ball_heights.compute_heights_by_camera(seen, read_camera_file(known))
+    if scale == "diameter" and diameter is None:
+        raise InputError("scale diameter: expected the ball's diameter in metres")
+    return ball_heights.compute_heights_by_scale(seen, diameter, scale)
+
+
+def _recording(
+    seen: BallTrack, heights: ball_heights.BallHeights, noise: float, part: slice, video: Path
+) -> Recording:
+    pixels = {"u": seen.u, "v": seen.v, "radius_px": seen.radius}
+    run = Run(
+        "1",
+        make_read_only(seen.times[part]),
+        {"z": make_read_only(heights.z[part])},
+        {},
+        {},
+        {},
+        False,
+        {name: make_read_only(values[part]) for name, values in pixels.items()},
+    )
+    title = f"{video.name}, tracked; z {heights.method}"
+    constants = {"radius": heights.radius, "gravity": ball_heights.DEFAULT_GRAVITY}
+    return Recording(
+        Path(), BallSystem.name, title, constants, {"z": noise}, (run,), dict.fromkeys(pixels, "px")
+    )

@@ -1,0 +1,342 @@
+"""Guess the meaning of log columns from their names and from a robot's model.
+
+The names show most: whether a column is a command or a sensor signal; a position, a rate or a
+force; and its joint. The numbers verify it: a position lies within its joint's range, in radians or
+in degrees, and a rate is the derivative of its position,
+
+    v = b dq/dt,    b = <v dq/dt> / <(dq/dt)^2>                                                (1)
+
+with b = 1 if both have the same unit, and 57.3 if the rate is in degrees and the position in
+radians.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.recording.column_mapping import MAX_REPEATED
+from sims.recording.log_formats.unit_names import read_unit, split_unit
+from sims.recording.unit_conversion import compute_unit_scale
+from sims.robot.robot_model import Joint
+
+Role = Literal["command", "position", "velocity", "force", "other"]
+
+_WORD_LISTS: Mapping[Role, str] = {
+    "command": "control controls command commands commanded cmd cmds target targets goal goals "
+    "action actions desired des ref refs reference references setpoint setpoints ctrl u demand "
+    "demanded soll sollwert sollwerte vorgabe consigne consignes referencia",
+    "velocity": "velocity velocities vel vels qd dq qvel speed speeds rate rates omega qdot rpm "
+    "geschwindigkeit geschwindigkeiten drehzahl vitesse velocidad",
+    "force": "torque torques effort efforts tau taus current currents load loads force forces "
+    "moment momente drehmoment drehmomente kraft strom couple",
+    "position": "position positions pos q qpos angle angles state states joint joints encoder "
+    "winkel lage istwert",
+    "other": "temperature temperatures temp temps voltage voltages volt acceleration accelerations "
+    "accel acc qdd ddq error errors err status mode modes enable enabled flag covariance pwm seq "
+    "stiffness damping",
+}
+ROLE_KEYWORDS: Mapping[Role, frozenset[str]] = {
+    role: frozenset(words.split()) for role, words in _WORD_LISTS.items()
+}
+"""Words in the name of a column or of its file, by the role that they indicate."""
+_VAGUE = frozenset({"joint", "joints", "state", "states", "current", "currents", "load", "loads"})
+"""Words that indicate a role only if no other word does."""
+_MEASURED = frozenset(["meas", "measured", "actual", "act", "present", "sensed", "ist", "istwert"])
+"""Words for a measured signal, if a log has several signals of one kind."""
+_GLUED = re.compile(r"(?P<what>q|dq|qd|tau|pos|vel)(?P<command>des|cmd|ref|goal|target|desired)")
+"""Pattern of two words written as one, for example ``qdes`` and ``taucmd``."""
+_ROLE_OF_QUANTITY: Mapping[str, Role] = {
+    "angular velocity": "velocity",
+    "velocity": "velocity",
+    "torque": "force",
+    "force": "force",
+    "current": "force",
+    "acceleration": "other",
+    "other": "other",
+}
+"""Role of a column by the quantity that its unit measures."""
+_TIME_WORDS = "t time times timestamp timestamps stamp stamps sec seconds secs clock zeit uhrzeit"
+TIME_COLUMN_NAMES = frozenset((_TIME_WORDS + " temps tiempo tempo").split())
+"""Words in the name of a column of time stamps."""
+TIME_UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Possible units of time stamps, with their values in seconds."""
+SAMPLING_RATE_RANGE_HZ = (2.0, 5000.0)
+"""Minimum and maximum sampling rate of a log, in Hz."""
+MAX_RANGE_EXCESS = 0.5
+"""Maximum distance of a position beyond its joint's range, as a fraction of the range."""
+MAX_UNLIMITED_POSITION_RAD = 4.0 * np.pi
+"""Largest position in radians of a joint without a range; a larger one is taken for degrees."""
+MIN_DERIVATIVE_CORRELATION = 0.7
+"""Minimum correlation of a rate with the derivative of its position."""
+SLOPE_RANGE = (0.7, 1.4)
+"""Interval of slopes b of equation (1), divided by a unit's factor, that confirm the unit."""
+DEGREES_PER_RADIAN = 180.0 / np.pi
+
+
+class LogColumn(NamedTuple):
+    """A column of a log.
+
+    Attributes:
+        file: Name of its file.
+        name: Name in the file.
+        values: (T,) numbers.
+        units_row: Unit in the file's row of units; empty if it has none.
+    """
+
+    file: str
+    name: str
+    values: Array
+    units_row: str = ""
+
+    @property
+    def bare(self) -> str:
+        """The name without its unit."""
+        return split_unit(self.name).name
+
+    @property
+    def unit(self) -> str:
+        """The unit in the file; empty if there is none."""
+        return self.units_row or split_unit(self.name).unit
+
+    @property
+    def quantity(self) -> str:
+        """The quantity that the stated unit measures; empty if there is no unit."""
+        found = read_unit(self.unit) if self.unit else None
+        return found[1] if found else ""
+
+
+def split_name(text: str) -> list[str]:
+    """Split a name into words: ``jointPositions[2]`` becomes joint, positions, 2."""
+    split = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
+    words = []
+    for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", split):
+        glued = _GLUED.fullmatch(part.lower())
+        words += [glued["what"], glued["command"]] if glued else [part.lower()]
+    return [word for word in words if word]
+
+
+def guess_role(column: LogColumn) -> Role | None:
+    """Return the role of a column by its name and unit, else by its file's name, or None."""
+    own, file = _words(column)
+    if own & ROLE_KEYWORDS["command"] or (
+        file & ROLE_KEYWORDS["command"] and not own & ROLE_KEYWORDS["other"]
+    ):
+        return "command"
+    if column.quantity in _ROLE_OF_QUANTITY:
+        return _ROLE_OF_QUANTITY[column.quantity]
+    return _measured(own) or _measured(file)
+
+
+def commanded_role(column: LogColumn) -> Role | None:
+    """Return the quantity that a command sets: position, velocity or force; None if unknown.
+
+    The column's name and unit are used first, then its file's name.
+    """
+    if column.quantity in _ROLE_OF_QUANTITY:
+        return _ROLE_OF_QUANTITY[column.quantity]
+    if column.quantity in ("angle", "length"):
+        return "position"
+    own, file = _words(column)
+    # `joint_command` gives no more information than `command`; `joint_position_command` does.
+    return _measured(own - _VAGUE) or _measured(file - _VAGUE)
+
+
+def is_measured(column: LogColumn) -> bool:
+    """Return whether a column's name says that it was measured."""
+    return bool(set(split_name(column.bare)) & _MEASURED)
+
+
+def _words(column: LogColumn) -> tuple[set[str], set[str]]:
+    """Return the words of a column's name and those of its file's name."""
+    # The name of a bag's topic has no file extension.
+    stem = column.file.rpartition(".")[0] or column.file
+    return set(split_name(column.bare)), set(split_name(stem))
+
+
+def _measured(words: set[str]) -> Role | None:
+    """Return the role of a measured signal that some words indicate; None if there is none."""
+    roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
+    # `current` in "current position" is not an electric current, and a joint state may be a
+    # velocity.
+    for some in (words - _VAGUE, words & {"current", "currents", "load", "loads"}, words):
+        for role in roles:
+            if some & ROLE_KEYWORDS[role]:
+                return role
+    return None
+
+
+def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
+    """Return the joint whose name is part of a column's name; the longest if there are several.
+
+    Args:
+        column: Column of a log.
+        joints: Joints of the robot.
+
+    Returns:
+        The joint, or None if no name matches.
+    """
+    text = _plain(column.bare)
+    for names in ([joint.name for joint in joints], _stems(joints)):
+        named = [
+            (len(name), joint)
+            for name, joint in zip(names, joints, strict=True)
+            if _plain(name) and _plain(name) in text
+        ]
+        if named:
+            return max(named, key=lambda pair: pair[0])[1]
+    return None
+
+
+def _stems(joints: Sequence[Joint]) -> list[str]:
+    """Return joint names without words that all may share: ``elbow`` for ``elbow_joint``."""
+    usual = {"joint", "motor", "link", "actuator", "dof"}
+    stems = ["".join(w for w in split_name(joint.name) if w not in usual) for joint in joints]
+    # A short stem, or one that two joints share, is ambiguous.
+    return [
+        stem if len(stem) > 2 and not stem.isdigit() and stems.count(stem) == 1 else ""
+        for stem in stems
+    ]
+
+
+def match_numbered_joints(
+    columns: Sequence[LogColumn], joints: Sequence[Joint]
+) -> dict[str, Joint]:
+    """Assign joints to numbered columns of one kind, in the order of the model.
+
+    Args:
+        columns: Columns with a number in their names.
+        joints: Joints of the robot in the order of the model.
+
+    Returns:
+        Joints by column name; empty if a column has no number, numbers repeat, or there are more
+            columns than joints.
+    """
+    places: dict[str, int] = {}
+    for column in columns:
+        digits = re.findall(r"\d+", column.bare)
+        if not digits:
+            return {}
+        places[column.name] = int(digits[-1])
+    first = min(places.values(), default=0)
+    if len(columns) > len(joints) or len(set(places.values())) < len(columns):
+        return {}
+    order = {name: place - first for name, place in places.items()}
+    if max(order.values(), default=0) >= len(joints):
+        return {}
+    return {name: joints[place] for name, place in order.items()}
+
+
+def clocks(columns: Iterable[LogColumn]) -> list[LogColumn]:
+    """Return the columns that may be time stamps, the most likely first.
+
+    The order is: the stamp of a message's header, other columns with a name or unit of time, and
+    increasing columns with other names.
+    """
+    ranked = []
+    for place, column in enumerate(columns):
+        words = set(split_name(column.bare))
+        named = bool(words & TIME_COLUMN_NAMES) or column.quantity == "time"
+        if _increases(column.values, MAX_REPEATED if named else 0.0):
+            rank = 0 if named and "header" in words else 1 if named else 2
+            ranked.append((rank, place, column))
+    return [column for _, _, column in sorted(ranked, key=lambda one: one[:2])]
+
+
+def guess_time_unit(stamps: Array) -> str | None:
+    """Return the unit of time stamps for a plausible sampling rate; None if no unit gives one."""
+    steps = np.diff(stamps)
+    interval = float(np.median(steps[steps > 0]))
+    for unit, second in TIME_UNITS.items():
+        if (
+            SAMPLING_RATE_RANGE_HZ[0]
+            <= 1.0 / max(interval * second, 1e-300)
+            <= SAMPLING_RATE_RANGE_HZ[1]
+        ):
+            return unit
+    return None
+
+
+def guess_position_unit(values: Array, joint: Joint) -> str | None:
+    """Return the unit of a position, rad or deg (m or mm for a slide joint), by the joint's range.
+
+    Args:
+        values: (T,) positions.
+        joint: Joint that they belong to.
+
+    Returns:
+        The unit, or None if neither fits the range.
+    """
+    usual, other, size = (
+        ("rad", "deg", DEGREES_PER_RADIAN) if joint.kind == "hinge" else ("m", "mm", 1e3)
+    )
+    ends = np.array([np.nanmin(values), np.nanmax(values)])
+    if joint.range is None:
+        return (
+            usual
+            if joint.kind != "hinge" or np.abs(ends).max() <= MAX_UNLIMITED_POSITION_RAD
+            else other
+        )
+    for unit, one in ((usual, 1.0), (other, size)):
+        if _within(ends / one, joint.range):
+            return unit
+    return None
+
+
+def _within(ends: Array, limits: tuple[float, float]) -> bool:
+    """Return whether a lowest and a highest position lie within a joint's widened range."""
+    slack = MAX_RANGE_EXCESS * (limits[1] - limits[0])
+    return bool(limits[0] - slack <= ends[0] and ends[1] <= limits[1] + slack)
+
+
+def guess_velocity_unit(rate: Array, slope: Array, joint: Joint, stated: str = "") -> str | None:
+    """Return the unit of a rate by equation (1); None if it is not the derivative of the position.
+
+    Args:
+        rate: (T,) numbers of the rate.
+        slope: (T,) derivative of the position, rad/s or m/s.
+        joint: Joint that moves.
+        stated: Unit in the log, which is tested first.
+    """
+    seen = np.isfinite(slope) & np.isfinite(rate)
+    r, d = rate[seen], slope[seen]
+    # Differences of an encoder's steps are noisy, so both are averaged over a few samples.
+    r, d = _smooth(r), _smooth(d)
+    if not (r @ r and d @ d) or abs(float(r @ d)) < MIN_DERIVATIVE_CORRELATION * float(
+        np.sqrt((r @ r) * (d @ d))
+    ):
+        return None
+    b = float(r @ d) / float(d @ d)
+    si = f"{joint.unit}/s"
+    usual = ("rad/s", "deg/s", "rpm", "turn/s") if joint.kind == "hinge" else ("m/s", "mm/s")
+    units: Sequence[str] = (stated, *usual) if stated else usual
+    for unit in units:
+        if SLOPE_RANGE[0] < b * compute_unit_scale(unit, si).gain < SLOPE_RANGE[1]:
+            return unit
+    return None
+
+
+def is_constant(values: Array) -> bool:
+    """Return whether a column never changes."""
+    return bool(np.nanmax(values) == np.nanmin(values))
+
+
+def _smooth(values: Array) -> Array:
+    kernel = np.ones(5) / 5.0
+    return np.convolve(values, kernel, mode="same") if values.size > 5 else values
+
+
+def _increases(values: Array, repeated: float) -> bool:
+    """Return whether a column increases from row to row, except for a share of repeated rows."""
+    if values.size < 2 or not np.isfinite(values).all():
+        return False
+    steps = np.diff(values)
+    return bool((steps >= 0).all() and steps.any() and (steps == 0).sum() <= repeated * values.size)
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", text.lower())

@@ -1,0 +1,177 @@
+"""Normalised positions of LeRobot: -100 to 100 of a joint's range (0 to 100 for a gripper).
+
+They look like degrees: only a calibration file or the user can distinguish them, not the numbers of
+a dataset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.logs.quality.anomaly import Anomaly
+from sims.core.simulator import Array, InputError
+from sims.core.toml_validation import read_toml
+from sims.recording.log_formats.lerobot_calibration import (
+    AngleScale,
+    MotorRange,
+    angle_scale,
+    find_calibration,
+    motor_of,
+    range_scale,
+    read_calibration,
+)
+from sims.recording.log_formats.lerobot_dataset import split_episode_path
+from sims.recording.recording import Recording
+
+if TYPE_CHECKING:  # A recording without a robot needs no model.
+    from sims.robot.robot_model import Joint
+
+LARGEST = 100.0 + 1e-3
+"""Largest magnitude of a normalised position, including the rounding of 32-bit floats."""
+REMEDY = (
+    "if they are normalised, import them with --calibration FILE (LeRobot keeps it in "
+    "~/.cache/huggingface/lerobot/calibration) or with --position-unit normalised (by the model's "
+    "ranges); if they are degrees, with --position-unit deg"
+)
+"""Advice for positions that may be normalised."""
+
+
+class NormalisedPositions:
+    """Conversion of the normalised positions of a log to angles.
+
+    Args:
+        motors: Calibrated ranges by motor; empty if only the model's ranges are known.
+        source: The calibration file; None if there is none.
+    """
+
+    def __init__(self, motors: Mapping[str, MotorRange], source: Path | None) -> None:
+        self.motors = motors
+        self.source = source
+
+    def scale_of(self, column: str, values: Array, joint: Joint) -> tuple[str, AngleScale] | None:
+        """Return the unit of a column's positions, and their conversion to it.
+
+        Args:
+            column: Name of the column.
+            values: (T,) numbers of the column.
+            joint: Joint of the column.
+
+        Returns:
+            Unit and conversion; None if neither a calibration nor the model gives the joint's
+                range.
+        """
+        from_zero = "gripper" in column.lower() and float(np.nanmin(values)) >= 0.0
+        motor = motor_of(column, self.motors)
+        # Encoder counts of a slide joint's motor are not metres, so the model's range is used.
+        if motor is not None and joint.kind == "hinge":
+            return "deg", angle_scale(self.motors[motor], from_zero)
+        if joint.range is None:
+            return None
+        return joint.unit, range_scale(*joint.range, from_zero)
+
+    @property
+    def description(self) -> str:
+        """The ranges to which the positions are normalised, as text."""
+        ranges = "the joints' ranges in the model"
+        if self.source is not None:
+            ranges = f"the ranges in {self.source.name}, zero in the middle of each"
+        return f"normalised, -100 to 100 (a gripper's 0 to 100) of {ranges}"
+
+
+def normalised_positions(
+    log: Path, largest: float, stated: str, calibration: Path | None
+) -> NormalisedPositions | None:
+    """Return the conversion of positions to angles; None if they are angles already.
+
+    Args:
+        log: Log that contains the positions.
+        largest: Largest magnitude of the positions.
+        stated: Unit that the user states; empty if none is stated.
+        calibration: File that the user names; None to search one in and next to the dataset.
+
+    Raises:
+        InputError: Positions stated as normalised are out of range, or the file cannot be read.
+    """
+    within = largest <= LARGEST
+    asked = stated == "normalised" or calibration is not None
+    if asked and not within:
+        raise InputError(
+            f"{log}: expected normalised positions within -100 to 100, found {largest:.4g}; leave "
+            "out --calibration and --position-unit normalised"
+        )
+    if calibration is None and within and not stated:
+        episode = split_episode_path(log)
+        folders = _folders(episode[0]) if episode else []
+        calibration = find_calibration(folders)
+        asked = calibration is not None
+    if not asked:
+        return None
+    motors = read_calibration(calibration) if calibration is not None else {}
+    return NormalisedPositions(motors, calibration)
+
+
+def is_lerobot(log: Path, columns: Iterable[str]) -> bool:
+    """Return whether a log is from LeRobot: an episode, or a table with its column names.
+
+    Args:
+        log: Path of the log.
+        columns: Names of its columns.
+    """
+    names = ("observation.state", "observation/state")
+    return split_episode_path(log) is not None or any(
+        column.startswith(names) for column in columns
+    )
+
+
+def may_be_normalised(recording: Recording) -> Iterator[Anomaly]:
+    """Yield an anomaly if positions of a LeRobot dataset in degrees may be normalised.
+
+    That is so if all of them lie within -100 to 100; channels whose description states a `scale`
+    are not checked.
+    """
+    description = recording.path.with_suffix(".toml")
+    if not description.is_file():
+        return
+    meta = read_toml(description)
+    channels = meta.get("channels")
+    if not isinstance(channels, dict) or not _episodes(description, meta):
+        return
+    degrees = [
+        name
+        for name, own in channels.items()
+        if name.startswith("q.")
+        and isinstance(own, dict)
+        and str(own.get("unit", "")).startswith("deg")
+        and "scale" not in own
+    ]
+    values = [
+        run.channels[name] for run in recording.runs for name in degrees if name in run.channels
+    ]
+    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=np.inf)
+    if np.degrees(largest) <= LARGEST:
+        yield Anomaly(
+            "positions of a LeRobot dataset are taken for degrees and lie within -100 to 100, as "
+            f"normalised ones do; {REMEDY} (scale = 1 in the description)",
+            False,
+        )
+
+
+def _episodes(description: Path, meta: Mapping[str, object]) -> bool:
+    """Return whether a description's runs are episodes of a dataset."""
+    runs = meta.get("runs")
+    tables = runs.values() if isinstance(runs, dict) else ()
+    folders = [own.get("folder") for own in tables if isinstance(own, dict)]
+    return any(
+        isinstance(folder, str)
+        and split_episode_path(description.parent / folder / "frames") is not None
+        for folder in folders[:1]
+    )
+
+
+def _folders(dataset: Path) -> Sequence[Path]:
+    """Return the folders that may contain the calibration of a dataset."""
+    return [dataset, dataset / "meta", dataset / "calibration", dataset.parent]

@@ -1,0 +1,105 @@
+"""Thin recordings of robots that are sampled much faster than they move.
+
+Neighbouring samples of a slow motion share the rounding errors of an encoder and vibrations that no
+model of the robot contains: at 500 Hz and more they, and not the motion, decide a likelihood. Each
+k-th sample is kept, with the largest k that preserves all motion: the other samples follow from a
+cubic spline through the kept ones (C. de Boor, A Practical Guide to Splines, 1978, chapter 4) as
+well as from one through every second sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sims.core.simulator import Array, Simulator
+from sims.recording.recording import Recording, Run
+
+FASTEST = 400.0
+"""Sampling rate in Hz up to which a recording is kept unchanged."""
+SLOWEST = 100.0
+"""Minimum sampling rate in Hz after thinning."""
+LARGER = 1.25
+"""Maximum ratio of the interpolation error to that of keeping every second sample."""
+PRECISION = 1e-4
+"""Negligible interpolation error as a fraction of a channel's range: a simulation's accuracy."""
+COMPLETE = 0.9
+"""Minimum share of available samples of each channel."""
+FEWEST = 40
+"""Minimum number of samples that each run must keep."""
+
+
+def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
+    """Keep each k-th sample of a robot's recording if these samples contain all motion.
+
+    Inputs with zero-order hold are averaged between the samples that are kept.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+
+    Returns:
+        The recording, and a message for the user, which is empty if it is unchanged.
+    """
+    rate = min((_rate(run) for run in recording.runs), default=0.0)
+    if not kind.has_model or rate <= FASTEST:
+        return recording, ""
+    every = next((k for k in range(round(rate / SLOWEST), 1, -1) if _holds(recording, k)), 1)
+    if every == 1:
+        return recording, ""
+    runs = tuple(_thinned(run, every) for run in recording.runs)
+    note = (
+        f"sampled at {rate:.4g} Hz, faster than it moves: each sample of {every} is used, "
+        "and the mean of the inputs between them"
+    )
+    return replace(recording, runs=runs), note
+
+
+def _rate(run: Run) -> float:
+    """Return the sampling rate in Hz."""
+    return float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
+
+
+def _holds(recording: Recording, every: int) -> bool:
+    """Return whether every k-th sample preserves all motion of all channels."""
+    for run in recording.runs:
+        if run.times.size < FEWEST * every:
+            return False
+        for values in run.channels.values():
+            if np.isfinite(values).mean() < COMPLETE:
+                return False
+            least = PRECISION * float(np.ptp(values[np.isfinite(values)]))
+            allowed = max(LARGER * _interpolation_error(run.times, values, 2), least)
+            if _interpolation_error(run.times, values, every) > allowed:
+                return False
+    return True
+
+
+def _interpolation_error(times: Array, values: Array, every: int) -> float:
+    """Return the RMS error of a cubic spline through every k-th sample at the other samples."""
+    # Import SciPy here, since only fast recordings need it.
+    from scipy.interpolate import CubicSpline
+
+    there = np.isfinite(values)
+    kept = there & (np.arange(times.size) % every == 0)
+    first, last = np.flatnonzero(kept)[[0, -1]]
+    others = there & ~kept
+    others[:first] = others[last:] = False
+    if not others.any():
+        return 0.0
+    missed = CubicSpline(times[kept], values[kept])(times[others]) - values[others]
+    return float(np.sqrt(np.mean(np.square(missed))))
+
+
+def _thinned(run: Run, every: int) -> Run:
+    """Keep every k-th sample of a run, and average its inputs from each one to the next."""
+    part = run.part(slice(None, None, every))
+    first = np.arange(0, run.times.size, every)
+    spans = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))
+    inputs = dict(part.inputs)
+    for name in part.inputs:
+        if name not in run.linear:
+            weighed = np.add.reduceat(run.inputs[name] * spans, first)
+            inputs[name] = weighed / np.add.reduceat(spans, first)
+    return replace(part, inputs=inputs)

@@ -1,0 +1,77 @@
+"""Estimate natural frequency and damping of a servo from its command and position.
+
+The result is a first guess of unknown gains. A joint whose drive pulls it towards the command u by
+a spring and a damper moves as
+
+    q'' = w^2 (u - q) - 2 d w q'                                                                 (1)
+
+with the natural frequency w and the damping ratio d. Commands are held over a sample, so (1) is
+integrated exactly from sample to sample (C. Van Loan, IEEE Trans. Autom. Control 23(3), 395, 1978);
+w and d are the grid values with the smallest residual of the position after removal of an offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array
+
+FREQUENCY_GRID = np.geomspace(2.0, 200.0, 33)
+"""Grid of natural frequencies in rad/s."""
+DAMPING_GRID = np.geomspace(0.3, 6.0, 14)
+MIN_EXPLAINED_VARIANCE = 0.8
+"""Minimum share of a position's variance that (1) must explain."""
+MAX_SAMPLES = 4000
+"""Maximum number of samples per run that are used."""
+MIN_SAMPLES = 20
+"""Minimum number of samples of a run."""
+
+
+class ServoResponse(NamedTuple):
+    """Natural frequency in rad/s, and damping ratio."""
+
+    frequency: float
+    damping: float
+
+
+def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> ServoResponse | None:
+    """Estimate how a position follows its command.
+
+    Args:
+        runs: For each run (T,) times in s, about uniform, (T,) commands, each held to the next
+            sample, and (T,) positions in the same unit.
+
+    Returns:
+        Frequency and damping; None if the position hardly moves or does not follow.
+    """
+    clean = [_seen(*run) for run in runs]
+    moving = [
+        (t, u, q) for t, u, q in clean if t.size >= MIN_SAMPLES and np.std(u) > 0 and np.std(q) > 0
+    ]
+    if not moving:
+        return None
+    # Import SciPy's signal module only here, since it is large.
+    from scipy.signal import cont2discrete, lfilter
+
+    step = float(np.median([np.median(np.diff(t)) for t, _, _ in moving]))
+    whole = sum(float(np.var(q)) * q.size for _, _, q in moving)
+    best, least = None, (1.0 - MIN_EXPLAINED_VARIANCE) * whole
+    for frequency, damping in product(FREQUENCY_GRID.tolist(), DAMPING_GRID.tolist()):
+        system = [frequency**2], [1.0, 2.0 * damping * frequency, frequency**2]
+        over, under, _ = cont2discrete(system, step)
+        left = 0.0
+        for _, u, q in moving:
+            left += float(np.var(q - lfilter(np.ravel(over), under, u - u[0]))) * q.size
+        if left < least:
+            best, least = ServoResponse(frequency, damping), left
+    return best
+
+
+def _seen(times: Array, command: Array, position: Array) -> tuple[Array, Array, Array]:
+    """Return the samples that are not missing, at most the first `MAX_SAMPLES`."""
+    seen = np.isfinite(position) & np.isfinite(command)
+    return times[seen][:MAX_SAMPLES], command[seen][:MAX_SAMPLES], position[seen][:MAX_SAMPLES]

@@ -1,0 +1,248 @@
+"""Summarise a recording as text: runs, rates, gaps, ranges and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.logs.signal_statistics import (
+    compute_run_statistics,
+    compute_signal_statistics,
+    list_recorded_signals,
+)
+from sims.core.simulator import InputError, Simulator
+from sims.core.value_limits import MAX_NUMBER
+from sims.recording.recording import (
+    Recording,
+    Run,
+    read_recording,
+    read_system_name,
+    split_held_out,
+)
+from sims.recording.recording_description import ModelFileReference, read_model_reference
+
+_MOST_RUNS = 40
+"""Maximum number of runs that are listed."""
+_MOST_NAMES = 12
+"""Maximum number of runs that are named in one line."""
+_CAVEAT = (
+    "estimated: from second and third differences, white noise assumed; coloured noise makes it "
+    "too small, motion that is fast against the sampling too large"
+)
+_RUN_HEAD = (
+    "run",
+    "use",
+    "samples",
+    "seconds",
+    "rate [Hz]",
+    "intervals [ms]: min",
+    "median",
+    "max",
+    "gaps",
+    "missing",
+)
+_SIGNAL_HEAD = ("signal", "kind", "unit", "min", "max", "missing", "noise: stated", "estimated", "")
+
+
+def load_recording(
+    source: str | Path | Recording,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    divide: bool = True,
+) -> tuple[Recording, type[Simulator]]:
+    """Read a recording and find its simulator.
+
+    Args:
+        source: Path of the table, or a recording in memory.
+        system: Registered system to use instead of the one that the recording names.
+        model: Model file of a robot to use instead of the one that the recording names.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+        divide: Whether to divide the runs for fitting and validation as `simgap explain` does;
+            False to hold out marked runs only.
+
+    Returns:
+        The recording, and the simulator class of its system.
+
+    Raises:
+        InputError: It cannot be read, or there is no such system.
+    """
+    path = source.path if isinstance(source, Recording) else Path(source)
+    kind = get_simulator_class(source, path, system, model, free)
+    memory = source if isinstance(source, Recording) else None
+    recording = memory or read_recording(path, kind, whole=True)
+    if divide:
+        recording = split_held_out(recording, folds=True)
+    check_value_sizes(recording)
+    return recording, kind
+
+
+def get_simulator_class(
+    source: str | Path | Recording,
+    path: Path,
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+) -> type[Simulator]:
+    """Find the simulator of the system or robot of a recording.
+
+    Args:
+        source: Path of the table, or a recording in memory.
+        path: Path of the table.
+        system: Registered system to use instead of the one that the recording names.
+        model: Model file of a robot to use instead of the one that the recording names.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+
+    Raises:
+        InputError: A system and a model file are both given, or the system is unknown.
+    """
+    if system is not None and model is not None:
+        raise InputError("expected a system or a model file, found both; leave one out")
+    if isinstance(source, Recording):
+        of_file = source.model
+        if model is not None:
+            of_file = replace(of_file or ModelFileReference(Path(), {}, {}), path=Path(model))
+    else:
+        of_file = None if system is not None else read_model_reference(path, model)
+    if of_file is not None and system is None:
+        return make_robot_simulator(
+            of_file.path, of_file.actuators, of_file.engine, free or of_file.free
+        )
+    name = system or (source.system if isinstance(source, Recording) else read_system_name(path))
+    try:
+        return simulators.get(name)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def check_value_sizes(recording: Recording) -> None:
+    """Reject values whose squares overflow.
+
+    Raises:
+        InputError: There is such a value; the message is one line.
+    """
+    for run in recording.runs:
+        for name, values in (*run.channels.items(), *run.inputs.items()):
+            largest = float(np.nanmax(np.abs(values), initial=0.0))
+            if largest > MAX_NUMBER:
+                what = f"expected values within ±{MAX_NUMBER:g}, found {largest:.3g}"
+                raise InputError(f"{recording.path}: run {run.name}, column {name}: {what}")
+
+
+def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
+    """Yield the lines of a text summary of a recording.
+
+    Args:
+        recording: Recording to summarise.
+        kind: Simulator class of its system.
+    """
+    runs = recording.runs
+    samples = sum(run.times.size for run in runs)
+    seconds = sum(run.times[-1] - run.times[0] for run in runs)
+    held_out = len(recording.held_out())
+    yield recording.title
+    # A single run is divided into two parts with the same name.
+    whole = len({run.name for run in runs})
+    held = "its last third held out" if whole < len(runs) else f"{held_out} held out"
+    if recording.folds():
+        held = "each left out in turn"
+    size = f"{_count(whole, 'run')} ({held}), {samples} samples, {seconds:.4g} s"
+    yield f"{recording.path}: system {recording.system}, {size}"
+    yield from recording.notes
+    yield ""
+    yield from _aligned([_RUN_HEAD, *map(_run_row, runs[:_MOST_RUNS])], left=2)
+    if len(runs) > _MOST_RUNS:
+        yield f"... and {len(runs) - _MOST_RUNS} more runs"
+    yield ""
+    yield from _aligned([_SIGNAL_HEAD, *_signal_rows(recording, kind)], left=3)
+    yield _CAVEAT
+    yield ""
+    yield from _constants(recording, kind)
+
+
+def _use(run: Run) -> str:
+    if run.fold is not None:
+        return "left out in turn"
+    return "held out" if run.held_out else "fitting"
+
+
+def _run_row(run: Run) -> tuple[str, ...]:
+    facts = compute_run_statistics(run)
+    return (
+        facts.name,
+        _use(run),
+        str(facts.samples),
+        f"{facts.seconds:.4g}",
+        f"{facts.rate:.4g}",
+        *(f"{1e3 * t:.4g}" for t in (facts.shortest, facts.median, facts.longest)),
+        str(facts.gaps),
+        str(facts.missing),
+    )
+
+
+def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
+    for channel, what in list_recorded_signals(recording, kind):
+        facts = compute_signal_statistics(recording, channel, what)
+        not_stated = "-" if what == "channel" else ""
+        yield (
+            facts.name,
+            what,
+            facts.unit,
+            f"{facts.low:.4g}",
+            f"{facts.high:.4g}",
+            f"{facts.missing:.1%}" if facts.missing else "0",
+            not_stated if facts.stated is None else f"{facts.stated:.3g}",
+            f"{facts.estimated:.3g}" if np.isfinite(facts.estimated) else "",
+            f"in steps of {facts.step:.3g}" if facts.step else "",
+        )
+
+
+def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
+    for constant in kind.constants:
+        yield _constant(recording, constant.name, constant.value, constant.unit)
+    known = []
+    for run in recording.runs:
+        if run.initial:
+            states = ", ".join(f"{name} = {value:g}" for name, value in run.initial.items())
+            known.append(f"{run.name} ({states})")
+    if known:
+        yield f"initial states stated: {', '.join(known[:_MOST_RUNS])}"
+
+
+def _constant(recording: Recording, name: str, default: float, unit: str) -> str:
+    """Describe a constant's value, and list the runs with each value if it differs."""
+    usual = recording.constants.get(name, default)
+    runs_by_value: dict[float, list[str]] = {}
+    for run in recording.runs:
+        runs_by_value.setdefault(run.constants.get(name, usual), []).append(run.name)
+    unit = "" if unit == "1" else f" {unit}"
+    if len(runs_by_value) > 1:
+        parts = [f"{value:g}{unit} in {_named(runs)}" for value, runs in runs_by_value.items()]
+        return f"{name} differs by run: {'; '.join(parts)}"
+    value = next(iter(runs_by_value))
+    stated = name in recording.constants or any(name in run.constants for run in recording.runs)
+    note = "" if stated else " (the system's default; not stated)"
+    return f"{name} = {value:g}{unit}{note}"
+
+
+def _named(names: Sequence[str]) -> str:
+    runs = f"run{'s' * (len(names) > 1)} {', '.join(names[:_MOST_NAMES])}"
+    more = len(names) - _MOST_NAMES
+    return f"{runs} and {more} more" if more > 0 else runs
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
+def _aligned(rows: Sequence[Sequence[str]], left: int) -> Iterator[str]:
+    """Align a table as text, with the first `left` columns left-justified."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        aligned = [c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(cells)]
+        yield "  ".join(aligned).rstrip()

@@ -1,0 +1,136 @@
+"""Join several recordings of one system into one; each run keeps the name of its log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.logs.inspection import load_recording
+from sims.core.simulator import InputError, Simulator
+from sims.recording.recording import MAX_FOLDS, Recording, Run, split_held_out
+
+
+def load_joined(
+    sources: Sequence[str | Path | Recording],
+    system: str | None = None,
+    model: str | Path | None = None,
+    free: Sequence[str] = (),
+    prepared: Callable[[Recording, type[Simulator]], Recording] | None = None,
+) -> tuple[Recording, type[Simulator]]:
+    """Read several recordings, join them into one, and find their simulator.
+
+    Two or three unmarked runs in total are cross-validated; otherwise each recording holds out the
+    runs that it would hold out alone, at least one. A constant that the recordings state
+    differently becomes a constant of the runs; a noise that they state differently is replaced by
+    its root mean square.
+
+    Args:
+        sources: Paths of the tables, or recordings in memory.
+        system: Registered system to use instead of the one that the recordings name.
+        model: Model file of a robot to use instead of the one that the recordings name.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+        prepared: Function applied to each recording before its runs are divided.
+
+    Returns:
+        The joined recording, and the simulator class of its system.
+
+    Raises:
+        InputError: One cannot be read, or they are not of one system with the same channels.
+    """
+    loaded = [load_recording(source, system, model, free, divide=False) for source in sources]
+    if prepared is not None:
+        loaded = [(prepared(recording, kind), kind) for recording, kind in loaded]
+    first, kind = loaded[0]
+    if len(loaded) == 1:
+        return split_held_out(first, folds=True), kind
+    for recording, other in loaded[1:]:
+        _refuse_other(first, kind, recording, other)
+    recordings = [recording for recording, _ in loaded]
+    runs_of_all = [run for recording in recordings for run in recording.runs]
+    folds = len(runs_of_all) <= MAX_FOLDS and not any(run.held_out for run in runs_of_all)
+    if not folds:
+        recordings = [split_held_out(recording) for recording in recordings]
+    names = make_log_names([recording.path for recording in recordings])
+    constants = {
+        key: value
+        for key, value in first.constants.items()
+        if all(recording.constants.get(key) == value for recording in recordings)
+    }
+    usual = {c.name: c.value for c in kind.constants}
+    differing = {key for recording in recordings for key in recording.constants} - set(constants)
+    runs = [
+        replace(
+            run,
+            name=f"{name}: {run.name}",
+            log=name,
+            constants={key: _constant(key, recording, run, usual) for key in differing}
+            | dict(run.constants),
+        )
+        for name, recording in zip(names, recordings, strict=True)
+        for run in recording.runs
+    ]
+    more = len(loaded) - 1
+    joined = replace(
+        first,
+        title=f"{first.title or first.path.stem} and {more} more log{'s' * (more > 1)}",
+        constants=constants,
+        noise=_noise(recordings),
+        runs=tuple(runs),
+        notes=tuple(note for recording in recordings for note in recording.notes),
+    )
+    return (split_held_out(joined, folds=True) if folds else joined), kind
+
+
+def _constant(key: str, recording: Recording, run: Run, usual: dict[str, float]) -> float:
+    return run.constants.get(key, recording.constants.get(key, usual.get(key, np.nan)))
+
+
+def _refuse_other(
+    first: Recording, kind: type[Simulator], other: Recording, of: type[Simulator]
+) -> None:
+    """Reject a recording that cannot be joined with the first one."""
+    robots = kind.has_model and of.has_model
+    if (kind.has_model or of.has_model) != robots or of.name != kind.name:
+        raise InputError(
+            f"{other.path}: expected a log of {kind.name} as {first.path}, found one of {of.name}; "
+            "explain it by itself"
+        )
+    if robots and vars(of)["source_digest"] != vars(kind)["source_digest"]:
+        raise InputError(
+            f"{other.path}: expected the model file, the actuators and the free numbers of "
+            f"{first.path}, found others; state the same, or give --model and --free"
+        )
+    ours, theirs = first.runs[0], other.runs[0]
+    for what, one, two in (
+        ("channels", set(ours.channels), set(theirs.channels)),
+        ("inputs", set(ours.inputs), set(theirs.inputs)),
+    ):
+        if one != two:
+            raise InputError(
+                f"{other.path}: expected the {what} of {first.path}, {', '.join(sorted(one))}, "
+                f"found {', '.join(sorted(two)) or 'none'}"
+            )
+
+
+def make_log_names(paths: Sequence[Path]) -> list[str]:
+    """Return a short name for each log: its stem, with its folder if stems repeat."""
+    stems = [path.stem for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    longer = [f"{path.parent.name}/{path.stem}" for path in paths]
+    if len(set(longer)) == len(longer):
+        return longer
+    return [f"{number}/{name}" for number, name in enumerate(longer, start=1)]
+
+
+def _noise(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Return the root mean square noise of each channel, if all recordings state it."""
+    shared = set(recordings[0].noise).intersection(*(r.noise for r in recordings))
+    return {
+        name: float(np.sqrt(np.mean([recording.noise[name] ** 2 for recording in recordings])))
+        for name in recordings[0].noise
+        if name in shared
+    }

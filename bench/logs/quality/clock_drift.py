@@ -1,0 +1,175 @@
+"""Check whether the clock of the sensors drifts against that of the commands.
+
+The response of a position y to a command u is modelled as linear with finite memory,
+
+    p(t) = c + d t + sum_k h_k <u>_k(t),  <u>_k the mean of u over the k-th interval before t  (1)
+
+so that slow and fast commands each have the lag that the drive gives them. A position whose delay
+grows by a share e of the time is
+
+    y(t) = p(t - T - e t) = p - (T + e t) p' + ...                                             (2)
+
+Least squares for T and e finds the shift at which the two are most similar (the maximum of the
+cross-correlation, to first order; C. Knapp, G. Carter, IEEE Trans. ASSP 24(4), 320, 1976). The
+standard error of e is computed from sums over blocks longer than the memory, since the residual of
+(1) is not white (W. Newey, K. West, Econometrica 55, 703, 1987).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.logs.quality.quality_finding import QualityFinding
+from sims.core.simulator import Array, Simulator
+from sims.recording.recording import Recording, Run
+from sims.system_simulator import SystemSimulator
+
+MAX_COMPARED_INSTANTS = 8000
+"""Maximum number of times of a run at which command and position are compared."""
+LAG_BIN_EDGES = (-2, -1, 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+"""Bounds of the intervals of equation (1), in grid steps before the time considered."""
+BLOCK_COUNT = 4
+"""Minimum number of blocks of a run for estimating the standard error of its drift."""
+STUDENT_T_FACTORS = (
+    9.0,
+    9.0,
+    9.0,
+    2.7,
+    1.9,
+    1.6,
+    1.43,
+    1.35,
+    1.3,
+    1.25,
+    1.2,
+    1.18,
+    1.16,
+    1.14,
+    1.12,
+    1.1,
+    1.05,
+)
+"""Correction factors of the standard error, indexed by the number of blocks.
+
+They are the factors by which an error from few blocks is too small (Student's t at 95 %, one block
+lost).
+"""
+MODEL_ERROR_SHARE = 0.01
+"""Relative error of the drift from truncating equation (2)."""
+MIN_EXPLAINED_VARIANCE = 0.9
+"""Minimum share of a position's variance that equation (1) must explain."""
+MIN_REPORTED_DRIFT = 2e-5
+"""Smallest reported drift (dimensionless); ordinary quartz clocks differ by less."""
+SIGNIFICANCE_SIGMAS = 4.0
+"""Detection threshold in standard deviations."""
+
+
+class _Estimate(NamedTuple):
+    drift: float
+    error: float
+
+
+def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find the clock drift, pooled over all runs and driven coordinates, if it is significant.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        At most one finding.
+    """
+    found = [
+        estimate
+        for command, position in _driven(kind)
+        for run in recording.runs
+        if command in run.inputs and position in run.channels
+        for estimate in _estimate(run, command, position)
+    ]
+    if not found:
+        return
+    drift, error = _pooled(found)
+    if abs(drift) < max(MIN_REPORTED_DRIFT, SIGNIFICANCE_SIGMAS * error):
+        return
+    word = "fast" if drift > 0 else "slow"
+    yield QualityFinding(
+        "drift",
+        f"the sensors' clock runs {1e6 * abs(drift):.3g} ppm (±{2e6 * error:.2g}) {word} against "
+        "the commands'",
+        "stamp both by one clock; explain's clock.skew finds and removes it",
+    )
+
+
+def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
+    """Return pairs of an input and a position that follows it."""
+    if not issubclass(kind, SystemSimulator):
+        return []
+    if kind.has_model:
+        robot: Any = kind
+        return [(f"u.{a.name}", f"q.{a.joint}") for a in robot.robot.actuators if a.joint]
+    return [(u.name, name) for u in kind.inputs for name in kind.system.coordinates]
+
+
+def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
+    """Estimate the drift of one run by equation (2); yield nothing if (1) explains too little."""
+    t, u, y = run.times, run.inputs[command], run.channels[position]
+    seen = np.isfinite(y)
+    if seen.sum() < 2 * len(LAG_BIN_EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):
+        return
+    step = max(float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_COMPARED_INSTANTS)
+    grid = np.arange(t[0], t[-1], step)
+    own = np.interp(grid, t[seen], y[seen])
+    memory = _memory(np.interp(grid, t, u))
+    inner = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
+    time = (grid - grid.mean())[inner]
+    own, memory = own[inner], memory[inner]
+    if time.size < BLOCK_COUNT * LAG_BIN_EDGES[-1] or not np.std(own) > 0:
+        return
+    smooth = np.column_stack([np.ones_like(time), time, memory])
+    answer, *_ = np.linalg.lstsq(smooth, own, rcond=1e-10)
+    predicted = smooth @ answer  # Equation (1).
+    if np.var(own - predicted) > (1.0 - MIN_EXPLAINED_VARIANCE) * np.var(own):
+        return
+    rate = np.gradient(predicted, step)
+    basis, _ = np.linalg.qr(np.column_stack([smooth, rate]))
+    late = -time * rate
+    late = late - basis @ (basis.T @ late)
+    power = float(late @ late)
+    if not power > 0:
+        return
+    drift = float(late @ own) / power
+    rest = own - basis @ (basis.T @ own) - drift * late
+    sums = np.add.reduceat(late * rest, np.arange(0, time.size, LAG_BIN_EDGES[-1]))
+    error = (
+        STUDENT_T_FACTORS[min(len(sums), len(STUDENT_T_FACTORS) - 1)]
+        * float(np.sqrt(sums @ sums))
+        / power
+    )
+    yield _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
+
+
+def _memory(u: Array) -> Array:
+    """Return the (N, K) means of a command over the intervals of equation (1)."""
+    total = np.concatenate([[0.0], np.cumsum(u)])
+    at = np.arange(u.size)
+    columns = []
+    for begin, end in pairwise(LAG_BIN_EDGES):
+        first, last = (np.clip(at - bound + 1, 0, u.size) for bound in (end, begin))
+        columns.append((total[last] - total[first]) / (end - begin))
+    return np.column_stack(columns)
+
+
+def _pooled(found: list[_Estimate]) -> _Estimate:
+    """Return the weighted mean; scale its error up if estimates scatter more than their errors."""
+    drifts, errors = np.array(found).T
+    weights = np.maximum(errors, 1e-12) ** -2.0
+    drift = float(weights @ drifts / weights.sum())
+    error = float(weights.sum() ** -0.5)
+    if len(found) > 1:
+        scatter = float(weights @ (drifts - drift) ** 2) / (len(found) - 1)
+        error *= max(scatter, 1.0) ** 0.5
+    return _Estimate(drift, error)

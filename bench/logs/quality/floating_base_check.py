@@ -1,0 +1,44 @@
+"""Check that a recording states the initial poses of floating bodies.
+
+Initial poses are not estimated, and the same commands produce a different motion from a different
+initial pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bench.logs.quality.anomaly import Anomaly
+from sims.core.simulator import Simulator
+from sims.recording.recording import Recording
+from sims.recording.recording_description import get_floating_state_units
+
+
+def find_missing_base_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Find floating joints whose initial state is missing in some run.
+
+    Only the first run without the state is reported for each joint.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One certain anomaly for each such joint.
+    """
+    own: dict[str, list[str]] = {}
+    for name in get_floating_state_units(kind):
+        joint = name.split(".", 1)[1].rpartition(".")[0]
+        own.setdefault(joint, []).append(name)
+    for joint, states in own.items():
+        found = (run for run in recording.runs if run.initial.keys().isdisjoint(states))
+        run = next(found, None)
+        if run is None:
+            continue
+        names = [other.name for other in recording.runs]
+        if names.count(run.name) > 1:
+            what = f"where {joint} is when the last third of a single run begins; record another"
+        else:
+            what = f"where {joint} begins; state [runs.{run.name}.initial], of {', '.join(states)}"
+            what = f"{what} (what is left out is as in the model file, at rest)"
+        yield Anomaly(f"run {run.name}: nothing says {what}", True)

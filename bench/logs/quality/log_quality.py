@@ -1,0 +1,32 @@
+"""Run all quality checks of a log: clock, signal values and consistency of channels.
+
+The checks need no fitted model. Each finding is one line with its remedy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bench.logs.quality import clock_drift, sampling_clock, signal_values, velocity_consistency
+from bench.logs.quality.quality_finding import QualityFinding
+from sims.core.simulator import Simulator
+from sims.recording.recording import Recording
+
+
+def check_log_quality(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Run all quality checks: clock, single signals, and consistency between signals.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+
+    Returns:
+        Findings in the order of the checks.
+    """
+    yield from sampling_clock.check_intervals(recording)
+    yield from sampling_clock.check_repeated_samples(recording)
+    yield from clock_drift.check_clock_drift(recording, kind)
+    yield from signal_values.check_quantisation(recording, kind)
+    yield from signal_values.check_saturation(recording, kind)
+    yield from signal_values.check_standstill(recording, kind)
+    yield from velocity_consistency.check_velocities(recording, kind)

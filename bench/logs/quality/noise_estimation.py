@@ -1,0 +1,109 @@
+"""Estimate the noise of a sampled signal from the signal alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from sims.core.simulator import Array
+
+_MAD = 1.4826
+"""Ratio of the standard deviation of a normal variable to its median magnitude."""
+_SAME = 0.05
+"""Share of unchanged samples above which a signal counts as quantised."""
+_GAP = 1.75
+"""Ratio of an interval to the median interval above which it is a gap.
+
+A lost sample makes an interval twice as long.
+"""
+
+
+class NoiseEstimate(NamedTuple):
+    """An estimate of noise.
+
+    Attributes:
+        sigma: Standard deviation (1 sigma); NaN if unknown.
+        step: Quantisation step; 0 if the signal is not quantised.
+    """
+
+    sigma: float
+    step: float
+
+
+def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
+    """Estimate noise from the residuals of samples against a line or parabola through neighbours.
+
+    For uniform sampling these are second and third differences (von Neumann et al., Ann. Math.
+    Stat. 12, 153, 1941, doi:10.1214/aoms/1177731746), made robust by their median and generalised
+    to non-uniform sampling by divided differences
+
+        d = sum_i w_i y_i,  w_i ~ 1 / prod_(j != i) (t_i - t_j),  sum_i w_i^2 = 1       (1)
+
+    The smaller of the two estimates is used, since residual motion only increases them. The method
+    assumes white noise: autocorrelated noise is underestimated, and motion that is fast relative to
+    the sampling looks like noise. A quantised signal has at least its rounding noise.
+
+    Args:
+        signals: (times (T,), values (T,)) of each run; NaN values are missing.
+    """
+    runs = [(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()]
+    sigmas, step = [_sigma(runs, order) for order in (2, 3)], _step(runs)
+    if not np.isfinite(sigmas).any():
+        return NoiseEstimate(np.nan, step)
+    # Rounding errors are uniform within half a step to either side: 1 sigma is step / sqrt(12).
+    return NoiseEstimate(max(float(np.nanmin(sigmas)), step / 12**0.5), step)
+
+
+def differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> float:
+    """Estimate white noise (1 sigma) from divided differences (1) of one order, over all runs.
+
+    The higher the order, the less a smooth motion contributes.
+
+    Args:
+        signals: (times (T,), values (T,)) of each run; NaN values are missing.
+        order: Order of the differences.
+
+    Returns:
+        Standard deviation; NaN if all runs are too short.
+    """
+    return _sigma([(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()], order)
+
+
+def _sigma(runs: list[tuple[Array, Array]], order: int) -> float:
+    """Return 1 sigma from differences of one order, over all runs; NaN if all are too short."""
+    rests = [_compute_divided_differences(t, y, order) for t, y in runs if t.size > order + 1]
+    pooled = np.concatenate(rests) if rests else np.empty(0)
+    return _MAD * float(np.median(np.abs(pooled))) if pooled.size else np.nan
+
+
+def _compute_divided_differences(times: Array, values: Array, order: int) -> Array:
+    """Compute divided differences, scaled to the variance of one sample, omitting gaps."""
+    t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
+    # Motion across a gap is no longer close to a polynomial.
+    near = t[:, -1] - t[:, 0] <= _GAP * order * np.median(np.diff(times))
+    t, y = t[near], y[near]
+    # The ones on the diagonal leave out the factor t_i - t_i.
+    between = t[:, :, None] - t[:, None, :] + np.eye(order + 1)
+    # Equation (1): a polynomial of lower order becomes zero, white noise keeps its variance.
+    weights = 1.0 / between.prod(axis=2)
+    weights /= np.sqrt((weights * weights).sum(axis=1, keepdims=True))
+    rests: Array = (weights * y).sum(axis=1)
+    return rests
+
+
+def _step(runs: list[tuple[Array, Array]]) -> float:
+    """Return the smallest change of a signal that often does not change at all; 0 otherwise."""
+    changes = np.abs(np.concatenate([np.empty(0), *(np.diff(y) for _, y in runs)]))
+    # Computed values that should be equal may differ by rounding, so tiny changes count as none.
+    moving = changes[changes > 1e-12 * np.max(changes, initial=0.0)]
+    quantised = moving.size and np.mean(changes == 0) > _SAME
+    return float(moving.min()) if quantised else 0.0
+
+
+def count_gaps(times: Array) -> int:
+    """Count intervals that are much longer than the median interval."""
+    intervals = np.diff(times)
+    return int((intervals > _GAP * np.median(intervals)).sum()) if intervals.size else 0

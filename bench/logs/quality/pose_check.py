@@ -1,0 +1,243 @@
+"""Check the plausibility of a robot's positions in a log.
+
+Joint limits and servo commands reveal wrong units (degrees), reversed signs and exchanged columns.
+The joint of a servo approximately follows its command: over the samples of all runs, with the
+command u and the position q about their means,
+
+    b = <u q> / <u^2>,    r = <u q> / sqrt(<u^2> <q^2>)                       (1)
+
+are the slope and the correlation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.logs.quality.anomaly import Anomaly
+from sims.core.simulator import Array, Simulator
+from sims.recording.recording import Recording, Run
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+
+MAX_RANGE_EXCESS = 1.0
+"""Maximum plausible distance of a position beyond its joint's range, as a fraction of the range."""
+RANGE_TOLERANCE = 0.02
+"""Distance beyond a joint's range explained by noise or an offset, as a fraction of the range."""
+MAX_PLAUSIBLE_TURNS = 8.0
+"""Maximum plausible number of turns of a joint without limits."""
+MIN_FOLLOWING_CORRELATION = 0.9
+"""Minimum correlation r of (1) for a position that follows a command."""
+MAX_UNRELATED_CORRELATION = 0.7
+"""Maximum absolute correlation r of (1) for a position that does not follow a command."""
+MAX_REVERSED_SLOPE = -0.3
+"""Maximum slope b of (1) for a servo that follows its command with reversed sign."""
+DEGREE_SLOPE_RANGE = (40.0, 80.0)
+"""Range of slopes b of (1) which show that one of the two signals is in degrees (57.3)."""
+CHECKED_INSTANTS = 100
+"""Maximum number of times of a run at which forces or contacts are evaluated."""
+_SMALLER = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
+"""Smaller unit in which positions are often recorded, by SI unit: its value and name."""
+
+
+def check_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Find implausible positions of a robot; none for other systems.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        Anomalies of joint ranges and of servos.
+    """
+    if not kind.has_model:
+        return
+    robot: Any = kind
+    for joint in robot.robot.joints:
+        if joint.single:
+            yield from _beyond(recording, joint)
+    yield from _servos(recording, robot.robot)
+
+
+def _beyond(recording: Recording, joint: Any) -> Iterator[Anomaly]:
+    """Find positions far beyond a joint's limits; only the first such run is reported."""
+    column = f"q.{joint.name}"
+    unit, (smaller, name) = joint.unit, _SMALLER[joint.unit]
+    for run in recording.runs:
+        values = run.channels.get(column)
+        if values is None or not np.isfinite(values).any():
+            continue
+        ends = np.array([np.nanmin(values), np.nanmax(values)])
+        found = float(ends[np.argmax(np.abs(ends))])
+        if joint.range is None:
+            if joint.kind == "hinge" and abs(found) > MAX_PLAUSIBLE_TURNS * 2.0 * np.pi:
+                turns = f"{abs(found) / (2.0 * np.pi):.3g} turns"
+                what = f"found {found:.4g} rad, {turns}; is the unit degrees?"
+                yield Anomaly(f"run {run.name}, column {column}: {what}", False)
+                return
+            continue
+        low, high = joint.range
+        slack = MAX_RANGE_EXCESS * (high - low)
+        if low - slack <= ends[0] and ends[1] <= high + slack:
+            over = np.array([low - ends[0], ends[1] - high])
+            if over.max() > RANGE_TOLERANCE * (high - low):
+                end = int(over.argmax())
+                stop = f"joint {joint.name} of the model stops at {(low, high)[end]:.4g}"
+                what = f"goes to {ends[end]:.4g} {unit}, and {stop}; is its range right?"
+                yield Anomaly(f"run {run.name}, column {column}: {what}", False)
+                return
+            continue
+        scaled = smaller * ends
+        fits = low - slack <= scaled[0] and scaled[1] <= high + slack
+        doubt = f"is the unit {name}?" if fits else "is the unit right?"
+        what = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
+        yield Anomaly(f"run {run.name}, column {column}: {what}, found {found:.4g}; {doubt}", True)
+        return
+
+
+def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
+    """Compute accelerations of a robot at rest in recorded positions under recorded commands.
+
+    Args:
+        run: Run with the positions and commands.
+        kind: Simulator class of the robot.
+
+    Returns:
+        (N, D) accelerations at up to `CHECKED_INSTANTS` times of the run.
+    """
+    import mujoco
+
+    robot = kind.robot  # type: ignore[attr-defined]
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    joints = [joint for joint in robot.joints if joint.single]
+    found = []
+    with capture_mujoco_warnings():
+        for row in np.unique(np.linspace(0, run.times.size - 1, CHECKED_INSTANTS).astype(np.intp)):
+            mujoco.mj_resetData(model, data)
+            for joint in joints:
+                seen = run.channels.get(f"q.{joint.name}")
+                if seen is not None and np.isfinite(seen[row]):
+                    data.qpos[joint.position] = seen[row]
+                data.qfrc_applied[joint.velocity] = _at(run, f"force.{joint.name}", row)
+            for actuator in robot.actuators:
+                data.ctrl[actuator.control] = _at(run, f"u.{actuator.name}", row)
+            mujoco.mj_forward(model, data)
+            found.append([data.qacc[joint.velocity] for joint in joints])
+    return np.array(found)
+
+
+def find_contacts(
+    kind: type[Simulator], positions: Mapping[str, Array]
+) -> frozenset[tuple[int, int]]:
+    """Find pairs of a robot's geoms that touch at some of `CHECKED_INSTANTS` times of a motion.
+
+    Args:
+        kind: Simulator class of the robot.
+        positions: (N,) position of each joint, rad or m, by channel; other joints keep their
+            initial position.
+    """
+    import mujoco
+
+    robot = kind.robot  # type: ignore[attr-defined]
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    count = max((values.size for values in positions.values()), default=0)
+    found = set()
+    with capture_mujoco_warnings():
+        for row in np.unique(np.linspace(0, max(count - 1, 0), CHECKED_INSTANTS).astype(np.intp)):
+            mujoco.mj_resetData(model, data)
+            for joint in robot.joints:
+                values = positions.get(f"q.{joint.name}")
+                if joint.single and values is not None and np.isfinite(values[row]):
+                    data.qpos[joint.position] = values[row]
+            mujoco.mj_forward(model, data)
+            found |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
+    return frozenset(found)
+
+
+def _at(run: Run, name: str, row: int) -> float:
+    return float(run.inputs[name][row]) if name in run.inputs else 0.0
+
+
+class _Pair(NamedTuple):
+    """Slope and correlation of a position against a command, equation (1)."""
+
+    slope: float
+    like: float
+
+
+def _servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
+    """Find servos whose joints do not behave like a servo."""
+    driven = [
+        (f"u.{a.name}", f"q.{a.joint}")
+        for a in robot.actuators
+        if a.kind == "position" and a.joint is not None and _both(recording, a)
+    ]
+    pairs = {
+        (command, position): _pair(recording, command, position)
+        for command, _ in driven
+        for _, position in driven
+    }
+    for command, position in driven:
+        own = pairs[command, position]
+        if (
+            own.like > MIN_FOLLOWING_CORRELATION
+            and DEGREE_SLOPE_RANGE[0] < own.slope < DEGREE_SLOPE_RANGE[1]
+        ):
+            far = f"{own.slope:.3g} times as far as {command} says"
+            what = f"moves {far}; is its unit degrees?"
+            yield Anomaly(f"column {position}: {what}", True)
+        elif (
+            own.like > MIN_FOLLOWING_CORRELATION
+            and 1.0 / DEGREE_SLOPE_RANGE[1] < own.slope < 1.0 / DEGREE_SLOPE_RANGE[0]
+        ):
+            far = f"1/{1.0 / own.slope:.3g} of what {command} says"
+            yield Anomaly(
+                f"column {position}: moves {far}; is the unit of {command} degrees?", False
+            )
+        elif own.like < -MIN_FOLLOWING_CORRELATION and own.slope < MAX_REVERSED_SLOPE:
+            yield Anomaly(f"column {position}: moves against {command}; is a sign wrong?", False)
+    yield from _swapped(driven, pairs)
+
+
+def _swapped(
+    driven: list[tuple[str, str]], pairs: dict[tuple[str, str], _Pair]
+) -> Iterator[Anomaly]:
+    """Find two joints that follow each other's commands and not their own."""
+    for i, (command, position) in enumerate(driven):
+        for other_command, other in driven[i + 1 :]:
+            crossed = pairs[command, other].like, pairs[other_command, position].like
+            own = pairs[command, position].like, pairs[other_command, other].like
+            if (
+                min(crossed) > MIN_FOLLOWING_CORRELATION
+                and max(map(abs, own)) < MAX_UNRELATED_CORRELATION
+            ):
+                what = f"columns {position} and {other}: each follows the other's command"
+                yield Anomaly(f"{what}; are they swapped?", False)
+
+
+def _both(recording: Recording, actuator: Any) -> bool:
+    """Return whether an actuator's command and its joint's position are recorded."""
+    first = recording.runs[0]
+    return f"u.{actuator.name}" in first.inputs and f"q.{actuator.joint}" in first.channels
+
+
+def _pair(recording: Recording, command: str, position: str) -> _Pair:
+    """Compute (1) over all runs, each run about its own means."""
+    squares = np.zeros(3)
+    for run in recording.runs:
+        u, q = run.inputs[command], run.channels[position]
+        seen = np.isfinite(u) & np.isfinite(q)
+        if seen.sum() > 1:
+            squares += _products(u[seen], q[seen])
+    uu, uq, qq = squares
+    if min(uu, qq) <= 0 or uq == 0:
+        return _Pair(1.0, 0.0)  # One of the two is constant, so nothing can be concluded.
+    return _Pair(float(uq / uu), float(uq / np.sqrt(uu * qq)))
+
+
+def _products(u: Array, q: Array) -> Array:
+    u, q = u - u.mean(), q - q.mean()
+    return np.array([u @ u, u @ q, q @ q])

@@ -1,0 +1,141 @@
+"""Check the sampling clock of a recording: jitter, lost samples and repeated samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bench.logs.quality.quality_finding import QualityFinding, format_names
+from sims.core.simulator import Array
+from sims.recording.recording import Recording, Run
+
+JITTER_THRESHOLD = 0.02
+"""Smallest jitter that is reported, 1 sigma, as a fraction of the sampling interval."""
+LOST_SAMPLE_SHARE_THRESHOLD = 0.002
+"""Smallest share of lost or repeated samples that is reported."""
+INTEGER_INTERVAL_TOLERANCE = 0.3
+"""Tolerance for lost samples, as a fraction of the sampling interval.
+
+An interval that is so close to a whole multiple of the median interval has lost the samples
+between.
+"""
+FAST_SIGNAL_STEPS = 5.0
+"""Smallest change of a signal per sample that counts as fast motion, in quantisation steps.
+
+A signal that changes this fast does not repeat its value by coincidence.
+"""
+SIGNIFICANCE_SIGMAS = 4.0
+"""Detection threshold in standard deviations."""
+_MAD = 1.4826
+
+
+def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
+    """Find jitter and lost samples, summarised over all runs."""
+    jittered, rests, lost, whole, lossy = [], [], 0, 0, []
+    for run in recording.runs:
+        steps = np.diff(_select_timestamps(run))
+        if steps.size < 2:
+            continue
+        ratios = steps / np.median(steps)
+        counts = np.maximum(np.round(ratios), 1.0)
+        own = ratios - counts
+        jitter = _MAD * float(np.median(np.abs(own - np.median(own))))
+        rests.append(jitter)
+        if jitter > JITTER_THRESHOLD:
+            jittered.append(run.name)
+        gone = int((counts - 1)[np.abs(own) < max(INTEGER_INTERVAL_TOLERANCE, 3.0 * jitter)].sum())
+        # If the clock jitters strongly, a long interval means a lost sample only if no short
+        # interval compensates for it.
+        gone = min(gone, max(int(ratios.sum()) - steps.size, 0))
+        if gone < SIGNIFICANCE_SIGMAS * jitter * steps.size**0.5:
+            gone = 0
+        lost, whole = lost + gone, whole + steps.size + gone
+        if gone:
+            lossy.append(run.name)
+    if jittered:
+        yield QualityFinding(
+            "clock",
+            f"intervals vary by {max(rests):.0%} of one (1 sigma) in {format_names(jittered)}",
+            "every sample is simulated at its own stamp, so let the stamps be those of measuring "
+            "and not of writing",
+        )
+    if whole and lost > LOST_SAMPLE_SHARE_THRESHOLD * whole:
+        yield QualityFinding(
+            "clock",
+            f"{lost} samples ({lost / whole:.1%}) are lost in {format_names(lossy)}",
+            "nothing is filled in, but a command that changed in between is not known: log "
+            "commands in a file of their own, or at a lower rate",
+        )
+
+
+def _select_timestamps(run: Run) -> Array:
+    """Return the sample times of the sensor that was read most often.
+
+    The sample times of a run also contain those of commands and of other sensors, which have their
+    own clocks. All sample times are returned if they are at least as regular: the missing samples
+    of the sensor are then empty cells.
+    """
+    seen = [np.isfinite(values) for values in run.channels.values()]
+    often = max(seen, key=lambda one: int(one.sum()), default=np.ones(run.times.size, np.bool_))
+    own = run.times[often]
+    return run.times if _uneven(run.times) <= _uneven(own) else own
+
+
+def _uneven(times: Array) -> float:
+    """Return the share of intervals that differ from the median interval by more than 1 %."""
+    steps = np.diff(times)
+    if not steps.size:
+        return 1.0
+    usual = float(np.median(steps))
+    return float(np.mean(np.abs(steps - usual) > 0.01 * usual))
+
+
+def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
+    """Find samples that repeat the previous one in every channel while the system moves."""
+    found, there, runs = 0, 0, []
+    for run in recording.runs:
+        count, expected = _count_stale_samples(run)
+        if count > expected + SIGNIFICANCE_SIGMAS * np.sqrt(max(expected, 1.0)):
+            found += count
+            runs.append(run.name)
+        there += run.times.size
+    if found > LOST_SAMPLE_SHARE_THRESHOLD * there:
+        yield QualityFinding(
+            "clock",
+            f"{found} samples ({found / there:.1%}) repeat the one before in every channel while "
+            f"it moves, in {format_names(runs)}",
+            "leave these rows out: a value that is old by an interval passes for a delay",
+        )
+
+
+def _count_stale_samples(run: Run) -> tuple[int, float]:
+    """Count samples that repeat the previous one during fast motion.
+
+    Returns:
+        The count, and the count expected by chance.
+    """
+    signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
+    if not signals or run.times.size < 4:
+        return 0, 0.0
+    changes = np.array([_in_steps(values) for values in signals])
+    same = np.nan_to_num(changes, nan=0.0) == 0
+    around = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
+    moving = np.nan_to_num(np.max(around, axis=0, initial=0.0), nan=0.0) >= FAST_SIGNAL_STEPS
+    stale = same.all(axis=0)[1:-1] & moving
+    # A signal whose noise spans several steps repeats its value half as often as it changes by one
+    # step in either direction.
+    near = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)[1:-1] & moving
+    one = int(near.sum()) - int(stale.sum())
+    return int(stale.sum()), one / max(3.0 ** len(signals) - 1.0, 1.0)
+
+
+def _in_steps(values: Array) -> Array:
+    """Return the (T - 1,) changes of a signal in units of its smallest change."""
+    changes = np.diff(values)
+    sizes = np.abs(changes[np.isfinite(changes)])
+    moving = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
+    if not moving.size:
+        return np.zeros_like(changes)
+    # A signal without quantisation has a tiny smallest change, so all of its motion counts as fast.
+    return np.asarray(np.round(changes / moving.min()), dtype=np.float64)

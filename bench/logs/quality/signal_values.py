@@ -1,0 +1,202 @@
+"""Check single signals: quantisation, saturation and standstill."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from bench.logs.quality.noise_estimation import estimate_noise
+from bench.logs.quality.quality_finding import QualityFinding, format_names
+from sims.core.simulator import Array, Channel, Simulator
+from sims.recording.recording import Recording, Run
+from sims.system_simulator import SystemSimulator
+
+QUANTISATION_SHARE_THRESHOLD = 0.02
+"""Smallest reported quantisation step, as a fraction of the signal's range."""
+MIN_SATURATED_SAMPLES = 5
+"""Minimum number of consecutive samples at the end of a range that counts as saturation."""
+CLIPPING_STEP_THRESHOLD = 2.5
+"""Minimum jump of a signal into or out of saturation, in quantisation steps."""
+MIN_SATURATED_SHARE = 0.005
+"""Smallest reported share of samples at a saturated end."""
+MIN_STANDSTILL_SHARE = 0.5
+"""Smallest reported share of samples at standstill."""
+WINDOW_SAMPLES = 20
+"""Number of samples of a window in which a signal is judged to move or stand still."""
+MOTION_THRESHOLD_SIGMAS = 6.0
+"""Smallest range within a window that counts as motion, in standard deviations of noise.
+
+Noise alone has a range of 3.7 standard deviations on average.
+"""
+
+
+def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find channels whose quantisation exceeds their motion or their specified noise.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One finding for each such channel.
+    """
+    for channel, signals in _signals(recording, kind):
+        step = estimate_noise(signals).step
+        values = np.concatenate([values for _, values in signals])
+        spread = float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
+        stated = recording.noise.get(channel.name)
+        rounding = step / 12**0.5
+        unit = channel.unit
+        if step and stated is not None and stated < rounding / 2:
+            yield QualityFinding(
+                "quantisation",
+                f"{channel.name} goes in steps of {step:.3g} {unit}, whose rounding alone is "
+                f"{rounding:.2g} {unit}, and the noise stated is {stated:.2g}",
+                f"state noise = {rounding:.2g} or more",
+            )
+        elif step > QUANTISATION_SHARE_THRESHOLD * spread > 0:
+            yield QualityFinding(
+                "quantisation",
+                f"{channel.name} goes in steps of {step:.3g} {unit}, {step / spread:.0%} of its "
+                "range",
+                "move further, or read a finer sensor: what is smaller than a step is hardly seen",
+            )
+
+
+def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find channels that are cut off at an end of their range, and commands at their limits.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One finding for each saturated end and each limited command.
+    """
+    for channel, signals in _signals(recording, kind):
+        for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
+            values = [sign * own for _, own in signals if np.isfinite(own).any()]
+            if not values:
+                continue
+            end = max(float(np.nanmax(own)) for own in values)
+            jump = CLIPPING_STEP_THRESHOLD * estimate_noise(signals).step
+            flat = sum(_flat(own, end, jump) for own in values)
+            total = sum(own.size for own in values)
+            if flat > MIN_SATURATED_SHARE * total and not all(_stands(own, end) for own in values):
+                yield QualityFinding(
+                    "saturation",
+                    f"{channel.name} stays at its {word} value, {sign * end:.4g} {channel.unit}, "
+                    f"in {flat / total:.1%} of the samples",
+                    "a sensor or a joint at its end shows nothing: leave these samples empty, or "
+                    "keep clear of the end",
+                )
+    yield from _commands(recording, kind)
+
+
+def _commands(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    if not kind.has_model:
+        return
+    robot: Any = kind
+    for actuator in robot.robot.actuators:
+        name = f"u.{actuator.name}"
+        if actuator.range is None or name not in recording.runs[0].inputs:
+            continue
+        low, high = actuator.range
+        values = np.concatenate([run.inputs[name] for run in recording.runs])
+        share = float(np.mean((values <= low) | (values >= high)))
+        if share > MIN_SATURATED_SHARE:
+            yield QualityFinding(
+                "saturation",
+                f"{name} is at or beyond its range, {low:.4g} to {high:.4g}, in {share:.1%} of "
+                "the samples",
+                "beyond it a command does nothing more: command less, or correct the range",
+            )
+
+
+def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find coordinates that move in few samples or never.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        At most two findings: coordinates that never move, and coordinates that seldom move.
+    """
+    if not issubclass(kind, SystemSimulator):
+        return
+    never, seldom = [], []
+    positions = set(kind.system.coordinates)
+    for channel, signals in _signals(recording, kind):
+        if channel.name not in positions:
+            continue
+        noise = estimate_noise(signals)
+        least = MOTION_THRESHOLD_SIGMAS * max(
+            np.nan_to_num(noise.sigma), noise.step, 1e-9 * channel.scale
+        )
+        moving = np.concatenate([_moving(values, least) for _, values in signals])
+        share = 1.0 - float(moving.mean()) if moving.size else 0.0
+        if share == 1.0:
+            never.append(channel.name)
+        elif share > MIN_STANDSTILL_SHARE:
+            seldom.append(f"{channel.name} ({share:.0%})")
+    if never:
+        yield QualityFinding(
+            "stillness",
+            f"{format_names(never)} never moves",
+            "nothing that acts in its motion shows: move it, or leave its joint out",
+        )
+    if seldom:
+        yield QualityFinding(
+            "stillness",
+            f"{format_names(seldom)} of the samples stand still",
+            "friction, damping and inertia show in motion alone: move more of the time",
+        )
+
+
+def _signals(
+    recording: Recording, kind: type[Simulator]
+) -> Iterator[tuple[Channel, list[tuple[Array, Array]]]]:
+    """Yield each recorded channel with its times and values in every run."""
+    for channel in kind.channels:
+        signals = [(run.times, run.channels[channel.name]) for run in _with(recording, channel)]
+        if signals:
+            yield channel, signals
+
+
+def _with(recording: Recording, channel: Channel) -> list[Run]:
+    return [run for run in recording.runs if channel.name in run.channels]
+
+
+def _flat(values: Array, end: float, jump: float) -> int:
+    """Count samples in saturated stretches of at least `MIN_SATURATED_SAMPLES` samples.
+
+    The signal must jump into or out of a stretch: a quantised signal that reverses at its end
+    changes by one step only.
+    """
+    at = np.concatenate([[False], values == end, [False]]).astype(np.int8)
+    edges = np.flatnonzero(np.diff(at))
+    first, last = edges[::2], edges[1::2]
+    framed = np.concatenate([[end], values, [end]])
+    jumps = np.fmax(np.abs(framed[first] - end), np.abs(framed[last + 1] - end))
+    lengths = last - first
+    return int(lengths[(lengths >= MIN_SATURATED_SAMPLES) & (jumps > jump)].sum())
+
+
+def _stands(values: Array, end: float) -> bool:
+    """Return whether a run begins or ends at this value, or never takes it: it is at rest there."""
+    seen = values[np.isfinite(values)]
+    return bool(seen.size and (seen[0] == end or seen[-1] == end)) or not (values == end).any()
+
+
+def _moving(values: Array, least: float) -> Array:
+    """Return for each window of a run whether the signal moves in it."""
+    count = values.size // WINDOW_SAMPLES
+    if not count:
+        return np.array([bool(np.nanmax(values) - np.nanmin(values) > least)])
+    rows = values[: count * WINDOW_SAMPLES].reshape(count, WINDOW_SAMPLES)
+    rows = rows[np.isfinite(rows).any(axis=1)]
+    found: Array = (np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)) > least
+    return found

@@ -1,0 +1,201 @@
+"""Check that time stamps can be seconds: compare the motion with what the system could do.
+
+The time in which a coordinate moves is estimated twice. From the recording: the shortest lag T
+after which its values x differ by as much as their spread,
+
+    mean (x(t + T) - x(t))^2 >= var x                                      (1)
+
+and from the system: at rest in the recorded positions, driven by the recorded inputs, its own
+forces would move it equally far within
+
+    T' = (var x / mean a^2)^(1/4)                                          (2)
+
+with its acceleration a at nominal parameters. An oscillation has T = 1.05/w and T' = 1/w. Dust,
+friction and a wrong mass change the ratio a few times, milliseconds read as seconds a thousand
+times; then the sampling interval exceeds (2), too, which nobody would record on purpose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bench.core.resource_estimates import FORCE_HINT
+from bench.logs.importing.normalised_positions import may_be_normalised
+from bench.logs.quality import pose_check
+from bench.logs.quality.anomaly import Anomaly
+from bench.logs.quality.floating_base_check import find_missing_base_poses
+from sims.core.simulator import Array, InputError, Simulator
+from sims.core.system import StateSnapshot, System
+from sims.recording.recording import Recording, Run
+from sims.system_simulator import SystemSimulator
+
+TIME_UNIT_RATIO_THRESHOLD = 300.0
+"""Ratio of the two times (1) and (2) above which a unit is wrong."""
+DRIVEN_SYSTEM_FACTOR = 10.0
+"""Minimum ratio of the sampling interval to (2) for a certain anomaly of a driven system.
+
+A driven system may be moved arbitrarily slowly.
+"""
+MIN_MOTION_SHARE = 0.01
+"""Minimum spread of a coordinate for this check, as a fraction of its usual size."""
+MAX_GAP_RATIO = 100.0
+"""Ratio of a gap to the rest of its run above which the run is rejected.
+
+The samples before such a gap do not determine the motion after it.
+"""
+_FEW = 10
+"""Minimum number of samples of a run that is checked."""
+_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+
+def check_recording_plausible(
+    recording: Recording, kind: type[Simulator], force: bool = False
+) -> list[str]:
+    """Reject impossible time stamps and impossible robot positions; return lesser anomalies.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+        force: Whether the user insists.
+
+    Returns:
+        Texts of the anomalies, to be shown to the user.
+
+    Raises:
+        InputError: An anomaly is certain and `force` is False; the message is one line.
+    """
+    # Positions first: their wrong units make stamps look implausible, but not vice versa.
+    found = [
+        *odd_logs(recording),
+        *pose_check.check_poses(recording, kind),
+        *find_anomalies(recording, kind),
+        *find_missing_base_poses(recording, kind),
+    ]
+    for oddity in found:
+        if oddity.certain and not force:
+            raise InputError(f"{recording.path}: {oddity.text}, {FORCE_HINT}")
+    return [oddity.text for oddity in found]
+
+
+def odd_logs(recording: Recording) -> Iterator[Anomaly]:
+    """Yield what was left out of a recording's logs, and units that they do not state."""
+    yield from (Anomaly(note, False) for note in recording.notes)
+    yield from may_be_normalised(recording)
+
+
+def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly]:
+    """Yield the anomalies of time stamps, at most one for each run.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
+    for run in recording.runs:
+        if run.times.size < _FEW:
+            continue
+        odd = _gap(run) or _slow(recording, run, kind)
+        if odd is not None:
+            yield odd
+
+
+def _gap(run: Run) -> Anomaly | None:
+    intervals = np.diff(run.times)
+    place = int(intervals.argmax())
+    gap = float(intervals[place])
+    rest = float(intervals.sum()) - gap
+    if gap <= MAX_GAP_RATIO * rest:
+        return None
+    where = f"{gap:.4g} s without a sample from t = {run.times[place]:.6g} s on"
+    known = f"in a run that has samples for {rest:.4g} s"
+    return Anomaly(f"run {run.name}: {where}, {known}; divide it there into two runs", True)
+
+
+def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
+    """Find a run in which every coordinate moves far more slowly or far faster than expected.
+
+    All coordinates share the stamps, so a coordinate that moves as expected clears them; another
+    one may belong to a link without inertia in the model file.
+    """
+    # The forces of a system with its own stepping are not accessible.
+    if not issubclass(kind, SystemSimulator) or (kind.own_engine and not kind.has_model):
+        return None
+    system = kind.system()
+    interval = float(np.median(np.diff(run.times)))
+    if kind.has_model:
+        accelerations = pose_check.compute_static_accelerations(run, kind)
+    else:
+        accelerations = _accelerations(recording, run, system)
+    # A servo holds its position by force, so large forces at rest are normal.
+    servo = kind.has_model and _driven(run)
+    sizes = {channel.name: channel.scale for channel in system.channels}
+    first: Anomaly | None = None
+    for column, name in enumerate(system.coordinates):
+        x = run.channels.get(name)
+        if x is None:
+            continue
+        spread = float(np.nanstd(x))
+        pull = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
+        if not (spread > MIN_MOTION_SHARE * sizes.get(name, 1.0) and pull > 0):
+            continue
+        own = (spread / pull) ** 0.5  # Equation (2).
+        recorded = interval * _lag(x)
+        ratio = recorded / own
+        if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
+            moves = f"{name} moves in {recorded:.3g} s as {kind.name} would within {own:.2g} s"
+            first = first or Anomaly(f"run {run.name}: {moves}; are the stamps seconds?", False)
+            continue
+        if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < (
+            DRIVEN_SYSTEM_FACTOR * own if servo else own
+        ):
+            return None
+        unit = min(_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
+        moves = f"{name} takes {recorded:.3g} s to move as {kind.name} would within {own:.2g} s"
+        apart = f"samples lie {interval:.3g} s apart"
+        remedy = f"are the stamps {_UNITS[unit]}? then divide t by {unit:g}"
+        certain = not _driven(run) or interval >= DRIVEN_SYSTEM_FACTOR * own
+        first = first or Anomaly(f"run {run.name}: {moves}, and {apart}; {remedy}", certain)
+    return first
+
+
+def _driven(run: Run) -> bool:
+    return any(np.any(signal) for signal in run.inputs.values())
+
+
+def _accelerations(recording: Recording, run: Run, system: System) -> Array:
+    """Compute (T, D) accelerations by the system's own forces, at rest in recorded positions."""
+    count = run.times.size
+    given = {**recording.constants, **run.constants}
+    constants = {c.name: np.full((count, 1), given.get(c.name, c.value)) for c in system.constants}
+    theta = np.tile([p.nominal for p in system.parameters], (count, 1))
+    default = [np.full(count, system.states[name]) for name in system.coordinates]
+    columns = [
+        run.channels.get(name, usual)
+        for name, usual in zip(system.coordinates, default, strict=True)
+    ]
+    x = np.stack(columns, axis=1)
+    nothing = np.zeros((count, 1))
+    inputs = {c.name: nothing for c in system.inputs}
+    inputs |= {name: signal[:, None] for name, signal in run.inputs.items()}
+    moment = StateSnapshot(system, theta, constants, nothing, x, np.zeros_like(x), inputs)
+    with np.errstate(all="ignore"):
+        accelerations: Array = system.force(moment) / system.inertia(theta, constants)
+    return accelerations
+
+
+def _lag(x: Array) -> float:
+    """Return the lag of (1) in samples.
+
+    Returns 0 if the first lag exceeds the spread already, since motion between samples is not
+    recorded.
+    """
+    variance = float(np.nanvar(x))
+    lag, before = 1, 0
+    while lag < x.size:
+        differences = x[lag:] - x[:-lag]
+        differences = differences[np.isfinite(differences)]
+        if differences.size and float(np.mean(differences**2)) >= variance:
+            return float(before)
+        before, lag = lag, 2 * lag
+    return float(before)

@@ -1,0 +1,109 @@
+"""Describe a robot's model file, signals missing in its log, and positions beyond limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import cast
+
+import numpy as np
+
+from sims.core.simulator import Simulator
+from sims.recording.recording import Recording
+from sims.robot.robot_model import RobotModel
+from sims.robot.robot_simulator import RobotSimulator
+
+LIMIT_TOLERANCE = 0.01
+"""Tolerance beyond a limit, as a fraction of the range, for soft limits and encoder offsets."""
+MAX_NAMED_RUNS = 4
+"""Maximum number of runs that are named in one line."""
+
+
+def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
+    """Yield lines about the robot of a simulator: its file, its parts and notes on repairs.
+
+    Other simulators have no lines.
+    """
+    if not kind.has_model:
+        return
+    simulator = cast(type[RobotSimulator], kind)
+    robot = simulator.robot
+    counts = (
+        (len(robot.joints), "joint"),
+        (len(robot.actuators), "actuator"),
+        (len(robot.bodies), "moving body"),
+        (len(robot.sensors), "sensor row"),
+    )
+    words = ", ".join(f"{n} {_plural(word, n)}" for n, word in counts if n)
+    step, integrator = simulator.numerics
+    form = robot.format.upper()
+    yield f"robot {robot.path} ({form}): {words}; {integrator} at {1e3 * step:g} ms"
+    yield from (f"note: {note}" for note in robot.notes)
+
+
+def _plural(word: str, count: int) -> str:
+    return word if count == 1 else word.replace("body", "bodie") + "s"
+
+
+def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
+    """Yield lines about signals missing in the log and signals beyond their limits.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
+    if not kind.has_model:
+        return
+    robot = cast(type[RobotSimulator], kind).robot
+    yield from _left_out(recording, robot)
+    yield from _beyond(recording, robot)
+
+
+def _left_out(recording: Recording, robot: RobotModel) -> Iterator[str]:
+    run = recording.runs[0]
+    silent = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]
+    if silent:
+        yield f"not in the log, and taken for zero: {', '.join(silent)}"
+    joints = [joint.name for joint in robot.joints if joint.has_one_coordinate]
+    unseen = [name for name in joints if f"q.{name}" not in run.channels]
+    if unseen:
+        where = ", ".join(unseen)
+        yield f"positions that are not in the log, and begin as the file states them: {where}"
+
+
+def _beyond(recording: Recording, robot: RobotModel) -> Iterator[str]:
+    """Yield a line for each signal that leaves its range."""
+    model = robot.path.name
+    for joint in robot.joints:
+        if joint.has_one_coordinate:
+            yield from _outside(recording, f"q.{joint.name}", joint.range, joint.unit, model)
+            effort = None if joint.effort is None else (-joint.effort, joint.effort)
+            yield from _outside(recording, f"tau.{joint.name}", effort, joint.force_unit, model)
+    for actuator in robot.actuators:
+        yield from _outside(recording, f"u.{actuator.name}", actuator.range, "", model)
+
+
+def _outside(
+    recording: Recording, name: str, limits: tuple[float, float] | None, unit: str, model: str
+) -> Iterator[str]:
+    """Yield a line if a signal leaves its range, with the runs and the extreme values."""
+    if limits is None:
+        return
+    low, high = limits
+    slack = LIMIT_TOLERANCE * (high - low)
+    runs, least, most = [], np.inf, -np.inf
+    for run in recording.runs:
+        signal = run.channels.get(name, run.inputs.get(name))
+        if signal is None or not np.isfinite(signal).any():
+            continue
+        begin, end = float(np.nanmin(signal)), float(np.nanmax(signal))
+        if begin < low - slack or end > high + slack:
+            runs.append(run.name)
+            least, most = min(least, begin), max(most, end)
+    if runs:
+        named = ", ".join(dict.fromkeys(runs[:MAX_NAMED_RUNS])) + (
+            " ..." if len(runs) > MAX_NAMED_RUNS else ""
+        )
+        states = f"{model} states {low:.4g} to {high:.4g}"
+        yield f"{name} goes from {least:.4g} to {most:.4g} {unit}".rstrip() + (
+            f" in runs {named}, and {states}: another unit, sign or zero?"
+        )

@@ -1,0 +1,163 @@
+"""Cut long recordings of robots into segments with their own initial states.
+
+Long recordings are cut because a search costs simulator steps, and segments from all over a
+recording are nearly as informative as the whole. Recordings of drifting or unstable motion, which
+no simulation follows for long, are cut if the user requests it.
+
+A search costs about
+
+    steps x evaluations of a step x (joints + 3)                                                (1)
+
+as measured with one joint and with six. Segments are spread evenly over each run and begin where
+its commands have been quiet, so that the effect of earlier commands has nearly decayed; the earlier
+samples that drives may still depend on are kept with each segment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError, Simulator
+from sims.recording.recording import Recording, Run
+
+MAX_RECORDING_COST = 1.6e5
+"""Cost (1) above which a recording is cut: 35 s of six joints at a step of 2 ms."""
+SEGMENT_SECONDS = 2.0
+"""Duration of a segment in seconds, unless runs are shorter."""
+MIN_SEGMENT_INTERVALS = 20
+"""Minimum number of sampling intervals of a segment."""
+ROUNDING_SECONDS = 1e-9
+"""Tolerance in seconds for rounding errors at the end of a segment."""
+QUIET_LEAD_SECONDS = 0.2
+"""Duration in seconds before a segment in which its commands should change little."""
+
+
+STEP_COST_BY_INTEGRATOR = {"RK4": 2.0}
+"""Cost of a step by integrator, 1 otherwise: half of RK4's four evaluations is saved elsewhere."""
+
+
+class SegmentedRecording(NamedTuple):
+    """A segmented recording and a message about it, which is empty if the recording is whole."""
+
+    recording: Recording
+    note: str
+
+
+def segment_recording(
+    recording: Recording,
+    kind: type[Simulator],
+    seconds: float | None = None,
+    whole: bool = False,
+) -> SegmentedRecording:
+    """Cut the runs of a recording into segments if it is too long or if the user requests it.
+
+    Runs for fitting are reduced to segments that together cost `MAX_RECORDING_COST`, and so are
+    held-out runs; at least one segment of each run is kept.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system; without a model file it is cut only on request.
+        seconds: Duration of a segment if every run is to be cut; None to cut long recordings only,
+            into segments of `SEGMENT_SECONDS` seconds.
+        whole: Whether to keep all segments, and to leave the recording whole if `seconds` is None.
+
+    Returns:
+        The recording, with a message for the user.
+
+    Raises:
+        InputError: Segments are requested for a robot with floating bodies.
+    """
+    if seconds is None and (whole or not kind.has_model):
+        return SegmentedRecording(recording, "")
+    robot: Any = kind
+    floats = kind.has_model and bool(robot.system.afloat)
+    if floats and seconds is not None:
+        raise InputError(
+            f"{recording.path}: expected no --pieces: bodies of {recording.system} float, and "
+            "nothing says where they are when a piece begins; leave it out"
+        )
+    budget = np.inf if whole or not kind.has_model else _budget(kind)
+    kept: list[Run] = []
+    notes = []
+    for word, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
+        all_of_it = sum(map(_seconds, runs))
+        if all_of_it <= budget and seconds is None:
+            kept += runs
+            continue
+        share = min(budget / all_of_it, 1.0) if all_of_it > 0 else 1.0
+        take = _first if floats else _pieces
+        pieces = [
+            p for run in runs for p in take(run, share * _seconds(run), seconds or SEGMENT_SECONDS)
+        ]
+        kept += pieces
+        left = sum(map(_seconds, pieces))
+        notes.append(f"{left:.3g} s of {all_of_it:.4g} s for {word}, in {len(pieces)} pieces")
+    if not notes:
+        return SegmentedRecording(recording, "")
+    said = " and ".join(notes)
+    left_out = budget < max(sum(map(_seconds, recording.training())), 0.0)
+    more = " from all over it (--whole takes all)" if left_out and not whole else ""
+    note = f"of the recording {said} were looked at{more}"
+    return SegmentedRecording(replace(recording, runs=tuple(kept)), note)
+
+
+def _budget(kind: type[Simulator]) -> float:
+    """Return the seconds of a robot's motion that cost `MAX_RECORDING_COST`."""
+    robot: Any = kind
+    step, integrator = robot.numerics
+    joints = sum(joint.single for joint in robot.robot.joints)
+    return float(
+        MAX_RECORDING_COST * step / (joints + 3) / STEP_COST_BY_INTEGRATOR.get(integrator, 1.0)
+    )
+
+
+def _seconds(run: Run) -> float:
+    return float(run.times[-1] - run.times[0])
+
+
+def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
+    """Cut a run into segments of at most `longest` seconds that last `seconds` in total."""
+    length = min(longest, seconds)
+    # A segment needs a few samples, even if only little of a run may be kept.
+    length = max(length, MIN_SEGMENT_INTERVALS * float(np.median(np.diff(run.times))))
+    count = max(int(seconds / length + 0.5), 1)
+    span = _seconds(run) / count
+    length = min(length, span)
+    change = _changes(run)
+    pieces = []
+    for number in range(count):
+        # A segment may begin anywhere in its part of the run that leaves enough room for it.
+        first = run.times[0] + number * span
+        low, high = np.searchsorted(run.times, (first, first + max(span - length, 0.0)))
+        high = max(high, low + 1)
+        begin = int(low + np.argmin(change[low:high]))
+        # The sample at its very end is the first sample of the next segment.
+        end = int(np.searchsorted(run.times, run.times[begin] + length - ROUNDING_SECONDS))
+        name = f"{run.name} from {run.times[begin]:.4g} s"
+        pieces.append(run.part(slice(begin, end), name))
+    return pieces
+
+
+def _first(run: Run, seconds: float, _: float) -> list[Run]:
+    """Return the beginning of a run, the only part with a known pose of floating bodies."""
+    end = int(np.searchsorted(run.times, run.times[0] + seconds - ROUNDING_SECONDS))
+    return [
+        run.part(
+            slice(0, max(end, MIN_SEGMENT_INTERVALS)), f"{run.name}, its first {seconds:.4g} s"
+        )
+    ]
+
+
+def _changes(run: Run) -> Array:
+    """Return (T,) the change of the commands before each sample, relative to their range."""
+    back = np.searchsorted(run.times, run.times - QUIET_LEAD_SECONDS)
+    total = np.zeros(run.times.size)
+    for values in run.inputs.values():
+        spread = float(np.ptp(values))
+        if spread > 0:
+            added = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(values)))]) / spread
+            total += added - added[back]
+    return total

@@ -1,0 +1,384 @@
+"""Simulate recordings with known truth, for tests and trials.
+
+The recording contains only what a real one would; the true parameters go to a separate file, so
+that a blind test stays blind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.core.input_signals import evaluate_signal
+from bench.core.plugin_registries import make_robot_simulator, simulators
+from bench.core.random_streams import make_rng
+from bench.logs.size_limits import check_simulation_size
+from sims import effects as library
+from sims.core.argument_checks import check_arguments
+from sims.core.simulator import Array, InputError, Scenario, Simulator
+from sims.core.system import DefaultRecording
+from sims.core.toml_validation import check_known_names
+from sims.core.value_limits import (
+    MAX_NUMBER,
+    MAX_SAMPLING_RATE_HZ,
+    MIN_RUN_SECONDS,
+    is_plausible_number,
+    truncate_text,
+)
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_description import ModelFileReference, get_floating_state_units
+from sims.recording.recording_writer import check_absent, write_recording
+from sims.system_simulator import SystemSimulator
+
+_DIGITS = 9
+"""Number of significant digits in the table: finer than any sensor, but files stay small."""
+_MOST_SAMPLES = 1e8
+"""Number of samples per run above which a length or rate is considered a typing error."""
+ALL_CHANNELS = "*"
+"""Name that stands for every channel that is not named."""
+
+EffectCoefficients = float | Sequence[float] | Mapping[str, float]
+"""Coefficients of one effect: the first one, several in order, or some by name."""
+
+
+@dataclass(frozen=True)
+class SimulationSpec:
+    """Specification of a recording to simulate; all numbers in SI units.
+
+    Attributes:
+        system: Registered name; empty if a model is given.
+        model: A robot's model file, MJCF or URDF.
+        actuators: Actuators that the model file lacks, as in a recording's ``[actuators.NAME]``.
+        parameters: Parameters that differ from their nominal values, by name; or all in order.
+        effects: Active effects with their coefficients.
+        constants: Constants that differ from their defaults.
+        noise: 1 sigma of every channel, or by channel; ``*`` stands for channels not named.
+        inputs: By name, a constant or the text of a signal (`bench.core.input_signals`).
+        initial: Initial states by name, a value or (low, high) for a uniform draw in each run.
+        observe: Channels to record; empty for the system's default channels.
+        runs: Number of runs.
+        seconds: Length of a run in seconds.
+        rate: Samples per second.
+        engine: Engine to use; None for the batch engine if there is a choice.
+        seed: Seed of all random numbers.
+        held_out: Number of final runs that are marked as held out; None for a third of them, at
+            least one if there are several.
+        force: Whether to simulate although it needs more resources than this machine has.
+    """
+
+    system: str = ""
+    model: str | Path | None = None
+    actuators: Mapping[str, Any] = field(default_factory=dict)
+    parameters: Mapping[str, float] | Sequence[float] = field(default_factory=dict)
+    effects: Mapping[str, EffectCoefficients] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    noise: float | Mapping[str, float] = 0.0
+    inputs: Mapping[str, float | str] = field(default_factory=dict)
+    initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
+    observe: Sequence[str] = ()
+    runs: int = 4
+    seconds: float = 4.0
+    rate: float = 100.0
+    engine: str | None = None
+    seed: int = 0
+    held_out: int | None = None
+    force: bool = False
+
+
+@dataclass(frozen=True)
+class SimulatedRecording:
+    """A recording made by simulation.
+
+    Attributes:
+        recording: The recording, as a real one would be.
+        truth: The true parameters and settings, as TOML tables.
+        simulator: Simulator that made the recording.
+    """
+
+    recording: Recording
+    truth: Mapping[str, Any] = field(repr=False)
+    simulator: Simulator = field(repr=False)
+
+    @check_arguments
+    def write(self, path: str | Path) -> list[Path]:
+        """Write the table, its description and its truth, either all three or none.
+
+        Args:
+            path: Path ``NAME.csv``; NAME.toml and NAME.truth.toml are written in the same folder.
+
+        Returns:
+            Paths of the three files.
+
+        Raises:
+            InputError: A file exists already, or cannot be written.
+        """
+        import tomli_w
+
+        out = Path(path)
+        truth = _truth_of(out)
+        beside = {truth: tomli_w.dumps(dict(self.truth))}
+        write_recording(out, self.recording, type(self.simulator), digits=_DIGITS, beside=beside)
+        return [out, out.with_suffix(".toml"), truth]
+
+
+def check_output_path(out: Path) -> None:
+    """Reject an output path that cannot be used, before the work, which may take minutes.
+
+    Raises:
+        InputError: It does not end in ``.csv``, or a file exists already.
+    """
+    check_absent([out, out.with_suffix(".toml"), _truth_of(out)])
+
+
+def _truth_of(out: Path) -> Path:
+    if out.suffix != ".csv":
+        raise InputError(f"{out}: expected a name that ends in .csv")
+    return out.with_suffix(".truth.toml")
+
+
+def simulate_recording(wish: SimulationSpec) -> SimulatedRecording:
+    """Simulate a recording.
+
+    Raises:
+        InputError: The specification contains something impossible.
+    """
+    return _RecordingSimulation(wish).make()
+
+
+class _RecordingSimulation:
+    """A checked specification, and its simulation."""
+
+    def __init__(self, wish: SimulationSpec) -> None:
+        self.wish = wish
+        self.kind = kind = _kind(wish)
+        self.name = wish.system or kind.name
+        self.usual = _get_default_recording(kind)
+        self.held_out = _held_out(wish)
+        self.theta = _theta(wish.parameters, kind)
+        self.effects = {name: _coefficients(name, c, kind) for name, c in wish.effects.items()}
+        self.engine = wish.engine
+        if not self.engine and issubclass(kind, SystemSimulator) and not kind.own_engine:
+            self.engine = "batch"
+        self.simulator = self._simulator()
+        self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
+        check_known_names("initial state", wish.initial, list(kind.states))
+        given = {name: _range(name, value) for name, value in wish.initial.items()}
+        self.ranges = {**self.usual.initial, **given}
+        check_known_names("input", wish.inputs, [c.name for c in kind.inputs])
+        inputs = {**self.usual.inputs, **wish.inputs}
+        self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
+        samples = _samples(wish)
+        check_simulation_size(wish.runs, samples, wish.seconds, self.simulator, wish.force)
+        self.times = _times(samples, wish.rate)
+
+    def make(self) -> SimulatedRecording:
+        scenarios = {str(number): self._scenario(number) for number in range(1, self.wish.runs + 1)}
+        runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
+        stated = {name: sigma for name, sigma in self.noise.items() if sigma}
+        constants, system = self.simulator.constant_values, self.name
+        path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
+        model = self.wish.model and ModelFileReference(
+            Path(self.wish.model), self.wish.actuators, {}
+        )
+        title = f"{system}, simulated"
+        recording = Recording(path, system, title, constants, stated, runs, model=model or None)
+        truth = {
+            "system": system,
+            **({"model": str(Path(self.wish.model).resolve())} if self.wish.model else {}),
+            "engine": self.engine or "its own",
+            "seed": self.wish.seed,
+            "parameters": self.theta,
+            "effects": self.effects,
+            "noise": self.noise,
+            "constants": constants,
+            "inputs": self.inputs,
+            "runs": {name: {"initial": dict(s.initial)} for name, s in scenarios.items()},
+        }
+        self.simulator.close()
+        return SimulatedRecording(recording, truth, self.simulator)
+
+    def _simulator(self) -> Simulator:
+        check_known_names("constant", self.wish.constants, [c.name for c in self.kind.constants])
+        values = {n: _number("constant", n, value) for n, value in self.wish.constants.items()}
+        observe = list(self.wish.observe) or list(self.usual.observe) or None
+        if issubclass(self.kind, SystemSimulator):
+            return self.kind(values, observe, engine=self.engine, fixed=self.effects)
+        if self.effects or self.engine:
+            raise InputError(f"simulator {self.name} takes neither effects nor an engine")
+        return self.kind(values, observe)
+
+    def _scenario(self, number: int) -> Scenario:
+        """Build the scenario of run `number`.
+
+        Each random draw has its own stream, so that no draw depends on any other.
+        """
+        initial = {
+            name: low if low == high else self._rng("initial", name, number).uniform(low, high)
+            for name, (low, high) in self.ranges.items()
+        }
+        inputs = {
+            name: evaluate_signal(text, self.times, self._rng("input", name, number))
+            for name, text in self.inputs.items()
+        }
+        return Scenario(self.times, initial, inputs)
+
+    def _run(self, number: int, scenario: Scenario) -> Run:
+        observed = self.simulator.simulate(np.array([list(self.theta.values())]), scenario)[0]
+        if not np.isfinite(observed).all():
+            raise InputError(
+                f"run {number}: the simulation failed; check parameters, effects and initial states"
+            )
+        channels = {}
+        for (name, sigma), values in zip(self.noise.items(), observed.T, strict=True):
+            rng = self._rng("noise", name, number)
+            channels[name] = values + sigma * rng.standard_normal(values.size)
+        held_out = number > self.wish.runs - self.held_out
+        # The pose of a floating body is never estimated, so it need not be hidden.
+        states = {**self.kind.states, **scenario.initial}
+        begun = {name: states[name] for name in get_floating_state_units(self.kind)}
+        return Run(str(number), self.times, channels, scenario.inputs, {}, begun, held_out)
+
+    def _rng(self, what: str, name: str, number: int) -> np.random.Generator:
+        return make_rng("simulate", self.name, what, name, self.wish.seed, number)
+
+
+def _kind(wish: SimulationSpec) -> type[Simulator]:
+    """Return the simulator class of a specification."""
+    if bool(wish.system) == (wish.model is not None):
+        found = "both" if wish.system else "neither"
+        raise InputError(f"expected a system (see `simgap list systems`) or a model, found {found}")
+    return (
+        simulators.get(wish.system)
+        if wish.model is None
+        else make_robot_simulator(wish.model, wish.actuators)
+    )
+
+
+def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
+    """Return the default recording of a simulator's system.
+
+    An extended simulator records the channels of the recording that it was fitted to.
+    """
+    if not issubclass(kind, SystemSimulator):
+        return DefaultRecording()
+    usual = kind.system.usual_recording
+    return usual if kind.name == kind.system.name else replace(usual, observe=())
+
+
+def _held_out(wish: SimulationSpec) -> int:
+    """Return how many of the last runs are held out."""
+    if wish.runs < 1:
+        raise InputError(f"runs = {wish.runs}: expected at least 1")
+    if wish.held_out is None:
+        # A single run is divided when it is read.
+        return 0 if wish.runs == 1 else max(1, wish.runs // 3)
+    if not 0 <= wish.held_out < wish.runs:
+        raise InputError(f"held_out = {wish.held_out}: expected fewer than the {wish.runs} runs")
+    return wish.held_out
+
+
+def _samples(wish: SimulationSpec) -> int:
+    product = wish.seconds * wish.rate
+    samples = round(product) if 0 < product < _MOST_SAMPLES else 0
+    if samples < 2 or wish.seconds < MIN_RUN_SECONDS or wish.rate > MAX_SAMPLING_RATE_HZ:
+        raise InputError(
+            f"seconds = {wish.seconds:g}, rate = {wish.rate:g}: expected at least 2 samples "
+            f"and below {_MOST_SAMPLES:g}"
+        )
+    return samples
+
+
+def _times(samples: int, rate: float) -> Array:
+    # Round as in the table, so that the times read back are the times simulated.
+    return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
+
+
+def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) -> dict[str, float]:
+    """Return every parameter's value by name, in the simulator's order."""
+    names = [p.name for p in kind.parameters]
+    if not isinstance(given, Mapping):
+        if len(given) != len(names):
+            raise InputError(
+                f"parameters: expected {len(names)} values ({', '.join(names)}), found {len(given)}"
+            )
+        given = dict(zip(names, given, strict=True))
+    check_known_names("parameter", given, names)
+    theta = {
+        p.name: _number("parameter", p.name, given.get(p.name, p.nominal)) for p in kind.parameters
+    }
+    for p in kind.parameters:
+        low, high = p.bounds
+        if not low <= theta[p.name] <= high:
+            raise InputError(
+                f"parameter {p.name} = {theta[p.name]:g}: expected {low:g} to {high:g} {p.unit}"
+            )
+    return theta
+
+
+def _coefficients(name: str, given: EffectCoefficients, kind: type[Simulator]) -> list[float]:
+    """Return an effect's coefficients in order; coefficients that are not named are zero."""
+    if isinstance(given, Mapping):
+        of_system = (
+            library.find_effect(name, kind.system).on(kind.system)
+            if issubclass(kind, SystemSimulator)
+            else ()
+        )
+        names = [c.name for c in of_system]
+        check_known_names(f"coefficient of effect {name}", given, names)
+        return [_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
+    values = [given] if isinstance(given, int | float) else list(given)
+    return [_number("effect", name, value) for value in _of_family(name, values, kind)]
+
+
+def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
+    """Repeat the coefficients of one place for all places of an effect family."""
+    if not name.endswith("@*") or not issubclass(kind, SystemSimulator):
+        return values
+    effect = library.find_effect(name, kind.system)
+    members = getattr(effect, "members", ())
+    of_one = len(members[0].coefficients) if members else 0
+    alike = len(values) == of_one < len(effect.coefficients)
+    return values * len(members) if alike else values
+
+
+def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:
+    """Return 1 sigma of every recorded channel."""
+    named = given if isinstance(given, Mapping) else {ALL_CHANNELS: given}
+    check_known_names(
+        "recorded channel", [name for name in named if name != ALL_CHANNELS], channels
+    )
+    rest = named.get(ALL_CHANNELS, 0.0)
+    values = {name: _number("noise of", name, named.get(name, rest)) for name in channels}
+    for name, value in values.items():
+        if value < 0:
+            raise InputError(f"noise of {name} = {value:g}: expected at least 0")
+    return values
+
+
+def _range(name: str, given: float | tuple[float, float]) -> tuple[float, float]:
+    """Return the lowest and highest initial value."""
+    ends = (given, given) if isinstance(given, int | float) else tuple(given)
+    if len(ends) != 2:
+        raise InputError(f"initial state {name}: expected a value or (low, high), found {given!r}")
+    low, high = (_number("initial state", name, end) for end in ends)
+    if low > high:
+        raise InputError(f"initial state {name} = {low:g}:{high:g}: expected low <= high")
+    return low, high
+
+
+def _signal_text(name: str, given: float | str) -> str:
+    return given if isinstance(given, str) else f"{_number('input', name, given):.17g}"
+
+
+def _number(what: str, name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise InputError(f"{what} {name}: expected a number, found {value!r:.60}")
+    if not is_plausible_number(value):
+        raise InputError(
+            f"{what} {name} = {truncate_text(str(value))}: expected a finite number within ±{MAX_NUMBER:g}"
+        )
+    return float(value)

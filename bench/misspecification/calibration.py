@@ -1,0 +1,168 @@
+"""Calibration recording for explain, and the experiments before and after the extension.
+
+The recording contains nothing of the targets: its parameters, initial states, inputs and noise are
+drawn from separate random streams.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.benchmark.problem import targets
+from bench.benchmark.problem.experiment import CalibrationConfig, Experiment
+from bench.benchmark.problem.model_file_simulator import find_model
+from bench.benchmark.problem.salt import TargetStreams
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.core.plugin_registries import simulators
+from sims import effects as library
+from sims import extended_simulator as extending
+from sims.core.simulator import Array, InputError, Scenario, Simulator
+from sims.extended_simulator import ExtendedSimulator
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_description import ModelFileReference
+from sims.recording.recording_writer import write_recording
+from sims.system_simulator import SystemSimulator
+
+PLAIN, EXTENDED = "plain", "extended"
+"""Names of the simulators in which tuners are compared: the original and the extended one."""
+MODEL_LABELS = (PLAIN, EXTENDED)
+
+
+def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -> Array:
+    """Write the calibration recording.
+
+    Args:
+        experiment: the experiment.
+        salt: salt from which the recording is drawn.
+        path: CSV file of the recording.
+
+    Returns:
+        True parameters, (p,).
+    """
+    problem = TuningProblem(experiment, salt)
+    wanted = experiment.calibration or CalibrationConfig()
+    streams = TargetStreams(salt, experiment.name, "calibration", 0)
+    inside = problem.cube.training
+    point = streams.get_stream("truth").uniform(inside[0], inside[1], size=problem.cube.dim)
+    theta = problem.cube.to_physical(point[None])[:, : len(problem.world.parameters)]
+    initial = {**experiment.initial, **wanted.initial}
+    inputs = {**experiment.inputs, **wanted.inputs}
+    runs = []
+    for number in range(wanted.runs):
+        scene = targets.draw_scenario(
+            experiment, streams.get_held_out_stream(number), initial, inputs
+        )
+        clean = problem.world.simulate(theta, scene)[0]
+        rng = TargetStreams(salt, experiment.name, "calibration", 1 + number).get_stream("noise")
+        seen = clean + problem.noise * rng.standard_normal(clean.shape)
+        runs.append(_run(problem, number, scene, seen, number >= wanted.runs - wanted.held_out))
+    kind = type(problem.simulator)
+    model = None
+    if experiment.model:
+        model = ModelFileReference(
+            find_model(experiment.model, experiment.name),
+            dict(experiment.actuators),
+            {},
+            experiment.free,
+        )
+    noise = {c.name: float(s) for c, s in zip(problem.channels, problem.noise, strict=True) if s}
+    constants = problem.simulator.constant_values
+    title = f"{experiment.name}, calibration"
+    write_recording(
+        path,
+        Recording(path, kind.name, title, constants, noise, tuple(runs), model=model),
+        kind,
+        digits=9,
+    )
+    problem.close()
+    made: Array = theta[0]
+    return made
+
+
+def _run(problem: TuningProblem, number: int, scene: Scenario, seen: Array, held_out: bool) -> Run:
+    names = [channel.name for channel in problem.channels]
+    channels = dict(zip(names, np.ascontiguousarray(seen.T), strict=True))
+    return Run(str(number + 1), scene.times, channels, scene.inputs, scene.constants, {}, held_out)
+
+
+def run_explain(recording: Path, experiment: Experiment, jobs: int) -> ExtendedSimulator:
+    """Extend the simulator by explain, and write its result to the subfolder `explain`.
+
+    Args:
+        recording: CSV file of the calibration recording.
+        experiment: the experiment.
+        jobs: number of worker processes.
+    """
+    from bench.diagnosis.evaluation.search_control import SearchControl
+    from bench.diagnosis.explain import explain  # a local import, because it imports all of explain
+
+    found = explain([recording], free=experiment.free, watch=SearchControl(), jobs=max(jobs, 1))
+    found.write(recording.parent / "explain")
+    return found.extended
+
+
+def load_extended(file: Path) -> ExtendedSimulator:
+    """Load an extended simulator from a file that explain wrote.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    return extending.open_extended(file, simulators.get)[0]
+
+
+def list_coefficients(extended: ExtendedSimulator, kind: type[Simulator]) -> dict[str, list[float]]:
+    """List the coefficients of an extended simulator by effect, in the order of the effect.
+
+    Args:
+        extended: the extended simulator.
+        kind: class of the simulator.
+
+    Raises:
+        InputError: the simulator does not support effects.
+    """
+    if not issubclass(kind, SystemSimulator):
+        raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
+    found = {}
+    for name, numbers in extended.effects.items():
+        there = library.find_effect(name, kind.system).on(kind.system)
+        found[name] = [numbers[c.name].value if c.name in numbers else 0.0 for c in there]
+    return found
+
+
+def make_base_experiment(experiment: Experiment) -> Experiment:
+    """Make the experiment in the original simulator."""
+    return _part(experiment, PLAIN, experiment.settings)
+
+
+def make_extended_experiment(experiment: Experiment, effects: dict[str, list[float]]) -> Experiment:
+    """Make the experiment in the extended simulator.
+
+    The tuned parameters remain the same. The missing effects act with the coefficients that explain
+    fitted.
+
+    Args:
+        experiment: the experiment.
+        effects: coefficients by name of the effect.
+    """
+    settings = dict(experiment.settings)
+    # An effect that is tuned stays tuned, although explain fitted its coefficients too.
+    tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
+    added = {name: values for name, values in effects.items() if name not in tuned}
+    settings["fixed"] = {**settings.get("fixed", {}), **added}
+    return _part(experiment, EXTENDED, settings)
+
+
+def _part(experiment: Experiment, model: str, settings: Mapping[str, Any]) -> Experiment:
+    return replace(
+        experiment,
+        name=f"{experiment.name}-{model}",
+        title=f"{experiment.title or experiment.name} ({model})",
+        same_targets_as=experiment.name,
+        settings=settings,
+        calibration=None,
+    )

@@ -1,0 +1,220 @@
+"""Draw the effect of model misspecification on tuners.
+
+The figures show the bias of a parameter, the prediction of unseen runs, and ranks, in the simulator
+as it is and in the extended one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.figures.style import (
+    BLUE,
+    VERMILION,
+    ZERO_LINE_GREY,
+    TunerStyles,
+    add_caption,
+    make_panel_grid,
+    style_axis,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MODELS = ("plain", "extended")
+_MARKER_STYLES: dict[str, dict[str, Any]] = {
+    "plain": {"color": VERMILION, "marker": "s", "markerfacecolor": "white"},
+    "extended": {"color": BLUE, "marker": "o"},
+}
+"""Marker styles by simulator: hollow before, filled after, distinguishable in greyscale."""
+_NAMES = {"plain": "simulator as it is", "extended": "extended by explain"}
+_REFERENCE = "least_squares"
+"""Tuner whose bias is taken as the model's own, since it finds the best fit if there is one."""
+_COLUMNS = 3
+
+
+class StudyResult(Protocol):
+    """Data of one study to draw."""
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment of the study."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the error channel."""
+
+    @property
+    def channel(self) -> str:
+        """Name of the error channel."""
+
+    @property
+    def name(self) -> str:
+        """A short name of the study."""
+
+    def tuners(self) -> list[str]:
+        """Return the labels of the tuners in the order of the experiment."""
+
+    def targets(self) -> list[str]:
+        """Return the names of the targets."""
+
+
+def draw_bias_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+    """Draw the signed error of each system's most biased parameter, by tuner.
+
+    Args:
+        systems: The studies, one panel each.
+        table: Rows of their error tables.
+    """
+    figure, panels = _panels(len(systems))
+    for panel, one in zip(panels, systems, strict=False):
+        lines = table[(table["experiment"] == one.experiment.name) & (table["metric"] == "bias")]
+        parameter = _most_biased(lines)
+        _compared(panel, one, lines[lines["parameter"] == parameter])
+        panel.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.8)
+        panel.set_title(f"{one.name}: {parameter}\n{_lacks(one)}", fontsize=9)
+        panel.set_xlabel("mean signed error [training widths]", fontsize=8)
+    caption = (
+        "The parameter that least squares gets most wrong in the simulator as it is. Point: mean "
+        f"over {_targets(systems)} of the recommendation after the whole budget less the truth. "
+        "Bar: 95 % bootstrap interval. Left and right of zero: too small, too large."
+    )
+    return _finished(figure, panels[0], "Bias of a parameter where an effect is missing", caption)
+
+
+def draw_prediction_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Figure:
+    """Draw the prediction error in unseen runs, by tuner.
+
+    Args:
+        systems: The studies, one panel each.
+        table: Rows of their error tables.
+    """
+    figure, panels = _panels(len(systems))
+    for panel, one in zip(panels, systems, strict=False):
+        mine = table["experiment"] == one.experiment.name
+        _compared(panel, one, table[mine & (table["metric"] == "heldout_error")])
+        panel.set_xscale("log")
+        panel.set_title(f"{one.name}\n{_lacks(one)}", fontsize=9)
+        panel.set_xlabel(f"RMSE of {one.channel} in unseen runs [{one.unit}]", fontsize=8)
+    caption = (
+        f"Point: mean over {_targets(systems)} of the error of the tuned simulator in runs that no "
+        "tuner saw, without sensor noise. Bar: 95 % bootstrap interval."
+    )
+    heading = "Prediction of unseen runs where an effect is missing"
+    return _finished(figure, panels[0], heading, caption)
+
+
+def draw_rank_slope_figure(
+    systems: Sequence[StudyResult], ranks: pd.DataFrame, ranking: pd.DataFrame
+) -> Figure:
+    """Draw mean ranks in both simulators, one row of panels per metric, one column per system.
+
+    Args:
+        systems: The studies.
+        ranks: Rows of their rank tables.
+        ranking: Rank agreement (Kendall's tau, p-value) of each study and metric.
+    """
+    metrics = {"param_error": "error of the parameters", "heldout_error": "prediction"}
+    width = max(6.0, 2.6 + 1.75 * len(systems))
+    figure, axes = make_panel_grid(len(metrics), len(systems), (width, 6.6), sharey=True)
+    for row, (metric, what) in zip(axes, metrics.items(), strict=True):
+        for panel, one in zip(row, systems, strict=True):
+            mine = ranks[(ranks["experiment"] == one.experiment.name) & (ranks["metric"] == metric)]
+            _slope(panel, one, mine)
+            said = ranking[ranking["experiment"] == one.experiment.name].set_index("metric")
+            tau, p = (float(said[column].loc[metric]) for column in ("tau", "p_value"))
+            panel.set_title(f"{one.name}\nτ = {tau:.2f}, p = {p:.2g}", fontsize=8)
+        row[0].set_ylabel(f"mean rank by {what}\n(1 is best)", fontsize=9)
+    axes[0][0].invert_yaxis()
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False)
+    caption = (
+        f"Mean over {_targets(systems)} of a tuner's rank on a target (its mean error over seeds). "
+        "τ: Kendall's between the mean ranks in the two simulators; p: that mean ranks differ as "
+        "much where the simulators are exchanged at random target by target."
+    )
+    figure.suptitle("Does the ranking of tuners change when the model is mended?", fontsize=11)
+    add_caption(figure, caption, letters=15)
+    return figure
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    columns = min(count, _COLUMNS)
+    rows = -(-count // columns)
+    figure, axes = make_panel_grid(rows, columns, (1.6 + 3.4 * columns, 1.3 + 2.9 * rows))
+    panels = list(np.ravel(axes))
+    for panel in panels[:count]:
+        style_axis(panel)
+    for panel in panels[count:]:
+        panel.set_axis_off()
+    return figure, panels
+
+
+def _compared(panel: Axes, one: StudyResult, lines: pd.DataFrame) -> None:
+    """Draw one row per tuner with both simulators and their intervals."""
+    tuners = one.tuners()
+    for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
+        part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
+        mean = part["mean"].to_numpy(dtype=np.float64)
+        # A mean's own interval contains it except for rounding.
+        bars = [np.maximum(mean - part["low"], 0.0), np.maximum(part["high"] - mean, 0.0)]
+        panel.errorbar(
+            mean,
+            np.arange(len(tuners)) + shift,
+            xerr=np.nan_to_num(np.array(bars, dtype=np.float64)),
+            linestyle="none",
+            markersize=4.5,
+            linewidth=1.1,
+            capsize=2,
+            label=_NAMES[model],
+            **_MARKER_STYLES[model],
+        )
+    panel.set_yticks(range(len(tuners)), tuners, fontsize=8)
+    panel.tick_params(axis="x", labelsize=8)
+    panel.invert_yaxis()
+
+
+def _most_biased(lines: pd.DataFrame) -> str:
+    """Return the parameter with the largest bias in the simulator as it is.
+
+    The bias is that of the reference tuner, or of all tuners without it.
+    """
+    before = lines[lines["model"] == "plain"]
+    reference = before[before["tuner"] == _REFERENCE]
+    sizes = (reference if len(reference) else before).groupby("parameter", sort=False)["mean"]
+    largest = sizes.mean().abs().fillna(0.0)
+    return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]
+
+
+def _slope(panel: Axes, one: StudyResult, ranks: pd.DataFrame) -> None:
+    style_axis(panel)
+    style = TunerStyles(one.experiment, list(ranks.sort_values("plain", kind="stable")["tuner"]))
+    for tuner, before, after in zip(ranks["tuner"], ranks["plain"], ranks["extended"], strict=True):
+        panel.plot([0, 1], [before, after], markersize=5, **style.get_plot_style(str(tuner)))
+    panel.set_xticks([0, 1], ["as it is", "extended"], fontsize=8)
+    panel.set_xlim(-0.25, 1.25)
+
+
+def _lacks(one: StudyResult) -> str:
+    names = list(one.experiment.world.get("fixed", {}))
+    return f"lacks {', '.join(names) or 'nothing'}; {len(one.targets())} targets"
+
+
+def _targets(systems: Sequence[StudyResult]) -> str:
+    counts = sorted({len(one.targets()) for one in systems})
+    many = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    return f"{many} targets"
+
+
+def _finished(figure: Figure, panel: Axes, heading: str, caption: str) -> Figure:
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8, frameon=False)
+    figure.suptitle(heading, fontsize=11, x=0.01, ha="left")
+    add_caption(figure, caption, letters=14)
+    return figure

@@ -1,0 +1,208 @@
+"""Tables and figures of a misspecification study, and of several studies together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.results_report import build_tables, format_failures
+from bench.benchmark.statistics.provenance_columns import add_trust_column
+from bench.benchmark.storage.result_folder import (
+    FolderConfiguration,
+    read_comparison,
+    read_configuration,
+)
+from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
+from bench.figures.style import add_trust_note, write_figure
+from bench.misspecification import misspecification_figures as figures
+from bench.misspecification import misspecification_scores
+from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN
+from sims.core.atomic_files import write_atomically
+
+PrintLine = Callable[[str], None]
+VERDICT_FILE = "explain/verdict.json"
+"""Path of the verdict of explain, in the folder of a study."""
+
+
+class ReportableMisspecificationStudy(Protocol):
+    """Protocol of the studies that can be reported."""
+
+    folder: Path
+    configuration: FolderConfiguration
+
+
+def write_report(study: ReportableMisspecificationStudy, say: PrintLine) -> int:
+    """Write tables and figures of a study, and print a summary.
+
+    Args:
+        study: the study.
+        say: prints a line.
+
+    Returns:
+        Number of failed runs.
+    """
+    folder, experiment = study.folder, study.configuration.experiment
+    failed = _comparisons(folder, say)
+    one = (
+        misspecification_scores.load_scores(folder, experiment)
+        if has_both_comparisons(folder)
+        else None
+    )
+    if one is None or not one.targets():
+        say(f"{experiment.name}: no target has been met in both simulators yet")
+        return failed
+    _written(folder, [one], say, whole=False)
+    return failed
+
+
+def write_joint_report(folder: Path, parts: Sequence[Path], say: PrintLine) -> None:
+    """Write tables and figures of several studies together, and print a summary.
+
+    Args:
+        folder: folder that contains the studies.
+        parts: folders of the studies.
+        say: prints a line.
+    """
+    there = [part for part in parts if has_both_comparisons(part)]
+    outcomes = [
+        misspecification_scores.load_scores(part, read_configuration(part).experiment)
+        for part in there
+    ]
+    outcomes = [one for one in outcomes if one.targets()]
+    if len(outcomes) < 2:
+        return
+    say(f"\ntogether, {len(outcomes)} systems")
+    _written(folder, outcomes, say, whole=True)
+
+
+def has_both_comparisons(folder: Path) -> bool:
+    """Return whether a study has runs of both comparisons."""
+    return all((folder / model / "runs.parquet").is_file() for model in MODEL_LABELS)
+
+
+def _comparisons(folder: Path, say: PrintLine) -> int:
+    """Write the tables of the comparisons that exist.
+
+    Returns:
+        Number of failed runs.
+    """
+    failed = 0
+    for model in MODEL_LABELS:
+        if not (folder / model / "runs.parquet").is_file():
+            continue
+        stored = read_comparison(folder / model)
+        for name, frame in build_tables(stored).items():
+            write_atomically(folder / model / f"{name}.csv", frame.to_csv(index=False))
+        bad = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
+        for text in format_failures(bad):
+            say(text)
+        failed += int((bad["status"] != "skipped").sum())
+    return failed
+
+
+def _written(
+    folder: Path,
+    outcomes: Sequence[misspecification_scores.StudyScores],
+    say: PrintLine,
+    whole: bool,
+) -> None:
+    """Write tables and figures of one study, or of all together, and print a summary."""
+    experiment: Experiment = outcomes[0].experiment
+    frames = {
+        "table": pd.concat([misspecification_scores.build_score_table(one) for one in outcomes]),
+        "ranks": pd.concat([misspecification_scores.build_rank_table(one) for one in outcomes]),
+        "ranking": pd.concat(
+            [misspecification_scores.build_rank_agreement_table(one) for one in outcomes]
+        ),
+    }
+    for name, frame in frames.items():
+        write_atomically(
+            folder / f"{name}.csv", add_trust_column(frame, experiment).to_csv(index=False)
+        )
+    for text in _said(folder, outcomes, frames, whole):
+        say(text)
+    drawn = {
+        "bias": figures.draw_bias_figure(outcomes, frames["table"]),
+        "prediction": figures.draw_prediction_figure(outcomes, frames["table"]),
+        "ranks": figures.draw_rank_slope_figure(outcomes, frames["ranks"], frames["ranking"]),
+    }
+    for name, figure in drawn.items():
+        path = write_figure(add_trust_note(figure, experiment.trusted), folder / "figures" / name)[
+            0
+        ]
+        say(f"figure  {path}")
+
+
+def _said(
+    folder: Path,
+    outcomes: Sequence[misspecification_scores.StudyScores],
+    frames: dict[str, pd.DataFrame],
+    whole: bool,
+) -> list[str]:
+    texts = []
+    for one in outcomes:
+        place = folder / one.experiment.name if whole else folder
+        texts += ["", _explained(one, place), _table(one, frames["table"])]
+        rows = frames["ranking"][frames["ranking"]["experiment"] == one.experiment.name]
+        texts += [_tau(row) for _, row in rows.iterrows()]
+    if whole:
+        for metric in misspecification_scores.RANKED_METRICS:
+            texts += ["", _together(frames["ranks"], metric)]
+    return texts
+
+
+def _explained(one: misspecification_scores.StudyScores, folder: Path) -> str:
+    """Format the effects of the true system and the causes that explain named."""
+    hidden = one.experiment.world.get("fixed", {})
+    world = ", ".join(f"{name} {value}" for name, value in hidden.items()) or "nothing more"
+    path = folder / VERDICT_FILE
+    answer = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    causes = ", ".join(str(c["effect"]) for c in answer.get("causes", ())) or "nothing"
+    return f"{one.name}: the world has {world}; explain says {answer.get('verdict')}: {causes}"
+
+
+def _table(one: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
+    """Format the errors of parameters and of prediction by tuner, in both simulators."""
+    mine = lines[
+        (lines["experiment"] == one.experiment.name)
+        & lines["metric"].isin(misspecification_scores.RANKED_METRICS)
+    ]
+    heads = {
+        misspecification_scores.PARAMETERS: "parameters",
+        misspecification_scores.PREDICTION: f"unseen {one.channel}",
+    }
+    mine = mine.assign(column=mine["metric"].map(heads) + " " + mine["model"])
+    wide = mine.pivot(index="tuner", columns="column", values="mean")
+    order = [f"{head} {model}" for head in heads.values() for model in MODEL_LABELS]
+    wide = wide[order].sort_values(order[-1]).rename_axis(index=None, columns=None)
+    title = f"mean error of the parameters [{misspecification_scores.TRAINING_WIDTHS_UNIT}] and RMSE of unseen runs [{one.unit}]"
+    return f"{title}\n{wide.to_string(float_format=lambda value: f'{value:.2g}')}"
+
+
+def _tau(row: pd.Series) -> str:
+    what = "parameters" if row["metric"] == misspecification_scores.PARAMETERS else "prediction"
+    return (
+        f"ranking by {what}: Kendall's tau {row['tau']:.2f} ({row['low']:.2f} to {row['high']:.2f})"
+        f" between the simulators, {row['tau_of_halves']:.2f} between halves of the targets in the"
+        f" plain one; p of no change {row['p_value']:.2g}"
+    )
+
+
+def _together(ranked: pd.DataFrame, metric: str) -> str:
+    """Format the mean ranks over several systems."""
+    joint = misspecification_scores.compute_joint_ranks(ranked, metric)
+    means = pd.DataFrame({model: joint.ranked[model].mean() for model in MODEL_LABELS})
+    means = means.sort_values(EXTENDED).rename_axis(index=None)
+    what = "parameters" if metric == misspecification_scores.PARAMETERS else "prediction"
+    head = f"mean rank over {len(joint.ranked[PLAIN])} systems by {what}, tau {joint.tau:.2f}"
+    tests = "; ".join(
+        f"{model}: Friedman p {joint.friedman[model]:.2g}, "
+        f"{joint.distinct_tuner_pairs[model]} pairs apart (Nemenyi)"
+        for model in MODEL_LABELS
+    )
+    return f"{head}\n{means.to_string(float_format=lambda value: f'{value:.1f}')}\n{tests}"

@@ -1,0 +1,287 @@
+"""Scores of a misspecification study, in the original and in the extended simulator.
+
+They are signed and absolute errors of parameters, prediction errors of unseen runs, and ranks of
+the tuners. The value of a target is the mean over its seeds. Means and intervals are over targets
+(95 % percentile bootstrap). Errors of parameters are in training widths. A failed run has no
+parameter errors here; it is counted as a failure and ranks last on its target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.statistics.bootstrap import compute_bootstrap_interval, compute_resampled_means
+from bench.benchmark.statistics.error_curves import RunRowTable
+from bench.benchmark.statistics.paired_tests import MIN_PROBLEMS_FOR_RANKS, compute_nemenyi_p_values
+from bench.benchmark.statistics.rank_agreement import (
+    compute_kendall_tau,
+    compute_mean_ranks,
+    compute_rank_agreement,
+)
+from bench.benchmark.storage.result_folder import read_comparison
+from bench.misspecification.calibration import EXTENDED, MODEL_LABELS, PLAIN
+from sims.core.simulator import Array, Parameter
+
+BIAS, ABSOLUTE, PARAMETERS, PREDICTION = "bias", "absolute_error", "param_error", "heldout_error"
+"""Metrics of a misspecification study.
+
+They are the mean signed and the mean absolute error of one parameter, the mean absolute error of
+all parameters, and the RMSE of unseen runs in the error channel.
+"""
+RANKED_METRICS = (PARAMETERS, PREDICTION)
+"""Metrics by which tuners are ranked."""
+SCORE_COLUMNS = [
+    "experiment",
+    "model",
+    "tuner",
+    "metric",
+    "parameter",
+    "unit",
+    "mean",
+    "low",
+    "high",
+    "targets",
+    "runs",
+    "failures",
+]
+RANK_COLUMNS = ["experiment", "metric", "tuner", *MODEL_LABELS]
+RANK_AGREEMENT_COLUMNS = [
+    "experiment",
+    "metric",
+    "tuners",
+    "targets",
+    "tau",
+    "low",
+    "high",
+    "tau_of_halves",
+    "p_value",
+    "friedman_plain",
+    "friedman_extended",
+]
+TRAINING_WIDTHS_UNIT = "training widths"
+
+
+@dataclass(frozen=True)
+class StudyScores:
+    """Final recommendations of all runs of a study.
+
+    Attributes:
+        experiment: the experiment.
+        unit: unit of the error channel.
+        channel: name of the error channel.
+        parameters: tuned parameters.
+        errors: one row per model, tuner and target. Columns are the signed error of each parameter
+            in training widths, under the name of the parameter; `PARAMETERS` and `PREDICTION`;
+            numbers of runs and failures.
+    """
+
+    experiment: Experiment
+    unit: str
+    channel: str
+    parameters: tuple[Parameter, ...]
+    errors: pd.DataFrame
+
+    @property
+    def name(self) -> str:
+        """Name of the system, for tables and figures."""
+        return self.experiment.name.removeprefix("misspecified-")
+
+    def tuners(self) -> list[str]:
+        """List the labels of the tuners with results in both simulators, as in the experiment."""
+        ran = set(self.errors["tuner"])
+        return [e.label for e in self.experiment.tuners if e.label in ran]
+
+    def build_metric_matrix(
+        self, model: str, metric: str, tuners: Sequence[str], targets: Sequence[str]
+    ) -> Array:
+        """Return a metric in one of the simulators as a matrix.
+
+        Args:
+            model: one of `MODEL_LABELS`.
+            metric: name of the metric.
+            tuners: labels of the tuners.
+            targets: names of the targets.
+
+        Returns:
+            Values, (targets, tuners).
+        """
+        part = self.errors[self.errors["model"] == model]
+        table = part.pivot(index="target", columns="tuner", values=metric)
+        values: Array = table.reindex(index=list(targets), columns=list(tuners)).to_numpy()
+        return values
+
+    def targets(self) -> list[str]:
+        """List the names of the targets with results of all tuners in both simulators."""
+        return sorted({str(name) for name in self.errors["target"]})
+
+
+def load_scores(folder: Path, experiment: Experiment) -> StudyScores:
+    """Load the scores of a study.
+
+    Args:
+        folder: result folder of the study.
+        experiment: its experiment.
+
+    Raises:
+        InputError: a comparison of the study is missing, unfinished or damaged.
+    """
+    problem = TuningProblem(experiment)
+    parameters, widths = problem.cube.parameters, problem.cube.compute_training_widths()
+    channel = problem.channels[problem.error_channel]
+    problem.close()
+    parts = [_last(folder / model, model, parameters, widths) for model in MODEL_LABELS]
+    errors = _whole(pd.concat(parts, ignore_index=True))
+    return StudyScores(experiment, channel.unit, channel.name, parameters, errors)
+
+
+def _whole(errors: pd.DataFrame) -> pd.DataFrame:
+    """Select the targets that every tuner finished in both simulators with all of its seeds.
+
+    In an interrupted study, other targets would compare different sets of targets.
+    """
+    asked = errors.groupby(["model", "tuner"])["runs"].transform("max")
+    # A tuner that was skipped in one simulator is excluded from both.
+    used = set.intersection(*(set(part["tuner"]) for _, part in errors.groupby("model")))
+    there = errors[(errors["runs"] == asked) & errors["tuner"].isin(used)]
+    met = there.groupby("target").size()
+    whole = set(met[met == len(MODEL_LABELS) * len(used)].index)
+    return there[there["target"].isin(whole)].reset_index(drop=True)
+
+
+def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Array) -> pd.DataFrame:
+    """Build the rows of `StudyScores.errors` for one of the comparisons."""
+    stored = read_comparison(folder)
+    rows = RunRowTable(stored.runs, stored.statuses, stored.experiment.budget)
+    frame = rows.keys[["tuner", "target"]].copy()
+    for parameter, width in zip(parameters, widths, strict=True):
+        named = (f"recommendation_{parameter.name}", f"true_{parameter.name}")
+        recommended, true = (rows.build_curves(column).values[:, -1] for column in named)
+        frame[parameter.name] = np.where(rows.failed, np.nan, (recommended - true) / width)
+    names = [parameter.name for parameter in parameters]
+    frame[PARAMETERS] = frame[names].abs().mean(axis=1, skipna=False)
+    for name in names:  # the mean over seeds of the absolute value is computed separately
+        frame[f"|{name}|"] = frame[name].abs()
+    frame[PREDICTION] = np.where(rows.failed, np.nan, rows.build_curves(PREDICTION).values[:, -1])
+    frame["runs"], frame["failures"] = 1, rows.failed.astype(int)
+    sums = {"runs": "sum", "failures": "sum"}
+    means = {c: "mean" for c in frame.columns if c not in ("tuner", "target", *sums)}
+    grouped = frame.groupby(["tuner", "target"], sort=False, as_index=False).agg({**means, **sums})
+    # A target with a failed seed counts as failed, because its other seeds are the easier ones.
+    grouped.loc[grouped["failures"] > 0, list(means)] = np.nan
+    grouped.insert(0, "model", model)
+    return grouped
+
+
+def build_score_table(one: StudyScores) -> pd.DataFrame:
+    """Build the table of means with intervals; columns as in `SCORE_COLUMNS`."""
+    lines = []
+    for (model, tuner), part in one.errors.groupby(["model", "tuner"], sort=False):
+        wanted = [
+            (metric, p.name, TRAINING_WIDTHS_UNIT, column)
+            for p in one.parameters
+            for metric, column in ((BIAS, p.name), (ABSOLUTE, f"|{p.name}|"))
+        ]
+        wanted += [
+            (PARAMETERS, "", TRAINING_WIDTHS_UNIT, PARAMETERS),
+            (PREDICTION, "", one.unit, PREDICTION),
+        ]
+        counts = len(part), int(part["runs"].sum()), int(part["failures"].sum())
+        for metric, parameter, unit, column in wanted:
+            values = part[column].to_numpy(dtype=np.float64)
+            values = values[np.isfinite(values)][:, None]
+            names = (one.experiment.name, str(model), str(tuner))
+            low, high = compute_bootstrap_interval(
+                values, compute_resampled_means, *names, metric, parameter
+            )
+            mean = float(values.mean()) if len(values) else np.nan
+            key = (one.experiment.name, model, tuner, metric, parameter, unit)
+            lines.append((*key, mean, low[0], high[0], *counts))
+    return pd.DataFrame(lines, columns=SCORE_COLUMNS)
+
+
+def build_rank_table(one: StudyScores) -> pd.DataFrame:
+    """Build the table of each tuner's mean rank in both simulators; columns as `RANK_COLUMNS`."""
+    tuners, targets = one.tuners(), one.targets()
+    lines = []
+    for metric in RANKED_METRICS:
+        both = [
+            compute_mean_ranks(one.build_metric_matrix(model, metric, tuners, targets))
+            for model in MODEL_LABELS
+        ]
+        lines += [(one.experiment.name, metric, t, *r) for t, *r in zip(tuners, *both, strict=True)]
+    return pd.DataFrame(lines, columns=RANK_COLUMNS)
+
+
+def build_rank_agreement_table(one: StudyScores) -> pd.DataFrame:
+    """Build the table of rank agreement between simulators; columns as `RANK_AGREEMENT_COLUMNS`."""
+    tuners, targets = one.tuners(), one.targets()
+    lines = []
+    for metric in RANKED_METRICS:
+        plain, extended = (
+            one.build_metric_matrix(model, metric, tuners, targets) for model in MODEL_LABELS
+        )
+        alike = compute_rank_agreement(plain, extended, one.experiment.name, metric)
+        friedman = [_friedman(errors) for errors in (plain, extended)]
+        numbers = (alike.tau, alike.low, alike.high, alike.halves, alike.p_value, *friedman)
+        lines.append((one.experiment.name, metric, len(tuners), len(targets), *numbers))
+    return pd.DataFrame(lines, columns=RANK_AGREEMENT_COLUMNS)
+
+
+def _friedman(errors: Array) -> float:
+    """Compute the p-value of Friedman's test over targets; NaN if there are too few."""
+    from scipy.stats import friedmanchisquare
+
+    targets, tuners = errors.shape
+    if targets < MIN_PROBLEMS_FOR_RANKS or tuners < 3:
+        return float("nan")
+    worst = np.where(np.isfinite(errors), errors, np.inf)
+    return float(friedmanchisquare(*np.log(np.maximum(worst, 1e-12)).round(9).T).pvalue)
+
+
+@dataclass(frozen=True)
+class JointRanks:
+    """Mean ranks of tuners over several systems, by one metric.
+
+    Attributes:
+        ranked: table by model with one row per system and one column per tuner: ranks of the mean
+            ranks, 1 is best.
+        tau: Kendall's tau between the mean ranks over systems in both simulators.
+        friedman: p-value of Friedman's test by model; NaN if there are too few systems.
+        distinct_tuner_pairs: number of pairs of tuners by model that differ significantly by
+            Nemenyi's test (p < 0.05).
+    """
+
+    ranked: Mapping[str, pd.DataFrame]
+    tau: float
+    friedman: Mapping[str, float]
+    distinct_tuner_pairs: Mapping[str, int]
+
+
+def compute_joint_ranks(ranked: pd.DataFrame, metric: str) -> JointRanks:
+    """Compute the ranks over systems.
+
+    Args:
+        ranked: rows of `build_rank_table` of several systems.
+        metric: name of the metric.
+    """
+    part = ranked[ranked["metric"] == metric]
+    tables, friedman, apart = {}, {}, {}
+    for model in MODEL_LABELS:
+        wide = part.pivot(index="experiment", columns="tuner", values=model)
+        wide = wide[list(dict.fromkeys(part["tuner"]))].dropna(axis="columns")
+        tables[model] = wide.rank(axis=1)
+        friedman[model], apart[model] = float("nan"), 0
+        if len(wide) >= MIN_PROBLEMS_FOR_RANKS and wide.shape[1] >= 3:
+            friedman[model], p_values = compute_nemenyi_p_values(tables[model])
+            upper = np.triu(p_values.to_numpy(), k=1)
+            apart[model] = int(((upper > 0) & (upper < 0.05)).sum())
+    tuners = [t for t in tables[PLAIN] if t in tables[EXTENDED]]
+    means = [tables[model][tuners].mean().to_numpy() for model in MODEL_LABELS]
+    return JointRanks(tables, compute_kendall_tau(*means), friedman, apart)

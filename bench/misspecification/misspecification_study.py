@@ -1,0 +1,250 @@
+"""Misspecification study in its result folder.
+
+A recording of the true system is made, explain extends the simulator from it, and every tuner is
+compared in both simulators on the same targets. The folder contains `calibration.csv`, the result
+of explain in `explain/`, and two comparisons, `plain/` and `extended/`, each in the common format
+of comparisons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bench.benchmark.comparison import Comparison
+from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
+from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_configuration
+from bench.benchmark.storage.salt_file import read_salt, reveal_salt
+from bench.benchmark.storage.study_progress import (
+    MISSING_STATUS,
+    RunEnd,
+    StudyOutcome,
+    StudyProgress,
+)
+from bench.misspecification.calibration import (
+    MODEL_LABELS,
+    PLAIN,
+    list_coefficients,
+    load_extended,
+    make_base_experiment,
+    make_extended_experiment,
+    run_explain,
+    write_calibration_recording,
+)
+
+if TYPE_CHECKING:
+    from bench.benchmark.problem.experiment import Experiment
+    from bench.benchmark.runner.experiment_runner import ProgressFactory
+    from bench.benchmark.runner.worker_pools import Pool
+
+PrintLine = Callable[[str], None]
+CALIBRATION_FILE = "calibration.csv"
+"""Calibration recording from which explain extends the simulator."""
+EXTENDED_MODEL_FILE = "explain/extended.toml"
+"""Extended simulator that explain writes."""
+
+
+class MisspecificationStudy:
+    """Study of tuners in a simulator with a missing effect and in the extended one.
+
+    It implements `bench.studies.study.Study`.
+
+    Args:
+        folder: result folder of such a study.
+
+    Attributes:
+        folder: result folder.
+        configuration: stored configuration of the study.
+        plugins: plugin files that it needs.
+
+    Raises:
+        InputError: the folder does not contain such a study, or it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.configuration = read_configuration(folder)
+        self.plugins = self.configuration.plugins
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+        salt: str | None = None,
+    ) -> MisspecificationStudy:
+        """Create a study in a new folder, without running it; see `Study.begin`.
+
+        Args:
+            experiment: experiment with a calibration table.
+            plugins: plugin files that it needs.
+            folder: new result folder; None for the default one.
+            jobs: number of worker processes that will be used; 0 runs everything in this process.
+            salt: random string from which targets are drawn; see `bench.studies.study.Study.begin`.
+        """
+        from bench.benchmark.runner.experiment_runner import (
+            check_classes_importable,
+            prepare_experiment,
+        )
+        from bench.benchmark.runner.run_ids import compute_fingerprint
+        from bench.benchmark.runner.study_setup import prepare_study
+
+        new = prepare_study(experiment, folder, jobs, salt)
+        # Validated before the folder is created: an error of the user leaves no files.
+        prepare_experiment(make_base_experiment(new.experiment), new.secret)
+        if jobs:
+            check_classes_importable(new.experiment)
+        return cls(new.create_folder(plugins, compute_fingerprint(new.experiment, plugins)))
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> MisspecificationStudy:
+        """Open an interrupted study to run what is missing; see `bench.studies.study.Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: further plugin files.
+        """
+        from bench.benchmark.runner.run_ids import check_resumable
+
+        study = cls(folder)
+        study.plugins = check_resumable(folder, study.configuration, plugins)
+        return study
+
+    def run(
+        self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
+    ) -> StudyOutcome:
+        """Run what is missing; see `bench.studies.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes.
+            progress: makes progress callbacks; None for no progress output.
+            pool: worker pool; None to create one.
+        """
+        from bench.benchmark.runner.experiment_runner import no_progress
+
+        finished = planned = 0
+        try:
+            self._extend(jobs, progress or no_progress)
+        except KeyboardInterrupt:
+            count = self._planned()
+            return StudyOutcome(0, 2 * count, interrupted=True)
+        for model in MODEL_LABELS:
+            comparison = self._comparison(model, jobs)
+            made = comparison.run(jobs, progress, pool)
+            finished, planned = finished + made.finished, planned + made.planned
+            if not made.is_complete:
+                # The comparison that has not started has the same number of runs.
+                left = made.planned if model == PLAIN else 0
+                return StudyOutcome(
+                    finished, planned + left, made.interrupted, made.stopped, made.skipped
+                )
+        reveal_salt(self.folder, read_salt(self.folder, self.configuration.experiment))
+        self.configuration = read_configuration(self.folder)
+        segments = self.folder / SEGMENTS_FOLDER
+        if segments.is_dir() and not any(segments.iterdir()):
+            segments.rmdir()
+        return StudyOutcome(finished, planned)
+
+    def _planned(self) -> int:
+        """Return the number of runs in each simulator."""
+        from bench.benchmark.runner.experiment_runner import count_seeds
+
+        experiment = self.configuration.experiment
+        runs = sum(count_seeds(experiment, entry) for entry in experiment.tuners)
+        return runs * experiment.targets * len(experiment.ranges)
+
+    def _extend(self, jobs: int, progress: ProgressFactory) -> None:
+        """Record the true system and extend the simulator by explain, unless done already."""
+        if (self.folder / EXTENDED_MODEL_FILE).is_file():
+            return
+        experiment = self.configuration.experiment
+        step = progress("explaining", 1)
+        table = self.folder / CALIBRATION_FILE
+        # If only one of the two files exists, the process was killed while writing.
+        for file in (table, table.with_suffix(".toml")):
+            file.unlink(missing_ok=True)
+        write_calibration_recording(experiment, self._salt(), table)
+        run_explain(table, experiment, jobs)
+        step()
+
+    def _salt(self) -> str:
+        experiment = self.configuration.experiment
+        return read_salt(self.folder, experiment) or experiment.salt
+
+    def _comparison(self, model: str, jobs: int) -> Comparison:
+        """Create or resume the comparison in one of the simulators."""
+        place, experiment = self.folder / model, self.configuration.experiment
+        if (place / CONFIGURATION_FILE).is_file():
+            comparison = Comparison.resume(place, self.plugins)
+        else:
+            # A public salt is already part of the experiment.
+            secret = read_salt(self.folder, experiment)
+            plan = replace(self.get_experiment(model), salt_sha256="")
+            comparison = Comparison.begin(plan, self.plugins, place, jobs, secret)
+        if comparison.results is not None:
+            # The folder of the other simulator contains the same truths, so it must be inaccessible
+            # too.
+            everything = (str(self.folder.resolve()), *comparison.results.hidden_paths)
+            comparison.results.hidden_paths = everything
+        return comparison
+
+    def get_experiment(self, model: str) -> Experiment:
+        """Return the experiment of the comparison in one of the simulators.
+
+        The extended simulator must exist for its experiment.
+        """
+        from bench.benchmark.problem.model_file_simulator import get_simulator_class
+
+        experiment = self.configuration.experiment
+        if model == PLAIN:
+            return make_base_experiment(experiment)
+        kind = get_simulator_class(experiment)
+        found = load_extended(self.folder / EXTENDED_MODEL_FILE)
+        return make_extended_experiment(experiment, list_coefficients(found, kind))
+
+    def close(self) -> None:
+        """Close the study; its comparisons are opened when they run."""
+
+    def status(self) -> StudyProgress:
+        """Return which runs are stored and which are missing, in both simulators.
+
+        Raises:
+            InputError: the study is damaged.
+        """
+        held = self.configuration
+        ends: list[RunEnd] = []
+        under_way = (self.folder / SEGMENTS_FOLDER).exists()
+        for model in MODEL_LABELS:
+            if not (self.folder / model / CONFIGURATION_FILE).is_file():
+                ends += [
+                    RunEnd(f"{model} {i}", model, MISSING_STATUS) for i in range(self._planned())
+                ]
+                continue
+            standing = Comparison(self.folder / model).status()
+            under_way = under_way or standing.under_way
+            ends += [
+                RunEnd(f"{model} {e.name}", f"{model} {e.group}", e.status, e.reason)
+                for e in standing.ends
+            ]
+        name = held.experiment.name
+        return StudyProgress(name, "runs finished", held.fingerprint, tuple(ends), under_way)
+
+    def report(self, say: PrintLine) -> int:
+        """Write tables and figures, and print a summary.
+
+        Args:
+            say: prints a line.
+
+        Returns:
+            Number of failed runs.
+
+        Raises:
+            InputError: a comparison of the study is damaged.
+        """
+        from bench.misspecification.misspecification_report import write_report
+
+        return write_report(self, say)

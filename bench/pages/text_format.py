@@ -1,0 +1,133 @@
+"""Format text and numbers for people, in pages, figures and on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import floor, isfinite, log10
+
+SUPERSCRIPT_DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+"""Translation of digits and minus sign to superscripts."""
+_SMALL = 1e-3
+"""Magnitude below which numbers are written with a power of ten."""
+_LARGE = 1e5
+"""Magnitude from which on numbers are written with a power of ten."""
+_FEW = log10(3.55)
+"""Logarithm of the mantissa below which an interval is written with two digits.
+
+This is the rule of the Particle Data Group.
+"""
+_LEAST = 1e-12
+"""Smallest p-value that is written as a number."""
+
+
+def sanitise(text: object, most: int = 400) -> str:
+    """Clean text from a file or plugin for one line of output.
+
+    Control characters are written as escapes, and long text is shortened.
+
+    Args:
+        text: Text or another value.
+        most: Maximum length in characters.
+    """
+    plain = "".join(_harmless(c) for c in str(text)).strip()
+    return plain if len(plain) <= most else plain[: most - 1] + "…"
+
+
+def joined(parts: Sequence[str], last: str = "and") -> str:
+    """Join names as ``a``, ``a and b`` or ``a, b and c``.
+
+    Args:
+        parts: Names.
+        last: Word before the last name.
+    """
+    if len(parts) < 2:
+        return "".join(parts)
+    return f"{', '.join(parts[:-1])} {last} {parts[-1]}"
+
+
+def _harmless(character: str) -> str:
+    if character.isprintable():
+        return character
+    # A line break or tab becomes a space; an escape sequence or a change of direction is spelled
+    # out.
+    return " " if character.isspace() else ascii(character)[1:-1]
+
+
+def format_number(value: float | None, digits: int = 3) -> str:
+    """Format a number with significant digits; a dash if there is none.
+
+    Args:
+        value: Number; None, NaN and infinity become a dash.
+        digits: Number of significant digits.
+    """
+    if value is None or not isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    # Rounded first: 0.0009996 is 0.001, which needs no power of ten.
+    rounded = float(f"{value:.{digits - 1}e}")
+    exponent = _exponent(abs(rounded))
+    decimals = max(0, digits - 1 - floor(log10(abs(rounded))) + exponent)
+    text = f"{rounded / 10.0**exponent:.{decimals}f}"
+    # Zeros before the decimal point are digits, trailing zeros after it are not needed.
+    if "." in text:
+        text = text.rstrip("0").rstrip(".")
+    return _signed(text) + _power(exponent)
+
+
+def format_estimate(value: float, low: float | None, high: float | None) -> str:
+    """Format an estimate with interval, e.g. ``0.00333 (0.00330 to 0.00336)``.
+
+    The last digit is the first one of the interval's half width, or the second if it begins with 1
+    to 3.
+
+    Args:
+        value: Estimate.
+        low: Lower end of the interval; None if unknown.
+        high: Upper end of the interval; None if unknown.
+    """
+    if low is None or high is None or not (isfinite(low) and isfinite(high)) or high <= low:
+        return f"{format_number(value)} (no interval)"
+    # One power of ten for all three numbers makes them comparable at a glance.
+    exponent = _exponent(max(abs(value), abs(low), abs(high)))
+    half = log10((high - low) / 2) - exponent
+    decimals = min(max(0, (half % 1 < _FEW) - floor(half)), 9)
+    texts = []
+    for x in (value, low, high):
+        digits = f"{x / 10.0**exponent:.{decimals}f}"
+        texts.append(_signed(digits) + _power(exponent))
+    middle, left, right = texts
+    return f"{middle} ({left} to {right})"
+
+
+def format_percent(share: float | None) -> str:
+    """Format a share as ``90 %``; with one decimal below 10 % and close to 100 %."""
+    if share is None or not isfinite(share):
+        return "–"
+    size = abs(100 * share)
+    # 99.6 % must not become 100 %, nor 0.4 % become 0 %.
+    decimals = 1 if 0 < size < 9.95 or 99 < size < 99.95 else 0
+    return _signed(f"{100 * share:.{decimals}f}") + " %"
+
+
+def format_p_value(p: float | None) -> str:
+    """Format a p-value, e.g. ``p = 0.03``."""
+    if p is None or not isfinite(p):
+        return "p unknown"
+    # In such an extreme tail the exact number has no meaning.
+    return f"p < {format_number(_LEAST, 1)}" if p < _LEAST else f"p = {format_number(p, 2)}"
+
+
+def _exponent(size: float) -> int:
+    """Return the power of ten that a number is written with; 0 for none."""
+    return 0 if size == 0 or _SMALL <= size < _LARGE else floor(log10(size))
+
+
+def _power(exponent: int) -> str:
+    return f"×10{str(exponent).translate(SUPERSCRIPT_DIGITS)}" if exponent else ""
+
+
+def _signed(text: str) -> str:
+    """Replace the hyphen by a true minus sign, and remove it from zero."""
+    zero = not text.strip("-0.")
+    return text.lstrip("-") if zero else text.replace("-", "−")

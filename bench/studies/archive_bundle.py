@@ -1,0 +1,396 @@
+"""Pack a result folder into one archive (`simgap bundle`); verify an archive or an explanation.
+
+The folder is that of a comparison or an explanation; the archive is meant for the supplement of a
+paper. `simgap verify` checks whether an archive made elsewhere is consistent.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench import __version__
+from bench.benchmark.storage.hashed_archive import (
+    MANIFEST_FILE,
+    UnpackedArchive,
+    unpack_archive,
+    write_archive,
+)
+from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
+from bench.benchmark.storage.provenance import (
+    compute_sha256,
+    format_explain_command,
+    read_environment,
+)
+from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_configuration
+from bench.core.plugin_registries import simulators
+from bench.diagnosis.score_extended import score_model
+from bench.diagnosis.verdict import Verdict
+from bench.schemas import find_violations
+from bench.studies.study import list_study_folders
+from bench.studies.verification import VerificationFailure, VerificationResult, verify_comparison
+from sims.core.atomic_files import get_first_line
+from sims.core.simulator import InputError
+from sims.extended_simulator import ExtendedSimulator, open_extended
+
+PrintLine = Callable[[str], None]
+VERDICT_FILE = "verdict.json"
+EXTENDED_MODEL_FILE = "extended.toml"
+_FORMAT = 1
+_RECORDINGS_FOLDER = "recordings"
+"""Folder of recordings in the archive of an explanation."""
+_PLUGINS = "plugins"
+"""Folder of plugin files in the archive of a comparison."""
+_ERROR_TOLERANCE = 1e-3
+"""Relative tolerance of a held-out error.
+
+Initial states are estimated again, possibly on another machine.
+"""
+
+
+class BundleResult(NamedTuple):
+    """Result of writing an archive.
+
+    Attributes:
+        archive: path of the archive.
+        kind: comparison or explanation.
+        files: number of files in it.
+        command: command that reproduces its content.
+        left_out: files of the folder that are not in it, with the reason.
+    """
+
+    archive: Path
+    kind: str
+    files: int
+    command: str
+    left_out: tuple[str, ...]
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        size = self.archive.stat().st_size
+        return {**self._asdict(), "bytes": size, "sha256": compute_sha256(self.archive)}
+
+
+def write_bundle(
+    folder: Path, out: Path | None = None, recordings: Sequence[Path] = ()
+) -> BundleResult:
+    """Write a result folder as one archive.
+
+    Args:
+        folder: folder of a finished comparison, a sweep or an explanation.
+        out: path of the new archive; None for NAME.zip in the current folder.
+        recordings: CSV files of the recordings to add to an explanation, with their descriptions.
+
+    Raises:
+        InputError: the folder is not a result folder or not finished, or the archive exists
+            already.
+    """
+    kind = _kind(folder)
+    name = folder.resolve().name
+    files, left_out = _files(folder)
+    if kind == "comparison":
+        if recordings:
+            raise InputError("--with: recordings go with an explanation; leave them out")
+        files |= _list_plugin_files(folder)
+        command = f"simgap compare {name}/{CONFIGURATION_FILE}"
+    else:
+        files |= _list_recording_files(recordings)
+        command = _format_explain_command(folder)
+    about = {
+        "format": _FORMAT,
+        "kind": kind,
+        "name": name,
+        "simgap": str(read_environment(list_study_folders(folder)[0]).get("simgap") or __version__),
+        "bundled_by": __version__,
+        "command": command,
+    }
+    archive = out or Path(f"{name}.zip")
+    write_archive(archive, name, files, about)
+    return BundleResult(archive, kind, len(files), command, tuple(left_out))
+
+
+def _kind(folder: Path) -> str:
+    if (folder / VERDICT_FILE).is_file() and (folder / EXTENDED_MODEL_FILE).is_file():
+        return "explanation"
+    for part in list_study_folders(folder):
+        read_configuration(part)
+        if (part / SEGMENTS_FOLDER).exists():
+            raise InputError(f"{part}: not finished; resume it first")
+    return "comparison"
+
+
+def _files(folder: Path) -> tuple[dict[str, Path], list[str]]:
+    """List the files of a folder by their relative paths, and those that are left out."""
+    found, left_out = {}, []
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            left_out.append(f"{name}: a link")
+        elif path.is_file() and any(part.startswith(".") for part in Path(name).parts):
+            left_out.append(f"{name}: hidden")
+        elif path.is_file() and name != MANIFEST_FILE:
+            found[name] = path
+    return found, left_out
+
+
+def _list_plugin_files(folder: Path) -> dict[str, Path]:
+    """List the plugin files of a comparison, so that they can be inspected before they run."""
+    plugins = [
+        Path(file)
+        for part in list_study_folders(folder)
+        for file in read_configuration(part).plugins
+    ]
+    there = [file for file in dict.fromkeys(plugins) if file.is_file()]
+    return {f"{_PLUGINS}/{file.name}": file for file in there}
+
+
+def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
+    files = {}
+    for table in tables:
+        if not table.is_file():
+            raise InputError(f"{table}: no such file")
+        for path in (table, table.with_suffix(".toml")):
+            if path.is_file():
+                files[f"{_RECORDINGS_FOLDER}/{path.name}"] = path
+    return files
+
+
+def _format_explain_command(folder: Path) -> str:
+    """Build the command that reproduces an explanation, as far as its folder states it."""
+    made = read_environment(folder)
+    tables = [each["file"] for each in made.get("recordings", []) if each["file"][-5:] != ".toml"]
+    words = format_explain_command(tables or ["RECORDING.csv"], made.get("settings", {}))
+    return shlex.join(words)
+
+
+class ExplanationVerification(NamedTuple):
+    """Result of verifying an explanation.
+
+    Attributes:
+        checked: descriptions of what was checked.
+        unchecked: what could not be checked, with the reason.
+        doubts: verification failures.
+    """
+
+    checked: list[str]
+    unchecked: list[str]
+    doubts: list[VerificationFailure]
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        doubts = [doubt._asdict() for doubt in self.doubts]
+        return {**self._asdict(), "follows": not self.doubts, "doubts": doubts}
+
+
+class ArchiveVerification(NamedTuple):
+    """Result of verifying an archive.
+
+    Attributes:
+        archive: metadata of the archive.
+        doubts: files that differ from the manifest; if there are any, nothing else is verified.
+        comparisons: result for each comparison in it.
+        explanation: result for the explanation in it.
+    """
+
+    archive: dict[str, Any]
+    doubts: list[VerificationFailure]
+    comparisons: list[VerificationResult]
+    explanation: ExplanationVerification | None
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether there is no verification failure."""
+        sound = not self.doubts and all(each.is_consistent for each in self.comparisons)
+        return sound and not (self.explanation and self.explanation.doubts)
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        compared = [each.to_document() for each in self.comparisons]
+        told = self.explanation.to_document() if self.explanation else None
+        archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
+        parts = {"archive": archive, "comparisons": compared, "explanation": told}
+        return {"follows": self.is_consistent, **parts}
+
+
+def verify_archive(
+    archive: Path, say: PrintLine, plugins: Sequence[str] = (), every: bool = False
+) -> ArchiveVerification:
+    """Verify that an archive matches its manifest, and verify the results in it.
+
+    Args:
+        archive: archive written by `write_bundle`, possibly elsewhere.
+        say: prints a line.
+        plugins: plugin files to load; those that the archive names or contains are never run.
+        every: whether to repeat every simulation instead of a sample.
+
+    Raises:
+        InputError: the file is not such an archive, or is unsafe to unpack.
+    """
+    with unpack_archive(archive) as found:
+        about = _about(archive, found)
+        count, size = about["files"], about["bytes"]
+        say(f"{archive}: {about['kind']} of simgap {about['simgap']}, {count} files, {size} bytes")
+        doubts = [VerificationFailure(fault.file, 0, fault.says) for fault in found.faults]
+        if doubts:
+            _format_result(doubts, archive, say)
+            return ArchiveVerification(about, doubts, [], None)
+        say(f"{MANIFEST_FILE}: every file is there and has its SHA-256, and there is no other")
+        if about["kind"] == "explanation":
+            explained = _verify_extended_model(found.folder, say)
+            _format_result(explained.doubts, archive, say)
+            return ArchiveVerification(about, [], [], explained)
+        compared = [
+            verify_comparison(part, say, plugins, every, own_plugins=False)._replace(
+                folder=archive / part.relative_to(found.folder.parent)
+            )
+            for part in list_study_folders(found.folder)
+        ]
+        return ArchiveVerification(about, [], compared, None)
+
+
+def _about(archive: Path, found: UnpackedArchive) -> dict[str, Any]:
+    manifest = found.manifest
+    return {
+        "file": archive,
+        "kind": manifest["kind"],
+        "files": len(manifest["files"]),
+        "bytes": sum(each["bytes"] for each in manifest["files"]),
+        "simgap": manifest["simgap"],
+        "command": manifest["command"],
+    }
+
+
+def _format_result(doubts: Sequence[VerificationFailure], where: Path, say: PrintLine) -> None:
+    for doubt in doubts[:20]:
+        say(f"DOES NOT FOLLOW  {where}/{doubt}")
+    if len(doubts) > 20:
+        say(f"and {len(doubts) - 20} more")
+
+
+def verify_explanation(folder: Path, say: PrintLine) -> ExplanationVerification:
+    """Verify that the files of an explanation are valid and consistent.
+
+    If the folder contains the recording, the held-out error is computed again.
+
+    Args:
+        folder: folder of the explanation.
+        say: prints a line.
+    """
+    found = _verify_extended_model(folder, say)
+    _format_result(found.doubts, folder, say)
+    return found
+
+
+def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerification:
+    found = ExplanationVerification([], [], [])
+
+    def note(line: str) -> None:
+        found.checked.append(line)
+        say(line)
+
+    verdict = _verdict(folder, found)
+    if verdict is None:
+        return found
+    note(f"{VERDICT_FILE}: of the form of schema verdict: {verdict.verdict}")
+    try:
+        extended, _, _ = open_extended(folder / EXTENDED_MODEL_FILE, simulators.get)
+    except InputError as error:
+        text = str(error).replace(f"{folder}/", "")
+        # The hash of a robot's model file is known; its absence here is no verification failure.
+        if "model" in text and "no such file" in text:
+            found.unchecked.append(f"{EXTENDED_MODEL_FILE}: {text}")
+            say(f"not checked: {found.unchecked[-1]}")
+        else:
+            found.doubts.append(VerificationFailure(EXTENDED_MODEL_FILE, 0, text))
+        return found
+    note(f"{EXTENDED_MODEL_FILE}: loads as a simulator of {extended.system or extended.name}")
+    found.doubts.extend(_find_differing_numbers(verdict, extended))
+    if not found.doubts:
+        note(f"{VERDICT_FILE} and {EXTENDED_MODEL_FILE} have the same numbers")
+    _score_extended_model(folder, verdict, found, note)
+    for line in found.unchecked:
+        say(f"not checked: {line}")
+    if not found.doubts:
+        say("all of it follows" if not found.unchecked else "what could be checked follows")
+    return found
+
+
+def _verdict(folder: Path, found: ExplanationVerification) -> Verdict | None:
+    try:
+        document = json.loads((folder / VERDICT_FILE).read_text(encoding="utf-8"))
+        wrong = find_violations(document, "verdict")
+        if not wrong:
+            return Verdict.from_document(document)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
+        wrong = [get_first_line(error)]
+    found.doubts.extend(VerificationFailure(VERDICT_FILE, 0, line) for line in wrong)
+    return None
+
+
+def _find_differing_numbers(
+    verdict: Verdict, extended: ExtendedSimulator
+) -> Iterator[VerificationFailure]:
+    """Yield numbers of the verdict that are missing or different in the extended simulator."""
+    for name, number in verdict.parameters.items():
+        other = extended.parameters.get(name)
+        if other is not None and not math.isclose(number.value, other.value, rel_tol=1e-9):
+            yield VerificationFailure(
+                VERDICT_FILE,
+                0,
+                f"{name}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {other.value:.9g}",
+            )
+    for cause in verdict.causes:
+        known: Mapping[str, Any] = extended.effects.get(cause.effect, {})
+        for name, number in cause.coefficients.items():
+            value = known[name].value if name in known else math.nan
+            if not math.isclose(number.value, value, rel_tol=1e-9):
+                what = f"{cause.effect} {name}"
+                yield VerificationFailure(
+                    VERDICT_FILE,
+                    0,
+                    f"{what}: {number.value:.9g}, in {EXTENDED_MODEL_FILE} {value:.9g}",
+                )
+
+
+def _score_extended_model(
+    folder: Path, verdict: Verdict, found: ExplanationVerification, note: PrintLine
+) -> None:
+    """Repeat the held-out error of the extended simulator, if the folder has the recording."""
+    made = read_environment(folder)
+    stated = verdict.heldout.rmse_extended if verdict.heldout else None
+    tables = sorted((folder / _RECORDINGS_FOLDER).glob("*.csv"))
+    if stated is None:
+        found.unchecked.append("held-out error: the verdict states none")
+        return
+    if len(tables) != 1:
+        where = f"{len(tables)} recordings are" if tables else "the recording is not"
+        found.unchecked.append(f"held-out error: {where} in it (simgap bundle --with LOG.csv)")
+        return
+    hashes = {each["file"]: each["sha256"] for each in made.get("recordings", [])}
+    for path in (tables[0], tables[0].with_suffix(".toml")):
+        if path.name in hashes and path.is_file() and compute_sha256(path) != hashes[path.name]:
+            wrong = f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
+            found.doubts.append(
+                VerificationFailure(
+                    f"{_RECORDINGS_FOLDER}/{path.name}", 0, f"{wrong}; found another"
+                )
+            )
+            return
+    try:
+        result = score_model(folder / EXTENDED_MODEL_FILE, tables[0], held_out=True)
+    except InputError as error:
+        found.unchecked.append(f"held-out error: {str(error).replace(f'{folder}/', '')}")
+        return
+    assert verdict.heldout is not None
+    units = result["units"]
+    alike = [e for name, e in result["rmse"].items() if units[name] == verdict.heldout.unit]
+    again = math.sqrt(sum(e * e for e in alike) / len(alike)) if alike else math.nan
+    if not math.isclose(stated, again, rel_tol=_ERROR_TOLERANCE):
+        what = f"rmse_extended on held-out runs: {stated:.6g}, scored again {again:.6g}"
+        found.doubts.append(VerificationFailure(VERDICT_FILE, 0, what))
+        return
+    note(f"{VERDICT_FILE}: rmse_extended on held-out runs comes out again: {again:.6g}")

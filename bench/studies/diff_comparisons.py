@@ -1,0 +1,380 @@
+"""Compare two tuner comparisons: which errors differ significantly.
+
+If both comparisons have the same targets (the same truth and start; names are not sufficient,
+because every salt draws its own targets), errors are compared target by target: Wilcoxon's
+signed-rank test of the logarithms of the mean over the common seeds. Otherwise the targets are two
+samples, and the test is that of H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18, 50, 1947. Holm's
+correction is over all lines.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
+from bench.benchmark.statistics.error_curves import RunCurves, RunRowTable, select_primary_metric
+from bench.benchmark.statistics.paired_tests import compare_pair, compute_log_errors, correct_holm
+from bench.benchmark.storage.provenance import read_environment
+from bench.benchmark.storage.result_folder import StoredComparison, read_comparison
+from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES
+from bench.studies.diff_changes import (
+    FAMILYWISE_ERROR_RATE,
+    describe_side,
+    find_changes,
+    format_changes,
+    format_columns,
+    format_number,
+    select_relevant_environment,
+)
+from sims.core.simulator import Array, InputError
+
+COMPARED_SIMULATION_COUNTS = (3, 10)
+"""Numbers of simulations at which errors are compared, in addition to the last common one."""
+_TARGET_KEY_COLUMNS = ("true_", "recommendation_")
+"""Prefixes of the columns that identify a target: its truth, and the start of its runs."""
+
+
+@dataclass(frozen=True)
+class ComparisonSide:
+    """One of two comparisons.
+
+    Attributes:
+        folder: its folder.
+        stored: its stored runs.
+        curves: its error curves by the compared metric.
+        targets: truth and start by name of the target.
+    """
+
+    folder: Path
+    stored: StoredComparison
+    curves: RunCurves
+    targets: pd.DataFrame
+
+    def index_errors(self, kind: str, tuner: str, k: int) -> pd.Series[float]:
+        """Return the errors of a tuner after k simulations.
+
+        Args:
+            kind: range of the targets.
+            tuner: label of the tuner.
+            k: number of simulations.
+
+        Returns:
+            Errors by (target, seed); infinite if the run failed and has ended by then, or has no
+            error.
+        """
+        part = self.curves.select(range=kind, tuner=tuner)
+        last = k >= part.values.shape[1] - 1
+        errors = part.values[:, k]
+        lost = np.isnan(errors) | (part.failed & last)
+        index = pd.MultiIndex.from_frame(part.keys[["target", "seed"]])
+        return pd.Series(np.where(lost, np.inf, errors), index=index)
+
+
+def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
+    """Load one of two comparisons.
+
+    Args:
+        folder: its folder.
+        metric: error to compare; None for the deciding error of the comparison.
+
+    Raises:
+        InputError: the folder has no comparison, no runs, or no runs with the metric.
+    """
+    stored = read_comparison(folder, [*REQUIRED_RUN_COLUMNS, *_target_columns(folder)])
+    if stored.runs.empty:
+        raise InputError(f"{folder}: holds no runs")
+    name = metric or select_primary_metric(stored.runs).metric
+    if name not in stored.runs or stored.runs[name].isna().all():
+        raise InputError(f"{folder}: has no {name}, by which the other is decided")
+    runs = stored.runs[stored.runs[name].notna()]
+    curves = RunRowTable(runs, stored.statuses, stored.experiment.budget).build_curves(name)
+    columns = [c for c in runs if str(c).startswith(_TARGET_KEY_COLUMNS)]
+    targets = stored.runs[stored.runs["k"] == 0].groupby("target")[columns].first()
+    return ComparisonSide(folder, stored, curves, targets)
+
+
+def _target_columns(folder: Path) -> list[str]:
+    from pyarrow import parquet
+
+    path = folder / "runs.parquet"
+    # Errors of the folder are reported by the code that reads it.
+    if not path.is_file():
+        return []
+    try:
+        return [n for n in parquet.read_schema(path).names if n.startswith(_TARGET_KEY_COLUMNS)]
+    except (OSError, ValueError):
+        return []
+
+
+@dataclass(frozen=True)
+class ComparisonDiff:
+    """Differences between two comparisons.
+
+    Attributes:
+        a: first comparison, from which changes are counted.
+        b: second comparison.
+        metric: the deciding error.
+    """
+
+    a: ComparisonSide
+    b: ComparisonSide
+    metric: str
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """Table of errors, a line per range, tuner and number of simulations (schema ``diff``)."""
+        lines = list(self._lines())
+        if not lines:
+            return pd.DataFrame()
+        frame = pd.DataFrame(lines)
+        there = frame["p_value"].notna().to_numpy()
+        frame["p_holm"] = np.nan
+        frame.loc[there, "p_holm"] = correct_holm(frame.loc[there, "p_value"].to_numpy(dtype=float))
+        frame["significant"] = frame["p_holm"] < FAMILYWISE_ERROR_RATE
+        return frame
+
+    def _lines(self) -> Iterator[dict[str, Any]]:
+        ranges = set(self.b.curves.keys["range"])
+        budget = min(side.stored.experiment.budget for side in (self.a, self.b))
+        moments = sorted({k for k in COMPARED_SIMULATION_COUNTS if k < budget} | {budget})
+        for kind in dict.fromkeys(self.a.curves.keys["range"]):
+            if kind not in ranges:
+                continue
+            mine, other = (s.curves.select(range=str(kind)).list_tuners() for s in (self.a, self.b))
+            for tuner in (t for t in mine if t in other):
+                for k in moments:
+                    yield self._line(str(kind), tuner, k)
+
+    def _line(self, kind: str, tuner: str, k: int) -> dict[str, Any]:
+        a, b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
+        shared = self.shared_targets
+        both = [key for key in a.index if key in b.index and key[0] in shared]
+        paired = bool(both)
+        if paired:
+            a, b = a[both], b[both]
+        by_target = [each.groupby(level="target").mean() for each in (a, b)]
+        first, second = (
+            compute_log_errors(np.asarray(each, dtype=np.float64)) for each in by_target
+        )
+        if paired:
+            count, _, _, ratio, p = compare_pair(second, first)
+        else:
+            count, ratio, p = min(len(first), len(second)), *_unpaired(first, second)
+        medians = [float(each.median()) for each in by_target]
+        return {
+            "range": kind,
+            "tuner": tuner,
+            "simulations": k,
+            "metric": self.metric,
+            "median_a": medians[0],
+            "median_b": medians[1],
+            "ratio": ratio,
+            "targets": count,
+            "paired": paired,
+            "p_value": p,
+            "failures_a": int(np.isinf(a).sum()),
+            "failures_b": int(np.isinf(b).sum()),
+        }
+
+    @cached_property
+    def shared_targets(self) -> set[str]:
+        """Targets that both comparisons have, with the same truth and the same start."""
+        a, b = self.a.targets, self.b.targets
+        if list(a.columns) != list(b.columns):
+            return set()
+        names = [name for name in a.index if name in b.index]
+        same = np.isclose(
+            a.loc[names].to_numpy(dtype=float),
+            b.loc[names].to_numpy(dtype=float),
+            rtol=1e-9,
+            atol=0.0,
+            equal_nan=True,
+        )
+        return {name for name, alike in zip(names, same.all(axis=1), strict=True) if alike}
+
+    @cached_property
+    def statuses(self) -> list[dict[str, Any]]:
+        """Numbers of runs by tuner and status that differ between the comparisons."""
+        counts = [
+            Counter(zip(s.stored.statuses["tuner"], s.stored.statuses["status"], strict=True))
+            for s in (self.a, self.b)
+        ]
+        return [
+            {"tuner": tuner, "status": status, "a": counts[0][key], "b": counts[1][key]}
+            for key in sorted({*counts[0], *counts[1]})
+            if counts[0][key] != counts[1][key]
+            for tuner, status in [key]
+        ]
+
+    @cached_property
+    def unshared_tuners(self) -> dict[str, list[str]]:
+        """Tuners that only one of the comparisons has."""
+        mine, other = (s.curves.list_tuners() for s in (self.a, self.b))
+        return {
+            "a": [t for t in mine if t not in other],
+            "b": [t for t in other if t not in mine],
+        }
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether an error differs significantly, or the fraction of failed runs differs."""
+        return bool(len(self._significant())) or any(a != b for a, b in self._failing())
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether an error has grown significantly, or the fraction of failed runs has grown."""
+        found = self._significant()
+        grown = bool(len(found) and (found["ratio"] > 1).any())
+        return grown or any(b > a for a, b in self._failing())
+
+    def _significant(self) -> pd.DataFrame:
+        return self.errors[self.errors["significant"]] if len(self.errors) else self.errors
+
+    def _failing(self) -> Iterator[tuple[float, float]]:
+        """Yield the fractions of failed runs in both comparisons, for each common tuner."""
+        frames = [s.stored.statuses for s in (self.a, self.b)]
+        for tuner in self.a.curves.list_tuners():
+            if tuner not in self.unshared_tuners["a"]:
+                mine = [
+                    f.loc[f["tuner"] == tuner, "status"].isin(FAILED_OR_SKIPPED_STATUSES).mean()
+                    for f in frames
+                ]
+                yield float(mine[0]), float(mine[1])
+
+    def _telling(self) -> Iterator[str]:
+        """Yield changed status counts as text lines.
+
+        Counts other than failures are included only if both comparisons have the same number of
+        runs of the tuner.
+        """
+        runs = [s.stored.statuses["tuner"].value_counts() for s in (self.a, self.b)]
+        for each in self.statuses:
+            tuner = each["tuner"]
+            if each["status"] in FAILED_OR_SKIPPED_STATUSES or runs[0].get(tuner) == runs[1].get(
+                tuner
+            ):
+                yield f"{tuner}: {each['status']} {each['a']} -> {each['b']}"
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """Notes on limitations of the comparison."""
+        notes = []
+        found = self.errors
+        if not len(found):
+            return ["no range and tuner is in both"]
+        if not found["paired"].any():
+            notes.append("no target is in both (each salt draws its own): not paired")
+        elif not found["paired"].all():
+            notes.append("some lines are not paired: their targets are not in both")
+        least = min(
+            _min_attainable_p_value(n, p)
+            for n, p in zip(found["targets"], found["paired"], strict=True)
+        )
+        if least * len(found) > FAMILYWISE_ERROR_RATE:
+            notes.append(
+                f"no difference could be significant: with {found['targets'].max()} targets a "
+                f"p-value is at least {least:.2g}, and {len(found)} lines are compared"
+            )
+        return notes
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        experiments = [s.stored.experiment for s in (self.a, self.b)]
+        environments = [read_environment(s.folder) for s in (self.a, self.b)]
+        sides = [
+            describe_side(s.folder, e.name, told)
+            for s, e, told in zip((self.a, self.b), experiments, environments, strict=True)
+        ]
+        return {
+            "kind": "comparison",
+            "changed": self.has_changed,
+            "worse": self.is_worse,
+            "a": sides[0],
+            "b": sides[1],
+            "errors": self.errors.to_dict("records"),
+            "statuses": self.statuses,
+            "only": self.unshared_tuners,
+            "configuration": find_changes(*(each.document() for each in experiments)),
+            "environment": find_changes(*map(select_relevant_environment, environments)),
+            "notes": self.notes,
+        }
+
+    def format_lines(self) -> Iterator[str]:
+        """Format the differences as text lines."""
+        document = self.to_document()
+        head = ("range", "tuner", "", "simulations", "a", "b", "b / a", "targets", "p (Holm)")
+        yield f"{self.metric}, median over targets; p of a difference, corrected for all lines"
+        rows = [head]
+        lines: list[dict[str, Any]] = document["errors"]
+        last = max((each["simulations"] for each in lines), default=0)
+        shown = [each for each in lines if each["significant"] or each["simulations"] == last]
+        for each in shown:
+            mark = "" if not each["significant"] else "WORSE" if each["ratio"] > 1 else "better"
+            rows.append(
+                (
+                    each["range"],
+                    each["tuner"],
+                    mark,
+                    str(each["simulations"]),
+                    format_number(each["median_a"]),
+                    format_number(each["median_b"]),
+                    format_number(each["ratio"]),
+                    f"{each['targets']}{'' if each['paired'] else ' not paired'}",
+                    format_number(each["p_holm"]),
+                )
+            )
+        yield from format_columns(rows)
+        if len(lines) > len(shown):
+            yield f"({len(lines) - len(shown)} more lines differ by chance at most; --json has all)"
+        yield from self._telling()
+        for name, tuners in self.unshared_tuners.items():
+            if tuners:
+                yield f"in {name} alone: {', '.join(tuners)}"
+        for what in ("configuration", "environment"):
+            if document[what]:
+                yield f"{what}, a -> b"
+                yield from format_changes(document[what])
+        yield from (f"note: {note}" for note in self.notes)
+        yield "something has changed" if self.has_changed else "nothing has changed significantly"
+
+    def to_table(self) -> pd.DataFrame:
+        """Return the table for a CSV file."""
+        return self.errors
+
+
+def _unpaired(a: Array, b: Array) -> tuple[float, float]:
+    """Compute the ratio of the medians of b over a, and the p-value of the Mann-Whitney test."""
+    from scipy.stats import mannwhitneyu
+
+    ratio = float(np.exp(np.clip(np.median(b) - np.median(a), -700, 700)))
+    return ratio, float(mannwhitneyu(a, b).pvalue)
+
+
+def _min_attainable_p_value(targets: int, paired: bool) -> float:
+    """Compute the smallest p-value that is possible with a number of targets."""
+    from math import comb
+
+    return 2.0 / 2**targets if paired else 2.0 / comb(2 * targets, targets)
+
+
+def diff_comparisons(a: Path, b: Path) -> ComparisonDiff:
+    """Compare two comparisons.
+
+    Args:
+        a: folder of the first comparison.
+        b: folder of the second comparison.
+
+    Raises:
+        InputError: a folder has no comparison, or nothing that can be compared.
+    """
+    first = load_side(a)
+    metric = select_primary_metric(first.stored.runs).metric
+    return ComparisonDiff(first, load_side(b, metric), metric)

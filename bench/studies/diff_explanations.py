@@ -1,0 +1,312 @@
+"""Compare two explanations: verdict, causes, and numbers that changed significantly.
+
+Half of a 95 % interval is 1.96 standard errors. The standard error of the difference of two numbers
+is the root of the sum of squares if the explanations use different recordings. For the same
+recording the numbers are not independent and the difference is known more accurately, so the test
+is conservative. Holm's correction is over all numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.statistics.paired_tests import correct_holm
+from bench.benchmark.storage.provenance import read_environment
+from bench.diagnosis.verdict import Verdict
+from bench.schemas import find_violations
+from bench.studies.diff_changes import (
+    FAMILYWISE_ERROR_RATE,
+    describe_side,
+    find_changes,
+    format_changes,
+    format_columns,
+    format_number,
+    select_relevant_environment,
+)
+from sims.core.atomic_files import get_first_line
+from sims.core.simulator import InputError
+from sims.core.toml_validation import read_toml
+from sims.extended_simulator import FittedValue
+
+VERDICT, EXTENDED = "verdict.json", "extended.toml"
+_MAX_COMPARED_CANDIDATES = 5
+"""Number of the best candidates of each explanation that are compared."""
+_HELD_OUT = ("rmse_base", "rmse_extended", "noise_floor", "gap_closed", "low", "high")
+_Z95 = 1.96
+"""Half width of a 95 % interval, in standard errors."""
+
+
+@dataclass(frozen=True)
+class ExplanationSide:
+    """One of two explanations.
+
+    Attributes:
+        folder: its folder.
+        verdict: its verdict.
+        title: title of its extended simulator.
+        environment: versions, settings and machine with which it was made.
+    """
+
+    folder: Path
+    verdict: Verdict
+    title: str
+    environment: Mapping[str, Any]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """System, settings, recordings, versions and machine of the explanation."""
+        made = self.environment
+        recordings = {each["file"]: each["sha256"] for each in made.get("recordings", [])}
+        asked = {"system": self.verdict.system, "engine": self.verdict.engine}
+        return {
+            **asked,
+            "settings": made.get("settings", {}),
+            "recordings": recordings,
+            **select_relevant_environment(made),
+        }
+
+    def classify_effect(self, effect: str) -> str:
+        """Return whether an effect is a cause, an alternative to one, or neither."""
+        if any(cause.effect == effect for cause in self.verdict.causes):
+            return "cause"
+        if any(effect in cause.alternatives for cause in self.verdict.causes):
+            return "alternative"
+        return "no"
+
+
+def load_side(folder: Path) -> ExplanationSide:
+    """Load one of two explanations.
+
+    Raises:
+        InputError: the folder has no explanation, or it is damaged.
+    """
+    path = folder / VERDICT
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        wrong = find_violations(document, "verdict")
+        verdict = Verdict.from_document(document) if not wrong else None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        wrong, verdict = [get_first_line(error)], None
+    if verdict is None:
+        raise InputError(f"{path}: expected a verdict of simgap explain; {wrong[0]}")
+    title = str(read_toml(folder / EXTENDED).get("title", ""))
+    return ExplanationSide(folder, verdict, title, read_environment(folder))
+
+
+@dataclass(frozen=True)
+class ExplanationDiff:
+    """Differences between two explanations.
+
+    Attributes:
+        a: first explanation.
+        b: second explanation.
+    """
+
+    a: ExplanationSide
+    b: ExplanationSide
+
+    @cached_property
+    def causes(self) -> list[dict[str, Any]]:
+        """All effects that either explanation names, with their roles in both."""
+        named = [
+            effect
+            for each in (self.a, self.b)
+            for cause in each.verdict.causes
+            for effect in (cause.effect, *cause.alternatives)
+        ]
+        return [
+            {
+                "effect": effect,
+                "in_a": self.a.classify_effect(effect),
+                "in_b": self.b.classify_effect(effect),
+            }
+            for effect in dict.fromkeys(named)
+        ]
+
+    @cached_property
+    def numbers(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """Coefficients and parameters of either explanation, with intervals and significance."""
+        coefficients = _beside(_coefficients(self.a), _coefficients(self.b))
+        parameters = _beside(self.a.verdict.parameters, self.b.verdict.parameters)
+        rows = [*coefficients, *parameters]
+        p = np.array([_p_value(row) for row in rows])
+        there = np.isfinite(p)
+        corrected = np.full(len(p), np.nan)
+        corrected[there] = correct_holm(p[there])
+        for row, value in zip(rows, corrected, strict=True):
+            row["significant"] = bool(value < FAMILYWISE_ERROR_RATE) if np.isfinite(value) else None
+        return coefficients, parameters
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether verdict or causes differ, or a number differs significantly."""
+        other = self.a.verdict.verdict != self.b.verdict.verdict
+        moved = any(row["significant"] for rows in self.numbers for row in rows)
+        causes = any("cause" in pair and len(set(pair)) > 1 for pair in self._places())
+        return other or moved or causes
+
+    def _places(self) -> list[tuple[str, str]]:
+        return [(each["in_a"], each["in_b"]) for each in self.causes]
+
+    @property
+    def is_worse(self) -> bool:
+        """Unavailable: of two explanations, neither is worse.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError("--fail-on worse: is for comparisons; of explanations take change")
+
+    def _held_out(self) -> list[dict[str, Any]]:
+        sides = [each.verdict.heldout for each in (self.a, self.b)]
+        return [
+            {"name": name, "a": getattr(sides[0], name, None), "b": getattr(sides[1], name, None)}
+            for name in _HELD_OUT
+        ]
+
+    def _candidates(self) -> list[dict[str, Any]]:
+        """Return the best candidates of either explanation, with score and rank in both."""
+        ranked = [
+            {c.effect: (rank, c.score) for rank, c in enumerate(each.verdict.candidates, 1)}
+            for each in (self.a, self.b)
+        ]
+        names = [
+            e
+            for each in ranked
+            for e, (rank, _) in each.items()
+            if rank <= _MAX_COMPARED_CANDIDATES
+        ]
+        rows = []
+        for name in dict.fromkeys(names):
+            (rank_a, score_a), (rank_b, score_b) = (each.get(name, (None, None)) for each in ranked)
+            scores = {"score_a": score_a, "score_b": score_b}
+            rows.append({"effect": name, **scores, "rank_a": rank_a, "rank_b": rank_b})
+        return rows
+
+    @cached_property
+    def notes(self) -> list[str]:
+        """Notes on limitations of the comparison."""
+        notes = []
+        if not (self.a.environment and self.b.environment):
+            notes.append("of an older explanation settings and versions are not known")
+        units = [each.verdict.heldout.unit for each in (self.a, self.b) if each.verdict.heldout]
+        if len(set(units)) > 1:
+            notes.append(f"held-out errors are in {units[0]} and in {units[1]}")
+        if self.a.verdict.system != self.b.verdict.system:
+            notes.append(f"of two systems: {self.a.verdict.system} and {self.b.verdict.system}")
+        return notes
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        coefficients, parameters = self.numbers
+        sides = [
+            describe_side(each.folder, each.title, each.environment) for each in (self.a, self.b)
+        ]
+        return {
+            "kind": "explanation",
+            "changed": self.has_changed,
+            "a": sides[0],
+            "b": sides[1],
+            "verdict": {"a": self.a.verdict.verdict, "b": self.b.verdict.verdict},
+            "causes": self.causes,
+            "coefficients": coefficients,
+            "parameters": parameters,
+            "heldout": self._held_out(),
+            "candidates": self._candidates(),
+            "settings": find_changes(self.a.settings, self.b.settings),
+            "notes": self.notes,
+        }
+
+    def format_lines(self) -> Iterator[str]:
+        """Format the differences as text lines."""
+        document = self.to_document()
+        words = document["verdict"]
+        same = words["a"] == words["b"]
+        yield f"verdict: {words['a']}" + ("" if same else f" -> {words['b']}")
+        for cause in self.causes:
+            here, there = cause["in_a"], cause["in_b"]
+            told = f"{here} in both" if here == there else f"{here} -> {there}"
+            yield f"{'cause' if 'cause' in (here, there) else '     '} {cause['effect']}: {told}"
+        rows = [("number", "unit", "", "a", "95 %", "b", "95 %")]
+        for row in (*document["coefficients"], *document["parameters"]):
+            mark = "MOVED" if row["significant"] else ""
+            cells = [
+                format_number(row["a"]),
+                _interval(row, "a"),
+                format_number(row["b"]),
+                _interval(row, "b"),
+            ]
+            rows.append((row["name"], row["unit"], mark, *cells))
+        yield from format_columns(rows)
+        for row in document["heldout"]:
+            if row["a"] is not None or row["b"] is not None:
+                yield f"held-out {row['name']}: {format_number(row['a'])} -> {format_number(row['b'])}"
+        for row in document["candidates"]:
+            if row["rank_a"] != row["rank_b"]:
+                ranks = f"{row['rank_a'] or 'none'} -> {row['rank_b'] or 'none'}"
+                yield f"candidate {row['effect']}: rank {ranks}"
+        if document["settings"]:
+            yield "settings, a -> b"
+            yield from format_changes(document["settings"])
+        yield from (f"note: {note}" for note in self.notes)
+        yield "something has changed" if self.has_changed else "nothing has changed significantly"
+
+    def to_table(self) -> pd.DataFrame:
+        """Return the table for a CSV file."""
+        coefficients, parameters = self.numbers
+        held_out = [{**row, "name": f"heldout {row['name']}"} for row in self._held_out()]
+        return pd.DataFrame([*coefficients, *parameters, *held_out])
+
+
+def _coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
+    return {
+        f"{cause.effect} {name}": value
+        for cause in each.verdict.causes
+        for name, value in cause.coefficients.items()
+    }
+
+
+def _beside(a: Mapping[str, FittedValue], b: Mapping[str, FittedValue]) -> list[dict[str, Any]]:
+    rows = []
+    for name in dict.fromkeys([*a, *b]):
+        first, second = a.get(name), b.get(name)
+        either = first or second
+        assert either is not None
+        row: dict[str, Any] = {"name": name, "unit": either.unit}
+        for mark, each in (("a", first), ("b", second)):
+            row |= {
+                mark: each.value if each else None,
+                f"low_{mark}": each.low if each else None,
+                f"high_{mark}": each.high if each else None,
+            }
+        rows.append(row)
+    return rows
+
+
+def _p_value(row: Mapping[str, Any]) -> float:
+    """Compute the p-value of no difference; NaN if an interval is open or a number is missing."""
+    ends = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
+    if any(end is None for end in ends):
+        return math.nan
+    errors = [(row[f"high_{m}"] - row[f"low_{m}"]) / (2 * _Z95) for m in ("a", "b")]
+    spread = math.hypot(*errors)
+    difference = abs(row["a"] - row["b"])
+    if spread == 0:
+        return 1.0 if difference == 0 else 0.0
+    return math.erfc(difference / spread / math.sqrt(2))
+
+
+def _interval(row: Mapping[str, Any], mark: str) -> str:
+    low, high = row[f"low_{mark}"], row[f"high_{mark}"]
+    return "" if row[mark] is None else f"{format_number(low)} to {format_number(high)}"

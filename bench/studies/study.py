@@ -1,0 +1,241 @@
+"""Studies in result folders: the interface, and the choice of the kind of study.
+
+Comparisons of tuners, comparisons of diagnosers, bounce shots and studies of a missing effect
+implement the same interface. Only this module decides which of them an experiment describes.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from bench.benchmark.problem.salt import generate_salt
+from bench.benchmark.storage.result_folder import (
+    CONFIGURATION_FILE,
+    choose_free_folder,
+    read_configuration,
+)
+
+if TYPE_CHECKING:
+    from bench.benchmark.comparison import PrintLine
+    from bench.benchmark.problem.experiment import Experiment
+    from bench.benchmark.runner.experiment_runner import ProgressFactory
+    from bench.benchmark.runner.worker_pools import Pool
+    from bench.benchmark.storage.result_folder import FolderConfiguration
+    from bench.benchmark.storage.study_progress import StudyOutcome, StudyProgress
+
+
+class Study(Protocol):
+    """A study in its result folder.
+
+    ``Kind(folder)`` opens a study for status and report, without disturbing a process that runs it.
+    `begin_study` and `resume_study` give a study that can be run.
+
+    Attributes:
+        folder: result folder.
+        configuration: configuration of the study.
+    """
+
+    folder: Path
+    configuration: FolderConfiguration
+
+    def __init__(self, folder: Path) -> None: ...
+
+    @classmethod
+    def begin(
+        cls,
+        experiment: Experiment,
+        plugins: Sequence[str] = (),
+        folder: Path | None = None,
+        jobs: int = 2,
+        salt: str | None = None,
+    ) -> Study:
+        """Check and plan a study in a new folder.
+
+        Args:
+            experiment: configuration of the study.
+            plugins: plugin files that it needs; the caller has loaded them.
+            folder: new or empty folder; None for one below results/ that is named after the time.
+            jobs: number of worker processes; 0 for none, and tuners without isolation.
+            salt: salt of the targets, secret until the study is complete; None for a new one.
+
+        Raises:
+            InputError: the experiment has an error, or the folder is not free.
+        """
+        ...
+
+    @classmethod
+    def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Study:
+        """Open an interrupted study to complete it.
+
+        Args:
+            folder: result folder.
+            plugins: additional plugin files; the study's own are loaded in any case.
+
+        Raises:
+            InputError: the folder is damaged, or something relevant has changed since.
+        """
+        ...
+
+    def run(
+        self, jobs: int = 2, progress: ProgressFactory | None = None, pool: Pool | None = None
+    ) -> StudyOutcome:
+        """Run what is missing.
+
+        Args:
+            jobs: number of worker processes; 0 to run everything in this process.
+            progress: called for every step.
+            pool: pool to use instead, for example of a cluster.
+
+        Returns:
+            How far the study came, also if it was interrupted.
+
+        Raises:
+            InputError: workers cannot be started; finished runs are stored.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release the folder without running what is missing."""
+        ...
+
+    def status(self) -> StudyProgress:
+        """Return what the folder contains, and what is missing."""
+        ...
+
+    def report(self, say: PrintLine) -> int:
+        """Write tables and figures, print the results, and return the number of failures."""
+        ...
+
+
+def begin_study(
+    experiment: Experiment,
+    plugins: Sequence[str] = (),
+    folder: Path | None = None,
+    jobs: int = 2,
+    salt: str | None = None,
+) -> Study:
+    """Check and plan the study of an experiment; see `Study.begin`.
+
+    Args:
+        experiment: configuration of the study.
+        plugins: plugin files that it needs.
+        folder: new or empty folder; None for a default name.
+        jobs: number of worker processes.
+        salt: salt of the targets; None for a new one.
+    """
+    return get_study_class(experiment).begin(experiment, plugins, folder, jobs, salt)
+
+
+def begin_studies(
+    experiment: Experiment,
+    plugins: Sequence[str] = (),
+    folder: Path | None = None,
+    jobs: int = 2,
+    salt: str | None = None,
+) -> list[Study]:
+    """Check and plan one study, or several if the experiment sweeps or names other experiments.
+
+    Args:
+        experiment: configuration of the study or studies.
+        plugins: as in `Study.begin`.
+        folder: folder of the study; for several studies the folder that contains one subfolder for
+            each, with the name of its experiment.
+        jobs: as in `Study.begin`.
+        salt: as in `Study.begin`; several studies of one sweep share it, so that they have the same
+            targets.
+
+    Raises:
+        InputError: one of the studies has an error, or the folder is not free; no files are left
+            behind.
+    """
+    from bench.benchmark.problem.experiment import expand_sweep
+
+    wanted = expand_sweep(experiment)
+    if len(wanted) == 1:
+        return [begin_study(wanted[0], plugins, folder, jobs, salt)]
+    # Separate experiments have separate salts, so that a complete one does not reveal another's.
+    if salt is None and not experiment.salt and not experiment.experiments:
+        salt = generate_salt()
+    parent = choose_free_folder(experiment, folder)
+    begun: list[Study] = []
+    try:
+        # All are planned before the first is run, so that an error in the last one shows at once.
+        for one in wanted:
+            begun.append(begin_study(one, plugins, parent / one.name, jobs, salt))
+    except BaseException:
+        for study in begun:
+            study.close()
+            shutil.rmtree(study.folder, ignore_errors=True)
+        if parent.is_dir() and not any(parent.iterdir()):
+            parent.rmdir()
+        raise
+    return begun
+
+
+def list_study_folders(folder: Path) -> list[Path]:
+    """Return the folders of the studies in a folder: itself, or the subfolders of a sweep."""
+    if (folder / CONFIGURATION_FILE).exists() or not folder.is_dir():
+        return [folder]
+    inside = sorted(path for path in folder.iterdir() if (path / CONFIGURATION_FILE).exists())
+    return inside or [folder]
+
+
+def report_jointly(folder: Path, say: PrintLine) -> None:
+    """Write and print the joint results of the studies in a folder, if their kind has any.
+
+    Args:
+        folder: folder that was given to `begin_studies`.
+        say: callback that prints one line.
+    """
+    parts = list_study_folders(folder)
+    experiments = [read_configuration(part).experiment for part in parts]
+    if len(parts) > 1 and all(experiment.calibration for experiment in experiments):
+        from bench.misspecification.misspecification_report import write_joint_report
+
+        write_joint_report(folder, parts, say)
+
+
+def resume_study(folder: Path, plugins: Sequence[str] = ()) -> Study:
+    """Open an interrupted study to complete it; see `Study.resume`.
+
+    Args:
+        folder: result folder.
+        plugins: additional plugin files.
+    """
+    return _kind_in(folder).resume(folder, plugins)
+
+
+def open_study(folder: Path) -> Study:
+    """Open the study in a folder, for status and report.
+
+    Raises:
+        InputError: there is no study, or it is damaged.
+    """
+    return _kind_in(folder)(folder)
+
+
+def get_study_class(experiment: Experiment) -> type[Study]:
+    """Return the kind of study that an experiment describes."""
+    # The classes are imported here, because a comparison does not need the other studies' modules.
+    if experiment.shot:
+        from bench.bounce_shot.shot_study import BounceShotStudy
+
+        return BounceShotStudy
+    if experiment.calibration:
+        from bench.misspecification.misspecification_study import MisspecificationStudy
+
+        return MisspecificationStudy
+    if experiment.diagnosis:
+        from bench.diagnosis_benchmark.diagnoser_study import DiagnosisStudy
+
+        return DiagnosisStudy
+    from bench.benchmark.comparison import Comparison
+
+    return Comparison
+
+
+def _kind_in(folder: Path) -> type[Study]:
+    return get_study_class(read_configuration(folder).experiment)

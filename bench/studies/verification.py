@@ -1,0 +1,299 @@
+"""Verify that a finished comparison is consistent.
+
+Its targets must follow from the salt that was committed before the first run, its errors from its
+targets, its losses from its proposals, and its tables from its rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
+from bench.benchmark.problem.targets import Target
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.results_report import build_tables
+from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
+from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
+from bench.benchmark.storage.result_folder import (
+    CONFIGURATION_FILE,
+    StoredComparison,
+    read_checked_comparison,
+    read_configuration,
+)
+from sims.core.simulator import Array, InputError
+
+PrintLine = Callable[[str], None]
+MAX_RESIMULATED_ROWS = 2000
+"""Maximum number of simulations that are repeated, unless all are requested."""
+_ARITHMETIC_TOLERANCE = 1e-9
+"""Relative tolerance of numbers that arithmetic alone determines."""
+_SIMULATION_TOLERANCE = 1e-6
+"""Relative tolerance of simulated numbers, possibly from another machine."""
+
+
+class VerificationFailure(NamedTuple):
+    """Verification failure: a file or row that does not follow from the others.
+
+    Attributes:
+        file: path in the folder.
+        row: number of the row from 1; 0 for the whole file.
+        says: what was expected and what was found.
+    """
+
+    file: str
+    row: int
+    says: str
+
+    def __str__(self) -> str:
+        return f"{self.file}{f', row {self.row}' if self.row else ''}: {self.says}"
+
+
+class VerificationResult(NamedTuple):
+    """Result of verifying a comparison.
+
+    Attributes:
+        folder: folder of the comparison.
+        checked: descriptions of what was checked.
+        doubts: verification failures.
+    """
+
+    folder: Path
+    checked: tuple[str, ...]
+    doubts: tuple[VerificationFailure, ...]
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether there is no verification failure."""
+        return not self.doubts
+
+    def to_document(self) -> dict[str, Any]:
+        """Convert to a JSON document."""
+        doubts = [doubt._asdict() for doubt in self.doubts]
+        return {
+            "folder": self.folder,
+            "follows": self.is_consistent,
+            "checked": self.checked,
+            "doubts": doubts,
+        }
+
+
+@numeric_warnings_silenced()
+def verify_comparison(
+    folder: Path,
+    say: PrintLine,
+    plugins: Sequence[str] = (),
+    every: bool = False,
+    own_plugins: bool = True,
+) -> VerificationResult:
+    """Verify a finished comparison, and print the result.
+
+    Args:
+        folder: folder of the comparison.
+        say: prints a line.
+        plugins: plugin files in addition to those that the comparison names.
+        every: whether to repeat every simulation instead of a sample.
+        own_plugins: whether to run the plugin files that the comparison names; False for a
+            comparison from an untrusted source.
+
+    Raises:
+        InputError: the comparison is not finished, or it is damaged.
+    """
+    held = read_configuration(folder)
+    experiment = held.experiment
+    if (folder / SEGMENTS_FOLDER).exists():
+        raise InputError(f"{folder}: not finished, and its salt not revealed; resume it first")
+    if experiment.shot:
+        raise InputError(f"{folder}: expected a comparison, found a bounce shot")
+    if experiment.calibration:
+        remedy = f"name one of the two in it: {folder / 'plain'} or {folder / 'extended'}"
+        raise InputError(f"{folder}: expected a comparison, found a study of two; {remedy}")
+    checks: list[str] = []
+
+    def note(line: str) -> None:
+        checks.append(line)
+        say(line)
+
+    # The salt in experiment.toml was already checked against its hash when the file was read.
+    stored = read_checked_comparison(folder)
+    note(_salt(experiment))
+    named = held.plugins if own_plugins else []
+    files = [*named, *(str(Path(plugin).resolve()) for plugin in plugins)]
+    load_plugins_for_experiment(list(dict.fromkeys(files)), experiment)
+    problem = TuningProblem(experiment)
+    try:
+        doubts = _rows(stored, problem, note, every)
+    finally:
+        problem.close()
+    doubts += _tables(folder, stored, note)
+    for doubt in doubts[:20]:
+        say(f"DOES NOT FOLLOW  {folder}/{doubt}")
+    if len(doubts) > 20:
+        say(f"and {len(doubts) - 20} more")
+    if not doubts:
+        say("all of it follows")
+    return VerificationResult(folder, tuple(checks), tuple(doubts))
+
+
+def _salt(experiment: Experiment) -> str:
+    if not experiment.salt_sha256:
+        return f"{CONFIGURATION_FILE}: a public salt: everybody could draw the targets beforehand"
+    return (
+        f"{CONFIGURATION_FILE}: the salt has the SHA-256 that was committed, "
+        f"{experiment.salt_sha256[:12]}"
+    )
+
+
+def _rows(
+    stored: StoredComparison, problem: TuningProblem, say: PrintLine, every: bool
+) -> list[VerificationFailure]:
+    """Verify runs.parquet, and return the failures."""
+    targets = {target.blinded.name: target for target in problem.draw_targets()}
+    runs = stored.runs
+    doubts = [
+        VerificationFailure(
+            "runs.parquet", int(runs.index[runs["target"] == name][0]) + 1, f"no target {name}"
+        )
+        for name in runs["target"].unique()
+        if name not in targets
+    ]
+    if doubts:
+        return doubts
+    for name, rows in runs.groupby("target", sort=False):
+        doubts += _errors(problem, targets[str(name)], rows)
+    say(f"runs.parquet: {len(targets)} targets drawn again, {len(runs)} rows compared with them")
+    shown = _chosen(runs, MAX_RESIMULATED_ROWS if not every else len(runs))
+    for name, rows in shown.groupby("target", sort=False):
+        doubts += _losses(problem, targets[str(name)], rows)
+    say(f"runs.parquet: {len(shown)} of {len(runs)} rows simulated again")
+    doubts += [
+        VerificationFailure(
+            "runs.parquet", int(row) + 1, f"trusted: expected {problem.experiment.trusted}"
+        )
+        for row in runs.index[runs["trusted"] != problem.experiment.trusted][:1]
+    ]
+    return doubts
+
+
+def _errors(
+    problem: TuningProblem, target: Target, rows: pd.DataFrame
+) -> Iterator[VerificationFailure]:
+    """Yield rows of a target whose errors do not follow from its truth."""
+    if target.truth is None:
+        return
+    names = [parameter.name for parameter in problem.cube.parameters]
+    recommended = rows[[f"recommendation_{name}" for name in names]].to_numpy()
+    errors = np.abs(recommended - target.truth)
+    expected = {f"true_{name}": np.full(len(rows), target.truth[i]) for i, name in enumerate(names)}
+    expected["param_error"] = (errors / problem.cube.compute_training_widths()).mean(axis=1)
+    expected["outside"] = np.full(len(rows), problem.compute_distance_from_training(target.truth))
+    if len(names) == 1:
+        expected["param_abs_error"] = errors[:, 0]
+    for column, values in expected.items():
+        # Rounding of parameters that are far larger than their error is not a failure.
+        slack = 1e-12 * float(np.abs(target.truth).max())
+        yield from _unlike(rows, column, values, _ARITHMETIC_TOLERANCE, slack)
+
+
+def _losses(
+    problem: TuningProblem, target: Target, rows: pd.DataFrame
+) -> Iterator[VerificationFailure]:
+    """Yield rows of a target whose losses and errors differ from repeated simulations."""
+    names = [parameter.name for parameter in problem.cube.parameters]
+    channel = problem.error_channel
+    made = rows[rows["k"] > 0]
+    fitting = ProposalEvaluator(problem, target.blinded.fitting)
+    if len(made):
+        proposed = _points(problem, made[[f"proposal_{name}" for name in names]])
+        losses = np.concatenate([fitting(point[None])[1] for point in proposed])
+        yield from _unlike(made, "loss", losses, _SIMULATION_TOLERANCE, _SIMULATION_TOLERANCE)
+    recommended = _points(problem, rows[[f"recommendation_{name}" for name in names]])
+    for column, side in (
+        ("obs_error", target.blinded.fitting),
+        ("heldout_error", target.blinded.held_out),
+    ):
+        # A run that ended before its first result has no error.
+        there = rows[column].notna().to_numpy()
+        if side.scenarios and there.any():
+            rmse = ProposalEvaluator(problem, side).compute_rmse(
+                recommended[:0], recommended[there]
+            )
+            typical = _SIMULATION_TOLERANCE * float(problem.scale[channel])
+            yield from _unlike(
+                rows[there], column, rmse[:, channel], _SIMULATION_TOLERANCE, typical
+            )
+
+
+def _points(problem: TuningProblem, frame: pd.DataFrame) -> Array:
+    """Convert parameters to points of the unit cube, clipped because of rounding."""
+    points: Array = np.clip(problem.cube.to_unit_cube(frame.to_numpy(dtype=float)), 0.0, 1.0)
+    return points
+
+
+def _unlike(
+    rows: pd.DataFrame, column: str, expected: Array, share: float, slack: float
+) -> Iterator[VerificationFailure]:
+    """Yield the first row in which a column differs from the expected values."""
+    if column not in rows:
+        return
+    found = rows[column].to_numpy(dtype=float)
+    same = np.isclose(found, expected, rtol=share, atol=slack, equal_nan=True)
+    if not same.all():
+        place = int(np.argmin(same))
+        count = int((~same).sum())
+        says = f"{column}: expected {expected[place]:.9g}, found {found[place]:.9g}"
+        more = f" ({count} rows of {rows['target'].iloc[0]})" if count > 1 else ""
+        yield VerificationFailure("runs.parquet", int(rows.index[place]) + 1, says + more)
+
+
+def _chosen(runs: pd.DataFrame, most: int) -> pd.DataFrame:
+    """Select at most `most` rows, evenly spaced."""
+    places = np.unique(np.linspace(0, len(runs) - 1, min(most, len(runs))).round().astype(int))
+    return runs.iloc[places]
+
+
+def _tables(folder: Path, stored: StoredComparison, say: PrintLine) -> list[VerificationFailure]:
+    """Verify that table.csv follows from the rows, and return the failures."""
+    path = folder / "table.csv"
+    if not path.exists():
+        say("table.csv: none; simgap plot writes it")
+        return []
+    found = pd.read_csv(path, keep_default_na=True)
+    expected = build_tables(stored)["table"]
+    if len(found) != len(expected):
+        return [
+            VerificationFailure(path.name, 0, f"expected {len(expected)} rows, found {len(found)}")
+        ]
+    doubts = []
+    # The order of the rows is ignored: it depends on the version that wrote them.
+    keys = ["experiment", "tuner", "range", "simulations", "metric"]
+    if not set(keys) - set(found):
+        expected = expected.sort_values(keys, kind="stable")
+        found = found.fillna({"range": "", "metric": ""}).sort_values(keys, kind="stable")
+    lines = found.index
+    for column in expected:
+        if column not in found:
+            doubts.append(
+                VerificationFailure(path.name, 0, f"expected a column {column}, found none")
+            )
+            continue
+        a = expected[column].reset_index(drop=True)
+        b = found[column].reset_index(drop=True)
+        if pd.api.types.is_numeric_dtype(a) and a.dtype != bool:
+            same = np.isclose(
+                a.astype(float), b.astype(float), rtol=_ARITHMETIC_TOLERANCE, equal_nan=True
+            )
+        else:
+            same = (a.astype(str) == b.fillna("").astype(str)).to_numpy()
+        if not same.all():
+            place = int(np.argmin(same))
+            says = f"{column}: expected {a[place]}, found {b[place]}"
+            doubts.append(VerificationFailure(path.name, int(lines[place]) + 2, says))
+    say(f"table.csv: {len(found)} rows made again from runs.parquet")
+    return doubts

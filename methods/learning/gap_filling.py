@@ -1,0 +1,91 @@
+"""Gaps in what another sensor shows, bridged by what the proposed model does there.
+
+A camera that stands still shows a motion x along a line as
+
+    (1)  y = (a + b x) / (1 + c x)
+
+(Hartley and Zisserman, Multiple View Geometry, 2004, chapter 2). Multiplied by the denominator it
+is linear in the three numbers:
+
+    (2)  y = a + b x - c x y
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from methods.tuner import Array
+
+_ROUNDS = 15
+"""Number of iterations of reweighted least squares."""
+_MIN_SEEN_SAMPLES = 8
+"""Minimum number of available samples for filling gaps."""
+_OUTLYING = 2.0
+"""Width of Cauchy's weight function, in median absolute residuals of the map."""
+_FINEST = 1e-6
+"""Minimum width of Cauchy's weight function, in standard deviations of the channel.
+
+A closer agreement counts as exact.
+"""
+_MIN_DENOMINATOR = 0.1
+"""Minimum denominator of (1).
+
+A smaller one means that the pole of the map is near, where the motion reaches the camera.
+"""
+
+
+def fill_gaps(seen: Array, shown: Array) -> Array:
+    """Fill the gaps of a sensor's channel from a simulation, through the map (1) between them.
+
+    The three numbers of the map are fitted to the available samples, as (2) and with Cauchy's
+    weights, because an inaccurate model agrees with the sensor only in parts of a run.
+
+    Args:
+        seen: (T,) channel with NaN for missing samples.
+        shown: (T,) simulated values at the same times, of another sensor.
+
+    Returns:
+        (T,) channel without gaps; unchanged if there are too few samples or no such map.
+    """
+    there = np.isfinite(seen)
+    if there.all() or there.sum() < _MIN_SEEN_SAMPLES:
+        return seen
+    # A simulation at rest does not determine the map.
+    if not np.ptp(shown[there]) > 0:
+        return seen
+    # Metres and pixels differ by orders of magnitude; scaling gives all columns of (2) equal
+    # weight.
+    x = _scaled(shown, shown[there])
+    y = _scaled(seen, seen[there])
+    table = np.stack([np.ones_like(x), x, -x * y], axis=1)[there]
+    a, b, c = _fitted(table, y[there])
+    below = 1 + c * x
+    # A change of sign would put a part of the run behind the camera.
+    if not (below > _MIN_DENOMINATOR).all():
+        return seen
+    mapped = (a + b * x) / below  # (1)
+    unscaled = mapped * float(seen[there].std()) + float(seen[there].mean())
+    result: Array = np.where(there, seen, unscaled)
+    return result
+
+
+def _fitted(table: Array, values: Array) -> Array:
+    """Compute the numbers (3,) of (2) by iteratively reweighted least squares, Cauchy's weights."""
+    weights: Array = np.ones(len(table))
+    numbers: Array = np.zeros(3)
+    for _ in range(_ROUNDS):
+        solution = np.linalg.lstsq(table * weights[:, None], values * weights, rcond=None)[0]
+        numbers = solution.astype(np.float64)
+        rest: Array = values - table @ numbers
+        width = max(_OUTLYING * float(np.median(np.abs(rest))), _FINEST)
+        # This is the root of Cauchy's weight, because it multiplies both sides of (2).
+        weights = 1 / np.sqrt(1 + (rest / width) ** 2)
+    return numbers
+
+
+def _scaled(values: Array, some: Array) -> Array:
+    """Return values in standard deviations from the mean, both computed from `some` of them."""
+    spread = float(some.std())
+    divisor = spread if spread > 0 else 1.0
+    result: Array = (values - float(some.mean())) / divisor
+    return result

@@ -1,0 +1,169 @@
+"""Causal transformer that reads a tuning history and proposes the next point.
+
+Source: X. Zhang, S. Liu et al., Dynamics as Prompts: In-Context Learning for Sim-to-Real System
+Identifications (CAPTURE), IEEE RA-L 2025, arXiv 2410.20357, section III; attention: A. Vaswani et
+al., NeurIPS 2017, arXiv 1706.03762, Eq. 1.
+
+With a the input row of a simulation at e, o that of the target, W a learned projection, e in half
+widths from the middle of the training range:
+
+    (1)  d = W (a - o),  s = root mean square of d,  u = d / s
+    (2)  slope = (d - d of the simulation before) / |step|
+    (3)  token = [u, log(s + s0), e, W o, step / |step|, arsinh(slope)]; the first one has W o alone
+    (4)  h = blocks of attention to the tokens before, and of two layers, on the token's embedding
+    (5)  next = e + s (A(h) u + c(h)), A and c linear in h; before any simulation: linear in h
+
+With (5), next = e if the simulation equals the target, and the step decreases with the difference.
+Published: next is always linear in h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+_SIGMA_ZERO = 0.01
+"""Constant s0 in (3): differences far below those of the training give equal tokens."""
+_STILL = 1e-9
+"""Minimum divisor, so that zero divided by zero is finite."""
+_CAUSAL_MASK_OFFSET = 1e9
+"""Value subtracted from attention scores of later tokens (causal mask)."""
+
+
+@dataclass(frozen=True)
+class HistoryTransformerDesign:
+    """Design of a network and of its training.
+
+    Attributes:
+        window: number of simulations of a history that the network reads.
+        seen: length of d in (1).
+        width: width of a token's embedding and of the layers of a block.
+        blocks: number of blocks of attention and layers.
+        published: True to learn the next point of a randomised binary search, as a linear function
+            of h; False to learn the target's parameters, by (5).
+        relative: each squared error is weighted by 1 / (|e - truth|^2 + relative^2), in half
+            widths.
+        rate: initial learning rate; it decreases along a cosine.
+        weight_decay: factor of the squared norm of the weights in the loss.
+        epochs: number of passes over the scenarios.
+        batch: number of scenarios in a batch.
+    """
+
+    window: int = 7
+    seen: int = 8
+    width: int = 32
+    blocks: int = 1
+    published: bool = False
+    relative: float = 0.3
+    rate: float = 3e-3
+    weight_decay: float = 1e-5
+    epochs: int = 80
+    batch: int = 10
+
+
+def get_weight_shapes(
+    inputs: int, dim: int, design: HistoryTransformerDesign
+) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every weight array by name.
+
+    Args:
+        inputs: length of an input row.
+        dim: number of parameters.
+        design: design of the network.
+    """
+    d, width = design.seen, design.width
+    layers = {"first": (d, width), "token": (3 * d + 1 + 2 * dim, width)}
+    for block in range(design.blocks):
+        layers[f"heard{block}"] = width, 3 * width
+        for part in ("mixed", "inner", "outer"):
+            layers[f"{part}{block}"] = width, width
+    layers["guess"] = width, dim
+    layers["next"] = width, dim if design.published else dim * (d + 1)
+    # The projection has no bias, because a bias would cancel in every difference.
+    named: dict[str, tuple[int, ...]] = {"seen.weight": (inputs, d)}
+    for layer, (fan_in, fan_out) in layers.items():
+        named[f"{layer}.weight"] = fan_in, fan_out
+        named[f"{layer}.bias"] = (fan_out,)
+    for block in range(design.blocks):
+        named[f"lag{block}.bias"] = (design.window + 1,)
+    return named
+
+
+def predict_proposals(
+    xp: Any,
+    w: dict[str, Any],
+    design: HistoryTransformerDesign,
+    target: Any,
+    shown: Any,
+    tried: Any,
+) -> Any:
+    """Compute the proposals before and after each simulation of a history.
+
+    The code is shared by numpy and torch, whose functions have the same names.
+
+    Args:
+        xp: module numpy or torch.
+        w: weight arrays as in `get_weight_shapes`.
+        design: design of the network.
+        target: (..., d) row of the target, projected by W.
+        shown: (..., k, d) rows of the simulations, projected by W; k is at most the window.
+        tried: (..., k, dim) parameters of the simulations, in half widths from the middle.
+
+    Returns:
+        (..., k + 1, dim) proposals, in half widths from the middle.
+    """
+    here = target[..., None, :]
+    far = shown - here
+    size = xp.sqrt((far**2).mean(axis=-1, keepdims=True) + _STILL**2)
+    unit = far / size  # (1)
+    known = [unit, xp.log(size + _SIGMA_ZERO), tried, xp.broadcast_to(here, far.shape)]
+    tokens = xp.concatenate([*known, *_compute_step_features(xp, far, tried)], axis=-1)  # (3)
+    h = xp.concatenate([_linear(w, "first", here), _linear(w, "token", tokens)], axis=-2)
+    for block in range(design.blocks):
+        h = h + _causal_attention(xp, w, block, h)  # (4)
+        h = h + _linear(w, f"outer{block}", _swish(xp, _linear(w, f"inner{block}", h)))
+    guess = _linear(w, "guess", h[..., :1, :])
+    following = _linear(w, "next", h[..., 1:, :])
+    if not design.published:
+        gain = following.reshape(*tried.shape, unit.shape[-1] + 1)
+        along = (gain[..., :-1] * unit[..., None, :]).sum(axis=-1)
+        following = tried + size * (along + gain[..., -1])  # (5)
+    return xp.concatenate([guess, following], axis=-2)
+
+
+def _compute_step_features(xp: Any, far: Any, tried: Any) -> tuple[Any, Any]:
+    """Compute the direction of each step and the slope (2); zeros for the first simulation."""
+    step = tried[..., 1:, :] - tried[..., :-1, :]
+    length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _STILL**2)
+    slope = (far[..., 1:, :] - far[..., :-1, :]) / length  # (2)
+
+    def begun(like: Any, rest: Any) -> Any:
+        return xp.concatenate([xp.zeros_like(like[..., :1, :]), rest], axis=-2)
+
+    return begun(tried, step / length), begun(far, xp.arcsinh(slope))
+
+
+def _causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
+    """Compute the attention of each token (..., k, width) to itself and to earlier tokens."""
+    count, width = h.shape[-2:]
+    heard = _linear(w, f"heard{block}", h)
+    query, key = heard[..., :width], heard[..., width : 2 * width]
+    lag = np.arange(count)[:, None] - np.arange(count)
+    later = xp.asarray(np.where(lag < 0, _CAUSAL_MASK_OFFSET, 0.0).astype(np.float32))
+    score = query @ key.swapaxes(-1, -2) / width**0.5 + w[f"lag{block}.bias"][np.maximum(lag, 0)]
+    score = score - later
+    # The largest score is subtracted, so that the exponentials do not overflow.
+    share = xp.exp(score - xp.amax(score, -1)[..., None])
+    share = share / share.sum(axis=-1, keepdims=True)
+    return _linear(w, f"mixed{block}", share @ heard[..., 2 * width :])
+
+
+def _linear(w: dict[str, Any], layer: str, x: Any) -> Any:
+    return x @ w[f"{layer}.weight"] + w[f"{layer}.bias"]
+
+
+def _swish(xp: Any, x: Any) -> Any:
+    """Compute x times its logistic function (swish), with a tanh that does not overflow."""
+    return x * (1.0 + xp.tanh(x / 2.0)) / 2.0

@@ -1,0 +1,199 @@
+"""Map from observations and scenario information to the input rows of learned tuners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from methods.learning.observation_features import (
+    ObservationFeatures,
+    make_raw_features,
+    make_weighted_features,
+)
+from methods.learning.scenario_features import ScenarioFeatures
+from methods.learning.training_data import TrainingData
+from methods.tuner import Array, ScenarioInfo
+
+_OBSERVATION_FEATURE_ARRAYS = ("chosen", "centre", "gain")
+"""Names of the arrays of `ObservationFeatures` that are stored."""
+_SCENARIO_FEATURE_ARRAYS = ("centre", "spread", "initial")
+"""Names of the arrays of `ScenarioFeatures` that are stored."""
+_NONE = np.empty(0)
+"""Replacement of a missing array."""
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """Configuration of network inputs and of the noise in training.
+
+    Attributes:
+        points: number of points to which each run is resampled; L in Algorithm 1.
+        inputs: maximum number of inputs that are used from an observation.
+        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        noise: sensor noise that a second network is trained with, as standard deviation in units of
+            each channel's standard deviation in training; 0 for no second network.
+        raw: True for the resampled series in SI units without weights, as published; the other
+            settings then have no effect.
+        use_scenario_features: True to use scenario information too, if scenarios differ in it
+            (`methods.learning.scenario_features`).
+        channels: indices of the first and the last channel that are used; None for all.
+        clean: whether targets may be noise-free; if not, only the network for noisy targets is
+            trained.
+        proposed: configuration of the inputs of the network's proposed side, if it differs.
+    """
+
+    points: int = 400
+    inputs: int = 400
+    strictness: float = 1000.0
+    noise: float = 0.01
+    raw: bool = False
+    use_scenario_features: bool = True
+    channels: tuple[int, int] | None = None
+    clean: bool = True
+    proposed: FeatureConfig | None = None
+
+    def select_channels(self, observations: Array) -> Array:
+        """Return the channels (..., c) of observations (..., C) that are used.
+
+        Indices beyond the last channel are replaced by the last one.
+        """
+        if self.channels is None:
+            return observations
+        most = observations.shape[-1] - 1
+        first, last = (min(channel, most) for channel in self.channels)
+        return observations[..., first : last + 1]
+
+
+@dataclass(frozen=True)
+class InputFeatures:
+    """Map to input rows, chosen and scaled by the training simulations.
+
+    Attributes:
+        reading: configuration from which it was made.
+        seen: map from observations to input rows.
+        told: map from scenario information to further inputs; None if scenarios were equal in
+            training.
+    """
+
+    reading: FeatureConfig
+    seen: ObservationFeatures
+    told: ScenarioFeatures | None = None
+
+    @classmethod
+    def fit(cls, data: TrainingData, reading: FeatureConfig) -> InputFeatures:
+        """Choose the inputs from training data.
+
+        Args:
+            data: training data.
+            reading: configuration of the inputs.
+        """
+        data = data._replace(observations=reading.select_channels(data.observations))
+        if reading.raw:
+            return cls(
+                reading,
+                make_raw_features(data.flattened_observations, data.lengths, reading.points),
+            )
+        told = None
+        if reading.use_scenario_features:
+            told = ScenarioFeatures.fit(data.scenes, data.observations, data.lengths)
+        # If inputs vary, samples have another meaning in each scenario, so only responses are used.
+        driven = told is not None and told.has_varying_inputs
+        most = 0 if driven else reading.inputs
+        seen = make_weighted_features(data, reading.points, most, reading.strictness)
+        return cls(reading, seen, told)
+
+    @property
+    def feature_count(self) -> int:
+        """Length of an input row."""
+        told = 0 if self.told is None else self.told.centre.size
+        return self.seen.chosen.size + told
+
+    def __call__(
+        self,
+        observations: Array,
+        lengths: tuple[int, ...],
+        scene: ScenarioInfo,
+        missing: Array | None = None,
+    ) -> Array:
+        """Compute input rows (n, D) from observations (n, T, C) of one scenario.
+
+        Args:
+            observations: observations in SI units; NaN for missing samples.
+            lengths: number of samples of each run.
+            scene: scenario information.
+            missing: (T, C) mask of further samples to treat as missing: those missing in the
+                target, so that a simulation with the true parameters gives the target's own row.
+
+        Raises:
+            ValueError: the observation or the scenario differs in its shape from those of the
+                training.
+        """
+        if missing is not None and missing.any():
+            observations = np.where(missing, np.nan, observations)
+        observations = self.reading.select_channels(observations)
+        rows = self.seen(observations, lengths)
+        if self.told is None:
+            return rows
+        further = self.told(observations, lengths, scene)
+        return np.concatenate([rows, further], axis=1)
+
+    def compute_rows(self, data: TrainingData) -> Array:
+        """Compute the input rows (scenarios, each, D) of training simulations."""
+        if self.told is None:
+            # All scenarios are computed in one call, because the rows do not depend on the
+            # scenario.
+            rows = self.seen(
+                self.reading.select_channels(data.flattened_observations), data.lengths
+            )
+            return rows.reshape(*data.parameters.shape[:2], -1)
+        each = zip(data.observations, data.scenes, strict=True)
+        return np.array([self(observations, data.lengths, scene) for observations, scene in each])
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return everything as plain arrays by name."""
+        state: dict[str, Array] = {}
+        for name in _OBSERVATION_FEATURE_ARRAYS:
+            state[f"inputs.{name}"] = np.asarray(getattr(self.seen, name))
+        if self.told is not None:
+            for name in _SCENARIO_FEATURE_ARRAYS:
+                state[f"told.{name}"] = np.asarray(getattr(self.told, name), dtype=np.float64)
+        return state
+
+    @classmethod
+    def from_arrays(
+        cls, state: dict[str, Array], reading: FeatureConfig
+    ) -> tuple[InputFeatures, dict[str, Array]]:
+        """Restore the map from the arrays of `to_arrays`.
+
+        Args:
+            state: arrays by name.
+            reading: configuration of the inputs.
+
+        Returns:
+            The map, and the arrays of other names.
+
+        Raises:
+            ValueError: arrays are missing or have other shapes, or numbers that are not finite.
+        """
+        rest = {name: np.array(array, dtype=np.float64) for name, array in state.items()}
+        names = [f"inputs.{name}" for name in _OBSERVATION_FEATURE_ARRAYS]
+        if any(name.startswith("told.") for name in rest):
+            names += [f"told.{name}" for name in _SCENARIO_FEATURE_ARRAYS]
+        # The shape of one array of each part determines the shapes of the others.
+        sizes = {part: rest.get(f"{part}.centre", _NONE).shape for part in ("inputs", "told")}
+        for name in names:
+            shape = () if name == "told.initial" else sizes[name.partition(".")[0]]
+            if name not in rest:
+                raise ValueError(f"expected array {name}, found {sorted(state)[:4]}")
+            array = rest[name]
+            if array.shape != shape or len(shape) > 1 or not np.isfinite(array).all():
+                raise ValueError(
+                    f"array {name}: expected finite numbers of shape {shape}, found {array.shape}"
+                )
+        if not sizes["inputs"][0] + sum(sizes["told"]):
+            raise ValueError("expected a network that reads something, found one without inputs")
+        chosen, centre, gain, *own = (rest.pop(name) for name in names)
+        seen = ObservationFeatures(reading.points, reading.raw, chosen, centre, gain)
+        told = ScenarioFeatures(own[0], own[1], int(own[2])) if own else None
+        return cls(reading, seen, told), rest

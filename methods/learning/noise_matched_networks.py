@@ -1,0 +1,171 @@
+"""Train one network for noise-free targets, and one for noisy targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from methods.learning.input_features import FeatureConfig
+from methods.learning.observation_features import estimate_noise_sigma
+from methods.learning.training_data import TrainingData
+from methods.tuner import Array, Task
+
+_CLEAN_ROUGHNESS_FACTOR = 2.0
+"""Maximum roughness of a noise-free target, in multiples of the simulations' roughness."""
+_NOISE_SHARE_THRESHOLD = 50.0
+"""Divisor of the training noise that gives the threshold for noisy targets.
+
+A target counts as noisy if its noise exceeds 1/50 of the noise of the training.
+"""
+
+
+class StorableNetwork(Protocol):
+    """Trained network that can be stored."""
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return everything as plain arrays by name."""
+        ...
+
+
+Learner = TypeVar("Learner", bound=StorableNetwork)
+TrainFunction = Callable[[str, TrainingData, "Array | None"], Learner]
+"""Function that trains a network.
+
+Its arguments are the name of the stage, the training data, and the standard deviations (C,) of the
+noise that was added to them; None for noise-free data.
+"""
+
+
+@dataclass(frozen=True)
+class NoiseMatchedNetworks(Generic[Learner]):
+    """One network for noise-free targets, and one for noisy targets.
+
+    The two networks use different features of an observation. Without noise, single samples follow
+    the parameters exactly even far outside the training range. With noise, a combination of many
+    samples is needed.
+
+    Attributes:
+        clean: network trained on noise-free simulations; the noisy one if noise-free targets are
+            excluded.
+        noisy: network trained on the same simulations with noise; the clean one if there is no
+            noise.
+        limit: (C,) roughness above which a target counts as noisy, SI units.
+    """
+
+    clean: Learner
+    noisy: Learner
+    limit: Array
+
+    @classmethod
+    def train(
+        cls,
+        data: TrainingData,
+        rng: np.random.Generator,
+        reading: FeatureConfig,
+        learn: TrainFunction[Learner],
+    ) -> NoiseMatchedNetworks[Learner]:
+        """Train both networks on the same simulations, or one if one kind of target is expected.
+
+        Args:
+            data: training data.
+            rng: random generator.
+            reading: configuration of the inputs and of the noise.
+            learn: function that trains a network.
+        """
+        spread = data.flattened_observations.std(axis=(0, 1))
+        own = estimate_noise_sigma(data.flattened_observations, data.lengths).max(axis=0)
+        limit = _CLEAN_ROUGHNESS_FACTOR * own + reading.noise / _NOISE_SHARE_THRESHOLD * spread
+
+        def noisy() -> Learner:
+            noise = reading.noise * spread
+            return learn("noisy", data.with_noise(noise, rng), noise)
+
+        # Autocorrelated sensor errors look as smooth as a noise-free target, so there is one
+        # network.
+        if reading.noise and not reading.clean:
+            network = noisy()
+            return cls(network, network, limit)
+        clean = learn("clean", data, None)
+        return cls(clean, noisy() if reading.noise else clean, limit)
+
+    def select_for(self, task: Task) -> Learner:
+        """Return the network for a target, chosen by the target's roughness."""
+        rough = estimate_noise_sigma(task.observed[None], task.lengths)[0]
+        return self.noisy if (rough > self.limit).any() else self.clean
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return everything as plain arrays by name."""
+        arrays = {f"clean.{name}": array for name, array in self.clean.to_arrays().items()}
+        if self.noisy is not self.clean:
+            arrays |= {f"noisy.{name}": array for name, array in self.noisy.to_arrays().items()}
+        return arrays | {"limit": self.limit}
+
+    @classmethod
+    def from_arrays(
+        cls,
+        state: dict[str, Array],
+        reading: FeatureConfig,
+        restore: Callable[[dict[str, Array]], Learner],
+    ) -> NoiseMatchedNetworks[Learner]:
+        """Restore the networks from the arrays of `to_arrays`.
+
+        Args:
+            state: arrays by name.
+            reading: configuration of the inputs and of the noise.
+            restore: function that restores one network from its arrays.
+
+        Raises:
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
+        """
+        parts: dict[str, dict[str, Array]] = {"clean": {}, "noisy": {}, "limit": {}}
+        for name, array in state.items():
+            part, _, rest = name.partition(".")
+            if part not in parts:
+                raise ValueError(f"expected arrays of {sorted(parts)}, found {name}")
+            parts[part][rest] = array
+        limit = np.array(parts["limit"].get("", np.nan), dtype=np.float64)
+        if limit.ndim != 1 or not np.isfinite(limit).all():
+            raise ValueError(
+                "array limit: expected finite numbers of shape (channels,), "
+                f"found shape {limit.shape}"
+            )
+        two = bool(reading.noise) and reading.clean
+        if two != bool(parts["noisy"]):
+            raise ValueError(
+                f"expected {'two networks' if two else 'one network'}, found another number of them"
+            )
+        clean = restore(parts["clean"])
+        noisy = restore(parts["noisy"]) if two else clean
+        return cls(clean, noisy, limit)
+
+
+def add_noise_to_held_out(apart: TrainingData, noise: Array | None) -> TrainingData:
+    """Add noise of standard deviations (C,) to held-out simulations; None for no noise."""
+    # A separate random stream keeps the training independent of the evaluation.
+    return apart if noise is None else apart.with_noise(noise, np.random.default_rng(0))
+
+
+def check_shapes(
+    arrays: dict[str, Array], expected: dict[str, tuple[int, ...]]
+) -> dict[str, Array]:
+    """Return the arrays in the order of the expected names, after a check of their shapes.
+
+    Args:
+        arrays: arrays by name.
+        expected: shapes by name.
+
+    Raises:
+        ValueError: arrays have other names or shapes, or numbers that are not finite.
+    """
+    if arrays.keys() != expected.keys():
+        raise ValueError(f"expected arrays {sorted(expected)}, found {sorted(arrays)}")
+    for name, shape in expected.items():
+        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+            raise ValueError(
+                f"array {name}: expected finite numbers of shape {shape}, "
+                f"found {arrays[name].shape}"
+            )
+    return {name: arrays[name] for name in expected}

@@ -1,0 +1,298 @@
+"""What the networks of TuneNet and its regressor see of an observation.
+
+Pure numpy, so that tuning needs no torch. An observation (T, C) becomes a row of numbers in three
+steps: each run is resampled to a fixed number of points (RESAMPLE in Algorithm 1, arXiv
+1907.11200); rates of change and sorted copies are added; each number is centred, and weighed by how
+faithfully it followed the parameters in training.
+
+With x a number, d its parameters' differences from their mean within a scenario, and strictness s:
+
+    (1)  x - mean = d slopes + left over, by least squares in each scenario
+    (2)  faith of a parameter = e / (e + s * left over), e = |slope| * spread of the parameter
+    (3)  weight = (largest faith, each parameter's scaled to the same maximum)^2, per deviation
+    (4)  weight of circumstances = (b / (b + s * w))^2, per deviation, with b and w the standard
+         deviations between and within scenarios
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from methods.learning.training_data import TrainingData
+from methods.tuner import Array
+
+_PARTS = 8
+"""Maximum number of parts of a run for the noise estimate."""
+_LEAST_PART = 16
+"""Minimum number of third differences in a part."""
+_NORMAL = 0.6745
+"""Median absolute value of a normal variable, in standard deviations."""
+_THIRD: float = 20.0**0.5
+"""Standard deviation of third differences of white noise with variance 1.
+
+The variance is 1 + 9 + 9 + 1 = 20.
+"""
+_EXACT = 1e-9
+"""Threshold of rounding errors, as a share of the largest deviation."""
+_LEAST_DEVIATION = 1e-3
+"""Minimum deviation, as a share of the largest one; smaller ones are not scaled up further."""
+_ZERO = 1e-300
+"""Minimum divisor, so that zero divided by zero is finite."""
+
+
+def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) -> Array:
+    """Resample every run to the same number of points by linear interpolation, without gaps.
+
+    Args:
+        observations: (n, T, C) observations with the runs concatenated along T; NaN for missing
+            samples.
+        lengths: number of samples of each run; their sum is T.
+        points: number of points of each resampled run, evenly spaced over its samples.
+
+    Returns:
+        (n, runs * C, points); NaN in a series without any sample.
+
+    Raises:
+        ValueError: the lengths do not add up to T.
+    """
+    n, samples, channels = observations.shape
+    if sum(lengths) != samples:
+        raise ValueError(
+            f"runs of {lengths} samples add up to {sum(lengths)}, the observation has {samples}"
+        )
+    out = np.empty((n, len(lengths), channels, points))
+    first = 0
+    for run, length in enumerate(lengths):
+        series = observations[:, first : first + length].transpose(0, 2, 1)
+        first += length
+        # Interpolation at the samples would return them; most runs need no interpolation.
+        if length == points and not np.isnan(series).any():
+            out[:, run] = series
+            continue
+        samples = np.arange(length)
+        at = np.linspace(0, length - 1, points)
+        for i in range(n):
+            for c in range(channels):
+                out[i, run, c] = _interpolated(at, samples, series[i, c])
+    return out.reshape(n, len(lengths) * channels, points)
+
+
+def _interpolated(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
+    """Interpolate linearly between available samples, shape (points,); NaN if there are none."""
+    there = ~np.isnan(values)
+    if not there.any():
+        return np.full(len(at), np.nan)
+    between: Array = np.interp(at, samples[there], values[there])
+    return between
+
+
+def compute_descriptors(series: Array) -> Array:
+    """Describe each series by values and rates of change, in order of time and sorted by size.
+
+    Sorted values are independent of time, so they do not change if the motion is shifted in time.
+
+    Args:
+        series: (n, series, points).
+
+    Returns:
+        (n, series * (4 * points - 2)).
+    """
+    rates = np.diff(series, axis=-1)
+    parts = (
+        series,
+        rates,
+        np.sort(series, axis=-1),
+        np.sort(rates, axis=-1),
+    )
+    return np.concatenate(parts, axis=-1).reshape(len(series), -1)
+
+
+def estimate_noise_sigma(observations: Array, lengths: tuple[int, ...]) -> Array:
+    """Estimate the standard deviation of white noise from the third differences of each run.
+
+    It is the one that explains the median third difference of the run's smoothest part, because
+    smooth motion has nearly none. A run is divided into up to eight parts of at least sixteen
+    differences, so that impacts and rattling elsewhere do not count.
+
+    Args:
+        observations: (n, T, C) observations; NaN for missing samples.
+        lengths: number of samples of each run.
+
+    Returns:
+        (n, C) noise in SI units: for each channel the largest one of all runs, 0 if no run has four
+        successive samples.
+    """
+    out = np.zeros((observations.shape[0], observations.shape[2]))
+    for run in np.split(observations, np.cumsum(lengths)[:-1], axis=1):
+        # Third differences of a parabola are zero, so those of smooth motion are small.
+        thirds = np.abs(np.diff(run, n=3, axis=1))
+        count = min(_PARTS, max(1, thirds.shape[1] // _LEAST_PART))
+        parts = np.array_split(thirds, count, axis=1)
+        for i, c in np.ndindex(out.shape):
+            calmest = _min_part_median([part[i, :, c] for part in parts])
+            noise = calmest / (_NORMAL * _THIRD)
+            out[i, c] = max(float(out[i, c]), noise)
+    return out
+
+
+def _min_part_median(parts: list[Array]) -> float:
+    """Return the smallest median of the parts, without NaN; 0 if there are no values."""
+    medians = []
+    for part in parts:
+        there = part[~np.isnan(part)]
+        if there.size:
+            medians.append(float(np.median(there)))
+    return min(medians, default=0.0)
+
+
+@dataclass(frozen=True)
+class ObservationFeatures:
+    """Map from observations to a network's input rows.
+
+    Attributes:
+        points: number of points to which each run is resampled.
+        plain: True to use the resampled series only, without rates and sorting.
+        chosen: (D,) indices of the numbers that are used.
+        centre: (D,) values that are subtracted from them.
+        gain: (D,) factors that they are then multiplied by.
+    """
+
+    points: int
+    plain: bool
+    chosen: Array
+    centre: Array
+    gain: Array
+
+    def __call__(self, observations: Array, lengths: tuple[int, ...]) -> Array:
+        """Compute input rows (n, D) from observations (n, T, C).
+
+        Args:
+            observations: observations in SI units; NaN for missing samples.
+            lengths: number of samples of each run.
+
+        Raises:
+            ValueError: the observation yields fewer numbers than the network was trained on.
+        """
+        if not self.chosen.size:
+            return np.empty((len(observations), 0))
+        rows = _rows(observations, lengths, self.points, self.plain)
+        chosen = self.chosen.astype(np.intp)
+        if chosen.max() >= rows.shape[1]:
+            raise ValueError(
+                f"the network reads number {chosen.max()} of an observation, "
+                f"this one gives {rows.shape[1]}; "
+                "train on observations of the same runs and channels"
+            )
+        centred = rows[:, chosen] - self.centre
+        scaled = centred * self.gain
+        # A series without any sample is replaced by its mean.
+        return np.nan_to_num(scaled)
+
+
+def _rows(observations: Array, lengths: tuple[int, ...], points: int, plain: bool) -> Array:
+    """Compute all candidate numbers (n, D) of observations (n, T, C)."""
+    series = resample_runs(observations, lengths, points)
+    return series.reshape(len(series), -1) if plain else compute_descriptors(series)
+
+
+def make_raw_features(
+    observations: Array, lengths: tuple[int, ...], points: int
+) -> ObservationFeatures:
+    """Make the published inputs: resampled series in SI units, neither centred nor scaled.
+
+    Args:
+        observations: (n, T, C) observations in SI units.
+        lengths: number of samples of each run.
+        points: number of points to which each run is resampled.
+    """
+    size = _rows(observations[:1], lengths, points, plain=True).shape[1]
+    every = np.arange(size, dtype=np.float64)
+    return ObservationFeatures(points, True, every, np.zeros(size), np.ones(size))
+
+
+def make_weighted_features(
+    data: TrainingData, points: int, most: int, strictness: float
+) -> ObservationFeatures:
+    """Choose and scale inputs by how closely they follow the parameters.
+
+    Within each scenario every candidate number is fitted as a linear function of the parameters
+    (1). A large residual of the fit (jumps, curvature, noise) means that the number is a poor
+    predictor, above all outside the training range; (2) and (3) give it a small weight. Each
+    parameter's weights are scaled to the same maximum, so that a parameter with strong effects does
+    not hide the others. A number that does not depend on the parameters but differs between
+    scenarios describes the scenario; its weight is (4).
+
+    Args:
+        data: training simulations.
+        points: number of points to which each run is resampled.
+        most: maximum number of inputs, those with the largest weights; 0 for none.
+        strictness: factor s of the residual in (2) and (4).
+
+    Returns:
+        The inputs; their mean square over the training data is 1.
+    """
+    rows = _rows(data.flattened_observations, data.lengths, points, plain=False)
+    grouped = rows.reshape(*data.parameters.shape[:2], -1)
+    spread, explained, left = _compute_sensitivities(data.parameters, grouped)
+    deviation = rows.std(axis=0)
+    between = grouped.mean(axis=1).std(axis=0)
+    floor = _EXACT * max(float(deviation.max()), _ZERO)
+    faith = explained / (explained + strictness * left + floor)  # (2)
+    best = faith.max(axis=1, keepdims=True)
+    share = faith / np.where(best > 0, best, 1.0)
+    following = np.max(share**2, axis=0)  # (3)
+    context = (between / (between + strictness * spread + floor)) ** 2  # (4)
+    # A stable sort chooses the same numbers on every machine if weights are equal.
+    order = np.argsort(-np.maximum(following, context), kind="stable")
+    chosen = np.sort(order[:most])
+    by_parameters = _per(following[chosen], spread[chosen])
+    by_context = _per(context[chosen], deviation[chosen])
+    gain = np.maximum(by_parameters, by_context)
+    # The network's initial weights and learning rate assume inputs of mean square 1.
+    size = np.sqrt(np.mean((gain * deviation[chosen]) ** 2)) if most else 1.0
+    return ObservationFeatures(
+        points,
+        False,
+        chosen.astype(np.float64),
+        rows[:, chosen].mean(axis=0),
+        gain / size if size > 0 else gain,
+    )
+
+
+def _per(weight: Array, deviation: Array) -> Array:
+    """Return the weight per unit of deviation, limited for small deviations."""
+    least = _LEAST_DEVIATION * deviation.max(initial=0.0)
+    scaled: Array = weight / (deviation + least + _ZERO)
+    return scaled
+
+
+def _compute_sensitivities(parameters: Array, rows: Array) -> tuple[Array, Array, Array]:
+    """Fit each number as a linear function of the parameters within scenarios.
+
+    Returns:
+        Root mean squares of each number (D,), of the part that each parameter explains (dim, D),
+        and of the residual (D,).
+    """
+    scenarios, each, dim = parameters.shape
+    count = rows.shape[2]
+    offsets = parameters - parameters.mean(axis=1, keepdims=True)
+    # A fit with 1 + dim free numbers leaves this share of the variance of pure noise.
+    free = max(each - 1 - dim, 1) / each
+    total = np.zeros(count)
+    rest = np.zeros(count)
+    explained = np.zeros((dim, count))
+    for delta, values in zip(offsets, rows, strict=True):
+        centred = values - values.mean(axis=0)
+        slopes = np.linalg.lstsq(delta, centred, rcond=None)[0]  # (1)
+        left_over = centred - delta @ slopes
+        total += np.mean(centred**2, axis=0)
+        rest += np.mean(left_over**2, axis=0) / free
+        explained += np.mean(delta**2, axis=0)[:, None] * slopes**2
+    return (
+        np.sqrt(total / scenarios),
+        np.sqrt(explained / scenarios),
+        np.sqrt(rest / scenarios),
+    )

@@ -1,0 +1,297 @@
+"""Base class of tuners on TuneNet's pair network: training, state and estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from methods.learning.gap_filling import fill_gaps
+from methods.learning.input_features import FeatureConfig, InputFeatures
+from methods.learning.noise_matched_networks import (
+    NoiseMatchedNetworks,
+    add_noise_to_held_out,
+    check_shapes,
+)
+from methods.learning.pair_network import (
+    PairInputs,
+    PairNetworkDesign,
+    PairValidationMonitor,
+    estimate_difference,
+    get_weight_shapes,
+    train_pair_network,
+)
+from methods.learning.training_data import TrainingData, generate_training_data
+from methods.tuner import Array, Task, TrainingSimulator, Tuner
+
+_PROPOSED_SIDE_PREFIX = "own-"
+"""Prefix of array names of the proposed side if both sides have different inputs."""
+
+
+@dataclass(frozen=True)
+class TrainingMonitor:
+    """Monitor of the training of one network.
+
+    Attributes:
+        held_out: simulations that are used for evaluation only.
+        epoch: called after each epoch with its number from 1, the number of epochs, training loss
+            and held-out loss.
+    """
+
+    held_out: TrainingData
+    epoch: Callable[[int, int, float, float], None]
+
+
+@dataclass(frozen=True)
+class TrainedPairNetwork:
+    """A trained pair network with its input features.
+
+    Attributes:
+        design: design of the network.
+        read: map from observations and scenarios to input rows of the target's side.
+        weights: weight arrays by name.
+        proposed: map to input rows of the proposed side; the object `read` if both sides have the
+            same inputs.
+    """
+
+    design: PairNetworkDesign
+    read: InputFeatures
+    weights: dict[str, Array]
+    proposed: InputFeatures
+
+    @classmethod
+    def train(
+        cls,
+        design: PairNetworkDesign,
+        data: TrainingData,
+        rng: np.random.Generator,
+        reading: FeatureConfig,
+        alone: bool,
+        look: TrainingMonitor | None,
+    ) -> TrainedPairNetwork:
+        """Choose the inputs, and train the network on them.
+
+        Args:
+            design: design of the network.
+            data: training data.
+            rng: random generator.
+            reading: configuration of the inputs.
+            alone: as in `pair_network.train`.
+            look: monitor of the training; None for none.
+        """
+        read = InputFeatures.fit(data, reading)
+        proposed = (
+            InputFeatures.fit(data.without_noise, reading.proposed) if reading.proposed else read
+        )
+        watched = None
+        if look is not None:
+            held_out = look.held_out
+            rows = _sides(proposed, read, held_out)
+            watched = PairValidationMonitor(rows, held_out.parameters, look.epoch)
+        rows = _sides(proposed, read, data)
+        weights = train_pair_network(rows, data.parameters, design, rng, alone, watched)
+        return cls(design, read, weights, proposed)
+
+    def predict_difference(self, proposed: Array, target: Array) -> Array:
+        """Compute h(proposed, target) of input rows; see `pair_network.estimate`.
+
+        Args:
+            proposed: (n, D) or (D,) input rows of the proposed side.
+            target: (n, E) or (E,) input rows of the target's side.
+        """
+        return estimate_difference(self.weights, self.design, proposed, target)
+
+    def make_estimator(self, task: Task) -> Callable[[Array], Array]:
+        """Return the function from one simulation (1, T, C) to h(simulation, target), shape (dim,).
+
+        The result is NaN if the simulation failed.
+        """
+        alike = self.proposed is self.read
+        # Samples missing in the target are hidden in the simulation too, so that the true
+        # parameters give the target's own row.
+        hidden = np.isnan(task.observed) if alike else None
+        row = None
+        if alike:
+            # The target's row is equal for all simulations, unless a simulation fills its gaps.
+            row = self.read(task.observed[None], task.lengths, task.scene, hidden)[0]
+
+        def difference(observations: Array) -> Array:
+            if not np.isfinite(observations).all():
+                return np.full(task.dim, np.nan)
+            proposed = self.proposed(observations, task.lengths, task.scene, hidden)[0]
+            target = row
+            if target is None:
+                whole = _bridged(task, observations[0], self)
+                target = self.read(whole[None], task.lengths, task.scene)[0]
+            return self.predict_difference(proposed, target)
+
+        return difference
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return weights and input features as plain arrays by name."""
+        state = self.read.to_arrays() | self.weights
+        if self.proposed is self.read:
+            return state
+        # The arrays of both sides have the same names.
+        own = {
+            _PROPOSED_SIDE_PREFIX + name: array for name, array in self.proposed.to_arrays().items()
+        }
+        return own | state
+
+    @classmethod
+    def from_arrays(
+        cls, state: dict[str, Array], design: PairNetworkDesign, reading: FeatureConfig
+    ) -> TrainedPairNetwork:
+        """Restore a network from the arrays of `to_arrays`.
+
+        Args:
+            state: arrays by name.
+            design: design of the network.
+            reading: configuration of the inputs.
+
+        Raises:
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
+        """
+        own: dict[str, Array] = {}
+        common: dict[str, Array] = {}
+        for name, array in state.items():
+            part = own if name.startswith(_PROPOSED_SIDE_PREFIX) else common
+            part[name.removeprefix(_PROPOSED_SIDE_PREFIX)] = array
+        read, arrays = InputFeatures.from_arrays(common, reading)
+        proposed = InputFeatures.from_arrays(own, reading.proposed)[0] if reading.proposed else read
+        dim = arrays.get("output.bias", np.empty(0)).size
+        expected = get_weight_shapes(
+            (proposed.feature_count, read.feature_count), design.width, dim
+        )
+        return cls(design, read, check_shapes(arrays, expected), proposed)
+
+
+def _sides(proposed: InputFeatures, target: InputFeatures, data: TrainingData) -> PairInputs:
+    """Compute input rows of both sides; separate inputs of the proposed side have no noise."""
+    rows = target.compute_rows(data)
+    own = rows if proposed is target else proposed.compute_rows(data.without_noise)
+    return PairInputs(own, rows)
+
+
+def _bridged(task: Task, shown: Array, network: TrainedPairNetwork) -> Array:
+    """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
+
+    This is done only if one channel is compared.
+    """
+    sensor = network.proposed.reading.select_channels(shown)
+    whole = task.observed.copy()
+    # With several channels of the simulation, the one that belongs to the sensor is not known.
+    if sensor.shape[-1] != 1:
+        return whole
+    ends = np.cumsum(task.lengths)
+    for first, end in zip(ends - task.lengths, ends, strict=True):
+        # Slices of the copy are filled in place.
+        for channel in network.read.reading.select_channels(whole[first:end]).T:
+            channel[:] = fill_gaps(channel, sensor[first:end, 0])
+    return whole
+
+
+class PairTuner(Tuner):
+    """Base class of tuners on TuneNet's network.
+
+    Subclasses define the design, the inputs and the tuning loop.
+    """
+
+    requires: ClassVar[tuple[str, ...]] = ("torch",)
+    stochastic: ClassVar[bool] = False
+    learned: ClassVar[bool] = True
+    is_single_input: ClassVar[bool] = False
+    """Whether the network has a single input, the target; see `pair_network.train`."""
+
+    _fitted: NoiseMatchedNetworks[TrainedPairNetwork] | None = None
+
+    def make_network_design(self) -> PairNetworkDesign:
+        """Return the design of the network."""
+        raise NotImplementedError
+
+    def make_feature_config(self) -> FeatureConfig:
+        """Return the configuration of the inputs."""
+        raise NotImplementedError
+
+    def choose_training_layout(self, dim: int) -> tuple[int, int]:
+        """Return the maximum number of training scenarios, and of simulations in each."""
+        raise NotImplementedError
+
+    def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
+        """Train on at most `budget` simulations of the training range.
+
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+
+        Raises:
+            ValueError: the budget is smaller than two scenarios.
+        """
+        scenarios, each = self.choose_training_layout(simulator.dim)
+        data = generate_training_data(simulator, rng, budget, scenarios, each)
+        watch = self.watch
+        apart = None
+        if watch is not None:
+            ground = watch.evaluation_simulator
+            # Separate simulations and a separate random stream do not affect the training.
+            stream = np.random.default_rng(0)
+            apart = generate_training_data(ground, stream, ground.budget, scenarios, max(each, 2))
+        self.train_on(data, rng, apart)
+
+    def train_on(
+        self, data: TrainingData, rng: np.random.Generator, apart: TrainingData | None = None
+    ) -> None:
+        """Train on simulations.
+
+        Args:
+            data: training data.
+            rng: random generator.
+            apart: held-out data for the losses that `watch` gets; None for none.
+        """
+        watch = self.watch
+
+        def fitted(stage: str, shown: TrainingData, noise: Array | None) -> TrainedPairNetwork:
+            look = None
+            if watch is not None and apart is not None:
+                look = TrainingMonitor(
+                    add_noise_to_held_out(apart, noise), partial(watch.on_epoch, stage)
+                )
+            return TrainedPairNetwork.train(
+                self.make_network_design(),
+                shown,
+                rng,
+                self.make_feature_config(),
+                self.is_single_input,
+                look,
+            )
+
+        self._fitted = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), fitted)
+
+    def state(self) -> dict[str, Array]:
+        """Return weights and input features by name; empty before `fit`."""
+        return {} if self._fitted is None else self._fitted.to_arrays()
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Restore the arrays that `state` returned.
+
+        Raises:
+            ValueError: arrays have other names or shapes.
+        """
+        design, reading = self.make_network_design(), self.make_feature_config()
+        self._fitted = NoiseMatchedNetworks.from_arrays(
+            state, reading, lambda part: TrainedPairNetwork.from_arrays(part, design, reading)
+        )
+
+    def get_trained_network(self) -> NoiseMatchedNetworks[TrainedPairNetwork]:
+        """Return the trained networks.
+
+        Raises:
+            RuntimeError: the tuner has not been trained.
+        """
+        if self._fitted is None:
+            raise RuntimeError(f"{self.name} has not been trained; call fit or restore first")
+        return self._fitted

@@ -1,0 +1,102 @@
+"""The direct regressor that TuneNet is compared with, arXiv 1907.11200, section III and Fig. 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from methods.learning.input_features import FeatureConfig
+from methods.learning.pair_network import PUBLISHED_DESIGN, PairNetworkDesign
+from methods.learning.pair_tuner import PairTuner
+from methods.tuner import Proposal, Task, TunerGenerator
+
+
+@dataclass(eq=False)
+class DirectRegressor(PairTuner):
+    """TuneNet's network on the target alone: its proposed input is zero, its output the parameters
+    themselves.
+
+    It needs no simulation of the target: it recommends its one estimate from the beginning,
+    simulates it, and stops.
+
+    Attributes:
+        published: the network and training of the authors' released code; other options are ignored
+            except `points`.
+        scenarios: training scenarios, at most as many as the budget allows.
+        each: simulations in each scenario, at least 2 (dim + 1).
+        points: points to which each run is resampled.
+        inputs: inputs kept of those an observation offers.
+        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        noise: as in `methods.tuners.tunenet.TuneNet`.
+        epochs: passes over the training data.
+        rate: learning rate at the beginning.
+        weight_decay: lambda in Eq. 1.
+        told: read what is known of the scenario too, where scenarios differ in it
+            (`methods.learning.scenario_features`).
+        channels: first and last channel that is read, by number, where targets do not show the
+            others; None for all.
+        clean: as in `methods.tuners.tunenet.TuneNet`.
+    """
+
+    name: ClassVar[str] = "regressor"
+    is_single_input: ClassVar[bool] = True
+
+    published: bool = False
+    scenarios: int = 400
+    each: int = 4
+    points: int = 400
+    inputs: int = 400
+    strictness: float = 100.0
+    noise: float = 0.01
+    epochs: int = 100
+    rate: float = 3e-3
+    weight_decay: float = 1e-6
+    told: bool = True
+    channels: tuple[int, int] | None = None
+    clean: bool = True
+
+    def make_network_design(self) -> PairNetworkDesign:
+        """Return the design of the network."""
+        if self.published:
+            return PUBLISHED_DESIGN
+        # The two inputs of this network are not a pair that could be exchanged.
+        return PairNetworkDesign(
+            antisymmetric=False,
+            epochs=self.epochs,
+            rate=self.rate,
+            weight_decay=self.weight_decay,
+        )
+
+    def make_feature_config(self) -> FeatureConfig:
+        """Return the configuration of the inputs."""
+        if self.published:
+            return FeatureConfig(self.points, noise=0.0, raw=True)
+        return FeatureConfig(
+            self.points,
+            self.inputs,
+            self.strictness,
+            self.noise,
+            use_scenario_features=self.told,
+            channels=self.channels,
+            clean=self.clean,
+        )
+
+    def choose_training_layout(self, dim: int) -> tuple[int, int]:
+        """Return the maximum number of training scenarios and the number of simulations in each."""
+        if self.published:
+            return 800, 1
+        # Half of them are enough for a linear fit of the parameters; the others are for its
+        # residual.
+        return self.scenarios, max(self.each, 2 * (dim + 1))
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
+        """Propose one estimate from the target, and stop after its simulation."""
+        network = self.get_trained_network().select_for(task)
+        target = network.read(task.observed[None], task.lengths, task.scene)[0]
+        # The proposed input is zero, so the difference is the parameters themselves.
+        nothing = np.zeros_like(target)
+        guess = np.clip(network.predict_difference(nothing, target), 0.0, 1.0)
+        yield Proposal(guess, recommend=guess)
+        return "it estimates once"

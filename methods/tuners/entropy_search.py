@@ -1,0 +1,178 @@
+"""Greedy entropy search: simulate where it is most uncertain whether the minimiser of the error
+lies there.
+
+Source: S. Zhu, A. Kimmel, K. E. Bekris, A. Boularias, Fast model identification via physics engines
+for data-efficient policy search, IJCAI 2018, doi:10.24963/ijcai.2018/451 (arXiv:1710.08893),
+algorithm 1.
+
+The error over the parameters θ is a Gaussian process; P(θ) is the share of its posterior draws
+whose minimiser, among candidates, is θ; the next simulation is where
+
+    (1)  -P(θ) log P(θ)
+
+is largest. Candidates are quasi-random points (`methods.learning.quasi_random`).
+
+As published the candidates are a fixed grid, which bounds the accuracy, and the search stops when
+its estimate repeats, which is often too early. The default draws new candidates each time, dense
+around the likely minimisers, models the logarithm of the error, and goes on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from methods.learning.gaussian_process import GaussianProcess, KernelSettings
+from methods.learning.quasi_random import generate_quasi_random_points
+from methods.tuner import Array, Proposal, Task, Tuner, TunerGenerator
+
+_PUBLISHED_DRAWS = 200
+"""Number of posterior samples of the published search."""
+_REFIT_INTERVAL_THRESHOLD = 20
+"""Number of simulations from which on hyper-parameters are not fitted after each simulation."""
+
+
+@dataclass(eq=False)
+class EntropySearch(Tuner):
+    """Greedy entropy search; recommends the lowest loss seen, or as published the candidate of the
+    largest P.
+
+    Attributes:
+        published: the fixed grid over the cube (the authors of the comparison laid it between their
+            smallest and largest test target, which a tuner cannot know), the plain error, and the
+            stop.
+        grid: number of grid points, if published (quasi-random where there are several parameters).
+        repeats_within: change of the estimate, a share of the cube, at which the published search
+            stops.
+        draws: draws of the posterior; 200 if published.
+        initial: simulations before the first model, the start included.
+        everywhere: candidates all over the cube.
+        nearby: candidates around the best point seen and the minimiser of the process's mean.
+        process: kernel and priors of the Gaussian process.
+        refit: with many simulations, the process's hyper-parameters are fitted anew after so many.
+    """
+
+    requires = ("scipy",)
+
+    published: bool = False
+    grid: int = 50
+    repeats_within: float = 1e-3
+    draws: int = 500
+    initial: int = 4
+    everywhere: int = 200
+    nearby: int = 200
+    process: KernelSettings = field(default_factory=KernelSettings)
+    refit: int = 3
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Run the published search, or the refined one."""
+        return self._published(task, rng) if self.published else self._refined(task, rng)
+
+    def _published(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Search on a fixed grid, and stop when the estimate repeats."""
+        grid = np.linspace(0.0, 1.0, self.grid)[:, None]
+        if task.dim > 1:
+            grid = generate_quasi_random_points(self.grid, rng.uniform(size=task.dim))
+        # The simulation has no noise; a small noise variance keeps the covariance invertible.
+        settings = KernelSettings(kernel="rbf", noise=(1e-8, 0.01))
+        points = np.empty((0, task.dim))
+        losses = np.empty(0)
+        proposal = task.start
+        hyper = None
+        estimate: Array | None = None
+        while True:
+            evaluation = yield Proposal(proposal[None], estimate)
+            points = np.vstack([points, evaluation.proposals])
+            losses = np.append(losses, evaluation.losses)
+            process = GaussianProcess(points, replace_failed_losses(losses), settings, hyper)
+            # The next fit starts from these values, because one more point changes them little.
+            hyper = process.hyper
+            p = compute_minimiser_probability(process, grid, _PUBLISHED_DRAWS, rng)
+            last = estimate
+            estimate = grid[p.argmax()]
+            if last is not None and np.abs(estimate - last).max() <= self.repeats_within:
+                return "the estimate repeated"
+            proposal = grid[compute_entropy_terms(p).argmax()]  # (1)
+
+    def _refined(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Search with new candidates for every simulation, without stopping."""
+        design = generate_quasi_random_points(self.initial, rng.uniform(size=task.dim))
+        points = np.empty((0, task.dim))
+        losses = np.empty(0)
+        proposal = task.start
+        hyper = None
+        while True:
+            evaluation = yield proposal[None]
+            points = np.vstack([points, evaluation.proposals])
+            losses = np.append(losses, evaluation.losses)
+            n = len(points)
+            if n < self.initial:
+                proposal = design[n]
+                continue
+            # Near the minimum the loss spans several decades, which only a logarithm resolves.
+            values = compute_log_losses(replace_failed_losses(losses))
+            fit = n < _REFIT_INTERVAL_THRESHOLD or n % self.refit == 0
+            process = GaussianProcess(points, values, self.process, hyper, fit=fit)
+            hyper = process.hyper
+            candidates = self._candidates(process, points[values.argmin()], rng)
+            p = compute_minimiser_probability(process, candidates, self.draws, rng)
+            score = compute_entropy_terms(p)  # (1)
+            # The first candidate has already been simulated.
+            proposal = candidates[score[1:].argmax() + 1]
+
+    def _candidates(self, process: GaussianProcess, best: Array, rng: np.random.Generator) -> Array:
+        """Choose the best point, quasi-random points, and points around likely minimisers.
+
+        The latter have distances of all orders of magnitude.
+        """
+        dim = len(best)
+        wide = generate_quasi_random_points(self.everywhere, rng.uniform(size=dim))
+        distances = np.linalg.norm(process.points - best, axis=1)
+        # Distances range from a tenth of the distance to the nearest neighbour to half the cube.
+        nearest = np.min(distances, where=distances > 0.0, initial=0.5)
+        finest = max(0.1 * nearest, 1e-9)
+        exponents = rng.uniform(np.log(finest), np.log(0.5), size=(self.nearby, 1))
+        # The expected length is the same in any number of dimensions.
+        scales = np.exp(exponents) / np.sqrt(dim)
+        expected = wide[process.predict(wide).argmin()]
+        even = np.arange(self.nearby)[:, None] % 2 == 0
+        centres = np.where(even, best, expected)
+        near = centres + scales * rng.standard_normal((self.nearby, dim))
+        return np.vstack([best, wide, np.clip(near, 0.0, 1.0)])
+
+
+def compute_minimiser_probability(
+    process: GaussianProcess, candidates: Array, draws: int, rng: np.random.Generator
+) -> Array:
+    """Compute the probability P (n,) that each candidate (n, dim) is the minimiser.
+
+    It is the share of joint posterior samples whose minimiser is the candidate.
+
+    Args:
+        process: Gaussian process of the loss.
+        candidates: (n, dim) points of the unit cube.
+        draws: number of posterior samples.
+        rng: random generator.
+    """
+    minimisers = process.sample(candidates, draws, rng).argmin(axis=1)
+    return np.bincount(minimisers, minlength=len(candidates)) / draws
+
+
+def compute_entropy_terms(p: Array) -> Array:
+    """Compute -P log P, and -1 if P = 0, so that such a candidate is chosen last."""
+    possible = p > 0.0
+    logarithms = np.log(np.where(possible, p, 1.0))
+    return np.where(possible, -p * logarithms, -1.0)
+
+
+def replace_failed_losses(losses: Array) -> Array:
+    """Replace the losses of failed simulations by the largest finite loss."""
+    good = np.isfinite(losses)
+    return np.where(good, losses, np.max(losses, where=good, initial=0.0))
+
+
+def compute_log_losses(losses: Array) -> Array:
+    """Compute the logarithm of the losses, with a floor far below the typical loss."""
+    values: Array = np.log(losses + 1e-6 * np.median(losses) + 1e-300)
+    return values

@@ -1,0 +1,188 @@
+"""A learned start and a least-squares finish: TuneNet (arXiv 1907.11200) while it pays, then
+Levenberg-Marquardt.
+
+The network's first steps are worth more than any search's, since it knows the simulator. Its last
+ones are not: outside its training range and under noise its estimate may settle where the
+simulation does not fit. The loss tells which it is.
+
+The linear model with which the finish begins has a Jacobian J that explains what was simulated
+nearby, with steps s from the best point and changes y of the residual:
+
+    (1)  J s = y for each, by least squares
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from methods.tuner import Array, Proposal, Task, TunerGenerator
+from methods.tuners.least_squares import (
+    EvaluationHistory,
+    LeastSquares,
+    LinearModel,
+    Mask,
+    SimulationGenerator,
+)
+from methods.tuners.tunenet import MIN_STEP, BroydenSearch, TuneNet
+
+_ROUNDING_LOSS = 1e-13
+"""Loss caused by rounding, as a share of the observation's root mean square."""
+_FULL_HORIZON = LeastSquares(
+    (1.0,),
+    ahead=True,
+    patience=2,
+    damping=1e-6,
+    step_tolerance=_ROUNDING_LOSS,
+    reproduced=_ROUNDING_LOSS,
+)
+"""Options of a least-squares fit of all samples at once, for a start near the solution."""
+_MIN_ORTHOGONAL_SHARE = 0.5
+"""Minimum share of a step that is orthogonal to the chosen secants, for a further secant."""
+
+
+@dataclass(eq=False)
+class TuneNetLeastSquares(TuneNet):
+    """TuneNet as long as each step divides the loss; then least squares, which takes over what has
+    been simulated.
+
+    The finish begins at the lowest loss seen, with the secants of the points nearby in place of
+    finite differences. It fits all samples first, then with growing horizons, then from new starts
+    (`methods.tuners.least_squares`).
+
+    Attributes:
+        pays: a network step pays if it brings the loss below this share of the lowest so far.
+        patience: the finish takes over after this many steps in succession that do not pay.
+        near: a simulated point counts as near up to this distance in any coordinate, unit cube.
+        finish: options of the finish.
+    """
+
+    name: ClassVar[str] = "hybrid"
+    stochastic: ClassVar[bool] = True
+    trains_as: ClassVar[str] = "tunenet"
+
+    pays: float = 0.5
+    patience: int = 2
+    near: float = 0.1
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Take network steps, then fit by least squares from there, then from new starts."""
+        finish = LeastSquares(reproduced=_ROUNDING_LOSS)
+        run = EvaluationHistory(task, _ROUNDING_LOSS)
+        enough = run.enough / _ROUNDING_LOSS * finish.reproduced
+        trusted = yield from self._approach(run, task)
+        # Without any successful simulation, the middle of the training range is the start.
+        if not np.isfinite(run.losses).any():
+            yield from finish.fit_from_point(run, task.training.mean(axis=0))
+        # Growing horizons cost simulations, so they are used only if a fit of all samples failed.
+        for fit in (_FULL_HORIZON, finish):
+            if run.finished or not np.isfinite(run.losses).any():
+                break
+            model = yield from self._model(run, finish)
+            model.trusted = trusted
+            yield from fit.fit_from_model(run, model)
+            if min(run.losses) <= enough:
+                break
+            trusted = False
+        while min(run.losses) > enough:
+            yield from finish.fit_from_point(run, run.find_untried_point(rng))
+        return "the simulation reproduces the target"
+
+    def _approach(self, run: EvaluationHistory, task: Task) -> SimulationGenerator[bool]:
+        """Take TuneNet's steps while they divide the loss; return whether they did to the end."""
+        estimate = self.get_trained_network().select_for(task).make_estimator(task)
+        search = BroydenSearch(task)
+        guess = task.start
+        lowest = np.inf
+        idle = 0
+        while not run.finished:
+            evaluation = yield Proposal(guess, recommend=guess)
+            run.record(evaluation)
+            loss = float(evaluation.losses[0])
+            # The first successful simulation has no loss to be compared with.
+            pays = loss < self.pays * lowest or not np.isfinite(lowest)
+            idle = 0 if pays else idle + 1
+            lowest = min(lowest, loss)
+            # A single increase of a jagged loss is not enough to stop.
+            if idle == self.patience:
+                return False
+            guess = search.propose_next(evaluation.proposals[0], estimate(evaluation.observations))
+            if np.abs(guess - search.best).max() <= MIN_STEP:
+                break
+        return idle == 0
+
+    def _model(
+        self, run: EvaluationHistory, finish: LeastSquares
+    ) -> SimulationGenerator[LinearModel]:
+        """Build the linear model at the lowest loss.
+
+        Its Jacobian consists of secants to points nearby, and of finite differences in the
+        remaining directions.
+        """
+        finite = np.isfinite(run.losses)
+        best = int(np.nanargmin(np.where(finite, run.losses, np.nan)))
+        point = run.tried[best]
+        residual = run.residuals[best]
+        steps = np.array(run.tried) - point
+        chosen, basis = self._secants(steps, finite, finish.smallest_difference)
+        directions = steps[chosen]
+        changes = [run.residuals[i] - residual for i in chosen]
+        missing = _orthogonal_complement(basis, len(point))
+        if len(missing):
+            # Differences have the length of the secants, so that all columns have similar accuracy.
+            size = float(np.abs(directions).max()) if chosen else finish.difference
+            size = min(max(size, finish.smallest_difference), finish.difference)
+            inward = np.where(missing @ (0.5 - point) < 0.0, -size, size)
+            moved = np.clip(point + missing * inward[:, None], 0.0, 1.0)
+            residuals = yield from run.simulate(moved)
+            whole = ~np.isnan(residuals).any(axis=1)
+            directions = np.concatenate([directions, (moved - point)[whole]])
+            changes += list(residuals[whole] - residual)
+        # If no simulation nearby succeeded, the model predicts no decrease.
+        if not changes:
+            return LinearModel(point, residual, np.zeros((len(residual), len(point))))
+        solution = np.linalg.lstsq(directions, np.array(changes), rcond=None)[0]  # (1)
+        slopes = np.asarray(solution, dtype=np.float64)
+        return LinearModel(point, residual, slopes.T)
+
+    def _secants(
+        self, steps: Array, finite: Mask, smallest: float
+    ) -> tuple[list[int], list[Array]]:
+        """Choose secants among steps from the best point.
+
+        Args:
+            steps: (n, dim) steps from the best point.
+            finite: (n,) mask of successful simulations.
+            smallest: minimum length of a secant.
+
+        Returns:
+            Indices of the chosen steps, and an orthonormal basis of them.
+        """
+        lengths = np.abs(steps).max(axis=1)
+        # Shorter steps than the smallest difference are dominated by rounding.
+        usable = finite & (lengths <= self.near)
+        usable &= lengths >= smallest
+        nearest = np.argsort((steps**2).sum(axis=1), kind="stable")
+        basis: list[Array] = []
+        chosen: list[int] = []
+        # The nearest points come first; each step is orthogonalised by Gram-Schmidt.
+        for i in nearest[usable[nearest]]:
+            step = steps[i]
+            along = sum((q * (q @ step) for q in basis), np.zeros(len(step)))
+            across = step - along
+            length = np.linalg.norm(across)
+            if length > _MIN_ORTHOGONAL_SHARE * np.linalg.norm(step):
+                basis.append(across / length)
+                chosen.append(int(i))
+        return chosen, basis
+
+
+def _orthogonal_complement(basis: list[Array], dim: int) -> Array:
+    """Return orthonormal directions (m, dim) orthogonal to `basis`; the axes if it is empty."""
+    if not basis:
+        return np.eye(dim)
+    # These are the right singular vectors beyond the rank.
+    directions: Array = np.linalg.svd(np.array(basis))[2][len(basis) :]
+    return directions

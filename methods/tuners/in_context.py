@@ -1,0 +1,299 @@
+"""A network that sees the whole history of a tuning and proposes what to try next.
+
+The idea is CAPTURE's: X. Zhang, S. Liu, P. Huang, W. J. Han, Y. Lyu, M. Xu, D. Zhao, Dynamics as
+Prompts: In-Context Learning for Sim-to-Real System Identifications, IEEE Robotics and Automation
+Letters, 2025, arXiv 2410.20357. There a causal transformer P reads the last k iterations with their
+parameters e, actions a, simulated and real trajectories s and r,
+
+    (1)  e_i = P(e_j, a_j, s_j, r_j for j = i - k ... i - 1)
+
+and learns to continue randomised binary searches (its Algorithm 1), whose targets are known, so
+that it goes on searching where none is. It needs no gradient and no training on the target.
+
+What is kept: the history as context, the causal transformer, histories made by Algorithm 1 from the
+training range, the last k simulations as the window. What is not: the policy that chooses a new
+action at each step, since a target here is one observation. What is changed, because it measured
+better (docs/tunenet.md): the target's parameters are learned and not the search's next point; every
+simulation of a scenario serves as the target of the others, in any order; what is proposed is a
+step from the last simulation that vanishes with the difference of what they show; a first guess is
+made from the target alone. `published` takes these changes back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from methods.learning.history_training import (
+    HistoryValidationMonitor,
+    TrainingHistories,
+    train_history_transformer,
+)
+from methods.learning.history_transformer import (
+    HistoryTransformerDesign,
+    get_weight_shapes,
+    predict_proposals,
+)
+from methods.learning.input_features import FeatureConfig, InputFeatures
+from methods.learning.noise_matched_networks import (
+    NoiseMatchedNetworks,
+    add_noise_to_held_out,
+    check_shapes,
+)
+from methods.learning.training_data import TrainingData, generate_training_data
+from methods.learning.tuning_histories import (
+    HistoryIndices,
+    draw_binary_search,
+    make_ordered_histories,
+    make_shuffled_histories,
+)
+from methods.tuner import Array, Proposal, Task, TrainingSimulator, Tuner, TunerGenerator
+from methods.tuners.tunenet import MIN_STEP
+
+_BOX = "box"
+"""Name of the array with the training range."""
+
+
+@dataclass(frozen=True)
+class TrainedHistoryNetwork:
+    """A trained network with its input features.
+
+    Attributes:
+        design: design of the network.
+        input_features: map from observations and scenarios to input rows.
+        weights: weight arrays by name.
+        training_range: (2, dim) training range in the unit cube.
+    """
+
+    design: HistoryTransformerDesign
+    input_features: InputFeatures
+    weights: dict[str, Array]
+    training_range: Array
+
+    def apply_weights(self, rows: Array) -> Array:
+        """Project input rows (n, D) by W to (n, d)."""
+        return rows @ self.weights["seen.weight"]
+
+    def propose_next(self, target: Array, shown: list[Array], tried: list[Array]) -> Array:
+        """Propose the next point (dim,) of the unit cube.
+
+        Args:
+            target: (d,) projected row of the target.
+            shown: projected rows (d,) of the simulations so far.
+            tried: points (dim,) of the simulations so far.
+        """
+        window = self.design.window
+        half = (self.training_range[1] - self.training_range[0]) / 2.0
+        middle = self.training_range.mean(axis=0)
+        seen = np.array(shown[-window:]).reshape(-1, target.size)
+        points = np.array(tried[-window:]).reshape(-1, half.size)
+        out = predict_proposals(
+            np, self.weights, self.design, target, seen, (points - middle) / half
+        )
+        following: Array = np.clip(middle + half * out[-1], 0.0, 1.0)
+        return following
+
+    def to_arrays(self) -> dict[str, Array]:
+        """Return everything as plain arrays by name."""
+        return self.input_features.to_arrays() | self.weights | {_BOX: self.training_range}
+
+    @classmethod
+    def from_arrays(
+        cls, state: dict[str, Array], design: HistoryTransformerDesign, reading: FeatureConfig
+    ) -> TrainedHistoryNetwork:
+        """Restore a network from the arrays of `to_arrays`.
+
+        Args:
+            state: arrays by name.
+            design: design of the network.
+            reading: configuration of the inputs.
+
+        Raises:
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
+        """
+        read, arrays = InputFeatures.from_arrays(state, reading)
+        dim = arrays.get("guess.bias", np.empty(0)).size
+        expected = get_weight_shapes(read.feature_count, dim, design) | {_BOX: (2, dim)}
+        weights = check_shapes(arrays, expected)
+        return cls(design, read, weights, weights.pop(_BOX))
+
+
+@dataclass(eq=False)
+class InContextTransformer(Tuner):
+    """A causal transformer, trained on simulated tuning histories, reads what was tried and seen
+    and proposes the next point; it recommends its newest.
+
+    The first proposal comes from the target alone. A simulation that failed is left out of the
+    history.
+
+    Attributes:
+        published: the published aim: it learns the next point of a randomised binary search, from
+            histories in their order, and begins at the start it is given.
+        window: simulations of the history that it looks back at.
+        scenarios: training scenarios, at most as many as the budget allows.
+        each: simulations in each scenario, at least 2 (dim + 1): a target and a search for it.
+        points: points to which each run is resampled.
+        inputs: inputs kept of those an observation offers.
+        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        noise: as in `methods.tuners.tunenet.TuneNet`.
+        epochs: passes over the training scenarios.
+        rate: learning rate at the beginning.
+        weight_decay: times the squared norm of the weights, added to the loss.
+        told: as in `methods.tuners.tunenet.TuneNet`.
+        channels: first and last channel that is read, by number; None for all.
+        clean: as in `methods.tuners.tunenet.TuneNet`.
+    """
+
+    name: ClassVar[str] = "in_context"
+    requires: ClassVar[tuple[str, ...]] = ("torch",)
+    stochastic: ClassVar[bool] = False
+    learned: ClassVar[bool] = True
+
+    published: bool = False
+    window: int = 7
+    scenarios: int = 100
+    each: int = 8
+    points: int = 400
+    inputs: int = 400
+    strictness: float = 1000.0
+    noise: float = 0.01
+    epochs: int = 80
+    rate: float = 3e-3
+    weight_decay: float = 1e-5
+    told: bool = True
+    channels: tuple[int, int] | None = None
+    clean: bool = True
+
+    _prepared: NoiseMatchedNetworks[TrainedHistoryNetwork] | None = None
+
+    def make_network_design(self) -> HistoryTransformerDesign:
+        """Return the design of the network."""
+        return HistoryTransformerDesign(
+            self.window,
+            published=self.published,
+            epochs=self.epochs,
+            rate=self.rate,
+            weight_decay=self.weight_decay,
+        )
+
+    def make_feature_config(self) -> FeatureConfig:
+        """Return the configuration of the inputs."""
+        return FeatureConfig(
+            self.points,
+            self.inputs,
+            self.strictness,
+            self.noise,
+            use_scenario_features=self.told,
+            channels=self.channels,
+            clean=self.clean,
+        )
+
+    def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
+        """Train on at most `budget` simulations of the training range.
+
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+
+        Raises:
+            ValueError: the budget is smaller than two scenarios.
+        """
+        each = max(self.each, 2 * (simulator.dim + 1))
+        data = generate_training_data(
+            simulator, rng, budget, self.scenarios, each, draw_binary_search
+        )
+        watch = self.watch
+        apart = None
+        if watch is not None:
+            ground = watch.evaluation_simulator
+            # Separate simulations and a separate random stream do not affect the training.
+            stream = np.random.default_rng(0)
+            apart = generate_training_data(
+                ground, stream, ground.budget, self.scenarios, each, draw_binary_search
+            )
+        box = np.array(simulator.training, dtype=np.float64)
+
+        def learned(stage: str, shown: TrainingData, noise: Array | None) -> TrainedHistoryNetwork:
+            read = InputFeatures.fit(shown, self.make_feature_config())
+            watched = None
+            if watch is not None and apart is not None:
+                material = _build_training_histories(read, add_noise_to_held_out(apart, noise), box)
+                watched = HistoryValidationMonitor(material, partial(watch.on_epoch, stage))
+            design = self.make_network_design()
+            material = _build_training_histories(read, shown, box)
+            weights = train_history_transformer(
+                material, partial(self._histories, each), design, rng, watched
+            )
+            return TrainedHistoryNetwork(design, read, weights, box)
+
+        self._prepared = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), learned)
+
+    def _histories(self, each: int, rng: np.random.Generator) -> HistoryIndices:
+        """Draw the histories of a batch from `each` simulations per scenario."""
+        window = min(self.window, each - 1)
+        return (
+            make_ordered_histories(each, window)
+            if self.published
+            else make_shuffled_histories(rng, each, window)
+        )
+
+    def state(self) -> dict[str, Array]:
+        """Return weights and input features by name; empty before `fit`."""
+        return {} if self._prepared is None else self._prepared.to_arrays()
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Restore the arrays that `state` returned.
+
+        Raises:
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
+        """
+        design, reading = self.make_network_design(), self.make_feature_config()
+        self._prepared = NoiseMatchedNetworks.from_arrays(
+            state, reading, lambda part: TrainedHistoryNetwork.from_arrays(part, design, reading)
+        )
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
+        """Propose one point per iteration, until the proposal no longer changes."""
+        if self._prepared is None:
+            raise RuntimeError("in_context has not been trained; call fit or restore first")
+        network = self._prepared.select_for(task)
+        missing = np.isnan(task.observed)
+        row = network.input_features(task.observed[None], task.lengths, task.scene, missing)
+        target = network.apply_weights(row)[0]
+        shown: list[Array] = []
+        tried: list[Array] = []
+        guess = task.start if self.published else network.propose_next(target, shown, tried)
+        while True:
+            evaluation = yield Proposal(guess, recommend=guess)
+            point = evaluation.proposals[0]
+            if np.isfinite(evaluation.observations).all():
+                row = network.input_features(
+                    evaluation.observations, task.lengths, task.scene, missing
+                )
+                shown.append(network.apply_weights(row)[0])
+                tried.append(point)
+                guess = network.propose_next(target, shown, tried)
+                if np.abs(guess - point).max() <= MIN_STEP:
+                    return "the proposal no longer changes"
+            else:
+                # Half the distance to the last successful point, or to the middle of the training
+                # range.
+                refuge = tried[-1] if tried else task.training.mean(axis=0)
+                guess = (point + refuge) / 2.0
+
+
+def _build_training_histories(
+    read: InputFeatures, data: TrainingData, box: Array
+) -> TrainingHistories:
+    """Build the training data: simulations without noise, targets with the sensor's noise."""
+    half = (box[1] - box[0]) / 2.0
+    parameters = (data.parameters - box.mean(axis=0)) / half
+    target = read.compute_rows(data)
+    shown = (
+        target if data.noise_free_observations is None else read.compute_rows(data.without_noise)
+    )
+    return TrainingHistories(shown, target, parameters)

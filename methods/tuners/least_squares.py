@@ -1,0 +1,358 @@
+"""Levenberg-Marquardt on the difference between simulated and observed samples: what a practitioner
+tries first.
+
+Sources: D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters, SIAM J.
+Appl. Math. 11(2), 1963, doi:10.1137/0111030. J. Nocedal, S. J. Wright, Numerical Optimization, 2nd
+ed., 2006, chapter 10, doi:10.1007/978-0-387-40065-5. H. B. Nielsen, Damping parameter in
+Marquardt's method, IMM-REP-1999-05, Technical University of Denmark. K. Madsen, H. B. Nielsen, O.
+Tingleff, Methods for non-linear least squares problems, 2nd ed., IMM lecture note, 2004, section
+3.5 (the secant version). C. G. Broyden, A class of methods for solving nonlinear simultaneous
+equations, Math. Comp. 19, 1965, doi:10.1090/S0025-5718-1965-0198670-6.
+
+With r the residual at θ, J its Jacobian, s a step and D the diagonal of J^T J:
+
+    (1)  (J^T J + mu D) s = -J^T r                       Marquardt's step
+    (2)  gain = decrease of r^T r / the decrease promised by r + J s
+    (3)  mu <- mu max(1/3, 1 - (2 gain - 1)^3) where gain > 0, else mu <- mu nu, nu <- 2 nu
+    (4)  J <- J + (r(θ + s) - r - J s) s^T / (s^T s)     Broyden's update
+
+(3) is Nielsen's rule.
+
+Two things go beyond the textbook. A small change of a parameter grows along a simulation until
+impacts fall into other time steps, so the residual as a whole is jagged, with many local minima,
+while its first part is smooth: the fit starts on the first samples of each run and takes in more of
+them step by step. (This is continuation from an easy problem to the hard one; C. Bunks et al. do it
+with the frequencies of seismic data, Geophysics 60(5), 1995, doi:10.1190/1.1443880.) And what
+remains of the budget is spent on new starts, far from everything tried so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from methods.tuner import Array, Evaluation, Proposal, Task, Tuner, TunerGenerator
+
+Result = TypeVar("Result")
+SimulationGenerator = Generator["Array | Proposal", Evaluation, Result]
+"""Part of a run: a generator that may simulate, and returns a Result."""
+Mask = NDArray[np.bool_]
+_FINAL_CONVERGENCE_SHARE = 1e-8
+"""Minimum predicted decrease of a step on all samples, as a share of the sum of squares."""
+_HORIZON_CONVERGENCE_SHARE = 0.1
+"""Minimum predicted decrease of a step on a shorter horizon, as a share of the sum of squares.
+
+It is larger than for all samples, because such a fit is only a start for the next horizon.
+"""
+_MIN_TRUST_RATIO = 0.5
+"""Minimum ratio of actual to predicted decrease at which a linear model is trusted."""
+_MIN_RELATIVE_SENSITIVITY = 1e-6
+"""Minimum mean squared sensitivity of a horizon, as a share of that of all samples.
+
+A horizon with a smaller one gives no information about the parameters.
+"""
+_MIN_DAMPING_SENSITIVITY = 1e-6
+"""Minimum sensitivity for the damping, as a share of the largest one.
+
+A parameter with a smaller sensitivity is damped as if it had this one.
+"""
+_CANDIDATES = 64
+"""Number of random points per parameter, from which a new start is chosen."""
+
+
+@dataclass(eq=False)
+class LeastSquares(Tuner):
+    """Levenberg-Marquardt with secant updates, a growing horizon and new starts; recommends the
+    lowest loss seen.
+
+    `LeastSquares(horizons=(1.0,), secant=False, difference=1e-4, restart=False)` is the textbook's.
+
+    Attributes:
+        horizons: shares of each run's samples to fit, one after another; (1.0,) fits all of them at
+            once.
+        secant: keep the Jacobian up to date with Broyden's formula, and take finite differences
+            anew only where that fails; otherwise take finite differences after every step that
+            succeeds.
+        difference: longest step of the finite differences, a share of the cube; it shrinks with the
+            fit's own steps.
+        smallest_difference: its lower limit.
+        damping: first damping, relative to the squared sensitivities.
+        patience: a fit is stuck after this many steps in succession without progress.
+        progress: share by which a step must lower the sum of squares to count as progress.
+        step_tolerance: a fit has converged when its step is shorter than this share of the cube.
+        restart: whether to start again elsewhere when the target has not been reproduced.
+        reproduced: the target is reproduced when the loss is below this share of the observation's
+            root mean square.
+        ahead: recommend a step before it is simulated where all samples are fitted and the last
+            step did what the model promised; otherwise the lowest loss seen.
+    """
+
+    horizons: tuple[float, ...] = (0.0625, 0.09, 0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0)
+    secant: bool = True
+    difference: float = 0.03
+    smallest_difference: float = 1e-6
+    damping: float = 1e-3
+    patience: int = 3
+    progress: float = 0.1
+    step_tolerance: float = 1e-10
+    restart: bool = True
+    reproduced: float = 1e-10
+    ahead: bool = False
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Fit from the start, then from other points until the target is reproduced."""
+        run = EvaluationHistory(task, self.reproduced)
+        yield from self.fit_from_point(run, task.start)
+        while not run.finished:
+            if not self.restart:
+                return "the fit reached a minimum"
+            yield from self.fit_from_point(run, run.find_untried_point(rng))
+        return "the simulation reproduces the target"
+
+    def fit_from_point(self, run: EvaluationHistory, point: Array) -> SimulationGenerator[None]:
+        """Fit from a point that has not been simulated.
+
+        Args:
+            run: history of the run.
+            point: (dim,) starting point in the unit cube.
+        """
+        (residual,) = yield from run.simulate(point[None])
+        # Without a residual there is nothing to differentiate.
+        if not np.isnan(residual).any():
+            model = yield from self._differentiate(run, point, residual, self.difference)
+            yield from self.fit_from_model(run, model)
+
+    def fit_from_model(
+        self, run: EvaluationHistory, model: LinearModel
+    ) -> SimulationGenerator[None]:
+        """Fit on all horizons in succession, beginning with a linear model.
+
+        Args:
+            run: history of the run.
+            model: linear model at the starting point.
+        """
+        for share in self.horizons:
+            chosen = run.select_samples(share)
+            # Before the first impact the samples may not depend on the parameters.
+            if share >= 1.0 or model.is_sensitive(chosen):
+                model = yield from self._descend(run, model, chosen)
+            if run.finished:
+                return
+
+    def _differentiate(
+        self, run: EvaluationHistory, point: Array, residual: Array, longest: float
+    ) -> SimulationGenerator[LinearModel]:
+        """Compute one-sided differences, inward at the upper bound.
+
+        If a simulation fails, the difference is taken on the other side.
+        """
+        h = min(max(longest, self.smallest_difference), self.difference)
+        steps = np.where(point + h > 1.0, -h, h)
+        moved = yield from run.simulate(point + np.diag(steps))
+        failed = np.isnan(moved).any(axis=1)
+        if failed.any():
+            steps[failed] *= -1.0
+            moved[failed] = yield from run.simulate(point + np.diag(steps)[failed])
+        slopes = (moved - residual) / steps[:, None]
+        # If both sides fail, the column stays zero.
+        return LinearModel(point, residual, np.nan_to_num(slopes).T)
+
+    def _descend(
+        self, run: EvaluationHistory, model: LinearModel, chosen: Mask
+    ) -> SimulationGenerator[LinearModel]:
+        """Run Levenberg-Marquardt on the chosen samples until convergence or lack of progress."""
+        worthwhile = _FINAL_CONVERGENCE_SHARE if chosen.all() else _HORIZON_CONVERGENCE_SHARE
+        damping = _Damping(self.damping)
+        stalled = 0
+        failed = 0
+        while stalled < self.patience:
+            before = model.compute_error(chosen)
+            step, promised = model.compute_step(chosen, damping.mu)
+            if np.abs(step).max() < self.step_tolerance or promised <= worthwhile * before:
+                break
+            proposal = model.point + step
+            # On a short horizon, or after a wrong prediction, a step is too uncertain to be
+            # recommended.
+            trusted = self.ahead and model.trusted and chosen.all()
+            hopeful = proposal if trusted else None
+            (residual,) = yield from run.simulate(proposal[None], hopeful)
+            # The error is NaN if the simulation failed, and then `select_better_fit` is False.
+            after = float(residual[chosen] @ residual[chosen])
+            better = after < before
+            # A step that increased the error still gives information about the slope along it.
+            if np.isfinite(after):
+                model.apply_broyden_update(step, residual)
+            if better:
+                model.point = proposal
+                model.residual = residual
+            decrease = before - after
+            model.trusted = decrease > _MIN_TRUST_RATIO * promised
+            damping.adapt(decrease / promised)  # (2)
+            failed = 0 if better else failed + 1
+            stalled = 0 if after < (1.0 - self.progress) * before else stalled + 1
+            if run.finished:
+                break
+            # With one parameter the secant is the slope; with several the secants may be outdated.
+            stale = failed == 2 and len(step) > 1
+            if stale or (better and not self.secant):
+                longest = float(np.abs(step).max())
+                model = yield from self._differentiate(run, model.point, model.residual, longest)
+        return model
+
+
+@dataclass
+class _Damping:
+    """Damping by Nielsen's rule (3): smaller after good predictions, larger after bad ones."""
+
+    mu: float
+    nu: float = 2.0
+
+    def adapt(self, gain: float) -> None:
+        """Adapt the damping to the result of a step.
+
+        Args:
+            gain: ratio of actual to predicted decrease; NaN for a failed simulation.
+        """
+        if gain > 0.0:
+            self.mu *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            self.nu = 2.0
+        elif np.isnan(gain):
+            # The step becomes a quarter if the parameters do not interact, because (1) divides by 1
+            # + mu.
+            self.mu = 4.0 * self.mu + 3.0
+        else:
+            self.mu *= self.nu
+            self.nu *= 2.0
+
+
+@dataclass
+class LinearModel:
+    """Linear model of the residual near a point: r(θ + s) ≈ residual + jacobian s.
+
+    Attributes:
+        point: (dim,) point of the unit cube.
+        residual: (samples,) residual at the point.
+        jacobian: (samples, dim) Jacobian at the point.
+        trusted: whether the last step gave at least half of the predicted decrease.
+    """
+
+    point: Array
+    residual: Array
+    jacobian: Array
+    trusted: bool = False
+
+    def compute_error(self, chosen: Mask) -> float:
+        """Return the sum of squares of the chosen samples."""
+        return float(self.residual[chosen] @ self.residual[chosen])
+
+    def is_sensitive(self, chosen: Mask) -> bool:
+        """Return whether the chosen samples are sensitive to any parameter.
+
+        Their sensitivity is compared with that of all samples.
+        """
+        here = (self.jacobian[chosen] ** 2).mean()
+        return bool(here > _MIN_RELATIVE_SENSITIVITY * (self.jacobian**2).mean())
+
+    def compute_step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
+        """Compute the step (1) within the cube, and the predicted decrease of the sum of squares.
+
+        Args:
+            chosen: mask of the fitted samples.
+            mu: damping.
+        """
+        r = self.residual[chosen]
+        jacobian = self.jacobian[chosen]
+        gradient = jacobian.T @ r
+        # A parameter at a bound that would leave the cube stays at the bound.
+        below = (self.point <= 0.0) & (gradient > 0.0)
+        above = (self.point >= 1.0) & (gradient < 0.0)
+        free = ~(below | above)
+        scale = np.sqrt((jacobian**2).sum(0))
+        scale = np.maximum(scale, _MIN_DAMPING_SENSITIVITY * scale.max())
+        # (1) is solved as a least-squares problem, which does not square the condition number of J.
+        stacked = np.vstack([jacobian, np.diag(np.sqrt(mu) * scale)])[:, free]
+        step = np.zeros_like(self.point)
+        target = np.append(-r, np.zeros_like(step))
+        step[free] = np.linalg.lstsq(stacked, target, rcond=None)[0]
+        # The step is clipped to the cube, and the predicted decrease is that of the clipped step.
+        step = np.clip(self.point + step, 0.0, 1.0) - self.point
+        remaining = r + jacobian @ step
+        return step, float(r @ r - remaining @ remaining)
+
+    def apply_broyden_update(self, step: Array, residual: Array) -> None:
+        """Apply Broyden's update, the smallest Jacobian change that explains a step's result.
+
+        Args:
+            step: (dim,) step from the point.
+            residual: (samples,) residual after the step.
+        """
+        missed = residual - self.residual - self.jacobian @ step
+        self.jacobian = self.jacobian + np.outer(missed, step / (step @ step))  # (4)
+
+
+@dataclass
+class EvaluationHistory:
+    """Record of everything that one run has simulated.
+
+    Attributes:
+        task: task of the target.
+        reproduced: loss at which the target counts as reproduced, as a share of the observation's
+            root mean square.
+        tried: simulated points.
+        residuals: residual of each point; NaN if the simulation failed.
+        losses: loss of each point.
+        finished: whether the target has been reproduced.
+    """
+
+    task: Task
+    reproduced: float
+    tried: list[Array] = field(default_factory=list)
+    residuals: list[Array] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    finished: bool = False
+
+    def __post_init__(self) -> None:
+        observed = np.nan_to_num(self.task.observed) / self.task.scale
+        self.enough = self.reproduced * float(np.sqrt(np.mean(observed**2)))
+
+    def simulate(self, points: Array, recommend: Array | None = None) -> SimulationGenerator[Array]:
+        """Simulate points.
+
+        Args:
+            points: (n, dim) points, which are clipped to the unit cube.
+            recommend: (dim,) recommended point; None for the lowest loss so far.
+
+        Returns:
+            Residuals (n, samples); rows of NaN if the simulation failed.
+        """
+        points = np.clip(points, 0.0, 1.0)
+        evaluation = yield points if recommend is None else Proposal(points, recommend)
+        return self.record(evaluation)
+
+    def record(self, evaluation: Evaluation) -> Array:
+        """Record an evaluation, and return its residuals."""
+        proposals, observations, losses = evaluation
+        finite = np.isfinite(losses)
+        residuals = np.where(finite[:, None], self.task.residuals(observations), np.nan)
+        self.tried.extend(proposals)
+        self.residuals.extend(residuals)
+        self.losses.extend(losses.tolist())
+        self.finished = self.finished or bool((losses <= self.enough).any())
+        return residuals
+
+    def select_samples(self, share: float) -> Mask:
+        """Return the mask of the residuals in the first `share` of their run."""
+        first = np.concatenate([np.arange(n) < share * n for n in self.task.lengths])
+        return np.repeat(first, self.task.observed.shape[1])
+
+    def find_untried_point(self, rng: np.random.Generator) -> Array:
+        """Return the random candidate point that is farthest from all simulated points."""
+        dim = self.task.dim
+        candidates = rng.uniform(size=(_CANDIDATES * dim, dim))
+        squares = [((candidates - point) ** 2).sum(1) for point in self.tried]
+        farthest: Array = candidates[np.min(squares, axis=0).argmax()]
+        return farthest

@@ -1,0 +1,64 @@
+"""Nelder and Mead's simplex in a box, as nlopt has it (LN_NELDERMEAD).
+
+Sources: J. A. Nelder, R. Mead, A simplex method for function minimization, The Computer Journal
+7(4), 1965, doi:10.1093/comjnl/7.4.308; the treatment of bounds: M. J. Box, The Computer Journal
+8(1), 1965, doi:10.1093/comjnl/8.1.42; S. G. Johnson, The NLopt nonlinear-optimization package,
+https://github.com/stevengj/nlopt.
+
+The simplex has dim + 1 corners; the worst is reflected through the middle of the others, and the
+new one is expanded, contracted, or all shrink towards the best. nlopt does that; here its questions
+are handed over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from methods.tuner import Array, Task, Tuner, TunerGenerator, from_callback
+
+
+@dataclass(eq=False)
+class NelderMead(Tuner):
+    """nlopt's simplex from the start on; recommends the lowest loss seen.
+
+    Attributes:
+        initial_step: edge of the first simplex, a share of the cube; None for nlopt's own choice,
+            which depends on the distance of the start from the bounds.
+        step_tolerance: nlopt's absolute tolerance on the parameters; 0 goes on to the limit of
+            rounding.
+    """
+
+    requires = ("nlopt",)
+    stochastic = False
+
+    initial_step: float | None = None
+    step_tolerance: float = 0.0
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
+        """Pass nlopt's points to the harness one by one."""
+        return from_callback(lambda loss: self._minimise(task, loss))
+
+    def _minimise(self, task: Task, loss: Callable[[Array], float]) -> str:
+        import nlopt
+
+        def objective(point: Array, gradient: Array) -> float:  # noqa: ARG001 - nlopt's signature
+            value = loss(point)
+            # The simplex could not sort its corners with NaN.
+            return value if np.isfinite(value) else np.inf
+
+        optimiser = nlopt.opt(nlopt.LN_NELDERMEAD, task.dim)
+        optimiser.set_lower_bounds(np.zeros(task.dim))
+        optimiser.set_upper_bounds(np.ones(task.dim))
+        optimiser.set_min_objective(objective)
+        optimiser.set_xtol_abs(self.step_tolerance)
+        if self.initial_step is not None:
+            optimiser.set_initial_step(self.initial_step)
+        try:
+            optimiser.optimize(task.start)
+        except nlopt.RoundoffLimited:
+            # With a tolerance of 0 this is the usual end, and not an error.
+            return "the simplex reached the limit of rounding"
+        return "the simplex has collapsed to a point"

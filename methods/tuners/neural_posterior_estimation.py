@@ -1,0 +1,200 @@
+"""Neural posterior estimation: a normalising flow learns p(parameters | observation) from
+simulations.
+
+Sources: G. Papamakarios, I. Murray, Fast ε-free inference of simulation models with Bayesian
+conditional density estimation, NeurIPS 2016, arXiv 1605.06376; D. Greenberg, M. Nonnenmacher, J.
+Macke, Automatic posterior transformation for likelihood-free inference, ICML 2019, arXiv
+1905.07488; the flow: G. Papamakarios, T. Pavlakou, I. Murray, Masked autoregressive flow for
+density estimation, NeurIPS 2017, arXiv 1705.07057. Built and trained by the `sbi` package (JOSS
+5(52), 2020, doi:10.21105/joss.02505), which is an optional extra: pip install -e ".[npe]".
+
+With θ drawn uniformly from the training range and o simulated from it, the flow q of weights w is
+trained by
+
+    (1)  the minimum over w of the mean of -log q_w(θ | o)
+
+whose minimum over all densities is the posterior p(θ | o).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from methods.learning.input_features import FeatureConfig, InputFeatures
+from methods.learning.library_isolation import NullTracker, isolated_library_call
+from methods.learning.training_data import generate_training_data
+from methods.tuner import Array, Proposal, Task, TrainingSimulator, Tuner, TunerGenerator
+
+
+@dataclass(eq=False)
+class NeuralPosteriorEstimation(Tuner):
+    """Recommends the mean of the learned posterior, simulates it, then draws from it and keeps the
+    lowest loss.
+
+    It reads the same numbers of an observation as TuneNet does (`learning.observation_features`),
+    of the target alone.
+
+    Attributes:
+        scenarios: training scenarios, at most as many as the budget allows.
+        each: simulations in each scenario, at least 2 (dim + 1).
+        points: points to which each run is resampled.
+        inputs: inputs kept of those an observation offers.
+        strictness: see `methods.learning.observation_features.make_weighted_features`.
+        noise: sensor noise that every second training observation gets, 1 sigma, in units of each
+            channel's standard deviation in training.
+        hidden: units of each layer of the flow.
+        transforms: autoregressive layers of the flow.
+        epochs: passes over the training data at most; it stops when the held-out loss no longer
+            falls.
+        draws: posterior samples behind the mean.
+        told: as in `methods.tuners.tunenet.TuneNet`.
+    """
+
+    name: ClassVar[str] = "npe"
+    requires: ClassVar[tuple[str, ...]] = ("torch", "sbi")
+    learned: ClassVar[bool] = True
+
+    scenarios: int = 400
+    each: int = 4
+    points: int = 400
+    inputs: int = 100
+    strictness: float = 100.0
+    noise: float = 0.01
+    hidden: int = 50
+    transforms: int = 5
+    epochs: int = 300
+    draws: int = 1000
+    told: bool = True
+    _flow: Any = field(default=None, init=False, repr=False)
+    _read: InputFeatures | None = field(default=None, init=False, repr=False)
+
+    def fit(self, simulator: TrainingSimulator, rng: np.random.Generator, budget: int) -> None:
+        """Train on at most `budget` simulations of the training range.
+
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+
+        Raises:
+            ValueError: the budget is smaller than two scenarios.
+        """
+        dim = simulator.dim
+        each = max(self.each, 2 * (dim + 1))
+        data = generate_training_data(simulator, rng, budget, self.scenarios, each)
+        spoilt = data.with_noise(self.noise * data.flattened_observations.std(axis=(0, 1)), rng)
+        self._read = read = InputFeatures.fit(data, self._reading())
+        # Each simulation is used twice, with and without noise, because targets may be of either
+        # kind.
+        rows = np.concatenate(
+            [read.compute_rows(some).reshape(-1, read.feature_count) for some in (data, spoilt)]
+        )
+        theta = np.tile(data.parameters.reshape(-1, dim), (2, 1))
+        with isolated_library_call(rng):
+            from sbi import inference
+
+            trainer = inference.NPE(
+                density_estimator=self._builder(),
+                tracker=NullTracker(),
+                show_progress_bars=False,
+            )
+            trainer.append_simulations(_tensor(theta), _tensor(rows))
+            # The minimum (1), until the loss of sbi's held-out rows no longer decreases.
+            self._flow = trainer.train(
+                max_num_epochs=self.epochs,
+                training_batch_size=min(100, len(rows) // 4),
+            )
+
+    def _reading(self) -> FeatureConfig:
+        return FeatureConfig(
+            self.points, self.inputs, self.strictness, use_scenario_features=self.told
+        )
+
+    def _builder(self) -> Callable[[Any, Any], Any]:
+        from sbi.neural_nets import posterior_nn
+
+        builder: Callable[[Any, Any], Any] = posterior_nn(
+            "maf",
+            hidden_features=self.hidden,
+            num_transforms=self.transforms,
+        )
+        return builder
+
+    def state(self) -> dict[str, Array]:
+        """Return the flow's tensors and the input features by name; empty before `fit`."""
+        if self._read is None:
+            return {}
+        tensors = {
+            f"flow.{name}": np.array(t.numpy()) for name, t in self._flow.state_dict().items()
+        }
+        return tensors | self._read.to_arrays()
+
+    def restore(self, state: dict[str, Array]) -> None:
+        """Restore the arrays that `state` returned.
+
+        Raises:
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
+        """
+        flow = {name: array for name, array in state.items() if name.startswith("flow.")}
+        others = {name: array for name, array in state.items() if name not in flow}
+        read, foreign = InputFeatures.from_arrays(others, self._reading())
+        broken = [name for name, array in flow.items() if not np.isfinite(array).all()]
+        if foreign or broken:
+            raise ValueError(
+                f"array {[*foreign, *broken][0]}: expected an array of the flow, of finite numbers"
+            )
+        self._flow = self._rebuilt(
+            {name.removeprefix("flow."): a for name, a in flow.items()}, read.feature_count
+        )
+        self._read = read
+
+    def _rebuilt(self, arrays: dict[str, Array], inputs: int) -> Any:
+        """Rebuild a flow of the default design from its tensors, which determine its dimension."""
+        import torch
+
+        sizes = {a.size for name, a in arrays.items() if name.endswith("_transforms.0._shift")}
+        dim = sizes.pop() if sizes else 0
+        if not 0 < dim < 1000:
+            raise ValueError("expected the arrays of a flow, found others")
+        rng = np.random.default_rng(0)
+        with isolated_library_call(rng):
+            # sbi takes the sizes from example data; the scaling is part of the tensors.
+            theta = _tensor(rng.standard_normal((4, dim)))
+            rows = _tensor(rng.standard_normal((4, inputs)))
+            flow = self._builder()(theta, rows)
+            try:
+                flow.load_state_dict(
+                    {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
+                )
+            except (RuntimeError, TypeError) as error:
+                raise ValueError(
+                    f"expected the arrays of a flow: {' '.join(str(error).split())[:200]}"
+                ) from None
+        return flow
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Propose the mean of the posterior, then samples of it."""
+        if self._read is None:
+            raise RuntimeError("npe has not been trained; call fit or restore first")
+        row = self._read(task.observed[None], task.lengths, task.scene)
+        with isolated_library_call(rng):
+            count = max(self.draws, task.budget)
+            samples = self._flow.sample((count,), condition=_tensor(row))
+            raw = samples.detach()[:, 0].numpy()
+        # A flow has mass outside the range of its training, and may overflow far from it.
+        draws = np.clip(np.nan_to_num(raw.astype(np.float64), nan=0.5), 0.0, 1.0)
+        mean = draws.mean(axis=0)
+        yield Proposal(mean, recommend=mean)
+        for point in draws:
+            yield point[None]
+        return "its draws are used up"
+
+
+def _tensor(array: Array) -> Any:
+    import torch
+
+    return torch.as_tensor(array, dtype=torch.float32)

@@ -1,0 +1,58 @@
+"""TuneNet on vision: simulated heights against what a tracker saw; Allevato et al., CoRL 2019,
+arXiv 1907.11200.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from methods.learning.input_features import FeatureConfig
+from methods.learning.pair_network import PairNetworkDesign
+from methods.tuners.tunenet import TuneNet
+
+_LAST = 1_000_000
+"""Index of the last channel, larger than any number of channels."""
+
+
+@dataclass(eq=False)
+class TuneNetVision(TuneNet):
+    """TuneNet with another sensor on the target's side: the network itself learns how the two
+    correspond.
+
+    The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed;
+    the target's side reads the other channels of the target, as the pixel row `v`, and nothing of
+    what is known of the camera, as published. Gaps of the target are bridged by the proposed model
+    (`learning.gap_filling`). Where there is one channel both sides read it. Inputs, training
+    and the step are otherwise those of `methods.tuners.tunenet.TuneNet`; h(o, o) = 0 cannot hold by
+    construction, since no target is seen as a simulation is.
+
+    Attributes:
+        scenarios: training scenarios, each with a camera of its own, at most as many as the budget
+            allows.
+        noise: of the tracker, 1 sigma, in units of the channel's standard deviation in training.
+        clean: as in TuneNet; a tracker's errors do last.
+        told: read what is known of the scenario, such as where the camera stands.
+        channels: first and last channel that the target's side reads, by number.
+    """
+
+    name: ClassVar[str] = "tunenet-vision"
+
+    scenarios: int = 200
+    strictness: float = 100.0
+    noise: float = 0.02
+    told: bool = False
+    channels: tuple[int, int] | None = (1, _LAST)
+    clean: bool = False
+
+    def make_network_design(self) -> PairNetworkDesign:
+        """Return the design of the network."""
+        return replace(super().make_network_design(), antisymmetric=False)
+
+    def make_feature_config(self) -> FeatureConfig:
+        """Return the configuration of the inputs of both sides."""
+        target = super().make_feature_config()
+        # The simulation shows heights, which do not depend on the camera.
+        return replace(
+            target, proposed=replace(target, use_scenario_features=False, channels=(0, 0))
+        )

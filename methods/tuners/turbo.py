@@ -1,0 +1,206 @@
+"""TuRBO-1: Bayesian optimisation in one trust region, with Thompson sampling.
+
+Sources: D. Eriksson, M. Pearce, J. Gardner, R. Turner, M. Poloczek, Scalable global optimization
+via local Bayesian optimization, NeurIPS 2019, arXiv 1910.01739 (section 2; constants from its
+supplement); M. Balandat et al., BoTorch: a framework for efficient Monte-Carlo Bayesian
+optimization, NeurIPS 2020, arXiv 1910.06403. Gaussian process and sampling are the `botorch`
+package's, which is an optional extra: pip install -e ".[turbo]".
+
+The region is a box around the best point of sides
+
+    (1)  length * l_i / (l_1 l_2 ... l_d)^(1/d)
+
+with the process's length scales l_i, so that its volume is length^d whatever they are.
+"""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from methods.learning.library_isolation import isolated_library_call
+from methods.tuner import Array, Task, Tuner, TunerGenerator
+
+_MIN_RELATIVE_IMPROVEMENT = 0.999
+"""Factor of the lowest loss; only a loss below this product counts as an improvement."""
+_MIN_FAILURES_TO_SHRINK = 4
+"""Minimum number of successive failures after which the side length is halved."""
+_MAX_PERTURBED_COORDINATES = 20.0
+"""Maximum mean number of coordinates in which a candidate differs from the centre."""
+_SHORTEST_SCALE = 0.005
+"""Minimum length scale of the process, in the unit cube."""
+_LONGEST_SCALE = 4.0
+"""Maximum length scale of the process, in the unit cube."""
+_LEAST_NOISE = 1e-8
+"""Minimum variance of the noise, for losses scaled to variance 1."""
+_MOST_NOISE = 1e-3
+"""Maximum variance of the noise, for losses scaled to variance 1.
+
+It is small, because simulations are reproducible.
+"""
+
+
+@dataclass(eq=False)
+class TuRBO(Tuner):
+    """A box around the best point that grows with successes and shrinks with failures; recommends
+    the lowest loss.
+
+    Where the box has shrunk below its smallest length, it starts again elsewhere with new initial
+    points.
+
+    Attributes:
+        initial: points before the first model, per parameter, the start included; at least 2 in
+            all.
+        candidates: points among which a Thompson sample is compared.
+        length: first side of the trust region, unit cube.
+        longest: its largest side.
+        shortest: below this side it starts again.
+        successes: improvements in succession after which the side is doubled; it is halved after as
+            many failures in succession as there are parameters, at least 4.
+    """
+
+    name: ClassVar[str] = "turbo"
+    requires: ClassVar[tuple[str, ...]] = ("torch", "botorch")
+
+    initial: int = 2
+    candidates: int = 1000
+    length: float = 0.8
+    longest: float = 1.6
+    shortest: float = 0.5**7
+    successes: int = 3
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+        """Propose initial points, then one Thompson sample at a time.
+
+        When the trust region has collapsed, start again from new initial points.
+        """
+        first: Array | None = task.start
+        while True:
+            count = max(2, self.initial * task.dim)
+            points = list(_draw_sobol_points(rng, count, task.dim))
+            # The start is used in the first region only.
+            if first is not None:
+                points[0] = first
+                first = None
+            losses = []
+            for point in points:
+                evaluation = yield point
+                losses.append(float(evaluation.losses[0]))
+            yield from self._region(task.dim, rng, np.array(points), np.array(losses))
+
+    def _region(
+        self, dim: int, rng: np.random.Generator, points: Array, losses: Array
+    ) -> TunerGenerator:
+        """Search in one trust region until it has collapsed."""
+        length = self.length
+        succeeded = 0
+        failed = 0
+        while length >= self.shortest:
+            point = self._sampled(points, losses, length, rng)
+            evaluation = yield point
+            loss = float(evaluation.losses[0])
+            # An improvement by rounding does not count as success.
+            if loss < _MIN_RELATIVE_IMPROVEMENT * losses.min():
+                succeeded += 1
+                failed = 0
+            else:
+                succeeded = 0
+                failed += 1
+            if succeeded == self.successes:
+                length = min(2.0 * length, self.longest)
+                succeeded = 0
+            elif failed == max(_MIN_FAILURES_TO_SHRINK, dim):
+                length = length / 2.0
+                failed = 0
+            points = np.vstack([points, point])
+            losses = np.append(losses, loss)
+        return None
+
+    def _sampled(
+        self, points: Array, losses: Array, length: float, rng: np.random.Generator
+    ) -> Array:
+        """Return the best candidate of a Thompson sample of the process in the trust region."""
+        import torch
+
+        finite = np.isfinite(losses)
+        if not finite.any():
+            anywhere: Array = rng.uniform(size=(points.shape[1],))
+            return anywhere
+        values = np.where(finite, losses, losses[finite].max())
+        scale = float(values.std()) or 1.0
+        with isolated_library_call(rng):
+            from botorch.generation.sampling import MaxPosteriorSampling
+
+            model = _fit_gaussian_process(points, -(values - values.mean()) / scale)
+            scales = model.covar_module.base_kernel.lengthscale.detach().numpy()
+            sides = np.asarray(scales).ravel()
+            # (1)
+            sides = length * sides / np.exp(np.log(sides).mean())
+            candidates = self._candidates(points[values.argmin()], sides, rng)
+            with torch.no_grad():
+                chosen = MaxPosteriorSampling(model=model, replacement=False)(
+                    torch.from_numpy(candidates)
+                )
+            best: Array = np.clip(chosen.numpy()[0].astype(np.float64), 0.0, 1.0)
+        return best
+
+    def _candidates(self, centre: Array, sides: Array, rng: np.random.Generator) -> Array:
+        """Draw points in the box around `centre`.
+
+        In many dimensions each one differs from the centre in about 20 coordinates.
+        """
+        dim = len(centre)
+        low = np.clip(centre - sides / 2.0, 0.0, 1.0)
+        high = np.clip(centre + sides / 2.0, 0.0, 1.0)
+        spread = low + (high - low) * _draw_sobol_points(rng, self.candidates, dim)
+        moved = rng.uniform(size=spread.shape) <= min(_MAX_PERTURBED_COORDINATES / dim, 1.0)
+        # At least one coordinate is changed, because the centre has already been simulated.
+        moved[~moved.any(axis=1), rng.integers(dim)] = True
+        return np.where(moved, spread, centre)
+
+
+def _draw_sobol_points(rng: np.random.Generator, n: int, dim: int) -> Array:
+    """Return scrambled Sobol points (n, dim)."""
+    from scipy.stats import qmc
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # n need not be a power of two
+        points: Array = qmc.Sobol(dim, seed=rng).random(n)
+    return points
+
+
+def _fit_gaussian_process(points: Array, values: Array) -> Any:
+    """Fit a Gaussian process with a scaled Matérn-5/2 kernel by its marginal likelihood."""
+    import torch
+    from botorch.exceptions.errors import ModelFittingError
+    from botorch.fit import fit_gpytorch_mll
+    from botorch.models import SingleTaskGP
+    from gpytorch.constraints import Interval
+    from gpytorch.kernels import MaternKernel, ScaleKernel
+    from gpytorch.likelihoods import GaussianLikelihood
+    from gpytorch.mlls import ExactMarginalLogLikelihood
+
+    kernel = MaternKernel(
+        nu=2.5,
+        ard_num_dims=points.shape[1],
+        lengthscale_constraint=Interval(_SHORTEST_SCALE, _LONGEST_SCALE),
+    )
+    likelihood = GaussianLikelihood(noise_constraint=Interval(_LEAST_NOISE, _MOST_NOISE))
+    x = torch.from_numpy(points)
+    y = torch.from_numpy(values)[:, None]
+    model = SingleTaskGP(
+        x,
+        y,
+        covar_module=ScaleKernel(kernel),
+        likelihood=likelihood,
+        # Losses have already been scaled.
+        outcome_transform=None,
+    )
+    # If the fit fails, the initial kernel is used.
+    with suppress(ModelFittingError):
+        fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+    return model.eval()

@@ -1,0 +1,308 @@
+"""Check the arguments of public functions against their annotations.
+
+`check_arguments` decorates a public function. Its arguments are checked before its body runs, and a
+wrong one raises an `InputError` that names the argument, the expected and the found value. Values
+that lower layers check, such as names of tuners, are not checked here.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, wraps
+from numbers import Integral, Real
+from os import PathLike
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.value_limits import truncate_text
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Restriction of an argument in addition to its type, used in ``Annotated``.
+
+    Attributes:
+        words: Description of the expected value in messages.
+        least: Minimum value; None for no minimum.
+        above: Exclusive lower bound; None for none.
+    """
+
+    words: str
+    least: float | None = None
+    above: float | None = None
+
+    def allows(self, value: Any) -> bool:
+        """Return whether a number is in range."""
+        low = self.least is None or value >= self.least
+        return low and (self.above is None or value > self.above)
+
+
+Count = Annotated[int, Expected("a whole number of at least 1", least=1)]
+Natural = Annotated[int, Expected("a whole number of at least 0", least=0)]
+Seconds = Annotated[float, Expected("a number of seconds above 0", above=0)]
+Name = Annotated[str, Expected("a name")]
+Names = Annotated[Sequence[str], Expected("a name or a list of names")]
+Files = Annotated[Sequence[str | Path], Expected("a path or a list of paths")]
+
+
+class _MismatchError(Exception):
+    """Value that does not match its annotation.
+
+    Args:
+        place: The argument and the position in it, as ``effects['drag.linear']``.
+        words: Description of the expected value.
+        value: Value that was found.
+    """
+
+    def __init__(self, place: str, words: str, value: object) -> None:
+        super().__init__(place, words, value)
+        self.place, self.words, self.value = place, words, value
+
+
+def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Check a function's arguments against its annotations at each call.
+
+    A single name is accepted as a list of one, and a text of names with commas as a list of
+    several. NumPy numbers are accepted as Python numbers, integers as floats, and floats without
+    fraction as integers.
+    """
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        bound = _bound(function, signature, args, kwargs)
+        hints = _hints(function)
+        for name, value in bound.arguments.items():
+            if name in hints:
+                try:
+                    bound.arguments[name] = _fitted(name, value, hints[name])
+                except _MismatchError as error:
+                    raise InputError(
+                        f"{error.place}: expected {error.words}, found {_shown(error.value)}"
+                    ) from None
+        return function(*bound.args, **bound.kwargs)
+
+    return call
+
+
+@cache
+def _hints(function: Callable[..., object]) -> dict[str, Any]:
+    return get_type_hints(function, include_extras=True)
+
+
+def _bound(
+    function: Callable[..., object],
+    signature: inspect.Signature,
+    args: Sequence[object],
+    kwargs: Mapping[str, object],
+) -> inspect.BoundArguments:
+    """Return the arguments by name.
+
+    Raises:
+        InputError: An argument is unknown or missing, or there are too many.
+    """
+    called = function.__name__
+    names = [name for name in signature.parameters if name != "self"]
+    for name in kwargs:
+        if name not in names:
+            raise make_unknown_name_error(f"argument of {called}", name, names)
+    try:
+        return signature.bind(*args, **kwargs)
+    except TypeError as error:
+        for name, parameter in signature.parameters.items():
+            required = parameter.default is parameter.empty
+            if required and "missing" in str(error) and f"'{name}'" in str(error):
+                wanted = _words(_hints(function)[name])
+                raise InputError(f"{called}: expected {name}, {wanted}; found none") from None
+        most = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
+        plural = "s" * (most != 1)
+        found = f"expected at most {most} argument{plural} without a name, found {len(args)}"
+        raise InputError(f"{called}: {found}; name the others, as {names[-1]}=...") from None
+
+
+def _fitted(place: str, value: Any, hint: Any) -> Any:
+    """Convert a value to the type of its annotation.
+
+    Raises:
+        _MismatchError: The value does not match.
+    """
+    origin = get_origin(hint)
+    if origin is Annotated:
+        return _expected(place, value, hint)
+    if origin in (Union, UnionType):
+        return _one_of(place, value, hint)
+    if origin is not None and origin is not type:
+        fitted = _FITS[origin](place, value, hint)
+    elif hint is Any:
+        return value
+    else:
+        fitted = _plain(value, hint, get_args(hint))
+    if fitted is _NOTHING:
+        raise _MismatchError(place, _words(hint), value)
+    return fitted
+
+
+_NOTHING = object()
+"""Marker for a value that does not match."""
+
+
+def _expected(place: str, value: Any, hint: Any) -> Any:
+    """Convert a value annotated with `Expected`, whose words replace the default ones."""
+    inner, expected = get_args(hint)[:2]
+    try:
+        fitted = _fitted(place, value, inner)
+    except _MismatchError as error:
+        if error.place != place:
+            raise
+        raise _MismatchError(place, expected.words, value) from None
+    if fitted is not None and not expected.allows(fitted):
+        raise _MismatchError(place, expected.words, value)
+    return fitted
+
+
+def _one_of(place: str, value: Any, hint: Any) -> Any:
+    """Convert a value to one of several types."""
+    inside = []
+    for kind in get_args(hint):
+        try:
+            return _fitted(place, value, kind)
+        except _MismatchError as error:
+            if error.place != place:
+                inside.append(error)
+    # For a list or dict, report the entry that is wrong.
+    if len(inside) == 1:
+        raise inside[0]
+    raise _MismatchError(place, _words(hint), value)
+
+
+def _plain(value: Any, hint: Any, inner: tuple[Any, ...]) -> Any:
+    """Convert a value to a single type; `_NOTHING` if it does not match."""
+    if hint is NoneType:
+        return None if value is None else _NOTHING
+    if get_origin(hint) is type:
+        return value if inspect.isclass(value) and issubclass(value, inner[0]) else _NOTHING
+    if hint is bool:
+        is_bool = isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1))
+        return bool(value) if is_bool else _NOTHING
+    if hint is int:
+        return int(value) if _is_number(value) and _is_whole(value) else _NOTHING
+    if hint is float:
+        if not _is_number(value):
+            return _NOTHING
+        # Keep integers, because hashes of experiments contain numbers as they are written.
+        return int(value) if isinstance(value, Integral) else float(value)
+    if hint is Path:
+        return Path(value) if isinstance(value, PathLike) else _NOTHING
+    return value if isinstance(value, hint) else _NOTHING
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, Integral) or float(value).is_integer()
+
+
+def _list(place: str, value: Any, hint: Any) -> Any:
+    """Convert a value to a list; a single entry becomes a list of one."""
+    (entry,) = get_args(hint)
+    if isinstance(value, str):
+        # Paths may contain commas, names may not.
+        one = get_origin(entry) in (Union, UnionType) and Path in get_args(entry)
+        parts = [value] if one else [part.strip() for part in value.split(",")]
+    elif isinstance(value, Iterable) and not isinstance(value, Mapping | bytes):
+        parts = list(value)
+    elif _fits(value, entry):
+        parts = [value]
+    else:
+        return _NOTHING
+    if isinstance(value, str) and not all(_fits(part, entry) for part in parts):
+        return _NOTHING
+    return [_fitted(f"{place}[{number}]", part, entry) for number, part in enumerate(parts)]
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    try:
+        _fitted("", value, hint)
+    except _MismatchError:
+        return False
+    return True
+
+
+def _dict(place: str, value: Any, hint: Any) -> Any:
+    """Convert a value to a dict with texts as keys."""
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        return _NOTHING
+    return {
+        key: _fitted(f"{place}[{key!r}]", entry, get_args(hint)[1]) for key, entry in value.items()
+    }
+
+
+def _tuple(place: str, value: Any, hint: Any) -> Any:
+    """Convert a value to a tuple of the annotated length."""
+    inner = get_args(hint)
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(inner):
+        return _NOTHING
+    return tuple(_fitted(place, entry, kind) for entry, kind in zip(value, inner, strict=True))
+
+
+def _function(_place: str, value: Any, _hint: Any) -> Any:
+    return value if callable(value) else _NOTHING
+
+
+_FITS: Mapping[Any, Callable[[str, Any, Any], Any]] = {
+    Sequence: _list,
+    Mapping: _dict,
+    tuple: _tuple,
+    Callable: _function,
+}
+"""Conversion for each generic type, by the type's origin."""
+_WORDS: Mapping[Any, str] = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    bool: "True or False",
+    Path: "a path",
+    Callable: "a function",
+    Mapping: "a dict",
+    tuple: "a pair of numbers",
+}
+"""Description of each type in messages."""
+
+
+def _words(hint: Any) -> str:
+    """Describe in words what an annotation expects."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return str(inner[1].words)
+    if origin in (Union, UnionType):
+        # Text is accepted for a path, too.
+        implied = {NoneType, str} if Path in inner else {NoneType}
+        return " or ".join(dict.fromkeys(_words(kind) for kind in inner if kind not in implied))
+    if origin is Sequence:
+        return f"a list ({_words(inner[0])} each)"
+    if origin is Mapping and inner[1] is not Any:
+        return f"a dict ({_words(inner[1])} for each name)"
+    if origin is type:
+        return f"a subclass of {inner[0].__name__}"
+    kind = origin or hint
+    return _WORDS.get(kind) or f"a {kind.__name__}"
+
+
+def _shown(value: object) -> str:
+    """Format a value for a message: small ones literally, others by their type."""
+    if value is None or isinstance(value, str | bool | Real | list | tuple | dict | Path):
+        return truncate_text(repr(value))
+    if inspect.isclass(value):
+        return f"the class {value.__name__}"
+    return f"a {type(value).__name__}"

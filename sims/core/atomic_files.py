@@ -1,0 +1,207 @@
+"""Write files and folders atomically, and check that files exist.
+
+A file is first written completely to disk under another name in the same folder, and then renamed,
+so that readers never see a partly written file, even after a crash.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from datetime import datetime, timezone
+from itertools import islice
+from pathlib import Path
+
+from sims.core.simulator import InputError
+from sims.core.value_limits import truncate_text
+
+Content = str | bytes
+"""Content of a file; text is written as UTF-8."""
+
+
+_MOST_LISTED = 10_000
+"""Maximum number of a folder's entries among which similar names are searched."""
+
+
+def require_file(path: Path, wanted: str = "") -> None:
+    """Refuse a path that is not a file.
+
+    Args:
+        path: Path of the file.
+        wanted: Description of the expected file for the message; may be empty.
+
+    Raises:
+        InputError: The file does not exist; the message names similar files in its folder.
+    """
+    expected = f"; expected {wanted}" if wanted else ""
+    try:
+        if path.is_file():
+            return
+        exists = path.exists()
+    except (OSError, ValueError) as error:  # too long, or with a null character
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{truncate_text(str(path))}: not a path ({why})") from None
+    if exists:
+        raise InputError(f"{path}: not a file{expected}")
+    raise InputError(f"{path}: no such file{expected}{_similar(path)}")
+
+
+def _similar(path: Path) -> str:
+    """Format the names of similar files in the folder as the end of a message."""
+    from difflib import get_close_matches
+
+    try:
+        entries = list(islice(path.parent.iterdir(), _MOST_LISTED))
+    except OSError:
+        return "" if path.parent.is_dir() else f"; there is no folder '{path.parent}'"
+    stems = {entry.stem: entry.name for entry in entries if entry.suffix == path.suffix}
+    near = [stems[stem] for stem in get_close_matches(path.stem, stems, n=3)]
+    return f"; did you mean {' or '.join(near)}?" if near else ""
+
+
+def write_atomically(path: Path, content: Content) -> None:
+    """Write a file atomically; an existing file is replaced.
+
+    Args:
+        path: Path of the file.
+        content: Content of the file.
+    """
+    with atomic_replacement(path) as partial:
+        partial.write_bytes(_bytes(content))
+
+
+def write_all_atomically(contents: Mapping[Path, Content]) -> None:
+    """Write several files, all or none; existing files are replaced."""
+    with ExitStack() as places:
+        # No file is renamed before all are complete.
+        for path, content in contents.items():
+            places.enter_context(atomic_replacement(path)).write_bytes(_bytes(content))
+
+
+@contextmanager
+def atomic_replacement(path: Path, *, keep_ending: bool = False) -> Iterator[Path]:
+    """Yield a temporary path that replaces `path` when the block ends without an error.
+
+    Args:
+        path: Path of the final file; an existing file is replaced.
+        keep_ending: Whether the temporary name keeps the ending, for libraries that derive the
+            format from it. By default it has another ending, so that the file is not listed as one
+            of its kind.
+    """
+    partial = _beside(path, keep_ending)
+    try:
+        yield partial
+        _to_disk(partial)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_new_files(contents: Mapping[Path, Content]) -> None:
+    """Write several new files, all or none; existing files are never overwritten.
+
+    Raises:
+        OSError: A file cannot be written, or exists (`FileExistsError`); its filename says which.
+    """
+    with ExitStack() as cleaning, ExitStack() as undoing:
+        partials = {path: _beside(path) for path in contents}
+        for path, partial in partials.items():
+            cleaning.callback(partial.unlink, missing_ok=True)
+            with _naming(path):
+                partial.write_bytes(_bytes(contents[path]))
+                _to_disk(partial)
+        for path, partial in partials.items():
+            with _naming(path):
+                _place(partial, path)
+            undoing.callback(path.unlink)
+        # All files are in place: keep them.
+        undoing.pop_all()
+
+
+def _place(partial: Path, path: Path) -> None:
+    try:
+        # Unlike a rename, this fails if the file was created in the meantime.
+        os.link(partial, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        if path.exists():
+            raise FileExistsError(str(path)) from None
+        partial.rename(path)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Set the file name of an OSError to `path`, whichever temporary file caused it."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = str(path)
+        raise
+
+
+@contextmanager
+def atomic_new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder that becomes `folder` when the block ends without an error.
+
+    Raises:
+        OSError: The folder cannot be made, or `folder` is not empty.
+    """
+    partial = _beside(folder)
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        partial.replace(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_folder_empty(folder: Path) -> None:
+    """Check that a folder is empty or does not exist.
+
+    Raises:
+        InputError: The folder is not empty.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            f"{folder}: exists and is not empty; results are never overwritten: name another folder"
+        )
+
+
+def make_timestamped_path(parent: Path, name: str) -> Path:
+    """Return the path of a new folder named with the time, numbered if it exists.
+
+    Args:
+        parent: Parent folder.
+        name: Beginning of the folder's name.
+    """
+    stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
+    folder, number = parent / f"{name}-{stamp}", 1
+    while folder.exists():
+        number += 1
+        folder = parent / f"{name}-{stamp}-{number}"
+    return folder
+
+
+def get_first_line(error: BaseException) -> str:
+    """Return the first line of an error's message; its class if the message is empty."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _beside(path: Path, keep_ending: bool = False) -> Path:
+    # The name contains the process id, so that two processes do not write to the same file.
+    if keep_ending:
+        return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    return path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+
+def _bytes(content: Content) -> bytes:
+    return content.encode() if isinstance(content, str) else content
+
+
+def _to_disk(path: Path) -> None:
+    """Flush a file's content to disk, so that it is there before the rename."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())

@@ -1,0 +1,240 @@
+"""Registry of parts by name: built-in, installed, and added at run time.
+
+Installed parts come from an entry-point group and are imported only when requested. Parts that
+cannot be imported are listed as skipped, with the reason. Files and notebooks add parts with
+`register_effect`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Generic, TypeVar
+
+from sims.core.simulator import InputError, make_unknown_name_error
+
+T = TypeVar("T")
+
+_NAME = re.compile(r"[A-Za-z0-9][\w.+-]{0,60}$")
+"""Pattern of names that are valid in tables, file names and command lines."""
+
+
+class PartUnavailableError(InputError):
+    """Registered part that cannot be used on this machine.
+
+    Attributes:
+        reason: Reason without the part's name; the message contains both.
+    """
+
+    def __init__(self, kind: str, name: str, reason: str) -> None:
+        super().__init__(f"{kind} {name} cannot be used here: {reason}")
+        self.reason = str(InputError(reason))
+        self._given = kind, name, reason
+
+    def __reduce__(self) -> tuple[type[PartUnavailableError], tuple[str, str, str]]:
+        # Errors of worker processes are pickled; by default that would call the class with the
+        # message only.
+        return PartUnavailableError, self._given
+
+
+@dataclass(frozen=True)
+class AddedPart(Generic[T]):
+    """Part that was added at run time, and its plugin file; None for a class from Python."""
+
+    part: type[T]
+    path: Path | None
+
+
+class Registry(Generic[T]):
+    """Registered parts of one kind.
+
+    Args:
+        kind: Word for such a part in messages, e.g. ``tuner``.
+        group: Entry-point group of the installed parts.
+        base: Base class of the parts.
+    """
+
+    def __init__(self, kind: str, group: str, base: type[T]) -> None:
+        self.kind, self.group, self.base = kind, group, base
+        self._added: dict[str, AddedPart[T]] = {}
+        self._announced: dict[str, AddedPart[T]] = {}
+        self._imported: dict[str, Any] = {}
+
+    @cached_property
+    def _entries(self) -> Mapping[str, EntryPoint]:
+        return {entry.name: entry for entry in entry_points(group=self.group)}
+
+    def names(self) -> list[str]:
+        """Return all registered names, sorted."""
+        return sorted({*self._entries, *self._announced, *self._added})
+
+    def get(self, name: str) -> type[T]:
+        """Return the class registered as `name`.
+
+        Raises:
+            InputError: The name is unknown.
+            SkippedError: The part cannot be imported, or needs a missing package.
+        """
+        if name in self._added:
+            part: Any = self._added[name].part
+        elif name in self._announced:
+            part = self._announced[name].part
+        elif name in self._entries:
+            part = self._installed(name)
+        else:
+            error = make_unknown_name_error(self.kind, name, self.names())
+            raise InputError(f"{error}; one of your own needs its file: --plugin FILE.py")
+        # Checked each time, because a package may be installed while a notebook is open.
+        requires = getattr(part, "requires", ())
+        missing = [package for package in requires if importlib.util.find_spec(package) is None]
+        if missing:
+            packages = ", ".join(missing)
+            remedy = f"pip install {' '.join(missing)}"
+            raise PartUnavailableError(
+                self.kind, name, f"needs {packages}, not installed ({remedy})"
+            )
+        result: type[T] = part
+        return result
+
+    def _installed(self, name: str) -> Any:
+        """Load the entry point `name`; it is imported once."""
+        if name not in self._imported:
+            try:
+                part = self._entries[name].load()
+            except Exception as error:  # a plugin may fail in any way during import
+                reason = f"{type(error).__name__}: {error}"
+                raise PartUnavailableError(self.kind, name, reason) from error
+            if not self.accepts(part):
+                reason = f"expected a {self.base.__name__}, found {part!r:.80}"
+                raise PartUnavailableError(self.kind, name, reason)
+            self._imported[name] = part
+        return self._imported[name]
+
+    def describe(self, name: str) -> str:
+        """Return one line for a list: the description, or why the part is skipped."""
+        try:
+            part = self.get(name)
+        except PartUnavailableError as error:
+            return f"skipped: {error.reason}"
+        says = getattr(part, "says", "") or (inspect.getdoc(part) or "").split("\n\n")[0]
+        return " ".join(says.split())
+
+    def accepts(self, part: object) -> bool:
+        """Return whether an object is a class of this registry's kind."""
+        return inspect.isclass(part) and issubclass(part, self.base)
+
+    def register(self, part: type[T], path: Path | None = None) -> type[T]:
+        """Add a class and return it, so that this can be used as a decorator.
+
+        Registering a class again has no effect. A class replaces an earlier one of the same
+        qualified name that was registered from Python, as when a notebook's cell is run again.
+
+        Args:
+            part: Class to register under its `name`.
+            path: Plugin file that contains it; None for a class from Python.
+
+        Raises:
+            InputError: The class is of another kind, or its name is taken or not usable in tables,
+                files and command lines.
+        """
+        where = f"plugin {path}: " if path else ""
+        if not self.accepts(part) or inspect.isabstract(part):
+            wanted = f"a complete subclass of {self.base.__name__}"
+            raise InputError(f"{where}{self.kind}: expected {wanted}, found {part!r:.80}")
+        name = _name_of(part, where)
+        if self._holds(name, part):
+            return part
+        # The loaded class replaces the stub of the same file.
+        if name in self._announced and self._announced[name].path == path:
+            del self._announced[name]
+        if name in self.names() and not self._may_replace(name, part, path):
+            raise InputError(f"{where}{self.kind} '{name}' exists already; give it another name")
+        self._added[name] = AddedPart(part, path)
+        return part
+
+    def announce(self, part: type[T], path: Path | None) -> None:
+        """Register a stub for a class whose code is not loaded into this process.
+
+        Args:
+            part: Stub class with the known attributes.
+            path: Plugin file of the class; None for a class of an installed package, which is
+                replaced.
+
+        Raises:
+            InputError: The name is taken or not usable.
+        """
+        where = f"plugin {path}: " if path else ""
+        name = _name_of(part, where)
+        other = self._announced.get(name) or self._added.get(name)
+        taken = other is not None and other.path != path
+        if taken or (path is not None and name in self._entries):
+            raise InputError(f"{where}{self.kind} '{name}' exists already; give it another name")
+        self._announced[name] = AddedPart(part, path)
+
+    def entry(self, name: str) -> str | None:
+        """Return the ``module:class`` of an installed part; None if no package has this name."""
+        return self._entries[name].value if name in self._entries else None
+
+    def place(self, name: str) -> Path | None:
+        """Return the plugin file of a loaded part or stub; None if it is not from a file."""
+        added = self._added.get(name) or self._announced.get(name)
+        return added.path if added else None
+
+    def _holds(self, name: str, part: type[T]) -> bool:
+        """Return whether this class is registered under the name."""
+        if name in self._added:
+            return self._added[name].part is part
+        return name in self._entries and self._entries[name].value == ":".join(_qualified(part))
+
+    def _may_replace(self, name: str, part: type[T], path: Path | None) -> bool:
+        """Return whether the registered class is an earlier version of this class."""
+        old = self._added.get(name)
+        # Only classes from Python: files of the same name in two folders give equal qualified
+        # names.
+        from_python = old is not None and old.path is None and path is None
+        return old is not None and from_python and _qualified(old.part) == _qualified(part)
+
+    def paths(self) -> set[Path]:
+        """Return the plugin files of all loaded parts."""
+        return {added.path for added in self._added.values() if added.path is not None}
+
+    def snapshot(self) -> Mapping[str, AddedPart[T]]:
+        """Return the parts added at run time by name, for `restore`."""
+        return MappingProxyType(dict(self._added))
+
+    def restore(self, snapshot: Mapping[str, AddedPart[T]]) -> None:
+        """Restore the added parts of a snapshot, and remove later parts and all stubs."""
+        self._added = dict(snapshot)
+        self._announced = {}
+
+
+def _qualified(part: type) -> tuple[str, str]:
+    return part.__module__, part.__qualname__
+
+
+def _name_of(part: type, where: str) -> str:
+    """Check the declaration of a class, and return its name.
+
+    Args:
+        part: Class to register.
+        where: Beginning of the message.
+
+    Raises:
+        InputError: The class has no name, or one that is not usable.
+    """
+    name = getattr(part, "name", None)
+    if not (isinstance(name, str) and _NAME.match(name)):
+        raise InputError(
+            f"{where}class {part.__name__}: expected name = 'plain_name', found {name!r:.80}"
+        )
+    requires = getattr(part, "requires", ())
+    if not (isinstance(requires, tuple | list) and all(isinstance(r, str) for r in requires)):
+        raise InputError(f"{where}class {part.__name__}: expected requires = ('package', ...)")
+    return name

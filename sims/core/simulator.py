@@ -1,0 +1,468 @@
+"""Interfaces of simulators: parameters, channels, scenarios, simulators.
+
+This module does not depend on any engine. A simulator maps *parameters x scenario* to an
+*observation*. A `Parameter` may be changed by a tuner, a `Scenario` contains what the experimenter
+controls or knows, and a `Channel` is a sensor signal. All numbers are in SI units.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sims.core.value_limits import (
+    MAX_MESSAGE_LENGTH,
+    MAX_NUMBER,
+    MAX_QUOTED_NAME_LENGTH,
+    truncate_text,
+)
+
+Array = NDArray[np.float64]
+
+
+class InputError(ValueError):
+    """Error in the user's input, with a one-line message.
+
+    The message states what was expected, what was found, and what to do.
+    """
+
+    def __init__(self, message: str) -> None:
+        # Names and cells from a user's file may contain anything; escape characters that would
+        # break the line or a terminal.
+        escaped = [
+            c if c.isprintable() else ascii(c)[1:-1]
+            for c in truncate_text(message, MAX_MESSAGE_LENGTH)
+        ]
+        # Escaping may make it longer again.
+        super().__init__(truncate_text("".join(escaped), MAX_MESSAGE_LENGTH))
+
+
+_ALIKE = 0.7
+"""Minimum similarity (0 to 1, `difflib`) of a name that a message proposes instead of another."""
+
+
+def make_unknown_name_error(kind: str, name: str, known: Sequence[str]) -> InputError:
+    """Make the error for an unknown name, which lists the known and the most similar names.
+
+    Args:
+        kind: Kind of the name in the message.
+        name: Unknown name.
+        known: Known names.
+    """
+    listed = ", ".join(sorted(known))
+    near = similar(str(name), known)
+    return InputError(f"unknown {kind} '{truncate_text(str(name))}'; there are: {listed}{near}")
+
+
+def similar(name: str, known: Iterable[str]) -> str:
+    """Format the names most similar to an unknown name as the end of a message.
+
+    Args:
+        name: Unknown name.
+        known: Known names.
+
+    Returns:
+        A question with the similar names; empty if there are none.
+    """
+    from difflib import get_close_matches
+
+    # Ignore case and accept prefixes: users write Pendulum for pendulum, or a family for a member.
+    names = {one.lower(): one for one in known}
+    wanted = name.lower()[:MAX_QUOTED_NAME_LENGTH]
+    begun = [one for one in names if len(wanted) >= 3 and one.startswith(wanted)]
+    near = [names[one] for one in (begun or get_close_matches(wanted, names, cutoff=_ALIKE))[:3]]
+    return f"; did you mean {' or '.join(near)}?" if near else ""
+
+
+def make_read_only(values: ArrayLike) -> Array:
+    """Return a read-only float64 copy of `values`."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Physical parameter of a simulator that a tuner may change.
+
+    Attributes:
+        name: Standard name, e.g. ``restitution``.
+        unit: SI unit, ``1`` for a pure number.
+        nominal: Value to use without any knowledge of the target.
+        bounds: Physically possible range, which is the search range of every tuner.
+        training: Part of `bounds` that learned tuners may use in training (default: all of it).
+        log: Whether the unit cube is logarithmic in this parameter.
+        says: Description in one sentence.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    bounds: tuple[float, float]
+    training: tuple[float, float] | None = None
+    log: bool = False
+    says: str = ""
+
+    def __post_init__(self) -> None:
+        # The order matters: each check relies on the previous ones.
+        low, high = self.bounds
+        if not (np.isfinite([low, high]).all() and low < high):
+            raise InputError(
+                f"parameter {self.name}: bounds must be finite and increasing, found {self.bounds}"
+            )
+        if max(-low, high) > MAX_NUMBER:
+            raise InputError(
+                f"parameter {self.name}: bounds must lie within ±{MAX_NUMBER:g}, found {self.bounds}"
+            )
+        if self.log and low <= 0:
+            raise InputError(
+                f"parameter {self.name}: a log-scaled parameter needs positive bounds, found"
+                f" {self.bounds}"
+            )
+        if not low <= self.nominal <= high:
+            raise InputError(
+                f"parameter {self.name}: nominal {self.nominal} lies outside its bounds"
+                f" {self.bounds}"
+            )
+        inner_low, inner_high = self.training_range
+        if not low <= inner_low < inner_high <= high:
+            raise InputError(
+                f"parameter {self.name}: training range {self.training_range} must increase inside"
+                f" {self.bounds}"
+            )
+
+    @property
+    def training_range(self) -> tuple[float, float]:
+        """Range on which learned tuners are trained, in the parameter's unit."""
+        return self.bounds if self.training is None else self.training
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One column of an observation.
+
+    Attributes:
+        name: Name, e.g. ``z``.
+        unit: SI unit.
+        scale: Typical magnitude in that unit, which weights channels if no sensor noise is known.
+        says: Description in one sentence.
+    """
+
+    name: str
+    unit: str
+    scale: float = 1.0
+    says: str = ""
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Known number of a system, which is not tuned.
+
+    Attributes:
+        name: Standard name.
+        unit: SI unit, ``1`` for a pure number.
+        value: Default value.
+        says: Description in one sentence.
+        positive: Whether it must be > 0.
+        limits: Minimum and maximum plausible value, in its unit.
+    """
+
+    name: str
+    unit: str
+    value: float
+    says: str = ""
+    positive: bool = False
+    limits: tuple[float, float] = (-MAX_NUMBER, MAX_NUMBER)
+
+    def wanted(self, value: float) -> str:
+        """Return the expected range if `value` is not possible; empty if it is possible."""
+        if self.positive and value <= 0:
+            return f"more than 0 {self.unit}"
+        low, high = self.limits
+        return "" if low <= value <= high else f"{low:g} to {high:g} {self.unit}"
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Conditions of one run that the experimenter controls or knows.
+
+    Attributes:
+        times: (T,) sample times, increasing, s; the state at ``times[0]`` is the initial state.
+        initial: Initial state by name, SI units; the system's defaults are used for missing ones.
+        inputs: Input signals by name, each (T,), held constant between samples.
+        constants: Constants that differ from the simulator's own in this run.
+        linear: Inputs that are interpolated linearly between samples instead.
+        offset: Delay of the inputs relative to their stamps, s.
+        before: Known inputs before the run by name, (2, K): times relative to ``times[0]`` (s,
+            negative and increasing), and values. Other inputs had their first value.
+        off: Whether actuators of a robot are switched off, (T,) by name, held between samples;
+            missing actuators are on.
+    """
+
+    times: Array
+    initial: Mapping[str, float] = field(default_factory=dict)
+    inputs: Mapping[str, Array] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    linear: frozenset[str] = frozenset()
+    offset: float = 0.0
+    before: Mapping[str, Array] = field(default_factory=dict)
+    off: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # Read-only copies, because batch elements and methods share scenarios.
+        times = make_read_only(self.times)
+        row = times.ndim == 1 and times.size > 0
+        if not row or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise InputError(
+                "a scenario's times must be finite and increasing, at least one sample"
+            )
+        inputs = {name: make_read_only(signal) for name, signal in self.inputs.items()}
+        for name, signal in inputs.items():
+            if signal.shape != times.shape:
+                raise InputError(
+                    f"input '{name}' has shape {signal.shape}, the scenario has {times.size}"
+                    " samples"
+                )
+        before = {
+            name: make_read_only(signal) for name, signal in self.before.items() if signal.size
+        }
+        for name, (stamps, _) in before.items():
+            if not (np.diff(stamps, append=0.0) > 0).all():
+                raise InputError(
+                    f"input '{name}' before the run: its instants must be negative and increasing"
+                )
+        for name, mask in self.off.items():
+            if mask.shape != times.shape:
+                raise InputError(
+                    f"actuator '{name}' is off in {mask.shape} samples, the scenario has "
+                    f"{times.size}"
+                )
+        # Fields of a frozen dataclass can only be set in this way.
+        object.__setattr__(self, "before", before)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "inputs", inputs)
+        object.__setattr__(self, "initial", {k: float(v) for k, v in self.initial.items()})
+        object.__setattr__(self, "constants", {k: float(v) for k, v in self.constants.items()})
+
+
+class UnitCube:
+    """Map between physical parameters and the unit cube in which all tuners work.
+
+    0..1 spans each parameter's `bounds`, linearly, or logarithmically for log-scaled parameters.
+    With bounds a and b, a parameter p and its coordinate u in the cube,
+
+        p = a + u (b - a),    or    p = exp(log a + u (log b - log a))     (1)
+
+    This class is the only implementation of the map.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter]) -> None:
+        self.parameters = tuple(parameters)
+        self._log = np.array([p.log for p in self.parameters])
+        self._any_log = bool(self._log.any())
+        pairs = [p.bounds for p in self.parameters]
+        bounds = np.array(pairs, dtype=np.float64).reshape(-1, 2)  # also without parameters
+        self._low, self._high = self._scaled(bounds.T)
+        self._span = self._high - self._low
+        self.training: Array = make_read_only(
+            self.to_unit_cube(np.array([p.training_range for p in self.parameters]).T)
+        )
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    def _scaled(self, theta: Array) -> Array:
+        if not self._any_log:
+            return theta
+        # Use the logarithm of 1 for linear parameters, because that of a negative number warns.
+        positive = np.where(self._log, theta, 1.0)
+        scaled: Array = np.where(self._log, np.log(positive), theta)
+        return scaled
+
+    def to_physical(self, points: Array) -> Array:
+        """Map unit-cube points (..., dim) to physical parameter vectors."""
+        scaled: Array = self._low + points * self._span  # (1)
+        if not self._any_log:
+            return scaled
+        logarithm = np.where(self._log, scaled, 0.0)
+        mixed: Array = np.where(self._log, np.exp(logarithm), scaled)  # (1)
+        return mixed
+
+    def to_unit_cube(self, theta: Array) -> Array:
+        """Map physical parameter vectors (..., dim) to unit-cube points."""
+        result: Array = (self._scaled(np.asarray(theta, dtype=np.float64)) - self._low) / self._span
+        return result
+
+    def compute_training_widths(self) -> Array:
+        """Return the widths (dim,) of the training ranges in the parameters' units.
+
+        The metric `param_error` is measured in these widths.
+        """
+        ranges = np.array([p.training_range for p in self.parameters], dtype=np.float64)
+        return ranges[:, 1] - ranges[:, 0]
+
+
+class Simulator(ABC):
+    """Map from parameters and scenario to observations, for many parameter vectors at once.
+
+    A subclass declares its interface in class attributes and implements `simulate`. The same
+    parameters and scenario must give the same observation bit for bit, regardless of earlier
+    simulations.
+
+    Attributes:
+        parameters: Tunable parameters, in the order of the entries of a parameter vector.
+        channels: Columns of an observation, in order.
+        constants: Known numbers, with their defaults.
+        inputs: Input signals that a scenario may contain, as channels.
+        states: Names of the initial states with their defaults (SI).
+        requires: Importable packages without which this simulator is skipped.
+        has_model: Whether it is made from a robot's model file.
+    """
+
+    name: ClassVar[str]
+    says: ClassVar[str] = ""
+    parameters: tuple[Parameter, ...] = ()
+    channels: tuple[Channel, ...] = ()
+    constants: tuple[Constant, ...] = ()
+    inputs: tuple[Channel, ...] = ()
+    states: Mapping[str, float] = {}
+    requires: ClassVar[tuple[str, ...]] = ()
+    has_model: ClassVar[bool] = False
+
+    def __init__(
+        self, constants: Mapping[str, float] | None = None, observe: Sequence[str] | None = None
+    ) -> None:
+        """Set the constants and select the observed channels.
+
+        Args:
+            constants: Values of `make_constant_nodes` that differ from their defaults.
+            observe: Names of the channels to return, in this order (default: all of the system).
+                `render_channels` then contains these, and `columns` their positions among the
+                system's channels.
+
+        Raises:
+            InputError: A constant or channel does not exist, or a value is impossible.
+        """
+        defaults = {c.name: c.value for c in self.constants}
+        self.constant_values = self._constants(defaults, constants or {})
+        names = [c.name for c in self.channels]
+        chosen = names if observe is None else list(observe)
+        for name in chosen:
+            if name not in names:
+                raise make_unknown_name_error(f"channel of simulator {self.name}", name, names)
+        if not chosen or len(set(chosen)) < len(chosen):
+            raise InputError(
+                f"simulator {self.name}: observe needs one or more different channels, found"
+                f" {truncate_text(str(chosen))}"
+            )
+        self.columns = [names.index(name) for name in chosen]
+        self.channels = tuple(self.channels[i] for i in self.columns)
+
+    @abstractmethod
+    def simulate(self, theta: Array, scenario: Scenario) -> Array:
+        """Simulate each parameter vector in one scenario.
+
+        A batch element whose simulation fails numerically is filled with NaN and does not affect
+        the others.
+
+        Args:
+            theta: Parameter vectors (n, dim), physical units.
+            scenario: Conditions of the run.
+
+        Returns:
+            Observations (n, T, C), SI units.
+
+        Raises:
+            InputError: The scenario names a constant, input or initial state that the simulator
+                does not have.
+        """
+
+    def close(self) -> None:
+        """Release resources such as engine worlds; the simulator may be used again."""
+
+    def run_constants(self, scenario: Scenario) -> dict[str, float]:
+        """Return the constants of one run: the simulator's, overridden by the scenario's."""
+        return self._constants(self.constant_values, scenario.constants)
+
+    def run_initial(self, scenario: Scenario) -> dict[str, float]:
+        """Return the initial state of one run: the defaults, overridden by the scenario's."""
+        return self._checked("initial state", self.states, scenario.initial)
+
+    def run_inputs(self, scenario: Scenario) -> dict[str, Array]:
+        """Return the input signals of one run, each (T,); missing inputs are zero."""
+        known = {c.name: np.zeros(scenario.times.size) for c in self.inputs}
+        return self._checked("input", known, scenario.inputs)
+
+    def _constants(
+        self, known: Mapping[str, float], given: Mapping[str, float]
+    ) -> dict[str, float]:
+        values = self._checked("constant", known, given)
+        for c in self.constants:
+            value = values[c.name]
+            if c.positive and value <= 0:
+                wanted = "be > 0"
+            elif not c.limits[0] <= value <= c.limits[1]:
+                wanted = f"lie in {c.wanted(value)}"
+            else:
+                continue
+            who = f"constant '{c.name}' of simulator {self.name}"
+            raise InputError(f"{who} must {wanted}, found {value}")
+        return values
+
+    def _checked(
+        self, kind: str, known: Mapping[str, Any], given: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        for name, value in given.items():
+            if name not in known:
+                raise make_unknown_name_error(
+                    f"{kind} of simulator {self.name}", name, list(known) or ["none"]
+                )
+            if not np.isfinite(value).all():
+                who = f"{kind} '{name}' of simulator {self.name}"
+                raise InputError(f"{who} must be finite, found {truncate_text(str(value))}")
+        return {**known, **given}
+
+
+def apply_parameter_changes(
+    parameters: Sequence[Parameter], changes: Mapping[str, Mapping[str, Any]]
+) -> tuple[Parameter, ...]:
+    """Replace attributes of parameters as an experiment states.
+
+    Args:
+        parameters: Parameters of a simulator.
+        changes: New attributes by parameter, such as ``{"restitution": {"training": (0.3, 0.7)}}``.
+
+    Returns:
+        The changed parameters.
+
+    Raises:
+        InputError: A parameter or attribute is unknown, or a value is not possible.
+    """
+    names = [p.name for p in parameters]
+    allowed = ("nominal", "bounds", "training", "log")
+    for name, change in changes.items():
+        if name not in names:
+            raise make_unknown_name_error("parameter", name, names)
+        for attribute in change:
+            if attribute not in allowed:
+                raise make_unknown_name_error(f"attribute of parameter {name}", attribute, allowed)
+    pairs = ("bounds", "training")  # given as lists in an experiment's file
+    result = []
+    for p in parameters:
+        change = changes.get(p.name, {})
+        new: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
+        changed = replace(p, **new)  # this also checks the new parameter
+        # Parameters that are positive by nature, such as masses, must stay positive.
+        low, lowest = p.bounds[0], changed.bounds[0]
+        if low >= 0 and (lowest < 0 or (low > 0 and lowest == 0)):
+            wanted = "more than 0" if low > 0 else "at least 0"
+            raise InputError(f"parameter {p.name}: bounds must be {wanted}, found {changed.bounds}")
+        result.append(changed)
+    return tuple(result)

@@ -1,0 +1,350 @@
+"""Check values of a user's TOML file, with one-line errors.
+
+An error names file, entry, expected and found value. Each check takes the source with which its
+message begins (the path of the file, or a name), the entry in it (``noise.x``), and the value, and
+returns the value as the program uses it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import is_dataclass
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints, is_typeddict
+
+from sims.core.atomic_files import require_file
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.value_limits import MAX_INTEGER, MAX_NUMBER, MAX_TITLE_LENGTH, truncate_text
+
+if sys.version_info >= (3, 11):
+    import tomllib as tomllib  # re-exported for other modules
+else:
+    import tomli as tomllib
+
+Source = Path | str
+Range = tuple[float, float]
+"""Lower and upper end of a range."""
+
+_LONGEST = 40
+"""Maximum number of characters of a user's value that a message quotes."""
+
+_WORDS: Mapping[type, str] = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    dict: "a table",
+    list: "a list",
+    bool: "a bool",
+}
+"""Description of each type in messages."""
+
+_WIDER: Mapping[type, tuple[type, ...]] = {float: (int, float), list: (list, tuple)}
+"""Types accepted instead of another: TOML integers as floats, tuples from Python as lists."""
+
+
+def toml_text(text: str) -> str:
+    """Format a text as a TOML string."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def toml_key(name: str) -> str:
+    """Format a name as a TOML key.
+
+    It is quoted if it contains characters other than ASCII letters, digits, ``_`` and ``-``.
+    """
+    bare = name.replace("_", "").replace("-", "")
+    return name if bare.isascii() and bare.isalnum() else toml_text(name)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        InputError: The file is missing, unreadable or not TOML.
+    """
+    require_file(path)
+    try:
+        # Editors on Windows begin a file with a byte order mark.
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        what = f"{error.reason} at byte {error.start}"
+        raise InputError(f"{path}: expected UTF-8 text ({what})") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # bad TOML, or an impossible date or number
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:  # for example a file of brackets only
+        raise InputError(f"{path}: not valid TOML: nested too deeply") from None
+
+
+def format_value(value: object) -> str:
+    """Format a value of a user's file for a message, truncated."""
+    return truncate_text(repr(value), _LONGEST)
+
+
+def make_error(source: Source, where: str, wanted: str, value: object) -> InputError:
+    """Make the error for a value that is not as expected.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value; empty for the whole file.
+        wanted: Description of the expected value.
+        value: Value that was found.
+    """
+    place = (
+        f"{truncate_text(where, MAX_TITLE_LENGTH)}: " if where else ""
+    )  # no entry if the whole file is meant
+    return InputError(f"{source}: {place}expected {wanted}, found {format_value(value)}")
+
+
+def check_known_names(kind: str, given: Iterable[str], allowed: Iterable[str]) -> None:
+    """Check that all names are among the allowed ones.
+
+    Args:
+        kind: Kind of the names and their place in messages, e.g. ``entry of [noise] in mine.toml``.
+        given: Names that the user wrote.
+        allowed: Allowed names.
+
+    Raises:
+        InputError: A name is not allowed.
+    """
+    names = list(allowed)
+    for name in given:
+        if name not in names:
+            raise make_unknown_name_error(kind, name, names or ["none"])
+
+
+def check_type(source: Source, where: str, value: Any, wanted: type, words: str = "") -> Any:
+    """Check the type of a value; integers are accepted as floats.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        wanted: Expected type.
+        words: Description of the expected value; that of the type if empty.
+
+    Raises:
+        InputError: The value has another type.
+    """
+    kinds = _WIDER.get(wanted, (wanted,))
+    # In Python, booleans are integers.
+    mistaken = isinstance(value, bool) and wanted is not bool
+    if mistaken or not isinstance(value, kinds):
+        raise make_error(source, where, words or _WORDS[wanted], value)
+    size: Any = value
+    if wanted is int and not -MAX_INTEGER <= size <= MAX_INTEGER:  # TOML integers are unbounded
+        raise make_error(source, where, f"{words or _WORDS[int]} within ±{MAX_INTEGER:.0e}", value)
+    return value
+
+
+def check_table(source: Source, where: str, value: Any, words: str = "") -> dict[str, Any]:
+    """Check that `value` is a table.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+    """
+    return dict(check_type(source, where, value, dict, words))
+
+
+def check_text(
+    source: Source, where: str, value: Any, words: str = "", most: int = MAX_TITLE_LENGTH
+) -> str:
+    """Check that `value` is a text of at most `most` characters.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+        most: Maximum number of characters.
+    """
+    read = str(check_type(source, where, value, str, words))
+    if len(read) > most:
+        raise make_error(source, where, f"at most {most} characters, not {len(read)}", value)
+    return read
+
+
+def check_name_list(
+    source: Source, where: str, value: Any, words: str = "a list of names"
+) -> tuple[str, ...]:
+    """Check that `value` is a list of texts.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value.
+    """
+    if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
+        raise make_error(source, where, words, value)
+    return tuple(value)
+
+
+def check_number(source: Source, where: str, value: Any, words: str = "") -> float:
+    """Check that `value` is a number, which may be infinite or NaN (TOML has inf and nan).
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+    """
+    try:
+        return float(check_type(source, where, value, float, words))
+    except OverflowError:  # TOML integers are unbounded
+        raise make_error(source, where, words or _WORDS[float], value) from None
+
+
+def check_finite(source: Source, where: str, value: Any, words: str = "") -> float:
+    """Check that `value` is a finite number of plausible size.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+    """
+    result = check_number(source, where, value, words)
+    if not math.isfinite(result):
+        raise make_error(source, where, words or _WORDS[float], value)
+    if abs(result) > MAX_NUMBER:
+        raise make_error(source, where, f"{words or _WORDS[float]} within ±{MAX_NUMBER:g}", value)
+    return result
+
+
+def check_number_list(
+    source: Source, where: str, value: Any, count: int, words: str = ""
+) -> tuple[float, ...]:
+    """Check that `value` is a list of `count` finite numbers.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        count: Required number of entries.
+        words: Description of the expected value; the default one if empty.
+    """
+    if not isinstance(value, list | tuple) or len(value) != count:
+        raise make_error(source, where, words or f"{count} numbers", value)
+    return tuple(check_finite(source, where, entry) for entry in value)
+
+
+def check_number_pair(source: Source, where: str, value: Any) -> Range:
+    """Check that `value` is a list of two numbers in any order.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+    """
+    low, high = check_number_list(source, where, value, 2, "[low, high]")
+    return low, high
+
+
+def check_range(source: Source, where: str, value: Any) -> Range:
+    """Check that `value` is a list of two increasing numbers.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+    """
+    low, high = check_number_pair(source, where, value)
+    if not low < high:
+        raise make_error(source, where, "low < high", value)
+    return low, high
+
+
+def check_annotation(source: Source, where: str, value: Any, declared: Any) -> Any:
+    """Check a value, including its content, against a type annotation, and convert it.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        declared: Annotation: text, number, bool, pair of numbers, tuple of one type, mapping from
+            names, or a dataclass or TypedDict of these; `None` in a union means that the entry may
+            be missing.
+
+    Raises:
+        InputError: The value does not match.
+    """
+    origin, inner = get_origin(declared), get_args(declared)
+    if declared is Any:
+        return value  # checked where it is used, for example settings by a simulator
+    if origin in (Union, UnionType):
+        return check_annotation(source, where, value, _chosen(value, inner))
+    if declared == Range:  # before other tuples, which may have any length
+        return check_range(source, where, value)
+    if origin is tuple:
+        items = check_type(source, where, value, list)
+        return tuple(check_annotation(source, where, item, inner[0]) for item in items)
+    if origin is not None:
+        return _mapping(source, where, value, inner[1])
+    if isinstance(declared, type) and is_dataclass(declared):
+        return declared(**check_entries(source, where, value, get_type_hints_of(declared)))
+    if is_typeddict(declared):
+        return check_entries(source, where, value, get_type_hints_of(declared))
+    if declared is float:
+        return check_number(source, where, value)
+    return check_type(source, where, value, declared)
+
+
+def _mapping(source: Source, where: str, value: Any, declared: Any) -> dict[str, Any]:
+    """Check a table with arbitrary names whose entries are all of one type."""
+    result = {}
+    for key, item in check_table(source, where, value).items():
+        result[key] = check_annotation(source, f"{where}.{key}", item, declared)
+    return result
+
+
+def check_entries(
+    source: Source, where: str, value: Any, hints: Mapping[str, Any], kind: str = ""
+) -> dict[str, Any]:
+    """Check a table whose entries have the names and types of `hints`.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the table; empty for the whole file.
+        value: Value from the file.
+        hints: Type annotations by name.
+        kind: Kind of the entries and their place in messages; derived from `where` if empty.
+
+    Raises:
+        InputError: A name is unknown, or an entry has a wrong type.
+    """
+    given = check_table(source, where, value)
+    # Check names first: an error about the type of an unknown key would be confusing.
+    check_known_names(kind or f"entry of [{where}] in {source}", given, hints)
+    result = {}
+    for key, item in given.items():
+        place = f"{where}.{key}" if where else key
+        read = check_annotation(source, place, item, hints[key])
+        # Keep integers, because hashes of runs and trained weights depend on what is written.
+        result[key] = item if hints[key] is float else read
+    return result
+
+
+@cache
+def get_type_hints_of(kind: type) -> dict[str, Any]:
+    """Return the fields of a dataclass or TypedDict with their types."""
+    return get_type_hints(kind)
+
+
+def _chosen(value: Any, among: Sequence[Any]) -> Any:
+    """Return the type of a union to check a value against: a tuple for a list, else the first."""
+    # TOML has no null: entries that may be None are left out.
+    kinds = [kind for kind in among if kind is not NoneType]
+    lists = [kind for kind in kinds if get_origin(kind) is tuple]
+    return lists[0] if lists and isinstance(value, list | tuple) else kinds[0]

@@ -1,0 +1,58 @@
+"""Contact effects: changes of the impact with the ground.
+
+With e0 the simulator's restitution, vn the normal speed before the impact and c the coefficient:
+
+* (1) e = e0 |vn|^c, vn in m/s
+* (2) tangential speed lost: c (1 + e) |vn|, Coulomb's law for the impulse, never more than there is
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Contact
+
+_SMALLEST = 1e-9
+"""Minimum impact speed in m/s for the power law, so that a negative power is finite."""
+_POWER = ((-0.4, 0.2), (-0.4, 0.2), (0, 0))
+"""Plausible powers of the impact speed: yielding bodies have about -1/4, viscoelastic ones less."""
+
+
+class SpeedDependentRestitution(Contact):
+    """Restitution that depends on the impact speed; at most 1, so that no energy is created."""
+
+    name = "restitution.speed"
+    noun = "speed-dependent restitution"
+    says = "how well it bounces depends on the speed of the impact"
+    source = "K. L. Johnson, Contact Mechanics (1985), chapter 11, doi:10.1017/CBO9781139171731"
+    needs = "ground"
+    coefficients = (Coefficient("coefficient", ("1", "1", None), _POWER),)
+
+    def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:
+        """Return the restitution (L, 1): its value at 1 m/s, times a power of the speed.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            restitution: (L, 1) restitution without the effect.
+            speed: (L, 1) impact speed in m/s.
+        """
+        scaled = restitution * np.maximum(speed, _SMALLEST) ** c[0]  # (1)
+        # a restitution above 1 without the effect stays: c = 0 is off
+        return np.minimum(scaled, np.maximum(restitution, 1.0))
+
+
+class ContactFriction(Contact):
+    """Friction in the impact: tangential speed lost is c (1 + e) |vn|, never more than there is."""
+
+    name = "contact.friction"
+    noun = "friction at impacts"
+    says = "the ground slows it along its surface at each impact"
+    source = "R. M. Brach, Mechanical Impact Dynamics: Rigid Body Collisions (1991)"
+    needs = "ground"
+    coefficients = (Coefficient("coefficient", ("1", None, None), ((0, 1), (0, 0), (0, 0))),)
+
+    def friction(self, c: Array) -> Array:
+        """Return the friction coefficient (L, 1); a negative one counts as zero."""
+        # the engine applies (2), because only the engine knows the tangential speed
+        return np.maximum(c[0], 0.0)

@@ -1,0 +1,301 @@
+"""Input effects: transformations from the commanded to the applied first input.
+
+With u the command, w the applied input and c the coefficient:
+
+* (0) hold: w = u + c (v - u), with v the command interpolated linearly between samples if the
+  recording specifies a zero-order hold, or held if it specifies linear interpolation
+* (1) gain: w = (1 + c) u
+* (2) bias: w = u + c
+* (3) delay: w(t) = u(t - c)
+* (4) lag: c dw/dt = u - w; the plant receives its mean over each step (`effects.first_order_lag`)
+* (5) dead band: w = u - clip(u, -c, c)
+* (6) saturation: w = clip(u, -c, c)
+* (7) backlash: w is constant while |u - w| <= c / 2, otherwise the nearer flank pushes it
+* (8) power: w = (1 + gain) sign(u) |u|^(1 + power), |u| in the input's unit
+* (9) rate: dw/dt = clip((u - w) / h, -c, c) over a step h, from the first command on
+
+A negative delay is a lead; a negative lag, width or limit counts as zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Input, Signal
+from sims.effects.first_order_lag import apply_recursion, compute_lag_response, shift_by_one_step
+
+_FORCE_UNITS = ("m/s^2", "N", "N*m")
+"""Units of an input that is a force, on the three kinds of system; an input may have another."""
+_TIME = ("s", "s", "s")
+"""Seconds, on every kind of system."""
+_PURE = ("1", "1", "1")
+"""Units of a dimensionless coefficient on every kind of system."""
+_SHARE = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
+"""Plausible gains: up to 50 % more or less."""
+_SCALE = ((-0.9, 9), (-0.9, 9), (-0.9, 9))
+"""Plausible gains combined with a power, which changes the scale far from one unit."""
+_EXPONENT = ((-0.5, 2), (-0.5, 2), (-0.5, 2))
+"""Plausible additions to the exponent one."""
+_LEAST = 0.01
+"""Smallest exponent; with zero, only the sign of the input would act."""
+_OFFSET = ((-2, 2), (-2, 2), (-0.2, 0.2))
+"""Plausible biases, in the units of `_FORCE_UNITS`."""
+_WIDTH = ((0, 2), (0, 2), (0, 0.2))
+"""Plausible widths of dead band and backlash, in the units of `_FORCE_UNITS`."""
+_LIMIT = ((0, 10), (0, 10), (0, 2))
+"""Plausible limits, in the units of `_FORCE_UNITS`."""
+_PER_SECOND = ("m/s^3", "N/s", "N*m/s")
+"""Units of `_FORCE_UNITS`, per second."""
+_SLEW = ((0, 50), (0, 50), (0, 10))
+"""Plausible limits of the rate, in the units of `_PER_SECOND`."""
+_DELAY = (-0.05, 0.2)
+"""Plausible delays in s.
+
+Time stamps may be late by one or two samples, so that a command seems to lead.
+"""
+_FEEDBACK = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
+_NONLINEAR = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
+_PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
+
+
+class InputHold(Input):
+    """Command held instead of interpolated between samples, or vice versa; a mixture for c < 1."""
+
+    name = "input.hold"
+    noun = "an input read the other way between samples"
+    says = "between two samples the input goes straight instead of holding, or holds instead"
+    source = "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems (1997), chapter 7"
+    coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)
+    between = True  # (0), applied where means over steps are computed: `sims.engines.time_grid`
+
+
+class InputGain(Input):
+    """Input times 1 + c."""
+
+    name = "input.gain"
+    noun = "an input gain"
+    says = "the input acts more strongly or weakly than commanded"
+    source = _FEEDBACK
+    coefficients = (Coefficient("coefficient", _PURE, _SHARE),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the scaled input (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        return signal.values * (1.0 + c[0])  # (1)
+
+
+class InputBias(Input):
+    """Input plus c."""
+
+    name = "input.bias"
+    noun = "an input bias"
+    says = "a constant is added to the input"
+    source = _FEEDBACK
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _OFFSET, of="input"),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the shifted input (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        return signal.values + c[0]  # (2)
+
+
+class InputDelay(Input):
+    """Input delayed by c seconds."""
+
+    name = "input.delay"
+    noun = "an input delay"
+    says = "the input acts later than commanded, or its stamps are late where it is negative"
+    source = _FEEDBACK
+    coefficients = (Coefficient("coefficient", _TIME, (_DELAY, _DELAY, _DELAY)),)
+
+    def times(self, c: Array, t: Array) -> Array:
+        """Return the earlier times (L, S) whose command is applied.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            t: (L, S) times in seconds.
+        """
+        return t - c[0]  # (3)
+
+
+class InputLag(Input):
+    """Input through a first-order lag with time constant c, settled at its first value."""
+
+    name = "input.lag"
+    noun = "an input lag"
+    says = "the input builds up gradually instead of at once"
+    source = _FEEDBACK
+    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.5), (0, 0.5), (0, 0.5))),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the mean (L, S) of the lagged input over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        # (4); without a lag the command itself, bit for bit
+        return np.where(c[0] > 0, _apply_lag(signal, c[0]), signal.values)
+
+
+class InputDeadBand(Input):
+    """Input with dead band: zero while it is within c of zero, otherwise the excess."""
+
+    name = "input.deadband"
+    noun = "an input dead band"
+    says = "small inputs have no effect"
+    source = _NONLINEAR
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH, of="input"),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the excess (L, S) over the half width.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        half = np.abs(c[0])
+        # the excess, not the whole value: the applied input is continuous at the border
+        beyond = signal.values - np.clip(signal.values, -half, half)  # (5)
+        return np.where(c[0] > 0, beyond, signal.values)
+
+
+class InputSaturation(Input):
+    """Input limited to c in both directions; a limit of zero is no limit."""
+
+    name = "input.saturation"
+    noun = "input saturation"
+    says = "the input is cut off at a limit"
+    source = _NONLINEAR
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _LIMIT, of="input"),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the limited input (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        limit = np.abs(c[0])
+        limited = np.clip(signal.values, -limit, limit)  # (6)
+        # a limit of zero is off, as the zero of every effect, and does not set the input to zero
+        return np.where(c[0] > 0, limited, signal.values)
+
+
+class InputBacklash(Input):
+    """Backlash of full width c, centred when the run starts."""
+
+    name = "backlash"
+    noun = "backlash"
+    says = "there is play: after a reversal the input acts only once the play is used up"
+    source = _PLAY
+    coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH, of="input"),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the input (L, S) on the load side of the backlash.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        played = _apply_play(signal, c[0] / 2)
+        return np.where(c[0] > 0, played, signal.values)
+
+
+class InputPower(Input):
+    """Input to a power, as a propeller's thrust is quadratic in its speed."""
+
+    name = "input.power"
+    noun = "a power of the input"
+    says = "what acts goes with a power of the input, as a propeller's thrust with its square"
+    source = "R. Mahony, V. Kumar, P. Corke, IEEE Robot. Autom. Mag. 19(3), 20 (2012), equation 6"
+    needs, contains = "input", ("input.gain",)
+    coefficients = (Coefficient("gain", _PURE, _SCALE), Coefficient("power", _PURE, _EXPONENT))
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the input (L, S) to a power; an input of one unit changes only by the gain.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        size = np.abs(signal.values)
+        bent = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _LEAST)
+        return (1.0 + c[0]) * np.where(c[1] != 0, bent, signal.values)  # (8)
+
+
+class InputRateLimit(Input):
+    """Input with a rate of at most c per second; a limit of zero is no limit."""
+
+    name = "input.rate"
+    noun = "a limit of the input's rate"
+    says = "the input follows commands no faster than a limit"
+    source = _NONLINEAR
+    coefficients = (Coefficient("coefficient", _PER_SECOND, _SLEW, of="input/s"),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the mean (L, S) of the rate-limited input over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        limit = np.where(c[0] > 0, c[0], np.inf)
+        return np.where(c[0] > 0, _apply_rate_limit(signal, limit), signal.values)
+
+
+def _apply_lag(signal: Signal, lag: Array) -> Array:
+    """Return means (L, S) of the lagged input (4) over each step; `lag` (L, 1) is in seconds."""
+    # the command is constant over a step, so (2) of sims.effects.first_order_lag gives the value at
+    # its end
+    decay, mean = compute_lag_response(signal.steps, lag)
+    ends = apply_recursion(decay, (1.0 - decay) * signal.values, signal.start)
+    # engines hold the input over a step: the mean transfers the same momentum as the lagged input
+    return signal.values + (shift_by_one_step(ends, signal.start) - signal.values) * mean
+
+
+def _apply_play(signal: Signal, half: Array) -> Array:
+    """Return the input (L, S) after backlash (7), with clearance `half` (L, 1) to either side."""
+    # The loop runs over contiguous rows, one per step.
+    low = np.ascontiguousarray((signal.values - half).T)
+    high = np.ascontiguousarray((signal.values + half).T)
+    # the position within the backlash is not recorded: the centre favours neither direction
+    state: Array = signal.start[:, 0]
+    for below, above in zip(low, high, strict=True):
+        # (7), in place and without the overhead of np.clip: the array of lower bounds becomes the
+        # result
+        np.maximum(state, below, out=below)
+        state = np.minimum(below, above, out=below)
+    return low.T
+
+
+def _apply_rate_limit(signal: Signal, limit: Array) -> Array:
+    """Return means (L, S) of the rate-limited input (9) over each step.
+
+    `limit` (L, 1) is the largest rate, infinite for no limit.
+    """
+    wanted = np.ascontiguousarray(signal.values.T)
+    # An infinite limit times a step of zero length counts as zero.
+    reach = np.where(signal.steps > 0, limit * np.where(signal.steps > 0, signal.steps, 1.0), 0.0).T
+    back = -reach
+    moved = np.empty_like(wanted)
+    ends = np.empty_like(wanted)
+    state: Array = signal.start[:, 0]
+    for row, up, down, move, end in zip(wanted, reach, back, moved, ends, strict=True):
+        np.subtract(row, state, out=move)
+        np.minimum(move, up, out=move)
+        np.maximum(move, down, out=move)
+        state = np.add(state, move, out=end)
+    # It rises until it reaches the command, and is constant for the rest of the step.
+    rising = np.abs(moved) / np.where(reach > 0, reach, np.inf)
+    means = ends - 0.5 * rising * moved
+    return np.where(np.isfinite(reach), means, wanted).T

@@ -1,0 +1,52 @@
+"""Generate the table of the project's own effects for the README of this folder.
+
+The command ``python -m sims.effects.readme_table`` prints it.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from sims import effects
+from sims.core.system import SYSTEM_KINDS, Coefficient, Effect
+
+
+def render_effects_table() -> str:
+    """Return the table in Markdown.
+
+    For each effect it contains the description, and a row for each coefficient with its plausible
+    ranges.
+    """
+    head = "| effect, hook | coefficient | " + " | ".join(SYSTEM_KINDS) + " |"
+    rows = [head, "|---|---|---|---|---|"]
+    for name in effects.list_names():
+        effect = effects.get_effect(name)
+        # effects of installed plugins use the same entry points and have their own documentation
+        if effect.__module__.startswith("sims.effects."):
+            rows += _rows(effect)
+    return "\n".join(rows) + "\n"
+
+
+def _rows(effect: type[Effect]) -> list[str]:
+    head = f"`{effect.name}` ({effect.hook}): {effect.says}"
+    rows = []
+    for c in effect.coefficients:
+        ranges = [_range(c, place) for place in range(len(SYSTEM_KINDS))]
+        rows.append(f"| {head} | {c.name} | " + " | ".join(ranges) + " |")
+        head = ""  # the description is only in the row of the first coefficient
+    return rows
+
+
+def _range(c: Coefficient, place: int) -> str:
+    unit = c.units[place]
+    if unit is None:
+        return "–"
+    low, high = c.plausible[place]
+    text = f"{low:g} … {high:g}"
+    if unit != "1":
+        text += f" {unit}"
+    return text + (" (*)" if c.of else "")
+
+
+if __name__ == "__main__":
+    sys.stdout.write(render_effects_table())

@@ -1,0 +1,238 @@
+"""Sensor effects: differences between the true values and their recording.
+
+With y the true value, r the recorded value, t the time stamp and c the coefficient:
+
+* (1) gain: r = (1 + c) y
+* (2) bias: r = y + c
+* (3) delay: r(t) = y(t - c)
+* (4) lag: c dr/dt = y - r (`sims.effects.first_order_lag`)
+* (5) drift: r(t) = y(t) + c t
+* (6) clock: r(t) = y((1 + c) t)
+* (7) eccentricity: r = y + a sin y + b cos y, y an angle
+* (8) slip: r(t) = y(t) + c from a time s on, on the clock of the stamps
+
+The time of a slip between two samples is unknown: over an interval h before a sample, (8) is linear
+from s = t - h / 2, where it has happened, to s = t + h / 2, where it has not.
+
+Gain, bias, drift, eccentricity and slip act on one channel, the system's first observed one; a
+delay, a lag and a skewed clock act on all. A negative delay is a lead; a negative lag counts as
+zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Sensor, Signal
+from sims.effects.first_order_lag import apply_recursion, compute_lag_response, shift_by_one_step
+
+_TIME = ("s", "s", "s")
+"""Seconds, on every kind of system."""
+_PURE = ("1", "1", "1")
+"""Units of a dimensionless coefficient on every kind of system."""
+_FIFTH = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
+"""Plausible gains: up to a fifth too much or too little."""
+_LEAST_GAIN = -0.8
+"""Smallest gain: a sensor shows at least a fifth of the true value.
+
+A reading that hardly depends on the measured quantity would agree with any constant signal.
+"""
+_MOST_GAIN = 4.0
+"""Largest gain: a sensor shows at most five times the true value."""
+_LENGTH = ("m", "m", "rad")
+"""Units of a reading that is a position; a reading may have another unit."""
+_OFFSET = ((-1, 1), (-0.2, 0.2), (-0.2, 0.2))
+"""Plausible biases, in the units of `_LENGTH`."""
+_OFF = Coefficient("coefficient", _LENGTH, _OFFSET, of="reading")
+"""Coefficient for a constant error of a reading."""
+_SPEED = ("m/s", "m/s", "rad/s")
+"""Units of `_LENGTH`, per second."""
+_DRIFT = ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1))
+"""Plausible drifts, in the units of `_SPEED`."""
+_SLOW = ((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05))
+"""Plausible clock errors in seconds per second."""
+_ANGLE = (None, None, "rad")
+"""Units of the reading of an angle encoder."""
+_OFF_AXIS = ((0, 0), (0, 0), (-0.1, 0.1))
+"""Plausible errors of an eccentric encoder, in the units of `_ANGLE`."""
+_INSTANT = ((0.01, 10), (0.01, 10), (0.01, 10))
+"""Plausible times in seconds on a recording's clock; a fit searches the duration of the runs."""
+_SHORTEST = 1e-12
+"""Smallest time in seconds between two different samples."""
+_VOCABULARY = "International Vocabulary of Metrology, JCGM 200:2012"
+
+
+class SensorGain(Sensor):
+    """Reading times 1 + c."""
+
+    name = "sensor.gain"
+    noun = "a sensor gain"
+    says = "the sensor shows too much or too little, in proportion"
+    source = _VOCABULARY + ", 4.12"
+    coefficients = (Coefficient("coefficient", _PURE, _FIFTH, least=_LEAST_GAIN, most=_MOST_GAIN),)
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """Return the scaled reading (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        return signal.values * (1.0 + c[0])  # (1)
+
+
+class SensorBias(Sensor):
+    """Reading plus c."""
+
+    name = "sensor.bias"
+    noun = "a sensor bias"
+    says = "the sensor's zero is off"
+    source = _VOCABULARY + ", 4.20"
+    coefficients = (_OFF,)
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """Return the shifted reading (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        return signal.values + c[0]  # (2)
+
+
+class SensorDelay(Sensor):
+    """Reading delayed by c seconds; before the start, the initial state."""
+
+    name = "sensor.delay"
+    noun = "a sensor delay"
+    says = "the sensor shows what was the case a while ago"
+    source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
+    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+
+    def times(self, c: Array, t: Array) -> Array:
+        """Return the earlier times (L, S) of the recorded values.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            t: (L, S) times in seconds.
+        """
+        return t - c[0]  # (3)
+
+
+class SensorLag(Sensor):
+    """Reading through a first-order lag with time constant c, settled at its first value."""
+
+    name = "sensor.lag"
+    noun = "a sensor lag"
+    says = "the sensor follows gradually instead of at once"
+    source = _VOCABULARY + ", 4.23"
+    filters = True  # the lag evolves between samples, so every step is needed
+    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """Return the lagged reading (L, S), exact for a reading that is linear over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        # (4); without a lag the reading itself, bit for bit
+        return np.where(c[0] > 0, _lagged(signal, c[0]), signal.values)
+
+
+class SensorDrift(Sensor):
+    """Reading plus c for each second since the start of the run."""
+
+    name = "sensor.drift"
+    noun = "a sensor drift"
+    says = "the sensor's zero drifts steadily"
+    source = _VOCABULARY + ", 4.21"
+    coefficients = (Coefficient("coefficient", _SPEED, _DRIFT, of="reading/s"),)
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """Return the reading (L, S) with an error proportional to time.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        return signal.values + c[0] * signal.times  # (5)
+
+
+class EncoderEccentricity(Sensor):
+    """Eccentric disc or magnet of an encoder: an error with the period of one turn."""
+
+    name = "sensor.eccentricity"
+    noun = "an eccentric encoder"
+    says = "the encoder is off its axis, so that its error comes once a turn"
+    source = "X.-D. Lu et al., CIRP Annals 59(1), 529 (2010), introduction"
+    needs = "guide"
+    coefficients = tuple(Coefficient(of, _ANGLE, _OFF_AXIS) for of in ("sine", "cosine"))
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """Return the reading (L, S) with an error periodic in the angle.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        y = signal.values
+        return y + c[0] * np.sin(y) + c[1] * np.cos(y)  # (7)
+
+
+class EncoderSlip(Sensor):
+    """Single slip of an encoder: reading plus c from a point in time on."""
+
+    name = "sensor.slip"
+    noun = "an encoder that slipped"
+    says = "the encoder slipped at an instant, and is off by the same amount from then on"
+    source = "M. Basseville, I. V. Nikiforov, Detection of Abrupt Changes (1993), chapter 2"
+    needs = "guide"
+    contains = ("sensor.bias",)
+    coefficients = (_OFF, Coefficient("instant", _TIME, _INSTANT))
+
+    def read(self, c: Array, signal: Signal) -> Array:
+        """Return the reading (L, S) with a constant error after the slip.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        return signal.values + c[0] * _smooth_step(c[1], signal.clock + signal.times)  # (8)
+
+
+class ClockSkew(Sensor):
+    """Recorder clock that is slow by c: 1 + c seconds pass between stamps one second apart."""
+
+    name = "clock.skew"
+    noun = "a clock skew"
+    says = "the recorder's clock runs slow or fast"
+    source = "V. Paxson et al., Framework for IP Performance Metrics, RFC 2330 (1998), section 10.1"
+    at = "world"
+    coefficients = (Coefficient("coefficient", _PURE, _SLOW),)
+
+    def times(self, c: Array, t: Array) -> Array:
+        """Return the times (L, S) on the true clock.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            t: (L, S) times in seconds.
+        """
+        return t * (1.0 + c[0])  # (6)
+
+
+def _smooth_step(instant: Array, now: Array) -> Array:
+    """Return the progress (L, S) of the slip at stamps `now`: 0 before, 1 after, (8) between."""
+    apart = np.maximum(np.diff(now, axis=1, prepend=now[:, :1]), _SHORTEST)
+    share: Array = np.clip((now - instant) / apart + 0.5, 0.0, 1.0)
+    return share
+
+
+def _lagged(signal: Signal, lag: Array) -> Array:
+    """Return the values (L, S) of (4) at the end of each step; `lag` (L, 1) is in seconds."""
+    decay, mean = compute_lag_response(signal.steps, lag)
+    old = shift_by_one_step(signal.values, signal.start)
+    # (4) of sims.effects.first_order_lag without its first term, which is the recursion
+    gained = signal.values - decay * old - mean * (signal.values - old)
+    return apply_recursion(decay, gained, signal.start)

@@ -1,0 +1,156 @@
+"""Servo-law effects: deviations from a proportional law of the set point.
+
+With u the set point, q the position, e = u - q, K the servo's stiffness and c the coefficient, the
+drive exerts in addition
+
+* (1) dead zone: K (dz(e) - e), dz(e) = e - clip(e, -c, c); the limits of the drive apply to it, too
+* (2) derivative: K (u(t) - u(t - c)): the servo's D term acts on the rate of the error, instead of
+  the rate of q alone; c is the D gain divided by the P gain, and the rate is averaged over the
+  time c, so that a step of the set point gives a pulse of its height instead of an impulse
+* (3) profile: the servo follows p instead of u, where p moves to u as fast as |d2p/dt2| <= c
+  permits and arrives at rest: d2p/dt2 = c sign(u - p - |dp/dt| dp/dt / (2 c)), and zero after
+  arrival
+
+A negative width or limit counts as zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import Coefficient, Force, Input, Signal, StateSnapshot
+
+_USUAL = ("m/s^2", "m", "rad")
+"""Units of a set point; point systems have no servo."""
+_WIDTH = ((0, 1), (0, 0.05), (0, 0.2))
+"""Plausible half widths of a dead zone, in the units of `_USUAL`."""
+_TIME = ("s", "s", "s")
+"""Seconds, on every kind of system."""
+_ACCELERATION = ("m/s^4", "m/s^2", "rad/s^2")
+"""Units of `_USUAL`, per second squared."""
+_REACHED = ((0, 500), (0, 50), (0, 200))
+"""Plausible limits of a set point's acceleration, in the units of `_ACCELERATION`."""
+
+
+class ServoDeadBand(Force):
+    """Dead zone of a servo: no drive within c of the set point, drive from the excess beyond."""
+
+    name = "servo.deadband"
+    noun = "a dead zone of the servo"
+    says = "the servo does nothing about small errors"
+    source = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
+    at = "actuator"
+    needs = "servo"
+    coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="error"),)
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return the force (L, D) that is missing in comparison with the proportional law.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
+        width = np.maximum(c[0], 0.0)
+        return moment.compute_set_point_force(-np.clip(moment.servo_error, -width, width))  # (1)
+
+
+class ServoDerivativeAction(Input):
+    """Set point with a lead of c times its rate, as if the D term acts on the error."""
+
+    name = "servo.derivative"
+    noun = "a D term on the error"
+    says = "the servo's D term acts on the error, so that it also follows the set point's rate"
+    source = "K. J. Astrom, R. M. Murray, Feedback Systems (2008), section 10.5"
+    needs = "servo"
+    coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the set point (L, S) plus its change in the last c seconds.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        lead = np.maximum(c[0], 0.0)
+        return np.where(
+            lead > 0, 2.0 * signal.values - _earlier(signal, lead), signal.values
+        )  # (2)
+
+
+class ServoMotionProfile(Input):
+    """Motion profile of the set point with acceleration of at most c; zero is no limit."""
+
+    name = "servo.profile"
+    noun = "a servo's motion profile"
+    says = "the servo's set point moves to the command with limited acceleration"
+    source = "L. Biagiotti, C. Melchiorri, Trajectory Planning (2008), section 4.6"
+    needs = "servo"
+    coefficients = (Coefficient("coefficient", _ACCELERATION, _REACHED, of="input/s^2"),)
+
+    def apply(self, c: Array, signal: Signal) -> Array:
+        """Return the mean (L, S) of the limited set point over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
+        limit = np.maximum(c[0], 0.0)
+        return np.where(limit > 0, _apply_acceleration_limit(signal, limit[:, 0]), signal.values)
+
+
+def _apply_acceleration_limit(signal: Signal, most: Array) -> Array:
+    """Return means (L, S) of (3) over each step, with accelerations of at most `most` (L,).
+
+    The speed w at the end of a step is chosen such that the remaining distance is sufficient for
+    stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.
+    """
+    wanted, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
+    means = np.empty_like(wanted)
+    gains = most * steps
+    inverses = np.divide(1.0, steps, out=np.zeros_like(steps), where=steps > 0)
+    rows = zip(wanted, steps, gains, 0.5 * gains, 0.25 * gains**2, inverses, means, strict=True)
+    place, speed = signal.start[:, 0].copy(), np.zeros(wanted.shape[1])
+    # The loop has thousands of steps of a few elements: everything possible is computed before it.
+    for row, h, gain, half, square, inverse, mean in rows:
+        apart = row - place
+        way = np.copysign(1.0, apart)
+        left, now = np.abs(apart), way * speed
+        braked = h * now
+        short = inverse * (left - 0.5 * braked)
+        root = np.maximum(square + most * (2.0 * left - braked), 0.0)
+        long = np.maximum(np.sqrt(root) - half, gain)
+        least = np.maximum(np.minimum(short, long), now - gain)
+        next_speed = way * np.minimum(least, now + gain)
+        both = 0.5 * h * (speed + next_speed)
+        np.add(place, (both + 0.5 * h * speed) / 3.0, out=mean)
+        place = place + both
+        speed = next_speed
+    return means.T
+
+
+def _earlier(signal: Signal, late: Array) -> Array:
+    """Return means (L, S) over each step of the signal `late` (L, 1) seconds earlier.
+
+    Before the run, the signal has its initial value.
+    """
+    ends = signal.times
+    begins = ends - signal.steps
+    gained = np.cumsum(signal.values * signal.steps, axis=1)
+    result = signal.values.copy()
+    for lane in np.flatnonzero(late[:, 0] > 0):
+        # integral of the signal, beginning long before the run
+        knots = np.concatenate([[begins[lane, 0] - 1.0, begins[lane, 0]], ends[lane]])
+        whole = np.concatenate([[-signal.start[lane, 0], 0.0], gained[lane]])
+        first, last = (_integral(knots, whole, t[lane] - late[lane]) for t in (begins, ends))
+        steps = signal.steps[lane]
+        long = steps > 0
+        result[lane, long] = (last - first)[long] / steps[long]
+    return result
+
+
+def _integral(knots: Array, whole: Array, t: Array) -> Array:
+    """Return the integral at times t, extrapolated linearly before the first knot."""
+    inside: Array = np.interp(t, knots, whole)
+    slope = (whole[1] - whole[0]) / (knots[1] - knots[0])
+    return inside + slope * np.minimum(t - knots[0], 0.0)

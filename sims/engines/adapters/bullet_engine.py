@@ -1,0 +1,332 @@
+"""PyBullet engine: forces through Bullet's force and torque interfaces, impacts by its solver.
+
+The module ``pendulum_bullet_world`` in the system's package builds the world of a system; its
+interface is specified in `sims.engines.external.world_interface`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import cast
+
+from sims.core.simulator import InputError
+from sims.core.system import Engine, IntegrationBatch, System, Trajectories
+from sims.engines.adapters import bullet_joints, bullet_world
+from sims.engines.external import (
+    ball_rollout,
+    batch_grouping,
+    joint_batch,
+    joint_rollout,
+    native_contact,
+)
+from sims.engines.external.ball_forces import BallState, Vector
+from sims.engines.external.external_engine import (
+    RolloutFunction,
+    integrate_batch,
+    integrate_one_by_one,
+    resolve_time_step,
+)
+from sims.engines.external.world_interface import (
+    BulletBallWorldModule,
+    BulletJointWorldModule,
+    BulletWorldModule,
+    find_world_module,
+)
+
+REQUIRED_PACKAGES = ("pybullet",)
+
+_PUBLISHED_SETTINGS = {"linear_damping": 0.04, "lateral_friction": 0.2, "plane_restitution": 1.0}
+"""Settings of the published scene (TuneNet, arXiv 1907.11200): 1/s, and dimensionless numbers."""
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+"""Identity rotation as a quaternion x, y, z, w."""
+_NOWHERE = (0.0, 0.0, 0.0)
+"""Zero vector: the origin, or zero velocity."""
+_IMPACT = 1e-4
+"""Length of the time step of an impact, in seconds."""
+_REACH = 0.02 * math.sqrt(3)
+"""Height above the ground, in radii of the ball, at which Bullet's contact begins."""
+
+
+def make_engine(
+    system: type[System],
+    *,
+    time_step: float | None = None,
+    native_contact: bool = False,
+    linear_damping: float | None = None,
+    lateral_friction: float | None = None,
+    plane_restitution: float | None = None,
+) -> Engine:
+    """Make the PyBullet engine for one simulator.
+
+    Args:
+        system: system that the engine will integrate.
+        time_step: longest step in seconds; each sampling interval is divided into equal steps not
+            longer than this.
+        native_contact: for a bouncing system: use Bullet's native contact
+            (`sims.systems.ball_bullet_world`), stepped and read at first order as in the published
+            experiments; without `time_step`, each sample interval is one step.
+        linear_damping: with `native_contact`: Bullet's linear air damping in 1/s (0.04).
+        lateral_friction: with `native_contact`: friction of both ball and ground (0.2); the contact
+            uses the product.
+        plane_restitution: with `native_contact`: restitution of the ground (1.0); the contact uses
+            the product.
+
+    Returns:
+        The engine.
+
+    Raises:
+        InputError: a setting is not valid.
+    """
+    own = {
+        "linear_damping": linear_damping,
+        "lateral_friction": lateral_friction,
+        "plane_restitution": plane_restitution,
+    }
+    given = {name: value for name, value in own.items() if value is not None}
+    if not native_contact:
+        if given:
+            raise InputError(
+                f"setting {next(iter(given))} belongs to Bullet's own contact: set"
+                " native_contact = true"
+            )
+        return BulletEngine(system, resolve_time_step(time_step, system))
+    if not system.bounces:
+        raise InputError(f"system {system.name} does not bounce: leave native_contact out")
+    for name, value in given.items():
+        if not 0 <= value < math.inf:
+            raise InputError(f"{name} must be a number of at least 0, found {value}")
+    step = math.inf if time_step is None else resolve_time_step(time_step, system)
+    return BulletEngine(system, step, {**_PUBLISHED_SETTINGS, **given})
+
+
+class BulletEngine:
+    """PyBullet engine for one system.
+
+    Batch elements are integrated one after the other in one world; where effects must be evaluated
+    at each step, several bodies may share one world.
+    """
+
+    name: str = "pybullet"
+    requires: tuple[str, ...] = REQUIRED_PACKAGES
+
+    def __init__(
+        self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None
+    ) -> None:
+        self.largest_step = largest_step
+        self._rollouts: RolloutFunction | None = None
+        self._many: bullet_joints.BulletJointBatch | None = None
+        asked = BulletWorldModule if system.bounces else BulletJointWorldModule
+        if own is not None:
+            asked = BulletBallWorldModule
+        module, self._reason = find_world_module(system, "bullet_world", asked)
+        if module is None:
+            return
+        if own is not None:
+            build = partial(cast(BulletBallWorldModule, module).build_native, settings=own)
+            self._world = bullet_world.PersistentBulletWorld(build)
+            rollout = partial(
+                native_contact.integrate_native_ball, BulletNativeBall(self._world, own)
+            )
+            self._rollouts = partial(integrate_one_by_one, rollout, self._world.invalidate)
+        elif system.bounces:
+            self._world = bullet_world.PersistentBulletWorld(cast(BulletWorldModule, module).build)
+            ball = partial(ball_rollout.integrate_ball, BulletBall(self._world))
+            self._rollouts = partial(integrate_one_by_one, ball, self._world.invalidate)
+        else:
+            body = cast(BulletJointWorldModule, module)
+            self._world = bullet_world.PersistentBulletWorld(body.build)
+            alone = partial(
+                joint_rollout.integrate_joint, bullet_joints.BulletJoint(self._world, body)
+            )
+            self._many = bullet_joints.BulletJointBatch(body)
+            company = joint_batch.JointBatchIntegrator(self._many)
+            self._rollouts = partial(
+                batch_grouping.integrate_grouped, alone, company, self._world.invalidate
+            )
+
+    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+        """Integrate all batch elements; see `Engine`."""
+        assert self._rollouts is not None, "a system that the engine refuses"
+        return integrate_batch(lanes, self._rollouts, self._discard)
+
+    def _discard(self) -> None:
+        """Discard the worlds, so that the next rollout builds new ones."""
+        self._world.invalidate()
+        if self._many is not None:
+            self._many.discard()
+
+    def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
+        """Return why the engine cannot integrate the system; see `Engine`."""
+        return self._reason
+
+    def close(self) -> None:
+        """Close the Bullet worlds; the next integration opens new ones."""
+        if self._rollouts is not None:
+            self._world.close()
+        if self._many is not None:
+            self._many.close()
+
+
+class _BulletMover:
+    """Free ball; see `sims.engines.external.ball_rollout.BallBody`."""
+
+    def __init__(self, world: bullet_world.PersistentBulletWorld) -> None:
+        self._world = world
+        self._client = self._body = -1
+        self._mass = math.nan
+        self._contact = math.nan, math.nan
+        self._x: Vector = _NOWHERE
+
+    def reset_world(self, constants: dict[str, float]) -> None:
+        """Prepare a world for these constants, without contact points of the previous rollout."""
+        p = bullet_world.import_pybullet()
+        self._mass = constants["mass"]
+        self._contact = (math.nan, math.nan)
+        self._client, self._body = self._world.get_body(constants)
+        # The world is reset in place, because building one is half the cost of a rollout. But
+        # contact points survive a reset, and Bullet would use them as old contacts, which changes
+        # the results by rounding. They are removed by placing the ball where it touches nothing.
+        far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
+        p.resetBasePositionAndOrientation(self._body, far, _UPRIGHT, self._client)
+        p.performCollisionDetection(self._client)
+
+    def set_step(self, step: float) -> None:
+        """Set the step in seconds."""
+        bullet_world.import_pybullet().setTimeStep(step, self._client)
+
+    def set_state(self, x: Vector, w: Vector) -> None:
+        """Set position and velocity; the ball is upright and does not spin."""
+        bullet_world.import_pybullet().resetBasePositionAndOrientation(
+            self._body, x, _UPRIGHT, self._client
+        )
+        bullet_world.import_pybullet().resetBaseVelocity(self._body, w, _NOWHERE, self._client)
+        self._x = x
+
+    def advance(self, force: Vector) -> BallState:
+        """Advance by one step with a force per unit mass at the ball's last known centre."""
+        # Bullet expects the force in newtons and the point where it acts.
+        p = bullet_world.import_pybullet()
+        mass = self._mass
+        newtons = mass * force[0], mass * force[1], mass * force[2]
+        p.applyExternalForce(self._body, -1, newtons, self._x, p.WORLD_FRAME, self._client)
+        return self.advance_freely((1,))[0]
+
+    def advance_freely(self, counts: Sequence[int]) -> list[BallState]:
+        """Advance by each number of steps in `counts` under gravity alone; return the states."""
+        p = bullet_world.import_pybullet()
+        client = self._client
+        body = self._body
+        step = p.stepSimulation
+        at = p.getBasePositionAndOrientation
+        moving = p.getBaseVelocity
+        states: list[BallState] = []
+        for count in counts:
+            for _ in range(count):
+                step(client)
+            states.append((at(body, client)[0], moving(body, client)[0]))
+        self._x = states[-1][0]
+        return states
+
+    def set_contact_parameters(self, restitution: float, friction: float) -> None:
+        """Set the ball's restitution and friction coefficient."""
+        if (restitution, friction) != self._contact:
+            self._contact = restitution, friction
+            bullet_world.import_pybullet().changeDynamics(
+                self._body,
+                -1,
+                restitution=restitution,
+                lateralFriction=friction,
+                physicsClientId=self._client,
+            )
+
+
+class BulletBall(_BulletMover):
+    """Ball without spin, on ground with restitution and friction 1.
+
+    See `sims.engines.external.ball_rollout.BallWithImpacts`.
+    """
+
+    def reset_world(self, constants: dict[str, float]) -> None:
+        """Prepare a world for these constants, with contact switched off."""
+        self._floor = constants["radius"]
+        self._gravity = constants["gravity"]
+        super().reset_world(constants)
+        self._meets(False)
+
+    def _meets(self, ground: bool) -> None:
+        """Switch contact between ball and ground on or off."""
+        # Contact is off in flight, because `ball_rollout` computes when the ball meets the ground.
+        p = bullet_world.import_pybullet()
+        floor = p.getBodyUniqueId(0, self._client)
+        p.setCollisionFilterPair(floor, self._body, -1, -1, ground, self._client)
+
+    def solve_impact(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
+        """Return the velocity after an impact, from Bullet's contact solver in one short step.
+
+        Args:
+            x: position at the impact.
+            v: velocity before the impact.
+            restitution: restitution coefficient.
+            friction: friction coefficient.
+        """
+        self.set_contact_parameters(restitution, friction)
+        self.set_step(_IMPACT)
+        # Bullet adds gravity's velocity change of the step before it solves the contact. This is
+        # compensated, so that the solver sees v.
+        inside = x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION
+        self.set_state(inside, (v[0], v[1], v[2] + self._gravity * _IMPACT))
+        self._meets(True)
+        _, after = self.advance_freely((1,))[0]
+        self._meets(False)
+        return after
+
+    def set_resting_contact(self) -> None:
+        """Set contact with zero restitution and zero friction."""
+        self.set_contact_parameters(0.0, 0.0)
+        self._meets(True)
+
+
+class BulletNativeBall(_BulletMover):
+    """Ball with Bullet's native contact; see `native_contact.NativeContactBall`."""
+
+    def __init__(
+        self, world: bullet_world.PersistentBulletWorld, settings: Mapping[str, float]
+    ) -> None:
+        super().__init__(world)
+        self.damping = settings["linear_damping"]
+        self._rough = settings["lateral_friction"]
+        self._reach = math.nan
+
+    def reset_world(self, constants: dict[str, float]) -> None:
+        """Prepare a world for these constants."""
+        super().reset_world(constants)
+        self._reach = _REACH * constants["radius"]
+
+    def set_contact_parameters(self, restitution: float, friction: float) -> None:
+        """Set the ball's restitution and the friction of the contact.
+
+        `friction` is added to that of the settings, which is the product of both bodies'
+        coefficients.
+        """
+        if (restitution, friction) == self._contact:
+            return
+        # The contact uses the product of both bodies' friction. With 1 for the ground, the ball's
+        # coefficient is the product from the settings plus the friction of the effect.
+        own = self._rough
+        ground = self._rough
+        if friction:
+            own = self._rough**2 + friction
+            ground = 1.0
+        p = bullet_world.import_pybullet()
+        if friction or self._contact[1]:
+            floor = p.getBodyUniqueId(0, self._client)
+            p.changeDynamics(floor, -1, lateralFriction=ground, physicsClientId=self._client)
+            p.changeDynamics(self._body, -1, lateralFriction=own, physicsClientId=self._client)
+        p.changeDynamics(self._body, -1, restitution=restitution, physicsClientId=self._client)
+        self._contact = restitution, friction
+
+    def is_near_contact(self, gap: float) -> bool:
+        """Return whether the gap is within Bullet's contact distance."""
+        return gap <= self._reach

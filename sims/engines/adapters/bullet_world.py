@@ -1,0 +1,146 @@
+"""PyBullet connection: importing the engine, lifetime of a world, a body on a joint.
+
+PyBullet runs in this process and without a window.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import os
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+NO_LIMIT = 1e100
+"""Speed limit in m/s or rad/s that has no effect; by default Bullet clips speeds at 100."""
+
+
+@functools.cache
+def import_pybullet() -> Any:
+    """Import the module ``pybullet`` on first use, because most commands never simulate."""
+    with _output_discarded():
+        import pybullet
+    return pybullet
+
+
+@contextlib.contextmanager
+def _output_discarded() -> Iterator[None]:
+    """Discard the output of C code, such as PyBullet's build date."""
+    # PyBullet prints from C and bypasses `sys.stdout`, so redirect the file descriptors.
+    flush = ctypes.CDLL(None).fflush if os.name == "posix" else lambda _: None
+    flush(None)  # keep earlier output of others
+    with contextlib.ExitStack() as undo:
+        for stream in (1, 2):
+            with contextlib.suppress(OSError):  # a process may lack this stream
+                kept = os.dup(stream)
+                undo.callback(os.close, kept)
+                undo.callback(os.dup2, kept, stream)
+                sink = os.open(os.devnull, os.O_WRONLY)
+                undo.callback(os.close, sink)
+                os.dup2(sink, stream)
+        undo.callback(flush, None)  # C has its own buffer, which would be printed later
+        yield
+
+
+class PersistentBulletWorld:
+    """Bullet world that is connected when first needed and reused until its owner is closed.
+
+    Building a world costs as much as simulating a hundred samples, so it is built once for each set
+    of constants. At the start of each rollout, the owner must reset everything that a rollout may
+    have changed.
+
+    Args:
+        build: Function called with (client, constants) on an empty world; returns the id of the
+            moving body.
+    """
+
+    def __init__(self, build: Callable[[int, Mapping[str, float]], int]) -> None:
+        self._build = build
+        self._client = -1
+        self._body = -1
+        self._built_for: dict[str, float] | None = None
+        self._disconnect: Callable[[], object] | None = None
+
+    def __reduce__(
+        self,
+    ) -> tuple[type[PersistentBulletWorld], tuple[Callable[[int, Mapping[str, float]], int]]]:
+        # A copy of a simulator, also in another process, gets its own world.
+        return PersistentBulletWorld, (self._build,)
+
+    def get_body(self, constants: Mapping[str, float]) -> tuple[int, int]:
+        """Return the ids (client, body) of a world with these constants."""
+        if self._disconnect is None:
+            self._client = import_pybullet().connect(import_pybullet().DIRECT)
+            self._disconnect = weakref.finalize(self, import_pybullet().disconnect, self._client)
+        if self._built_for != constants:
+            # Invalidate first, because building may fail half way.
+            self.invalidate()
+            import_pybullet().resetSimulation(physicsClientId=self._client)
+            self._body = self._build(self._client, constants)
+            self._built_for = dict(constants)
+        return self._client, self._body
+
+    def invalidate(self) -> None:
+        """Have the world built again before the next rollout.
+
+        Used when the world is in a state that resetting its bodies cannot restore.
+        """
+        self._built_for = None
+
+    def close(self) -> None:
+        """Disconnect the world if it is connected."""
+        if self._disconnect is not None:
+            self._disconnect()
+        self._disconnect = None
+        self.invalidate()
+
+
+def create_jointed_body(
+    client: int,
+    kind: int,
+    axis: tuple[float, float, float],
+    mass: float,
+    centre: tuple[float, float, float],
+) -> int:
+    """Create a body on one joint without friction that is fixed to the world.
+
+    Args:
+        client: Id of the world.
+        kind: ``JOINT_REVOLUTE`` or ``JOINT_PRISMATIC``, at the origin.
+        axis: Axis of the joint.
+        mass: Mass of the body, kg.
+        centre: Centre of mass at joint position 0, m.
+
+    Returns:
+        The id of the body, whose joint has the index 0.
+    """
+    p = import_pybullet()
+    body: int = p.createMultiBody(
+        linkMasses=[mass],
+        linkCollisionShapeIndices=[-1],
+        linkVisualShapeIndices=[-1],
+        linkPositions=[(0.0, 0.0, 0.0)],
+        linkOrientations=[(0.0, 0.0, 0.0, 1.0)],
+        linkInertialFramePositions=[centre],
+        linkInertialFrameOrientations=[(0.0, 0.0, 0.0, 1.0)],
+        linkParentIndices=[0],
+        linkJointTypes=[kind],
+        linkJointAxis=[axis],
+        physicsClientId=client,
+    )
+    # By default Bullet adds air resistance, sleeping, a speed limit of 100, and a motor that brakes
+    # the joint.
+    p.changeDynamics(
+        body,
+        -1,
+        linearDamping=0.0,
+        angularDamping=0.0,
+        activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING,
+        maxJointVelocity=NO_LIMIT,
+        physicsClientId=client,
+    )
+    # Replace the default motor of the joint by one without force.
+    p.setJointMotorControl2(body, 0, p.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
+    return body

@@ -1,0 +1,290 @@
+"""Single bodies in MuJoCo: a body on a joint, and a ball over level ground.
+
+MuJoCo's contact computes a reference acceleration along the normal and applies the share d of it.
+With the penetration r, its rate v, and the acceleration a_0 without contact,
+
+    a_ref = -b v - k r                                                     (1)
+    a = (1 - d) a_0 + d a_ref, never pulling                               (2)
+
+("Solver parameters", https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters).
+Written as ``solref = (-stiffness, -damping)`` with constant impedance d and zero stiffness, a_ref =
+-(damping / d) v. Therefore, with
+
+    damping = (1 + e) / h                                                  (3)
+
+a single step of length h from the surface, with other forces compensated (a_0 = 0), changes v to v
+- (1 + e) v = -e v: exactly the restitution e, for any h. A resting ball is supported with
+
+    damping = 1 / h,    stiffness = 0.1 / h^2                              (4)
+
+which lets it sink in by 10 (1 - d) g h^2. MuJoCo's friction is a convex relaxation that turns slip
+into lift (Todorov, ICRA 2014, doi:10.1109/ICRA.2014.6907751). Therefore contact is frictionless
+here, and the tangential speed lost in an impact is applied as an impulse, through ``qfrc_applied``
+in the step of the impact.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from sims.engines.external import ball_rollout
+from sims.engines.external.ball_forces import BallState, Vector
+from sims.engines.external.world_interface import MujocoJointWorldModule
+
+_IMPACT = 1e-4
+"""Length of the time step of an impact in seconds.
+
+MuJoCo treats accelerations above 1e10 as a failure.
+"""
+_IMPEDANCE = 0.9999
+"""Impedance d of the contact: the largest value that MuJoCo allows."""
+
+
+@functools.cache
+def import_mujoco() -> Any:
+    """Import the module ``mujoco`` on first use.
+
+    The import is slow, and most commands never simulate.
+    """
+    import mujoco
+
+    return mujoco
+
+
+class CompiledWorld:
+    """MuJoCo model and its state, compiled on first use and again when the constants change.
+
+    Args:
+        model: function from constants to MJCF.
+    """
+
+    def __init__(self, model: Callable[[Mapping[str, float]], str]) -> None:
+        self._compile = model
+        self._built_for: dict[str, float] | None = None
+        self._model: Any = None
+        self._data: Any = None
+
+    def __reduce__(self) -> tuple[type[CompiledWorld], tuple[Callable[[Mapping[str, float]], str]]]:
+        # A copy of a simulator, in this or in another process, gets its own world.
+        return CompiledWorld, (self._compile,)
+
+    def get_fresh(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
+        """Return model and data in their initial state, for these constants."""
+        if self._built_for != constants:
+            mujoco = import_mujoco()
+            self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
+            disabled = mujoco.mjtDisableBit
+            # Joint damping is explicit, as in Bullet and as `external.joint_rollout` assumes.
+            self._model.opt.disableflags |= disabled.mjDSBL_EULERDAMP
+            # A failed element must become NaN; otherwise MuJoCo would reset it, and it would look
+            # finished.
+            self._model.opt.disableflags |= disabled.mjDSBL_AUTORESET
+            self._data = mujoco.MjData(self._model)
+            self._built_for = dict(constants)
+        else:
+            import_mujoco().mj_resetData(self._model, self._data)
+        return self._model, self._data
+
+    def close(self) -> None:
+        """Release model and data."""
+        self._model = self._data = self._built_for = None
+
+
+class MujocoJoint:
+    """Body on one hinge or guide; see `sims.engines.external.joint_rollout.JointBody`."""
+
+    def __init__(self, world: CompiledWorld, module: MujocoJointWorldModule) -> None:
+        self._world = world
+        self._load = module.load
+        self._gravity = module.gravity
+        self.open_loop: bool = module.OPEN_LOOP
+
+    def reset_world(self, constants: dict[str, float]) -> None:
+        """Prepare a world for these constants, in its initial state."""
+        self._constants, self.compute_gravity_force = constants, self._gravity(constants)
+        self._model, self._data = self._world.get_fresh(constants)
+        self._x = self._data.qpos
+        self._w = self._data.qvel
+        self._force = self._data.qfrc_applied
+        self._step = import_mujoco().mj_step
+
+    def set_step(self, step: float, inertia: float, damping: float) -> bool:
+        """Set step (s), inertia and damping; return False if MuJoCo cannot represent them."""
+        self._model.opt.timestep = step
+        self._model.dof_damping[0] = damping
+        return self._load(self._model, inertia, self._constants)
+
+    def set_state(self, x: float, w: float) -> None:
+        """Set the joint's position and velocity."""
+        self._x[0] = x
+        self._w[0] = w
+
+    def advance(self, force: float) -> tuple[float, float]:
+        """Advance by one step; return position and velocity."""
+        self._force[0] = force
+        self._step(self._model, self._data)
+        return self._x.item(), self._w.item()
+
+    def advance_freely(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
+        """Advance by each number of steps in `counts` with a constant force or torque at the joint.
+
+        Returns:
+            Position and velocity after each count.
+        """
+        states = []
+        self._force[0] = force
+        for count in counts:
+            # The count is zero where `joint` has already made the step, with another input.
+            if count:
+                self._step(self._model, self._data, count)
+            states.append((self._x.item(), self._w.item()))
+        return states
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in ("_world", "_load", "_gravity", "open_loop")}
+
+
+class MujocoMover:
+    """Ball on three slide joints; see `sims.engines.external.ball_rollout.BallBody`."""
+
+    def __init__(self, world: CompiledWorld) -> None:
+        self._world = world
+
+    def reset_world(self, constants: dict[str, float]) -> None:
+        """Prepare a world for these constants in its initial state, with contact switched off."""
+        mujoco = import_mujoco()
+        self._mass = constants["mass"]
+        self._floor = constants["radius"]
+        self._gravity = constants["gravity"]
+        self._model, self._data = self._world.get_fresh(constants)
+        self._x = self._data.qpos
+        self._w = self._data.qvel
+        self._force = self._data.qfrc_applied
+        self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self._model.geom_solimp[:] = _IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0
+        self._step = mujoco.mj_step
+        self._hertz = math.nan
+        self._meets(False)
+
+    def _meets(self, ground: bool) -> None:
+        """Switch contact on or off."""
+        flags = self._model.opt.disableflags
+        self._model.opt.disableflags = (
+            flags & ~self._no_contact if ground else flags | self._no_contact
+        )
+
+    def _contact(self, stiffness: float, damping: float) -> None:
+        """Set stiffness (1/s^2) and damping (1/s) of the following contacts."""
+        self._model.geom_solref[:] = -stiffness, -damping
+
+    def set_step(self, step: float) -> None:
+        """Set the step in seconds."""
+        self._model.opt.timestep = step
+        self._hertz = 1.0 / step
+
+    def set_state(self, x: Vector, w: Vector) -> None:
+        """Set position and velocity."""
+        self._x[:] = x
+        self._w[:] = w
+
+    def advance(self, force: Vector) -> BallState:
+        """Advance by one step with a force per unit mass at the centre."""
+        mass = self._mass
+        self._force[:] = mass * force[0], mass * force[1], mass * force[2]
+        self._step(self._model, self._data)
+        self._force[:] = 0.0
+        return self._x.tolist(), self._w.tolist()
+
+    def advance_freely(self, counts: Sequence[int]) -> list[BallState]:
+        """Advance by each number of steps in `counts` under gravity alone; return the states."""
+        states: list[BallState] = []
+        for count in counts:
+            self._step(self._model, self._data, count)
+            states.append((self._x.tolist(), self._w.tolist()))
+        return states
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            name: self.__dict__[name] for name in ("_world", "_stiffness") if name in self.__dict__
+        }
+
+
+class MujocoBall(MujocoMover):
+    """Ball whose impact MuJoCo's contact solves in one step.
+
+    See `sims.engines.external.ball_rollout.BallWithImpacts`.
+    """
+
+    def reset_world(self, constants: dict[str, float]) -> None:
+        """Prepare a world for these constants, with contact switched off."""
+        super().reset_world(constants)
+        self._held = False
+
+    @property
+    def model(self) -> Any:
+        """The compiled model that `reset_world` has prepared."""
+        return self._model
+
+    def load_state(self, held: bool, before: Any) -> None:
+        """Load the contact state of another ball; its step and position must be set afterwards.
+
+        Args:
+            held: whether contact supports the ball.
+            before: acceleration of the previous step, with which MuJoCo's solver is warm-started.
+        """
+        self._held = held
+        self._meets(held)
+        self._hertz = math.nan
+        self._data.qacc_warmstart[:] = before
+
+    @property
+    def exported_state(self) -> tuple[bool, int, Any]:
+        """State to continue as another ball: `held` of `load_state`, disable flags, `before` of `load_state`."""
+        return self._held, self._model.opt.disableflags, self._data.qacc_warmstart
+
+    def get_resting_solref(self, step: float) -> tuple[float, float]:
+        """Return the ``solref`` of contact that supports a resting ball, for this step."""
+        hertz = 1.0 / step
+        return -0.1 * hertz**2, -hertz  # (4)
+
+    def set_step(self, step: float) -> None:
+        """Set the step in seconds."""
+        super().set_step(step)
+        if self._held:
+            self._model.geom_solref[:] = self.get_resting_solref(step)
+
+    def solve_impact(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
+        """Return the velocity after an impact, from MuJoCo's contact solver in one short step.
+
+        Gravity is compensated, and friction is applied as an impulse.
+
+        Args:
+            x: position at the impact.
+            v: velocity before the impact.
+            restitution: restitution coefficient.
+            friction: friction coefficient.
+        """
+        self._held = False
+        self.set_step(_IMPACT)
+        self.set_state((x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION), v)
+        self._contact(0.0, (1.0 + restitution) * self._hertz)  # (3)
+        # The impact removes tangential speed mu (1 + e) |vn| (`engines.ground_contact`), in this
+        # one # step.
+        along = math.hypot(v[0], v[1])
+        share = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) if along else 0.0
+        lost = share * self._hertz
+        self._meets(True)
+        _, after = self.advance((-lost * v[0], -lost * v[1], self._gravity))
+        self._meets(False)
+        return after
+
+    def set_resting_contact(self) -> None:
+        """Set contact that supports the ball: damping, and a weak spring."""
+        self._held = True
+        self._meets(True)
+        # (4) depends on the step; if a step is already set, the contact is set for it.
+        if not math.isnan(self._hertz):
+            self.set_step(1.0 / self._hertz)

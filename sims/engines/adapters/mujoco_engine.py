@@ -1,0 +1,208 @@
+"""MuJoCo engine: forces through ``qfrc_applied``, impacts through its contact solver.
+
+The module ``pendulum_mujoco_world`` in the system's package writes the world of a system; its
+interface is specified in `sims.engines.external.world_interface`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Protocol, cast
+
+from sims.core.simulator import InputError
+from sims.core.system import Engine, IntegrationBatch, System, Trajectories
+from sims.core.value_limits import truncate_text
+from sims.engines.adapters import mujoco_ball_batch, mujoco_joint_batch
+from sims.engines.adapters.mujoco_bodies import (
+    CompiledWorld,
+    MujocoBall,
+    MujocoJoint,
+    import_mujoco,
+)
+from sims.engines.adapters.mujoco_soft_contact import MujocoSoftBall
+from sims.engines.external import (
+    ball_batch,
+    ball_rollout,
+    batch_grouping,
+    joint_batch,
+    joint_rollout,
+    native_contact,
+)
+from sims.engines.external.external_engine import (
+    ElementWork,
+    RolloutFunction,
+    Trajectory,
+    integrate_batch,
+    integrate_one_by_one,
+    resolve_time_step,
+)
+from sims.engines.external.world_interface import (
+    MujocoJointWorldModule,
+    MujocoWorldModule,
+    find_world_module,
+)
+
+REQUIRED_PACKAGES = ("mujoco",)
+
+_STIFFNESS = 1e5
+"""Default stiffness of the native contact in 1/s^2: contacts then last 10 ms."""
+_MOST_THREADS = 1024
+_OWN_STEP = 2e-3
+"""MuJoCo's default time step in seconds."""
+
+
+def make_engine(
+    system: type[System],
+    *,
+    time_step: float | None = None,
+    native_contact: bool = False,
+    stiffness: float | None = None,
+    threads: int = 1,
+) -> Engine:
+    """Make the MuJoCo engine for one simulator.
+
+    Args:
+        system: system that the engine will integrate.
+        time_step: longest step in seconds (2 ms with `native_contact`); each sampling interval is
+            divided into equal steps not longer than this.
+        native_contact: for a bouncing system: use MuJoCo's soft contact, a spring and a damper
+            whose damping is chosen for the restitution, stepped and read at first order
+            (`sims.engines.external.native_contact`).
+        stiffness: with `native_contact`: stiffness of the contact in 1/s^2 (1e5: contacts of 10
+            ms).
+        threads: number of threads for batch elements that are stepped together; the results do not
+            depend on it. Use 1 if other processes use the other cores.
+
+    Returns:
+        The engine.
+
+    Raises:
+        InputError: a setting is not valid.
+    """
+    if native_contact and time_step is None:
+        time_step = _OWN_STEP
+    step = resolve_time_step(time_step, system)
+    if not (isinstance(threads, int) and 1 <= threads <= _MOST_THREADS):
+        raise InputError(
+            f"threads must be a whole number from 1 to {_MOST_THREADS}, found {truncate_text(str(threads))}"
+        )
+    if not native_contact:
+        if stiffness is not None:
+            raise InputError(
+                "setting stiffness belongs to MuJoCo's contact as it comes: set"
+                " native_contact = true"
+            )
+        return MujocoEngine(system, step, threads=threads)
+    if not system.bounces:
+        raise InputError(f"system {system.name} does not bounce: leave native_contact out")
+    if stiffness is not None and not 0 < stiffness < math.inf:
+        raise InputError(f"stiffness must be a positive number, found {stiffness}")
+    return MujocoEngine(system, step, stiffness or _STIFFNESS)
+
+
+class _Closable(Protocol):
+    """Object that is closed together with the engine."""
+
+    def close(self) -> None:
+        """Release stored worlds."""
+        ...
+
+
+class MujocoEngine:
+    """MuJoCo engine for one system.
+
+    Batch elements are integrated together if `mujoco.batch` is available and there are enough of
+    them, otherwise one after the other in one world.
+    """
+
+    name: str = "mujoco"
+    requires: tuple[str, ...] = REQUIRED_PACKAGES
+
+    def __init__(
+        self,
+        system: type[System],
+        largest_step: float,
+        stiffness: float | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.largest_step = largest_step
+        self._rollouts: RolloutFunction | None = None
+        self._many: _Closable | None = None
+        asked = MujocoWorldModule if system.bounces else MujocoJointWorldModule
+        module, self._reason = find_world_module(system, "mujoco_world", asked)
+        if module is None:
+            return
+        self._world = CompiledWorld(cast(MujocoWorldModule, module).model)
+        if stiffness is not None:
+            self._alone(
+                partial(
+                    native_contact.integrate_native_ball, MujocoSoftBall(self._world, stiffness)
+                )
+            )
+        elif system.bounces:
+            alone = partial(ball_rollout.integrate_ball, MujocoBall(self._world))
+            balls = mujoco_ball_batch.MujocoBallBatch(
+                CompiledWorld(cast(MujocoWorldModule, module).model), threads
+            )
+            self._together(alone, balls, ball_batch.BallBatchIntegrator(balls))
+        else:
+            body = cast(MujocoJointWorldModule, module)
+            on_joint = partial(joint_rollout.integrate_joint, MujocoJoint(self._world, body))
+            bodies = mujoco_joint_batch.MujocoJointBatch(self._world, body, threads)
+            self._together(on_joint, bodies, joint_batch.JointBatchIntegrator(bodies))
+
+    def _alone(self, rollout: Callable[[ElementWork], Trajectory]) -> None:
+        """Set up integration of one element after the other."""
+        self._rollouts = partial(integrate_one_by_one, rollout, self.close)
+
+    def _together(
+        self,
+        alone: Callable[[ElementWork], Trajectory],
+        many: _Closable,
+        company: batch_grouping.BatchIntegrator,
+    ) -> None:
+        """Set up integration of elements together, if this MuJoCo version can step batches."""
+        if not mujoco_joint_batch.is_batch_available():
+            self._alone(alone)
+            return
+        self._many = many
+        self._rollouts = partial(batch_grouping.integrate_grouped, alone, company, self.close)
+
+    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+        """Integrate all batch elements; see `Engine`."""
+        assert self._rollouts is not None, "a system that the engine refuses"
+        with _suppress_warnings():
+            return integrate_batch(lanes, self._rollouts, self.close)
+
+    def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
+        """Return why the engine cannot integrate the system; see `Engine`."""
+        return self._reason
+
+    def close(self) -> None:
+        """Release the MuJoCo worlds; the next integration makes new ones."""
+        if self._rollouts is not None:
+            self._world.close()
+        if self._many is not None:
+            self._many.close()
+
+
+@contextlib.contextmanager
+def _suppress_warnings() -> Iterator[None]:
+    """Suppress MuJoCo's warnings of instability, which it would write to a file.
+
+    Unstable batch elements become NaN.
+    """
+    mujoco = import_mujoco()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_ignore)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _ignore(message: str) -> None:
+    """Ignore a warning."""

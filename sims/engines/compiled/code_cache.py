@@ -1,0 +1,89 @@
+"""Cache of machine code on disk.
+
+The name of a file contains a hash of everything on which the code depends. One process compiles the
+code while the others wait.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+_DIGEST = hashlib.sha256().digest_size
+
+
+def is_compilation_disabled() -> bool:
+    """Return whether the user has disabled compilation."""
+    return os.environ.get("SIMGAP_COMPILED") == "off"
+
+
+def get_cache_folder() -> Path:
+    """Return the cache folder: $SIMGAP_COMPILED, else simgap/ in the user's cache folder."""
+    if named := os.environ.get("SIMGAP_COMPILED"):
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
+
+
+def read_cached(path: Path) -> bytes | None:
+    """Return the cached content; None if it does not exist or is damaged."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    content = data[_DIGEST:]
+    return content if hashlib.sha256(content).digest() == data[:_DIGEST] else None
+
+
+def make_cached(path: Path, make: Callable[[], bytes], waits: Callable[[], None]) -> bytes:
+    """Return the cached content of a file, made by one of all processes that request it.
+
+    Args:
+        path: path of the file.
+        make: function that makes the content if it does not exist.
+        waits: called once if another process is making the content.
+
+    Returns:
+        The content.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(path.with_suffix(".lock"), waits):
+        # Another process may have made it meanwhile.
+        content = read_cached(path)
+        if content is None:
+            content = make()
+            _write(path, content)
+    return content
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file atomically, with the hash of its content."""
+    # The temporary name is fixed, so that the file of a killed process is overwritten by the next.
+    partial = path.with_suffix(".part")
+    try:
+        partial.write_bytes(hashlib.sha256(content).digest() + content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _alone(path: Path, waits: Callable[[], None]) -> Iterator[None]:
+    """Hold an exclusive lock between processes, if the operating system supports it."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with path.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            waits()
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

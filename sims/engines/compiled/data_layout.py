@@ -1,0 +1,188 @@
+"""Data layout of the compiled engine: tuples of arrays, and the rows of its tables."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+FloatArray = NDArray[np.float64]
+Row = NDArray[np.float64]
+"""Array with one number per batch element."""
+IntTable = NDArray[np.int64]
+
+BLOCK_WIDTH = 32
+"""Number of slots of a block: elements that are stepped together."""
+MAX_COORDINATES = 6
+"""Maximum number of coordinates of a system."""
+
+
+class ProgramArrays(NamedTuple):
+    """Force program of a system with some effects: instructions on registers.
+
+    Attributes:
+        code: (n, 5) operation, result register, three argument registers.
+        ends: (4,) boundaries of its parts: values that depend on parameters alone; forces; impacts.
+        rows: (11,) input registers of t, x, v, inputs, parameters, restitution, friction of the
+            ground and speed; output registers of the limit of dry friction, restitution and
+            friction of the ground.
+        out: (D,) registers of the force.
+        flags: (5,) number of dimensions D; whether dry friction acts; whether forces of effects
+            act; whether it bounces; number of coordinates, counted from the first, on which dry
+            friction acts.
+    """
+
+    code: IntTable
+    ends: IntTable
+    rows: IntTable
+    out: IntTable
+    flags: IntTable
+
+
+class BatchArrays(NamedTuple):
+    """Batch elements of one program; N of them are selected out of L.
+
+    Attributes:
+        order: (N,) selected elements in the order in which they begin.
+        parameters: (N, P) parameters of the program, in that order.
+        mass: (L,) generalised inertia.
+        x: (L, D) initial position.
+        v: (L, D) initial velocity.
+        steps: (L or 1, S) step sizes in seconds.
+        inputs: (U, L or 1, S) inputs.
+        longest: (L,) longest step in seconds.
+        planned: (L,) number of planned steps.
+        ground: (4, L) floor, restitution, friction, minimum remaining fraction of tangential speed.
+        every: number of steps between recorded states.
+        patience: maximum number of steps of an element, as a multiple of the planned ones.
+        kept: (L, R, 3 D) recorded states, to be filled in.
+    """
+
+    order: IntTable
+    parameters: FloatArray
+    mass: FloatArray
+    x: FloatArray
+    v: FloatArray
+    steps: FloatArray
+    inputs: FloatArray
+    longest: FloatArray
+    planned: FloatArray
+    ground: FloatArray
+    every: int
+    patience: float
+    kept: FloatArray
+
+
+class BlockBuffers(NamedTuple):
+    """Buffers of a block.
+
+    Attributes:
+        r: (., WIDTH) registers.
+        a: (., WIDTH) floating-point numbers of each slot; rows as below.
+        n: (., WIDTH) integers of each slot; rows as below.
+    """
+
+    r: FloatArray
+    a: FloatArray
+    n: IntTable
+
+
+# Entries of `ProgramArrays.rows`.
+IN_T, IN_X, IN_V, IN_U, IN_P, IN_E, IN_MU, IN_SPEED, OUT_LIMIT, OUT_E, OUT_MU = range(11)
+# Entries of `ProgramArrays.flags`.
+DIMENSIONS, DRY, PUSHED, BOUNCES, GUIDED = range(5)
+# Rows of `BatchArrays.ground`.
+FLOOR, RESTITUTION, RUBBING, LEAST = range(4)
+# Rows of `BlockBuffers.a`: first the rows with one number per slot, then the first of the LARGEST
+# rows of # each vector.
+(
+    T,
+    LEFT,
+    LIMIT,
+    LONGEST,
+    PEAK,
+    RUBBED,
+    TRY,
+    H,
+    MASS,
+    BEFORE,
+    AFTER,
+    TAKEN,
+    STARTS,
+    BEND,
+    SPARE,
+    LEVEL,
+    FIRST,
+) = range(17)
+X, V, K1, K2, K3, K4, NEXT_X, NEXT_V, WAY, F1, F2, F3, F4, ROWS = range(
+    FIRST, FIRST + 14 * MAX_COORDINATES, MAX_COORDINATES
+)
+# Rows of `BlockBuffers.n`.
+PLACE, LANE, STEP, GOAL, EVENTS, SHORTS, BEGINS, STICKS, RESTS, IDLE, BUSY, ASKED = range(12)
+STATE_ROW_COUNT = ASKED + 6
+
+NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
+"""Event to which a slot's next step leads."""
+
+
+def allocate_block(registers: int) -> BlockBuffers:
+    """Allocate the buffers of a block with this number of registers."""
+    r = np.zeros((registers, BLOCK_WIDTH))
+    return BlockBuffers(
+        r, np.zeros((ROWS, BLOCK_WIDTH)), np.zeros((STATE_ROW_COUNT, BLOCK_WIDTH), dtype=np.int64)
+    )
+
+
+def check_array_layout(
+    program: ProgramArrays,
+    work: BatchArrays,
+    block: BlockBuffers,
+    w: int,
+    spans: FloatArray,
+    parts: FloatArray,
+) -> None:
+    """Check that all arrays have the specified shapes, because machine code does not check them.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+        spans: (L,) step sizes in seconds.
+        parts: (L,) numbers of parts.
+
+    Raises:
+        ValueError: an array is not as specified.
+    """
+    lanes, d = work.x.shape
+    chosen, columns = work.parameters.shape
+    steps = work.steps.shape[1]
+    rows = program.rows
+    whole = [
+        *((program.code, (len(program.code), 5)), (program.ends, (4,)), (rows, (11,))),
+        *((program.out, (d,)), (program.flags, (5,))),
+        *((work.order, (chosen,)), (block.n, (STATE_ROW_COUNT, BLOCK_WIDTH))),
+    ]
+    real = [
+        *((work.parameters, (chosen, columns)), (work.x, (lanes, d)), (work.v, (lanes, d))),
+        *((work.mass, (lanes,)), (work.longest, (lanes,)), (work.planned, (lanes,))),
+        *((spans, (lanes,)), (parts, (lanes,)), (work.ground, (4, lanes))),
+        (work.steps, (1 if len(work.steps) == 1 else lanes, steps)),
+        (work.inputs, (len(work.inputs), 1 if work.inputs.shape[1] == 1 else lanes, steps)),
+        (work.kept, (lanes, steps // work.every + 1, 3 * d)),
+        *((block.r, (len(block.r), BLOCK_WIDTH)), (block.a, (ROWS, BLOCK_WIDTH))),
+    ]
+    for arrays, kind in ((whole, np.int64), (real, np.float64)):
+        for array, shape in arrays:
+            if array.shape != shape or array.dtype != kind or not array.flags.c_contiguous:
+                raise ValueError(f"expected {shape} {kind.__name__}, found {array.shape}")
+    groups = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
+    if (
+        groups != (d, len(work.inputs), columns)
+        or not (1 <= w <= BLOCK_WIDTH and 1 <= d <= MAX_COORDINATES and chosen and steps)
+        or not 0 <= work.order.min() <= work.order.max() < lanes
+        or program.code.max(initial=0) >= len(block.r)
+    ):
+        raise ValueError("the program is not one for these lanes")

@@ -1,0 +1,86 @@
+"""Expression graph of the numbers that system and effects compute for one batch element.
+
+A node is an operation on nodes, an input or a constant. Equal expressions are one node
+(common-subexpression elimination), so that a value used by two effects is computed once.
+Expressions of constants are evaluated here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+OPERATIONS: tuple[str, ...] = (
+    *("add", "subtract", "multiply", "divide", "negative", "absolute", "sqrt"),
+    *("maximum", "minimum", "where", "sin", "cos", "exp", "power"),
+    *("less", "less_equal", "equal", "not_equal", "logical_and", "logical_or", "logical_not"),
+    *("sign", "tan", "tanh", "arctan", "arctan2", "log", "expm1", "log1p"),
+    *("floor", "ceil", "rint", "sinh", "cosh", "arcsin", "arccos", "hypot", "copysign"),
+)
+"""Operations in the order of their codes; all except `where` are NumPy functions of that name."""
+OPERATION_CODES = {name: code for code, name in enumerate(OPERATIONS)}
+
+CONSTANT, LANE, MOMENT, IMPACT = range(4)
+"""Change frequency of a value: never, per batch element, per evaluation, or per impact."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExpressionNode:
+    """Node of an expression graph: one number.
+
+    Attributes:
+        operation: a name of `OPERATIONS`, ``input`` or ``constant``.
+        args: argument nodes.
+        value: value of a constant.
+        change_frequency: change frequency, from CONSTANT to IMPACT.
+    """
+
+    operation: str
+    args: tuple[ExpressionNode, ...] = ()
+    value: float = 0.0
+    change_frequency: int = CONSTANT
+
+
+class ExpressionGraph:
+    """Factory of nodes in which equal expressions are one node."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[object, ...], ExpressionNode] = {}
+
+    def make_constant(self, value: float) -> ExpressionNode:
+        """Return the node of a number; zeros of different sign and different NaN are distinct."""
+        bits = np.float64(value).tobytes()
+        return self._once(
+            ("constant", bits), lambda: ExpressionNode("constant", value=float(value))
+        )
+
+    def make_input(self, changes: int) -> ExpressionNode:
+        """Return a new input node with this change frequency."""
+        return ExpressionNode("input", change_frequency=changes)
+
+    def make_operation(self, operation: str, *args: ExpressionNode) -> ExpressionNode:
+        """Return the node of an operation on nodes.
+
+        Args:
+            operation: a name of `OPERATIONS`.
+            *args: argument nodes.
+        """
+        if all(arg.change_frequency == CONSTANT for arg in args):
+            return self.make_constant(_computed(operation, [arg.value for arg in args]))
+        changes = max(arg.change_frequency for arg in args)
+        key = operation, *map(id, args)
+        return self._once(key, lambda: ExpressionNode(operation, args, change_frequency=changes))
+
+    def _once(self, key: tuple[object, ...], make: Callable[[], ExpressionNode]) -> ExpressionNode:
+        if key not in self._known:
+            self._known[key] = make()
+        return self._known[key]
+
+
+def _computed(operation: str, values: list[float]) -> float:
+    with np.errstate(all="ignore"):
+        if operation == "where":
+            return values[1] if values[0] else values[2]
+        return float(getattr(np, operation)(*map(np.float64, values)))

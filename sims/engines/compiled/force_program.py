@@ -1,0 +1,337 @@
+"""Force program of a system with effects: traced once and written as instructions.
+
+A program has three parts: values that depend on an element's parameters alone, computed when an
+element begins; the forces and the limit of dry friction, computed at every evaluation; and the
+contact parameters with effects, computed at impacts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.system import Contact, Effect, Force, Friction, StateSnapshot, System
+from sims.engines.compiled.data_layout import (
+    BLOCK_WIDTH,
+    DRY,
+    GUIDED,
+    MAX_COORDINATES,
+    BlockBuffers,
+    FloatArray,
+    IntTable,
+    ProgramArrays,
+    allocate_block,
+)
+from sims.engines.compiled.expression_graph import (
+    IMPACT,
+    LANE,
+    MOMENT,
+    OPERATION_CODES,
+    ExpressionGraph,
+    ExpressionNode,
+)
+from sims.engines.compiled.node_arrays import NotTraceableError, make_constant_nodes
+from sims.engines.compiled.traced_array import TracedArray
+
+MAX_REGISTERS = 4000
+"""Maximum number of registers of a program."""
+MAX_CACHED_PROGRAMS = 2000
+"""Maximum number of cached programs of a system."""
+
+
+class CompiledModel(NamedTuple):
+    """Program with its constants.
+
+    Attributes:
+        program: instructions and layout.
+        constants: (C, WIDTH) values of the registers from `first` on.
+        first: first register of the constants.
+        registers: number of registers.
+    """
+
+    program: ProgramArrays
+    constants: FloatArray
+    first: int
+    registers: int
+
+    @property
+    def has_no_events(self) -> bool:
+        """Whether no event can occur within a step."""
+        return not self.program.flags[DRY:GUIDED].any()
+
+    def allocate_buffers(self) -> BlockBuffers:
+        """Allocate buffers in which the constants are set."""
+        block = allocate_block(self.registers)
+        block.r[self.first : self.first + len(self.constants)] = self.constants
+        return block
+
+
+class InputNames(NamedTuple):
+    """Input names and sizes of batch elements, in the order of the parameters.
+
+    Attributes:
+        constants: names of the constants.
+        inputs: names of the inputs.
+        parameters: number of the system's parameters.
+        coordinates: number of coordinates.
+    """
+
+    constants: tuple[str, ...]
+    inputs: tuple[str, ...]
+    parameters: int
+    coordinates: int
+
+
+class EffectProgram(NamedTuple):
+    """Traced effect as a part of a program.
+
+    Attributes:
+        coefficients: (K, 1, 1) input nodes of the coefficients.
+        force: (1, D) force, for a force effect.
+        limit: (1, 1) friction limit, for a friction effect.
+    """
+
+    coefficients: Any
+    force: TracedArray | None
+    limit: TracedArray | None
+
+
+class SystemTracer:
+    """Traced system; effects are traced on first use.
+
+    Args:
+        system: system to trace.
+        names: input names and sizes.
+
+    Raises:
+        UntracedError: the system cannot be traced.
+    """
+
+    def __init__(self, system: System, names: InputNames) -> None:
+        if not 1 <= names.coordinates <= MAX_COORDINATES:
+            raise NotTraceableError(f"it has {names.coordinates} coordinates")
+        graph = ExpressionGraph()
+        self.graph = graph
+        self.bounces = system.bounces
+        self.bends = system.bends
+        self.guided = system.guided or names.coordinates
+        self.t = make_input_vector(graph, 1, MOMENT)
+        self.x = make_input_vector(graph, names.coordinates, MOMENT)
+        self.v = make_input_vector(graph, names.coordinates, MOMENT)
+        self.u: dict[str, Any] = {
+            name: make_input_vector(graph, 1, MOMENT) for name in names.inputs
+        }
+        theta = make_input_vector(graph, names.parameters, LANE)
+        constants: dict[str, Any] = {
+            name: make_input_vector(graph, 1, LANE) for name in names.constants
+        }
+        self.e: Any
+        self.mu: Any
+        self.speed: Any
+        self.e, self.mu, self.speed = (make_input_vector(graph, 1, IMPACT) for _ in range(3))
+        self.parameters = collect_nodes(theta, *constants.values())
+        self._moment = StateSnapshot(system, theta, constants, self.t, self.x, self.v, self.u)
+        self._shape = 1, names.coordinates
+        self._force = self._shaped(system.force(self._moment), self._shape)
+        self._pieces: dict[type[Effect], EffectProgram] = {}
+        self._models: dict[tuple[type[Effect], ...], CompiledModel] = {}
+
+    def build_model(self, effects: Sequence[Effect]) -> CompiledModel:
+        """Return the program of the system with these effects.
+
+        Raises:
+            UntracedError: an effect cannot be traced.
+        """
+        key = tuple(map(type, effects))
+        if key not in self._models:
+            if len(self._models) == MAX_CACHED_PROGRAMS:
+                self._models.clear()
+            self._models[key] = _model(self._composed(effects))
+        return self._models[key]
+
+    def trace_effect(self, effect: Effect) -> EffectProgram:
+        """Return the traced effect.
+
+        Raises:
+            UntracedError: the effect cannot be traced.
+        """
+        kind = type(effect)
+        if kind not in self._pieces:
+            count = len(effect.coefficients)
+            c = make_input_vector(self.graph, count, LANE).T[:, :, None]
+            force = limit = None
+            if isinstance(effect, Force):
+                force = self._shaped(effect.force(c, self._moment), self._shape)
+            elif isinstance(effect, Friction):
+                limit = self._shaped(effect.limit(c, self._moment), (1, 1))
+            self._pieces[kind] = EffectProgram(c, force, limit)
+        return self._pieces[kind]
+
+    def _composed(self, effects: Sequence[Effect]) -> _Composed:
+        force: Any = self._force
+        limit: Any = None
+        e: Any = self.e
+        mu: Any = self.mu
+        parameters = list(self.parameters)
+        for effect in effects:
+            c, own, rubs = self.trace_effect(effect)
+            parameters += collect_nodes(c)
+            if own is not None:
+                force = force + own
+            if rubs is not None:
+                limit = rubs if limit is None else limit + rubs
+            if isinstance(effect, Contact):
+                e = self._shaped(effect.restitution(c, e, self.speed), (1, 1))
+                mu = self._shaped(mu + effect.friction(c), (1, 1))
+        has = [any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)]
+        return _Composed(
+            inputs=[
+                *(
+                    collect_nodes(self.t),
+                    collect_nodes(self.x),
+                    collect_nodes(self.v),
+                    collect_nodes(*self.u.values()),
+                ),
+                *(
+                    parameters,
+                    collect_nodes(self.e),
+                    collect_nodes(self.mu),
+                    collect_nodes(self.speed),
+                ),
+            ],
+            force=collect_nodes(force),
+            limit=[] if limit is None else collect_nodes(limit),
+            impact=collect_nodes(e, mu),
+            flags=[self._shape[1], has[0], has[1] or self.bends, self.bounces, self.guided],
+        )
+
+    def _shaped(self, values: Any, shape: tuple[int, int]) -> TracedArray:
+        """Return the result of an array function, broadcast to its expected shape."""
+        if not isinstance(values, TracedArray):
+            values = TracedArray(self.graph, make_constant_nodes(self.graph, values))
+        return TracedArray(self.graph, np.broadcast_to(values.nodes, shape))
+
+
+class _Composed(NamedTuple):
+    """Input and output nodes of a program, in order."""
+
+    inputs: list[list[ExpressionNode]]
+    force: list[ExpressionNode]
+    limit: list[ExpressionNode]
+    impact: list[ExpressionNode]
+    flags: list[int]
+
+
+def _model(composed: _Composed) -> CompiledModel:
+    """Return the composed expressions as a program."""
+    outputs = [*composed.force, *composed.limit, *composed.impact]
+    written = emit_instructions(composed.inputs, outputs)
+    limit = written.place[composed.limit[0]] if composed.limit else -1
+    rows = [*written.rows, limit, *(written.place[node] for node in composed.impact)]
+    program = ProgramArrays(
+        code=written.code,
+        ends=written.ends,
+        rows=np.array(rows, dtype=np.int64),
+        out=np.array([written.place[node] for node in composed.force], dtype=np.int64),
+        flags=np.array(composed.flags, dtype=np.int64),
+    )
+    constants = np.repeat(written.values[:, None], BLOCK_WIDTH, axis=1)
+    return CompiledModel(program, constants, written.first, len(written.place))
+
+
+class InstructionList(NamedTuple):
+    """Expressions as instructions on registers.
+
+    Attributes:
+        code: (n, 5) operation, result register, three argument registers.
+        ends: (4,) boundaries of the instructions per element, per evaluation and per impact.
+        rows: first register of each group of inputs.
+        place: register of each node.
+        first: first register of the constants.
+        values: (C,) constants.
+    """
+
+    code: IntTable
+    ends: IntTable
+    rows: list[int]
+    place: dict[ExpressionNode, int]
+    first: int
+    values: FloatArray
+
+
+def emit_instructions(
+    groups: Sequence[Sequence[ExpressionNode]], outputs: Sequence[ExpressionNode]
+) -> InstructionList:
+    """Return instructions that compute outputs from groups of inputs.
+
+    Args:
+        groups: groups of input nodes; the registers of a group are consecutive.
+        outputs: output nodes.
+
+    Raises:
+        UntracedError: too many registers are needed.
+    """
+    place: dict[ExpressionNode, int] = {}
+    rows = []
+    for group in groups:
+        rows.append(len(place))
+        for node in group:
+            place[node] = len(place)
+    first = len(place)
+    order = _ordered(outputs)
+    # Constants have consecutive registers, so that they are set by one assignment.
+    values = []
+    for node in order:
+        if node.operation == "constant":
+            place[node] = len(place)
+            values.append(node.value)
+    parts: dict[int, list[list[int]]] = {LANE: [], MOMENT: [], IMPACT: []}
+    for node in order:
+        if node.args:
+            place[node] = len(place)
+            args = [place[arg] for arg in node.args]
+            args += [args[0]] * (3 - len(args))
+            parts[node.change_frequency].append(
+                [OPERATION_CODES[node.operation], place[node], *args]
+            )
+    if len(place) > MAX_REGISTERS:
+        raise NotTraceableError("it computes too much")
+    lines = [line for part in parts.values() for line in part]
+    ends = np.cumsum([0, *(len(part) for part in parts.values())])
+    code = np.array(lines, dtype=np.int64).reshape(-1, 5)
+    return InstructionList(code, ends.astype(np.int64), rows, place, first, np.array(values))
+
+
+def _ordered(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
+    """Return the outputs and all nodes they depend on, each after its arguments."""
+    order: dict[ExpressionNode, None] = {}
+    stack = [(node, False) for node in reversed(outputs)]
+    while stack:
+        node, ready = stack.pop()
+        if ready:
+            order[node] = None
+        elif node not in order:
+            stack.append((node, True))
+            stack += [(arg, False) for arg in reversed(node.args)]
+    return list(order)
+
+
+def make_input_vector(graph: ExpressionGraph, size: int, changes: int) -> Any:
+    """Return a traced array (1, size) of new inputs with this change frequency.
+
+    Args:
+        graph: graph that contains the nodes.
+        size: number of inputs.
+        changes: change frequency.
+    """
+    nodes = np.empty((1, size), dtype=object)
+    for k in range(size):
+        nodes[0, k] = graph.make_input(changes)
+    return TracedArray(graph, nodes)
+
+
+def collect_nodes(*arrays: TracedArray) -> list[ExpressionNode]:
+    """Return all nodes of traced arrays, in order."""
+    return [node for array in arrays for node in array.nodes.ravel()]

@@ -1,0 +1,105 @@
+"""Step a block whose elements share their steps and have no events.
+
+They are elements of a smooth program whose steps are not divided. The results are, bit for bit,
+those of `sims.engines.compiled.element_stepping`, which checks every element in every step.
+"""
+
+from __future__ import annotations
+
+from sims.engines.compiled.data_layout import (
+    DIMENSIONS,
+    IN_U,
+    K1,
+    NEXT_V,
+    NEXT_X,
+    STARTS,
+    STEP,
+    BatchArrays,
+    BlockBuffers,
+    H,
+    ProgramArrays,
+    T,
+    V,
+    X,
+)
+from sims.engines.compiled.dynamics import compute_frictionless_acceleration, evaluate_forces
+from sims.engines.compiled.element_clock import load_element, record_state, set_inputs
+from sims.engines.compiled.element_stepping import try_step
+from sims.engines.compiled.interpreter import run_instructions
+
+
+def step_in_lockstep(
+    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int
+) -> None:
+    """Make all steps of all elements, w at a time.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
+    a = block.a
+    end = work.steps.shape[1]
+    for first in range(0, work.order.size, w):
+        count = min(w, work.order.size - first)
+        for i in range(w):
+            load_element(program, work, block, i, first + min(i, count - 1))
+        run_instructions(program.code, program.ends[0], program.ends[1], block.r, w)
+        for step in range(end + 1):
+            evaluate_forces(program, block, w)
+            compute_frictionless_acceleration(program, block, w, K1)
+            if step % work.every == 0:
+                for i in range(count):
+                    record_state(program, work, block, i, step // work.every)
+            if step == end:
+                break
+            h = work.steps[0, step]
+            for i in range(w):
+                a[H, i] = h
+            try_step(program, block, w)
+            accept_step(program, block, w, h)
+            set_shared_inputs(program, work, block, w, step + 1)
+
+
+def accept_step(program: ProgramArrays, block: BlockBuffers, w: int, h: float) -> None:
+    """Accept the step of h seconds just tried.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+        h: step size in seconds.
+    """
+    a = block.a
+    for k in range(program.flags[DIMENSIONS]):
+        for i in range(w):
+            a[X + k, i] = a[NEXT_X + k, i]
+            a[V + k, i] = a[NEXT_V + k, i]
+    for i in range(w):
+        a[STARTS, i] += h
+        a[T, i] = a[STARTS, i]
+
+
+def set_shared_inputs(
+    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int, step: int
+) -> None:
+    """Set the inputs of this step; after the last step, those of the last step.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+        step: index of the step.
+    """
+    if work.inputs.shape[1] > 1:
+        for i in range(w):
+            block.n[STEP, i] = step
+            set_inputs(program, work, block, i)
+        return
+    at = min(step, work.steps.shape[1] - 1)
+    for u in range(work.inputs.shape[0]):
+        value = work.inputs[u, 0, at]
+        for i in range(w):
+            block.r[program.rows[IN_U] + u, i] = value

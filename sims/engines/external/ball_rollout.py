@@ -1,0 +1,336 @@
+"""Integrate a ball with an engine at second order in the step, with impacts at their exact time.
+
+The engine's contact solver computes the impacts.
+
+In flight the engine's velocity w belongs to the time half a step before the position (see
+`sims.engines.external.external_engine`): with acceleration a, a step of length h is
+
+    w' = v + h/2 a                                                         (1)
+    x' = x + h w'                                                          (2)
+    v' = w' + h/2 a'                                                       (3)
+
+where the engine adds gravity g itself and receives the additional force per unit mass that leads to
+(1):
+
+    f = (v + h/2 a - w) / h - g                                            (4)
+
+Under gravity alone this is the exact parabola. A step that would pass the ground is cut at the
+impact: from height H above the ground, with upward speed u and upward acceleration l, the impact is
+
+    s = (u + r) / -l = 2 H / (r - u),    r = sqrt(u^2 - 2 l H)             (5)
+
+seconds away. There the engine solves the contact in a separate step, of which only the change of
+velocity is used, and the rest of the step follows. The error of an impact is therefore that of the
+flight: of second order in h, and zero under gravity alone.
+
+The condition for the end of bouncing is that of the batch engine (`sims.engines.ground_contact`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+from sims.engines.external.ball_forces import (
+    BallState,
+    EffectForce,
+    ImpactParameters,
+    Vector,
+    get_gravity,
+    make_trajectory,
+)
+from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
+
+_NO_TIME = 1e-12
+"""Duration in seconds that is too short for a step."""
+CONTACT_PENETRATION = 1e-9
+"""Depth in metres at which a ball is placed inside the ground for contact.
+
+It is larger than rounding, so that contact certainly acts.
+"""
+
+
+class BallBody(Protocol):
+    """Ball in an engine; vectors are x, y, z, and forces are per unit mass."""
+
+    def reset_world(self, constants: dict[str, float]) -> None:
+        """Prepare the world for a rollout, independent of the previous one."""
+        ...
+
+    def set_step(self, step: float) -> None:
+        """Set the step in seconds."""
+        ...
+
+    def set_state(self, x: Vector, w: Vector) -> None:
+        """Set the position and the engine's velocity."""
+        ...
+
+    def advance(self, force: Vector) -> BallState:
+        """Advance by one step with a force per unit mass (m/s^2) in addition to gravity."""
+        ...
+
+    def advance_freely(self, counts: Sequence[int]) -> list[BallState]:
+        """Advance by each number of steps in `counts` under gravity alone.
+
+        Returns:
+            The state after each count.
+        """
+        ...
+
+
+class BallWithImpacts(BallBody, Protocol):
+    """Ball over level ground."""
+
+    def solve_impact(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
+        """Return the velocity after the engine's contact with the ground at x.
+
+        Nothing else moves. `set_state` must be called afterwards.
+
+        Args:
+            x: position at the impact.
+            v: velocity before the impact.
+            restitution: restitution coefficient.
+            friction: friction coefficient.
+        """
+        ...
+
+    def set_resting_contact(self) -> None:
+        """Set contact that only supports the resting ball; `set_state` must be called afterwards."""
+        ...
+
+
+def integrate_ball(ball: BallWithImpacts, lane: ElementWork) -> Trajectory:
+    """Integrate one batch element.
+
+    Args:
+        ball: ball in an engine.
+        lane: batch element to integrate.
+
+    Returns:
+        Positions, velocities and accelerations (N, 3); NaN if the integration failed.
+    """
+    ball.reset_world(lane.plain_constants)
+    flight = BallRollout(ball, lane)
+    kept = set(lane.recorded_steps.tolist())
+    steps = lane.steps.tolist()
+    rows = [flight.state]
+    for begin, counts in split_into_legs(lane):
+        states = flight.advance_leg(steps[begin], counts)
+        # A leg may end between two samples, where no state is recorded.
+        rows.extend(states if begin + sum(counts) in kept else states[:-1])
+        if not math.isfinite(sum(flight.state)):
+            break
+    return make_trajectory(lane, rows)
+
+
+class BallRollout:
+    """Rollout of one ball.
+
+    Attributes:
+        x: position.
+        v: velocity.
+        a: acceleration.
+        lift: vertical acceleration without the ground.
+        w: the engine's velocity; None when it must be set again.
+        step: the engine's step in seconds; NaN when it must be set again.
+        rests: whether the ball rests on the ground.
+        time: seconds since the start.
+    """
+
+    def __init__(self, ball: BallWithImpacts, lane: ElementWork) -> None:
+        self._ball = ball
+        self._contact = ImpactParameters(lane)
+        self._pull = EffectForce(lane)
+        self._gravity = get_gravity(lane)
+        self._floor = float(lane.system.floor(lane.constants)[0, 0])
+        x, y, z = lane.x.tolist()
+        self.x: Vector = x, y, max(z, self._floor)  # not inside the ground
+        self.v: Vector = lane.v.tolist()
+        self.a = self._gravity
+        self.lift = self._gravity[2]
+        self.w: Vector | None = None
+        self.step = math.nan
+        self.rests = False
+        self.time = 0.0
+        self._look()
+        if self._time_to_ground() == 0.0 and self.v[2] == 0.0:
+            self._rest()
+            self._look()
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """Position, velocity and acceleration."""
+        return (*self.x, *self.v, *self.a)
+
+    def advance_leg(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
+        """Advance by each number of steps in `counts`.
+
+        Args:
+            step: step size in seconds.
+            counts: numbers of steps.
+
+        Returns:
+            Position, velocity and acceleration after each count.
+        """
+        if self._pull.any:
+            return [self._stepwise(step, count) for count in counts]
+        states: list[tuple[float, ...]] = []
+        left = list(counts)
+        while left:
+            # As many whole sample intervals as fit before the impact are integrated in one engine
+            # call.
+            room = math.inf if self.rests else self._time_to_ground() / step
+            whole = 0
+            for count in left:
+                if room < count:
+                    break
+                room -= count
+                whole += 1
+            if whole:
+                states.extend(self._glide(step, left[:whole]))
+                left = left[whole:]
+                continue
+            # Then follow the whole steps before the impact, and the step that contains it.
+            if room >= 1.0:
+                self._glide(step, (int(room),))
+            self.advance_with_impacts(step)
+            left[0] -= int(room) + 1
+            if not left[0]:
+                states.append(self.state)
+                left = left[1:]
+        return states
+
+    def _stepwise(self, step: float, count: int) -> tuple[float, ...]:
+        """Advance by `count` steps that evaluate the forces; return the state."""
+        for _ in range(count):
+            # A resting ball that is pulled upward takes off.
+            if self.rests and self.lift > 0.0:
+                self.rests = False
+                self.w = None
+                self._look()
+            if self.rests or self._time_to_ground() >= step:
+                self._forced(step)
+            else:
+                self.advance_with_impacts(step)
+        return self.state
+
+    def advance_with_impacts(self, left: float) -> None:
+        """Advance by a step that contains impacts.
+
+        Args:
+            left: length of the step in seconds.
+        """
+        while left > _NO_TIME:
+            until = math.inf if self.rests else self._time_to_ground()
+            if until > _NO_TIME:
+                part = min(until, left)
+                if self._pull.any:
+                    self._forced(part)
+                else:
+                    self._glide(part, (1,))
+            if until >= left:
+                return
+            left -= until
+            self._strike()
+
+    def _ready(self, step: float) -> Vector:
+        """Set the engine's step, and its state if necessary; return the engine's velocity."""
+        # The velocity half a step earlier depends on the step size.
+        if step != self.step:
+            self._ball.set_step(step)
+            self.step = step
+            self.w = None
+        if self.w is None:
+            # Equation (1) backwards, from the previous step.
+            half = 0.5 * step
+            x, y, z = self.v
+            ax, ay, az = self.a
+            self.w = x - half * ax, y - half * ay, z - half * az
+            self._ball.set_state(self.x, self.w)
+        return self.w
+
+    def _glide(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
+        """Advance under gravity alone, or at rest; return the state after each count."""
+        self._ready(step)
+        ax, ay, az = self.a
+        x = 0.5 * step * ax
+        y = 0.5 * step * ay
+        z = 0.5 * step * az
+        reached = self._ball.advance_freely(counts)
+        self.x, self.w = reached[-1]
+        states = []
+        for at, w in reached:
+            v = w[0] + x, w[1] + y, w[2] + z  # (3)
+            states.append((*at, *v, ax, ay, az))
+        self.v = states[-1][3:6]
+        return states
+
+    def _forced(self, step: float) -> None:
+        """Advance by one step, in flight or at rest, under all forces."""
+        half = 0.5 * step
+        wx, wy, wz = self._ready(step)
+        x, y, z = self.v
+        ax, ay, az = self.a
+        gx, gy, gz = self._gravity
+        # (4); at rest the engine's contact balances any force that presses the ball on the ground.
+        lift = self.lift - gz if self.rests else (z + half * az - wz) / step - gz
+        along = (x + half * ax - wx) / step - gx
+        across = (y + half * ay - wy) / step - gy
+        self.x, self.w = self._ball.advance((along, across, lift))
+        self.time += step
+        wx, wy, wz = self.w
+        # The acceleration at the end is evaluated at the velocity that (3) gives with the
+        # acceleration at the beginning; then (3) is evaluated with the result.
+        self.v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self.rests else 2.0 * wz - z
+        self._look()
+        ax, ay, az = self.a
+        self.v = wx + half * ax, wy + half * ay, 0.0 if self.rests else wz + half * az
+
+    def _look(self) -> None:
+        """Evaluate the acceleration at the present state; at rest the vertical one is zero."""
+        x, y, z = self._gravity
+        if self._pull.any:
+            felt = self._pull.compute(self.time, self.x, self.v)
+            x = x + felt[0]
+            y = y + felt[1]
+            z = z + felt[2]
+        self.lift = z
+        self.a = x, y, 0.0 if self.rests else z
+
+    def _time_to_ground(self) -> float:
+        """Return the seconds until the ball meets the ground with its present acceleration.
+
+        It is 0 on the ground and inf if the ball never meets it.
+        """
+        gap = max(self.x[2] - self._floor, 0.0)
+        rate = self.v[2]
+        lift = self.a[2]
+        inside = rate * rate - 2.0 * lift * gap
+        # (5): of the two forms, the one without cancellation is used.
+        if rate > 0.0 or (rate == 0.0 and lift < 0.0):
+            return (rate + math.sqrt(inside)) / -lift if lift < 0.0 else math.inf
+        if inside < 0.0 or (rate == 0.0 and lift >= 0.0):
+            return math.inf
+        return 2.0 * gap / (math.sqrt(inside) - rate)
+
+    def _strike(self) -> None:
+        speed = -self.v[2]
+        self.w = None  # contact changes the velocity, so the engine's state must be set again
+        restitution, friction, over = self._contact.compute_with_rest_condition(
+            max(speed, 0.0), -self.a[2]
+        )
+        if speed > 0.0:
+            self.v = self._ball.solve_impact(self.x, self.v, restitution, friction)
+            self.step = math.nan  # the engine's step is still that of the contact
+        if over:
+            self._rest()
+        self._look()
+
+    def _rest(self) -> None:
+        self.rests = True
+        # Slightly inside the ground, so that the engine's contact acts from the first step on.
+        x, y, z = self.x
+        self.x = x, y, min(z, self._floor - CONTACT_PENETRATION)
+        self.v = self.v[0], self.v[1], 0.0
+        self._ball.set_resting_contact()

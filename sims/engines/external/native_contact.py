@@ -1,0 +1,106 @@
+"""Integrate a ball with an engine's native integrator and contact model, without corrections.
+
+The result is of first order in the step.
+
+Effects act through their force at the beginning of each step. Their contact parameters are set when
+the next step may bring the ball to the ground. The smooth acceleration in flight, which no engine
+reports, is
+
+    a = g + f - k v (1 + |v|)                                              (1)
+
+with f the effects' force per unit mass and k the engine's air damping
+(`systems.ball_bullet_world`). There is no vertical acceleration where the ball rests.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.engines.external.ball_forces import (
+    EffectForce,
+    ImpactParameters,
+    Vector,
+    get_gravity,
+    make_trajectory,
+)
+from sims.engines.external.ball_rollout import BallBody
+from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
+
+_SLOW = 0.2
+"""Speed in m/s below which Bullet treats a ball on the ground as resting."""
+
+
+class NativeContactBall(BallBody, Protocol):
+    """Ball over level ground in an engine."""
+
+    damping: float
+    """Coefficient of the engine's air damping: -damping v (1 + |v|), in m/s^2."""
+
+    def set_contact_parameters(self, restitution: float, friction: float) -> None:
+        """Set restitution and friction coefficient of the following impacts."""
+        ...
+
+    def is_near_contact(self, gap: float) -> bool:
+        """Return whether contact may act with the ball's lowest point `gap` m above the ground."""
+        ...
+
+
+def integrate_native_ball(ball: NativeContactBall, lane: ElementWork) -> Trajectory:
+    """Integrate one batch element.
+
+    Args:
+        ball: ball in an engine.
+        lane: batch element to integrate.
+
+    Returns:
+        Positions, velocities and accelerations (N, 3); NaN if the integration failed.
+    """
+    # Unlike in `ball_rollout`, velocity and contact of the engine are used without correction.
+    contact = ImpactParameters(lane)
+    felt = EffectForce(lane)
+    floor = float(lane.system.floor(lane.constants)[0, 0])
+    ball.reset_world(lane.plain_constants)
+    x: Vector = lane.x.tolist()
+    w: Vector = lane.v.tolist()
+    ball.set_contact_parameters(*contact.compute(max(-w[2], 0.0)))
+    ball.set_state(x, w)
+    kept = set(lane.recorded_steps.tolist())
+    steps = lane.steps.tolist()
+    t = 0.0
+    step = math.nan
+    rows = [(*x, *w, *felt.compute(t, x, w))]
+    for begin, counts in split_into_legs(lane):
+        if steps[begin] != step:
+            step = steps[begin]
+            ball.set_step(step)
+        if felt.any or contact.has_contact_effects:
+            states = []
+            for count in counts:
+                for _ in range(count):
+                    # Contact can act only if the predicted end of the next step is near the ground.
+                    if (
+                        contact.has_contact_effects
+                        and w[2] < 0.0
+                        and ball.is_near_contact(x[2] + step * w[2] - floor)
+                    ):
+                        ball.set_contact_parameters(*contact.compute(-w[2]))
+                    x, w = ball.advance(felt.compute(t, x, w))
+                    t += step
+                states.append((*x, *w, *felt.compute(t, x, w)))
+        else:
+            # No force must be evaluated: the engine runs from sample to sample.
+            states = [(*x, *w, 0.0, 0.0, 0.0) for x, w in ball.advance_freely(counts)]
+        rows.extend(states if begin + sum(counts) in kept else states[:-1])
+        if not math.isfinite(sum(rows[-1])):
+            break
+    at, v, pulled = make_trajectory(lane, rows)
+    speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
+    a: Array = get_gravity(lane) + pulled - ball.damping * v * (1.0 + speed)  # (1)
+    for i in np.flatnonzero(np.abs(v[:, 2]) < _SLOW):
+        if ball.is_near_contact(at[i, 2] - floor):
+            a[i, 2] = 0.0
+    return at, v, a

@@ -1,0 +1,180 @@
+"""Interface of the world modules that build a system in PyBullet or MuJoCo.
+
+A system that PyBullet can simulate has a module ``pendulum_bullet_world`` in its package, one that
+MuJoCo
+can simulate a module ``pendulum_mujoco_world``. The required members depend on the system: a body
+on a hinge
+or guide needs a function that sets its inertia, a bouncing ball does not. The protocols below
+specify them. A module that does not fulfil its protocol is rejected with the name of the missing
+member before any simulation.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any, Generic, Protocol
+
+from sims.core.system import System
+
+Constants = Mapping[str, float]
+"""Known constants of a system by name, in SI units."""
+
+
+class JointWorldModule(Protocol):
+    """World module of a one-coordinate system: a body on one hinge or guide."""
+
+    OPEN_LOOP: bool
+    """Whether the drive depends on the inputs alone.
+
+    If True, the engine runs on its own while the inputs are constant.
+    """
+
+    def gravity(self, constants: Constants, /) -> Callable[[float], float]:
+        """Return a function from position to the generalised force of the engine's own gravity.
+
+        Positions are in m or rad, forces in N or N*m.
+        """
+        ...
+
+
+class BulletWorldModule(Protocol):
+    """Module ``pendulum_bullet_world`` of a system."""
+
+    def build(self, client: int, constants: Constants, /) -> int:
+        """Build the world in an empty client; return the id of the moving body."""
+        ...
+
+
+class BulletJointWorldModule(BulletWorldModule, JointWorldModule, Protocol):
+    """Module ``pendulum_bullet_world`` of a one-coordinate system."""
+
+    def load(self, client: int, body: int, inertia: float, constants: Constants, /) -> bool:
+        """Set the generalised inertia of the body.
+
+        Args:
+            client: Bullet client of the world.
+            body: id of the body.
+            inertia: generalised inertia in kg or kg*m^2.
+            constants: constants of the system by name.
+
+        Returns:
+            False if Bullet cannot represent the inertia.
+        """
+        ...
+
+
+class BulletBallWorldModule(BulletWorldModule, Protocol):
+    """Module ``pendulum_bullet_world`` of a bouncing ball, required for the setting `native_contact`."""
+
+    def build_native(self, client: int, constants: Constants, /, settings: Constants) -> int:
+        """Build the world with Bullet's native contact.
+
+        Args:
+            client: Bullet client of the world.
+            constants: constants of the system by name.
+            settings: settings of the engine by name.
+
+        Returns:
+            The id of the ball.
+        """
+        ...
+
+
+class MujocoWorldModule(Protocol):
+    """Module ``pendulum_mujoco_world`` of a system."""
+
+    def model(self, constants: Constants, /) -> str:
+        """Return the world as MJCF."""
+        ...
+
+
+class MujocoJointWorldModule(MujocoWorldModule, JointWorldModule, Protocol):
+    """Module ``pendulum_mujoco_world`` of a one-coordinate system."""
+
+    def load(self, model: Any, inertia: float, constants: Constants, /) -> bool:
+        """Set the generalised inertia in a compiled model.
+
+        Args:
+            model: compiled model (``MjModel``).
+            inertia: generalised inertia in kg or kg*m^2.
+            constants: constants of the system by name.
+
+        Returns:
+            False if MuJoCo cannot represent the inertia.
+        """
+        ...
+
+
+def find_world_module(
+    system: type[System], name: str, asked: type
+) -> tuple[ModuleType | None, str]:
+    """Find the world module of a system and check its interface.
+
+    Args:
+        system: system whose world is needed.
+        name: name of the module in the package of the system's own module.
+        asked: protocol that the module must fulfil.
+
+    Returns:
+        The module and an empty text, or None and the reason why there is no usable module.
+    """
+    package = system.__module__.rpartition(".")[0]
+    # Several systems of one package have a world module each.
+    for path in (f"{system.__module__}_{name}", f"{package}.{name}"):
+        if package and find_spec(path) is not None:
+            break
+    else:
+        return None, f"no module {name} beside {system.__module__} builds it"
+    module = import_module(path)
+    if reason := describe_missing_members(module, asked):
+        return None, f"module {path} {reason}"
+    return module, ""
+
+
+def describe_missing_members(module: ModuleType, asked: type) -> str:
+    """Describe which member of the protocol `asked` a module does not have.
+
+    A type checker covers the modules of this project; this function covers external modules as
+    well, when they are loaded.
+
+    Args:
+        module: world module to check.
+        asked: protocol that the module must fulfil.
+
+    Returns:
+        The end of a sentence; empty if the module is complete.
+    """
+    # The check begins with the most general protocol, so that members required of all worlds are
+    # reported first.
+    for part in reversed(asked.__mro__):
+        if part in (object, Generic, Protocol):
+            continue
+        for name in inspect.get_annotations(part):
+            if not isinstance(getattr(module, name, None), bool):
+                return f"has no {name} = True or False"
+        for name, function in vars(part).items():
+            if not name.startswith("_") and not _answers(getattr(module, name, None), function):
+                return f"has no function {name}({_arguments(function)})"
+    return ""
+
+
+def _answers(found: Any, asked: Callable[..., Any]) -> bool:
+    """Return whether `found` can be called with the arguments of the protocol's function."""
+    if not callable(found):
+        return False
+    parameters = list(inspect.signature(asked).parameters.values())[1:]  # the first is self
+    by_place = [p for p in parameters if p.kind is p.POSITIONAL_ONLY]
+    by_name = {p.name: p for p in parameters if p.kind is not p.POSITIONAL_ONLY}
+    try:
+        inspect.signature(found).bind(*by_place, **by_name)
+    except TypeError:
+        return False
+    return True
+
+
+def _arguments(function: Callable[..., Any]) -> str:
+    return ", ".join(list(inspect.signature(function).parameters)[1:])

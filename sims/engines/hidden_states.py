@@ -1,0 +1,256 @@
+"""Extend a system by the hidden states of effects, one coordinate for each.
+
+With a hidden coordinate in addition to those of the system, any engine for several coordinates can
+integrate the state of an effect. The augmented system scales forces by the inertia that remains for
+its own coordinates,
+
+    M' = M (1 - sum of the load-side shares)                               (1)
+
+so that the forces on them need no change, and a rate r of a hidden state is written as the force M'
+r. Dry friction acts on the system's own coordinates only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import (
+    Effect,
+    Engine,
+    Force,
+    Friction,
+    HiddenState,
+    HiddenStateEffect,
+    IntegrationBatch,
+    StateSnapshot,
+    System,
+    Trajectories,
+)
+from sims.engines.batch.batch_slicing import join_trajectories, slice_batch
+
+
+class AugmentedSystem(System):
+    """System with hidden coordinates after its own; `make_augmented_system` makes one.
+
+    Its parameters are those of the system, followed by the coefficients of the effects.
+
+    Attributes:
+        base_system: system without hidden coordinates.
+        effects: effects with a hidden state, one coordinate for each.
+    """
+
+    base_system: ClassVar[System]
+    effects: ClassVar[tuple[HiddenStateEffect, ...]]
+
+    @classmethod
+    def get_base_snapshot(cls, moment: StateSnapshot) -> StateSnapshot:
+        """Return the state snapshot without hidden coordinates."""
+        own = len(cls.base_system.coordinates)
+        theta = moment.theta[:, : len(cls.base_system.parameters)]
+        x, v = moment.x[:, :own], moment.v[:, :own]
+        return replace(moment, system=cls.base_system, theta=theta, x=x, v=v)
+
+    @classmethod
+    def split_coefficients(cls, theta: Array) -> list[Array]:
+        """Return the coefficients (K, L, 1) of each effect."""
+        found = []
+        place = len(cls.base_system.parameters)
+        for effect in cls.effects:
+            count = len(effect.coefficients)
+            found.append(theta[:, place : place + count].T[:, :, None])
+            place += count
+        return found
+
+    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """Return the inertia (L, 1) of the system's own coordinates.
+
+        Args:
+            theta: (L, p) parameters of the augmented system.
+            constants: (L, 1) constants by name.
+        """
+        whole = self.base_system.inertia(theta[:, : len(self.base_system.parameters)], constants)
+        pairs = zip(self.effects, self.split_coefficients(theta), strict=True)
+        left = np.ones_like(whole)
+        for effect, c in pairs:
+            left = left - effect.get_inertia_share(c)
+        return whole * left  # (1)
+
+    def weight(self, moment: StateSnapshot) -> Array:
+        """Return the force of gravity (L, D) of the system."""
+        return pad_force(self.base_system.weight(self.get_base_snapshot(moment)), moment)
+
+    def force(self, moment: StateSnapshot) -> Array:
+        """Return the force (L, D) of system and hidden-state effects on all coordinates."""
+        plain = self.get_base_snapshot(moment)
+        own = len(self.base_system.coordinates)
+        total = self.base_system.force(plain)
+        inertia = self.inertia(moment.theta, moment.constants)
+        rates = []
+        for k, c in enumerate(self.split_coefficients(moment.theta)):
+            place = slice(own + k, own + k + 1)
+            state = HiddenState(moment.x[:, place], moment.v[:, place])
+            force, rate = self.effects[k].compute_force_and_rate(c, plain, state)
+            total = total + force
+            rates.append(inertia * rate)
+        return np.concatenate([total, *rates], axis=1)
+
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """Return the sensor channels of the system without hidden coordinates.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: constants by name.
+        """
+        own = len(self.base_system.coordinates)
+        return self.base_system.observe(x[:, :, :own], v[:, :, :own], a[:, :, :own], constants)
+
+
+class _BaseForce(Force):
+    """Force on the system's own coordinates; `_acting` makes one."""
+
+    inner: ClassVar[Force]
+
+    def force(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return the force of the base effect, padded with zeros.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of the augmented system.
+        """
+        return pad_force(self.inner.force(c, _plain(moment)), moment)
+
+
+class _BaseFriction(Friction):
+    """Dry friction on the system's own coordinates; `_acting` makes one."""
+
+    inner: ClassVar[Friction]
+
+    def limit(self, c: Array, moment: StateSnapshot) -> Array:
+        """Return the friction limit of the base effect.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of the augmented system.
+        """
+        return self.inner.limit(c, _plain(moment))
+
+
+def integrate_with_hidden_states(engine: Engine, lanes: IntegrationBatch) -> Trajectories:
+    """Integrate batch elements, on some of which hidden-state effects may be active.
+
+    Args:
+        engine: engine for several coordinates.
+        lanes: batch to integrate.
+
+    Returns:
+        The trajectories of the system's own coordinates.
+    """
+    hidden = [(e, c) for e, c in lanes.effects if isinstance(e, HiddenStateEffect)]
+    if not hidden:
+        return engine.integrate(lanes)
+    others = tuple((e, c) for e, c in lanes.effects if not isinstance(e, HiddenStateEffect))
+    on = np.array([c[0, :, 0] > 0 for _, c in hidden])
+    # Most calls have no hidden-state effects; they must not become slower.
+    if not on.any():
+        return engine.integrate(replace(lanes, effects=others))
+    motions = []
+    numbers = (1 << np.arange(len(hidden))) @ on
+    for number in sorted(set(numbers.tolist())):
+        members = np.flatnonzero(numbers == number)
+        there = [pair for k, pair in enumerate(hidden) if number >> k & 1]
+        part = slice_batch(replace(lanes, effects=others), members)
+        effects = [(e, c[:, members]) for e, c in there]
+        motion = engine.integrate(_enlarged(part, effects) if there else part)
+        own = lanes.x.shape[1]
+        parts = (values[:, :, :own] for values in (motion.x, motion.v, motion.a))
+        motions.append((members, Trajectories(*parts)))
+    return join_trajectories(motions, lanes)
+
+
+def _enlarged(
+    lanes: IntegrationBatch, effects: Sequence[tuple[HiddenStateEffect, Array]]
+) -> IntegrationBatch:
+    """Return the batch for the augmented system."""
+    kinds = tuple(type(effect) for effect, _ in effects)
+    system = make_augmented_system(type(lanes.system), kinds)()
+    inputs = {name: values[:, :1] for name, values in lanes.inputs.items()}
+    start = np.zeros((len(lanes.x), 1))
+    at = StateSnapshot(lanes.system, lanes.theta, lanes.constants, start, lanes.x, lanes.v, inputs)
+    states = [effect.get_initial_state(c, at) for effect, c in effects]
+    return replace(
+        lanes,
+        system=system,
+        theta=np.concatenate([lanes.theta, *(c[:, :, 0].T for _, c in effects)], axis=1),
+        x=np.concatenate([lanes.x, *(state.x for state in states)], axis=1),
+        v=np.concatenate([lanes.v, *(state.v for state in states)], axis=1),
+        effects=tuple((_acting(type(effect))(), c) for effect, c in lanes.effects),
+    )
+
+
+@cache
+def make_augmented_system(
+    system: type[System], effects: tuple[type[HiddenStateEffect], ...]
+) -> type[AugmentedSystem]:
+    """Return the system with a hidden coordinate for each of these effects.
+
+    Args:
+        system: system to extend.
+        effects: effect classes with a hidden state.
+    """
+    names = [effect.name for effect in effects]
+    declared: dict[str, Any] = {
+        "base_system": system(),
+        "effects": tuple(effect() for effect in effects),
+        "name": f"{system.name} with {' and '.join(names)}",
+        "kind": system.kind,
+        "parameters": system.parameters,
+        "constants": system.constants,
+        "inputs": system.inputs,
+        "channels": system.channels,
+        "coordinates": (*system.coordinates, *names),
+        "rates": (*system.rates, *(f"rate of {name}" for name in names)),
+        "states": system.states,
+        "sensed": system.sensed,
+        "primary": system.primary,
+        "servo": system.servo,
+        "bends": True,
+        "fastest": max(effect.fastest for effect in effects),
+        "guided": len(system.coordinates),
+    }
+    return type("EnlargedSystem", (AugmentedSystem,), declared)
+
+
+@cache
+def _acting(effect: type[Effect]) -> type[Effect]:
+    """Return an effect that acts on the system's own coordinates of the augmented system."""
+    if not issubclass(effect, (Force, Friction)):
+        return effect
+    base = _BaseForce if issubclass(effect, Force) else _BaseFriction
+    declared = {"name": effect.name, "coefficients": effect.coefficients, "inner": effect()}
+    return type("PlainEffect", (base,), {**declared, "says": effect.says})
+
+
+def _plain(moment: StateSnapshot) -> StateSnapshot:
+    assert isinstance(moment.system, AugmentedSystem)
+    return moment.system.get_base_snapshot(moment)
+
+
+def pad_force(force: Array, moment: StateSnapshot) -> Array:
+    """Return a force (L, D), padded with zeros for the hidden coordinates.
+
+    Args:
+        force: (L, d) force on the system's own coordinates.
+        moment: state snapshot with hidden coordinates.
+    """
+    nothing = np.zeros_like(moment.x[:, force.shape[1] :])
+    return np.concatenate([force, nothing], axis=1)

@@ -1,0 +1,558 @@
+"""Integration time grid and applied inputs of many batch elements.
+
+Effects that shift time (a sensor's delay, a skewed clock) move the times at which the system is
+sampled. Effects on the input change the signal before the integration starts, since it does not
+depend on the plant. Therefore every engine supports them. The result of a batch element does not
+depend on the others, except for steps of zero length in which it waits for them.
+
+A command u is held from one sample to the next (zero-order hold). Over a step from a to b its mean
+is applied to the plant; its integral A is piecewise linear:
+
+    (A(b) - A(a)) / (b - a),    A(t) = sum of u_i (t_{i+1} - t_i) up to t  (1)
+
+Where a scenario states linear interpolation between samples, A is piecewise quadratic instead.
+
+With an effect that shifts time, the command of the time s(t) is applied at t. The change commanded
+at t is then applied at
+
+    t + (t - s(t))                                                         (2)
+
+This is exact if the shift is equal at both times, as for a delay, and a good approximation if it
+changes slowly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array, Scenario
+from sims.core.system import ActiveEffects, Effect, Input, Sensor, Signal
+
+_ROUNDING = 1e-6
+"""Fraction of a step by which an interval may exceed an integer number of steps."""
+
+MAX_LEAD_IN_STEP_SECONDS = 2e-3
+"""Maximum step before the run in seconds, unless a step within the run is longer."""
+
+Indices = NDArray[np.intp]
+Number = TypeVar("Number", np.float64, np.intp)
+
+
+@dataclass(frozen=True)
+class TimeGrid:
+    """Time grid: the steps of all batch elements.
+
+    Attributes:
+        steps: (L, S) lengths of the steps, s; S is a multiple of `steps_per_sample`. Batch elements
+            may share memory.
+        ends: (L, S) time since the start of the run at the end of each step, s.
+        steps_per_sample: Number of steps after which the state is stored; the initial state is
+            stored first.
+        rows: (L, T) number of the stored state for each sample.
+        has_uniform_steps: Whether batch elements with the same scenario have the same steps.
+    """
+
+    steps: Array
+    ends: Array
+    steps_per_sample: int
+    rows: Indices
+    has_uniform_steps: bool = False
+
+
+@dataclass(frozen=True)
+class ScenarioGroups:
+    """Scenarios of batch elements, grouped if they are equal.
+
+    Attributes:
+        unique_scenarios: Scenarios that differ in their times or inputs.
+        scenario_index: (L,) number of the distinct scenario of each batch element.
+    """
+
+    unique_scenarios: tuple[Scenario, ...]
+    scenario_index: Indices
+
+    def expand_rows(self, rows: NDArray[Number]) -> NDArray[Number]:
+        """Expand rows (N, ...) of the distinct scenarios to rows (L, ...) of the batch elements.
+
+        A single row is broadcast and shares memory.
+        """
+        if len(rows) == 1:
+            return np.broadcast_to(rows, (self.scenario_index.size, *rows.shape[1:]))
+        return rows[self.scenario_index]
+
+
+def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> ScenarioGroups:
+    """Group scenarios with the same times and inputs.
+
+    Args:
+        scenarios: Scenario of each batch element.
+        by_initial: Whether grouped scenarios must also state the same initial states.
+    """
+    # Compare objects first, because comparing the contents of each scenario is slow.
+    objects, of = group_by_identity(scenarios)
+    by_content: dict[object, int] = {}
+    distinct: list[Scenario] = []
+    groups = []
+    for scenario in objects:
+        signals = sorted(scenario.inputs.items())
+        earlier = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
+        read = tuple(sorted(scenario.linear)), scenario.offset, earlier
+        stated = tuple(sorted(scenario.initial.items())) if by_initial else ()
+        told = ((name, u.tobytes()) for name, u in signals)
+        off = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
+        content = scenario.times.tobytes(), read, stated, off, *told
+        group = by_content.setdefault(content, len(distinct))
+        if group == len(distinct):
+            distinct.append(scenario)
+        groups.append(group)
+    return ScenarioGroups(tuple(distinct), np.array(groups, dtype=np.intp)[of])
+
+
+def group_by_identity(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], Indices]:
+    """Return the distinct objects among scenarios, and the number of each element's object (L,)."""
+    # One dictionary lookup per batch element, of which there may be thousands.
+    objects = {id(scenario): scenario for scenario in scenarios}
+    place = {key: i for i, key in enumerate(objects)}
+    of = np.array([place[id(scenario)] for scenario in scenarios], dtype=np.intp)
+    return list(objects.values()), of
+
+
+Commands = Sequence[Mapping[str, Array]]
+"""Commanded inputs of each distinct scenario by name, each (T,)."""
+
+
+def build_time_grid(
+    runs: ScenarioGroups, commands: Commands, acting: ActiveEffects, largest_step: float
+) -> TimeGrid:
+    """Build steps through all times at which a sample is taken or a changed command is applied.
+
+    A sample before the start shows the initial state. Shorter runs wait at their end.
+
+    Args:
+        runs: Scenarios of the batch elements.
+        commands: Inputs of each distinct scenario.
+        acting: Effects on input and sensors.
+        largest_step: Maximum length of a step, s.
+    """
+    samples = max(s.times.size for s in runs.unique_scenarios)
+    instants = np.stack([_padded(_since_start(s), samples) for s in runs.unique_scenarios])
+    shifting = [(e, c) for e, c in acting if c.any() and _shifts(e)]
+    if not shifting and not any(s.offset for s in runs.unique_scenarios):
+        # Runs with the same sample times share one row and everything computed from it.
+        if (instants == instants[:1]).all():
+            instants = instants[:1]
+        steps, ends, every, rows = _divided(instants, largest_step)
+        return TimeGrid(
+            runs.expand_rows(steps),
+            runs.expand_rows(ends),
+            every,
+            runs.expand_rows(rows),
+            has_uniform_steps=True,
+        )
+    instants = instants[runs.scenario_index]
+    for effect, c in shifting:
+        if isinstance(effect, Sensor):
+            instants = np.where(is_active(c), effect.times(c, instants), instants)
+    # Times must increase and begin with the run, whatever an effect returns.
+    instants = np.maximum(instants, 0.0)
+    instants = np.maximum.accumulate(instants, axis=1)
+    changes = _changes(runs, commands, shifting)
+    marks = np.concatenate([instants, changes], axis=1)
+    marks = np.clip(marks, 0.0, instants[:, -1:])
+    order = np.argsort(marks, axis=1, kind="stable")
+    marks = np.take_along_axis(marks, order, axis=1)
+    steps, ends, every, rows = _divided(marks, largest_step)
+    # Rows in the original order of the marks, of which the first are samples.
+    back = np.empty_like(rows)
+    np.put_along_axis(back, order, rows, axis=1)
+    return TimeGrid(steps, ends, every, back[:, :samples])
+
+
+def _changes(
+    runs: ScenarioGroups, commands: Commands, shifting: Sequence[tuple[Effect, Array]]
+) -> Array:
+    """Return the times (L, K) at which a changed command is applied; zero where there are fewer."""
+    columns = []
+    for place, name in enumerate(commands[0]):
+        rows = []
+        for s, u in zip(runs.unique_scenarios, commands, strict=True):
+            changed = np.diff(u[name]) != 0
+            later = np.maximum(_commanded(s)[1:], 0.0)
+            # Commands from before the run may be applied within it.
+            rows.append(np.concatenate([_earlier(s, name), later[changed]]))
+        size = max(row.size for row in rows)
+        padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
+        felt = np.stack(padded)[runs.scenario_index]
+        # Effects act on the first input only.
+        for effect, c in shifting if place == 0 else ():
+            if isinstance(effect, Input):
+                commanded = effect.times(c, felt)
+                felt = np.where(is_active(c), felt + (felt - commanded), felt)  # (2)
+        columns.append(felt)
+    if not columns:
+        return np.zeros((runs.scenario_index.size, 0))
+    return np.concatenate(columns, axis=1)
+
+
+def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
+    """Divide the intervals between times into equal steps.
+
+    The steps are arranged in blocks of the most frequent number of steps per interval; steps of
+    zero length fill the last block of an interval. The steps of a batch element do not depend on
+    others.
+
+    Args:
+        instants: (N, T) times since the start, s.
+        largest_step: Maximum length of a step, s.
+
+    Returns:
+        Steps (N, S), their ends (N, S), the number of steps per stored state, and the number of the
+        stored state at each time (N, T).
+    """
+    lanes, samples = instants.shape
+    start = np.zeros((lanes, 1))
+    before = np.concatenate([start, instants[:, :-1]], axis=1)
+    intervals = instants - before
+    # Tolerate rounding where an interval is an integer number of steps.
+    parts = np.ceil(intervals / largest_step - _ROUNDING).astype(np.intp)
+    parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
+    every = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
+    blocks = -(-parts // every)
+    rows = np.cumsum(blocks, axis=1)
+    size = max(int(rows[:, -1].max()), 1)
+    # Arrays with one entry per block: its interval, its number in the batch element, and the
+    # numbers of its steps in the interval.
+    interval = np.repeat(np.arange(lanes * samples), blocks.ravel())
+    lane = interval // samples
+    in_lane = rows[:, -1]
+    in_lanes_before = np.cumsum(in_lane) - in_lane
+    block = np.arange(interval.size) - in_lanes_before[lane]
+    blocks_before = (rows - blocks).ravel()[interval]
+    in_interval = (block - blocks_before)[:, None]
+    number = in_interval * every + np.arange(every)
+    count = parts.ravel()[interval, None]
+    length = intervals.ravel()[interval, None] / count
+    steps = np.zeros((lanes, size, every))
+    ends = np.repeat(instants[:, -1], size * every).reshape(lanes, size, every)
+    steps[lane, block] = np.where(number < count, length, 0.0)
+    # The last step of an interval ends exactly at the given time.
+    inside = before.ravel()[interval, None] + (number + 1) * length
+    instant = instants.ravel()[interval, None]
+    ends[lane, block] = np.where(number + 1 < count, inside, instant)
+    return steps.reshape(lanes, -1), ends.reshape(lanes, -1), every, rows
+
+
+def _since_start(scenario: Scenario) -> Array:
+    """Return the sample times (T,) since the first sample, s."""
+    seconds: Array = scenario.times - scenario.times[0]
+    return seconds
+
+
+def _commanded(scenario: Scenario) -> Array:
+    """Return the times (T,) since the first sample at which inputs change, s."""
+    seconds: Array = _since_start(scenario) + scenario.offset
+    return seconds
+
+
+def _earlier(scenario: Scenario, name: str) -> Array:
+    """Return the times (K,) of an input's known history before the run, s."""
+    if name not in scenario.before:
+        return np.empty(0)
+    earlier: Array = scenario.before[name][0] + scenario.offset
+    return earlier
+
+
+def _signal(scenario: Scenario, name: str, values: Array) -> Array:
+    """Return the values (K + T,) of an input, including its known history before the run.
+
+    Args:
+        scenario: Scenario with the history.
+        name: Name of the input.
+        values: (T,) values in the run.
+    """
+    if name not in scenario.before:
+        return values
+    return np.concatenate([scenario.before[name][1], values])
+
+
+def _padded(values: Array, size: int) -> Array:
+    """Repeat the last of `values` up to the given size."""
+    more = np.full(size - values.size, values[-1])
+    return np.concatenate([values, more])
+
+
+def compute_applied_inputs(
+    plan: TimeGrid, runs: ScenarioGroups, commands: Commands, acting: ActiveEffects
+) -> dict[str, Array]:
+    """Return the applied inputs: the mean of each command over each step, changed by the effects.
+
+    A command is held between recorded samples, and had its first value before the first sample,
+    unless its history is known. Effects act on the first input; effects with memory begin at the
+    start of the known history.
+
+    Args:
+        plan: Time grid.
+        runs: Scenarios of the batch elements.
+        commands: Inputs of each distinct scenario.
+        acting: Input effects in the order in which the signal passes them.
+
+    Returns:
+        Applied inputs (L, S) by name.
+    """
+    effects = tuple((effect, c, is_active(c)) for effect, c in acting if c.any())
+    begin, end, steps = _before(plan.ends), plan.ends, plan.steps
+    first, *others = commands[0]
+    felt = {}
+    for name in others if effects else (first, *others):
+        felt[name] = _felt(runs, name, commands, begin, end, plan.has_uniform_steps)
+    if not effects:
+        return felt
+    lead = _build_lead_in_steps(
+        runs, first, max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
+    )
+    if lead[0].size:
+        parts = zip(lead, (begin, end, steps), strict=True)
+        begin, end, steps = (np.hstack([before[runs.scenario_index], now]) for before, now in parts)
+    ends = end
+    # Backwards from the plant to the command: map the times through the effects.
+    for effect, c, on in reversed(effects):
+        assert isinstance(effect, Input)
+        # Most effects do not shift time; skip them.
+        if not _shifts(effect):
+            continue
+        begin = np.where(on, effect.times(c, begin), begin)
+        end = np.where(on, effect.times(c, end), end)
+    # Forwards with the values.
+    means = _felt(runs, first, commands, begin, end, plan.has_uniform_steps)
+    for effect, c, on in effects:
+        if isinstance(effect, Input) and effect.between:
+            other = _felt(runs, first, commands, begin, end, plan.has_uniform_steps, other=True)
+            means = np.where(on, means + c[0] * (other - means), means)
+    pairs = zip(runs.unique_scenarios, commands, strict=True)
+    beginnings = np.array([_signal(s, first, u[first])[0] for s, u in pairs])
+    passed = _apply_input_effects(
+        effects, steps, ends, means, beginnings[runs.scenario_index, None]
+    )
+    return {first: passed[:, lead[0].shape[1] :], **felt}
+
+
+def _build_lead_in_steps(
+    runs: ScenarioGroups, name: str, largest: float
+) -> tuple[Array, Array, Array]:
+    """Build the steps before the runs in which the history of an input is known.
+
+    Args:
+        runs: Scenarios of the batch elements.
+        name: Name of the input.
+        largest: Maximum length of a step, s.
+
+    Returns:
+        Beginnings, ends and lengths (N, K) of the steps, s; the length is zero where the history is
+        unknown.
+    """
+    marks = [_earlier(s, name) for s in runs.unique_scenarios]
+    marks = [np.append(row[row < 0], 0.0) for row in marks]
+    size = max(row.size for row in marks)
+    if size == 1:
+        nothing = np.empty((len(marks), 0))
+        return nothing, nothing, nothing
+    first = np.array([[row[0]] for row in marks])
+    steps, ends, _, _ = _divided(np.stack([_padded(row, size) for row in marks]) - first, largest)
+    ends = ends + first
+    return np.hstack([first, ends[:, :-1]]), ends, steps
+
+
+def _apply_input_effects(
+    effects: Sequence[tuple[Effect, Array, NDArray[np.bool_]]],
+    steps: Array,
+    ends: Array,
+    means: Array,
+    start: Array,
+) -> Array:
+    """Pass the means of the command through the effects on the input.
+
+    Args:
+        effects: Effects with their coefficients, and masks (L, 1) of the batch elements in which
+            they are active.
+        steps: (L, S) lengths of the steps, s.
+        ends: (L, S) ends of the steps, s.
+        means: (L, S) mean of the command over each step.
+        start: (L, 1) first value of the command, which it also had before the first step.
+
+    Returns:
+        Applied values (L, S).
+    """
+    lasting = _last_nonzero_step(steps)
+    values = np.take_along_axis(means, lasting, axis=1)
+    start = start.copy()
+    for effect, c, on in effects:
+        assert isinstance(effect, Input)
+        # An effect may be active in few of the batch elements; evaluate only these.
+        lanes = np.flatnonzero(on)
+        own, begin = c[:, lanes], start[lanes]
+        nothing = np.zeros_like(begin)
+        signal = Signal(values[lanes], steps[lanes], begin, ends[lanes])
+        passed = effect.apply(own, signal)
+        values[lanes] = np.take_along_axis(passed, lasting[lanes], axis=1)
+        start[lanes] = effect.apply(own, Signal(begin, nothing, begin, nothing))
+    return values
+
+
+def _before(ends: Array) -> Array:
+    """Return the beginnings (L, S) of steps from their ends; memory is shared as in `ends`."""
+    own = ends[:1] if ends.strides[0] == 0 else ends
+    start = np.zeros((len(own), 1))
+    begin = np.concatenate([start, own[:, :-1]], axis=1)
+    return np.broadcast_to(begin, ends.shape)
+
+
+def _last_nonzero_step(steps: Array) -> Indices:
+    """Return the number (L, S) of each step, or of the last step before it with nonzero length.
+
+    The input does not change while a batch element waits.
+    """
+    own = np.arange(steps.shape[1])
+    lasting = np.where(steps > 0, own, 0)
+    last: Indices = np.maximum.accumulate(lasting, axis=1)
+    return last
+
+
+def _felt(
+    runs: ScenarioGroups,
+    name: str,
+    commands: Commands,
+    begin: Array,
+    end: Array,
+    alike: bool,
+    other: bool = False,
+) -> Array:
+    """Return the mean of each batch element's signal over each step.
+
+    Args:
+        runs: Scenarios of the batch elements.
+        name: Name of the input.
+        commands: Inputs of each distinct scenario.
+        begin: (L, S) beginnings of the steps, s.
+        end: (L, S) ends of the steps, s.
+        alike: Whether batch elements with the same scenario have the same steps, so that only the
+            first of them is evaluated.
+        other: Whether to interpolate held signals linearly, and to hold linear ones.
+
+    Returns:
+        Means (L, S).
+    """
+    count = len(commands) if alike else len(begin)
+    result = np.empty((count, begin.shape[1]))
+    # Process all batch elements with the same scenario in one call.
+    by_run = np.argsort(runs.scenario_index, kind="stable")
+    borders = np.flatnonzero(np.diff(runs.scenario_index[by_run])) + 1
+    for lanes in np.split(by_run, borders):
+        run = runs.scenario_index[lanes[0]]
+        scenario = runs.unique_scenarios[run]
+        means = (
+            _average_linear_signal if (name in scenario.linear) != other else _average_held_signal
+        )
+        to, of = (slice(run, run + 1), lanes[:1]) if alike else (lanes, lanes)
+        instants = np.concatenate([_earlier(scenario, name), _commanded(scenario)])
+        signal = _signal(scenario, name, commands[run][name])
+        result[to] = means(instants, signal, begin[of], end[of])
+    return runs.expand_rows(result) if alike else result
+
+
+def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) -> Array:
+    """Return the means of a held signal over intervals; its value where an interval has no length.
+
+    Args:
+        times: (T,) times from which the values hold, s.
+        values: (T,) values.
+        begin: Beginnings of the intervals, s.
+        end: Ends of the intervals, s.
+    """
+    place = np.searchsorted(times, begin, side="right") - 1
+    place = np.clip(place, 0, times.size - 1)
+    value: Array = values[place]
+    last = np.searchsorted(times, end, side="left") - 1
+    last = np.clip(last, 0, times.size - 1)
+    # Equation (1) only where the command changes within the interval; elsewhere its value is exact.
+    crossing = last > place
+    if crossing.any():
+        held = values[:-1] * np.diff(times)
+        area = np.concatenate([[0.0], np.cumsum(held)])
+        a = begin[crossing]
+        b = end[crossing]
+        over = _area(times, values, area, b) - _area(times, values, area, a)
+        value[crossing] = over / (b - a)  # (1)
+    return value
+
+
+def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array) -> Array:
+    """Return the means of a linearly interpolated signal over intervals.
+
+    The signal is constant before the first and after the last sample.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        begin: Beginnings of the intervals, s.
+        end: Ends of the intervals, s.
+    """
+    halves = 0.5 * (values[:-1] + values[1:]) * np.diff(times)
+    area = np.concatenate([[0.0], np.cumsum(halves)])
+    value = np.interp(0.5 * (begin + end), times, values)
+    # The mean over a part of one linear segment is its middle value; over several segments, (1).
+    first = np.searchsorted(times, begin, side="right")
+    crossing = np.searchsorted(times, end, side="left") > first
+    if crossing.any():
+        a, b = begin[crossing], end[crossing]
+        over = _straight_area(times, values, area, b) - _straight_area(times, values, area, a)
+        value[crossing] = over / (b - a)  # (1)
+    result: Array = value
+    return result
+
+
+def _straight_area(times: Array, values: Array, area: Array, t: Array) -> Array:
+    """Return the integral A(t) of (1) of a linearly interpolated signal.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        area: (T,) integral up to each of `times`.
+        t: Times, s.
+    """
+    place = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
+    here = np.interp(t, times, values)
+    result: Array = area[place] + 0.5 * (values[place] + here) * (t - times[place])
+    return result
+
+
+def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
+    """Return the integral A(t) of (1) of a held signal.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        area: (T,) integral up to each of `times`.
+        t: Times, s.
+    """
+    place = np.searchsorted(times, t, side="right") - 1
+    place = np.clip(place, 0, times.size - 1)
+    result: Array = area[place] + values[place] * (t - times[place])
+    return result
+
+
+def _shifts(effect: Effect) -> bool:
+    """Return whether an effect shifts time, that is, overrides `times`."""
+    if not isinstance(effect, (Input, Sensor)):
+        return False
+    return type(effect).times not in (Input.times, Sensor.times)
+
+
+def is_active(c: Array) -> NDArray[np.bool_]:
+    """Return the mask (L, 1) of batch elements in which coefficients (K, L, 1) are not all zero."""
+    result: NDArray[np.bool_] = (c != 0).any(axis=0)
+    return result

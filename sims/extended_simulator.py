@@ -1,0 +1,454 @@
+"""Extended simulators: write and load `extended.toml`.
+
+The file is written by explain and names the system, the effects and every number with its interval;
+for a robot it names the model file instead of a system. When it is loaded, it is a registered
+simulator whose nominal values are the fitted ones, so that `compare`, `simulate` and every tuner
+accept it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from sims import effects as library
+from sims.core import atomic_files
+from sims.core.simulator import InputError, Parameter, Simulator
+from sims.core.toml_validation import (
+    check_finite,
+    check_known_names,
+    check_name_list,
+    check_table,
+    check_text,
+    make_error,
+    read_toml,
+)
+from sims.robot import robot_reference
+from sims.robot.robot_reference import RobotReference
+from sims.system_simulator import SystemSimulator, make_effect_parameters
+
+FORMAT_VERSION = 1
+"""Version of the file format; files with another version are refused."""
+
+MIN_TRAINING_RANGE_SHARE = 0.2
+"""Minimum half width of the training range of a fitted number, as a fraction of the number."""
+
+TRAINING_RANGE_HALF_WIDTHS = 3.0
+"""Minimum half width of the training range, in half widths of the number's interval."""
+
+MAX_SYSTEM_NAME_LENGTH = 40
+"""Maximum number of characters of the system's name in the name of its extension."""
+
+_SMALLEST = 1e-12
+"""Minimum half width of the training range in the number's unit; otherwise it is empty about 0."""
+
+_KEYS = (
+    "format",
+    "name",
+    "system",
+    "engine",
+    "title",
+    "observe",
+    "constants",
+    "parameters",
+    "effects",
+    *robot_reference.ROBOT_KEYS,
+)
+"""Keys allowed in the file."""
+
+
+@dataclass(frozen=True)
+class FittedValue:
+    """Fitted number with its 95 % interval, which is None where the data do not bound it.
+
+    Attributes:
+        value: Estimate.
+        unit: Unit of the estimate and its interval.
+        low: Lower end of the 95 % interval.
+        high: Upper end of the 95 % interval.
+        at_bound: End of the range at which the estimate is; None inside the range. At a bound there
+            is no interval.
+        stated: Number of the robot's model file that the estimate changes; None if the file has no
+            such number.
+        total: Value of that number with the estimate applied.
+        total_unit: Unit of `stated` and `total`; empty if it is `unit`.
+        usual_range: Expected range of the estimate; None if the estimate is inside it.
+    """
+
+    value: float
+    unit: str
+    low: float | None
+    high: float | None
+    at_bound: Literal["low", "high"] | None = None
+    stated: float | None = None
+    total: float | None = None
+    total_unit: str = ""
+    usual_range: tuple[float, float] | None = None
+
+    @property
+    def is_result(self) -> bool:
+        """Whether the data determine the number.
+
+        This is the case if it has an interval, or if it is zero at its lower bound, such as the
+        coefficient of a friction that does not exist.
+        """
+        if self.at_bound is not None:
+            return self.at_bound == "low" and self.value == 0.0
+        return self.low is not None and self.high is not None
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the number as a TOML table, which has no null."""
+        stated: dict[str, Any] = {"value": self.value, "unit": self.unit}
+        if self.low is not None and self.high is not None:
+            stated |= {"low": self.low, "high": self.high}
+        return stated
+
+
+@dataclass(frozen=True)
+class ExtendedSimulator:
+    """Extended simulator.
+
+    Attributes:
+        name: Name under which it is registered.
+        system: Registered name of the system, or name of the robot.
+        engine: Engine with which it was fitted; None for a user-defined simulator, which steps
+            itself.
+        title: Title of the recording to which it was fitted.
+        parameters: Fitted parameters of the system itself.
+        effects: Coefficients by effect, in the order in which a signal passes the effects.
+        constants: Constants stated by the recording, and fitted ones.
+        observe: Channels of the recording.
+        kind: Simulator class of the system, if it is known, as after `open_extended` and explain.
+        robot: Model file and additions to it, if the system is a robot.
+    """
+
+    name: str
+    system: str
+    engine: str | None
+    title: str
+    parameters: Mapping[str, FittedValue]
+    effects: Mapping[str, Mapping[str, FittedValue]]
+    constants: Mapping[str, float]
+    observe: Sequence[str]
+    # Not compared: it is not part of the fit, and the file contains only the system's name.
+    kind: type[SystemSimulator] | None = field(default=None, compare=False, repr=False)
+    robot: RobotReference | None = None
+
+    def simulator(self) -> SystemSimulator:
+        """Return the fitted simulator, ready to use.
+
+        The nominal values of its parameters are the fitted ones.
+
+        Raises:
+            InputError: The simulator class of the system is unknown.
+        """
+        if self.kind is None:
+            remedy = "open its file with sims.extended_simulator.open_extended, or use simulator_of"
+            raise InputError(f"{self.name}: the class of system {self.system} is unknown; {remedy}")
+        return make_simulator_class(self, self.kind)()
+
+
+def make_extended_name(system: str) -> str:
+    """Return the name of the extension of a system; special characters are replaced."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", system)[:MAX_SYSTEM_NAME_LENGTH]
+    return f"{plain if plain[:1].isalpha() else f'robot_{plain}'}_extended"
+
+
+def get_robot_reference(kind: type[SystemSimulator]) -> RobotReference | None:
+    """Return the robot data that a file contains for a simulator; None if it is not a robot."""
+    robot: Any = kind
+    return robot_reference.make_robot_reference(robot) if kind.has_model else None
+
+
+def write_extended(extended: ExtendedSimulator, path: Path) -> None:
+    """Write an extended simulator to a file.
+
+    Args:
+        extended: Extended simulator.
+        path: Path of the file.
+    """
+    atomic_files.write_atomically(path, format_extended(extended, path.parent))
+
+
+def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> str:
+    """Format the content of the file.
+
+    Args:
+        extended: Extended simulator.
+        folder: Folder of the file, to which the path of a robot's model file is relative.
+    """
+    import tomli_w
+
+    if extended.robot is None:
+        engine = {"engine": extended.engine} if extended.engine else {}
+        of: dict[str, Any] = {"system": extended.system, **engine}
+    else:
+        of = extended.robot.to_document(folder)
+    document = {
+        "format": FORMAT_VERSION,
+        "name": extended.name,
+        **of,
+        "title": extended.title,
+        "observe": list(extended.observe),
+        "constants": dict(extended.constants),
+        "parameters": {name: number.to_table() for name, number in extended.parameters.items()},
+        "effects": {
+            name: {coefficient: number.to_table() for coefficient, number in numbers.items()}
+            for name, numbers in extended.effects.items()
+        },
+    }
+    return tomli_w.dumps(document)
+
+
+def read_extended(path: Path) -> ExtendedSimulator:
+    """Read and check a file.
+
+    Raises:
+        InputError: The file is missing, malformed, or has another format.
+    """
+    document = read_toml(path)
+    if document.get("format") != FORMAT_VERSION:
+        wanted = f"an extended simulator with format = {FORMAT_VERSION}"
+        raise make_error(path, "", wanted, document.get("format"))
+    check_known_names(f"key of {path}", document, _KEYS)
+    name = _name(path, document.get("name"))
+    robot = robot_reference.read_robot_reference(path, document) if "model" in document else None
+    system, engine = (robot.path.stem, None) if robot else _system(path, document)
+    return ExtendedSimulator(
+        name=name,
+        system=system,
+        engine=engine,
+        title=str(document.get("title", "")),
+        parameters=_numbers(path, "parameters", document.get("parameters", {})),
+        effects=_effects(path, document.get("effects", {})),
+        constants=_constants(path, document.get("constants", {})),
+        observe=_observe(path, document.get("observe", [])),
+        robot=robot,
+    )
+
+
+def _system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | None]:
+    """Return the name of the registered system, and of the engine if the file states one."""
+    for key in document:
+        if key in robot_reference.ROBOT_KEYS and key != "engine":
+            raise InputError(f"{path}: {key} is for a robot; expected model too, found none")
+    engine = _text(path, "engine", document["engine"]) if "engine" in document else None
+    return _text(path, "system", document.get("system")), engine
+
+
+def _name(path: Path, value: Any) -> str:
+    """Check the name under which the simulator is registered; it is also used for files."""
+    name = _text(path, "name", value)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
+        raise make_error(path, "name", "letters, digits, '_', '.' and '-'", name)
+    return name
+
+
+def _observe(path: Path, value: Any) -> list[str]:
+    wanted = "a list of channel names"
+    observe = check_name_list(path, "observe", value, wanted)
+    if not observe:
+        raise make_error(path, "observe", wanted, value)
+    return list(observe)
+
+
+def _constants(path: Path, value: Any) -> dict[str, float]:
+    given = check_table(path, "constants", value)
+    return {name: _real(path, f"constants.{name}", number) for name, number in given.items()}
+
+
+def _effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
+    coefficients = {}
+    # The order matters: a signal passes the effects one after another.
+    for name, numbers in check_table(path, "effects", value).items():
+        check_table(path, name, numbers)
+        coefficients[name] = _numbers(path, f"effects.{name}", numbers)
+    return coefficients
+
+
+def _numbers(path: Path, where: str, value: Any) -> dict[str, FittedValue]:
+    given = check_table(path, where, value)
+    return {name: _number(path, f"{where}.{name}", number) for name, number in given.items()}
+
+
+def _number(path: Path, where: str, value: Any) -> FittedValue:
+    given = check_table(path, where, value, "a table with value and unit")
+    fitted = _real(path, f"{where}.value", given.get("value"))
+    low, high = (
+        _real(path, f"{where}.{end}", given[end]) if end in given else None
+        for end in ("low", "high")
+    )
+    return FittedValue(fitted, _text(path, "unit", given.get("unit")), low, high)
+
+
+def _text(path: Path, where: str, value: Any) -> str:
+    result = check_text(path, where, value, "a text")
+    if not result:
+        raise make_error(path, where, "a text", value)
+    return result
+
+
+def _real(path: Path, where: str, value: Any) -> float:
+    return check_finite(path, where, value, "a finite number")
+
+
+def make_simulator_class(
+    extended: ExtendedSimulator, kind: type[SystemSimulator]
+) -> type[SystemSimulator]:
+    """Make the extended simulator as a class that can be registered.
+
+    An instance made without arguments is the fitted simulator.
+
+    Args:
+        extended: Content of the file.
+        kind: Simulator class of the system.
+
+    Raises:
+        InputError: A parameter, effect, coefficient, constant or channel does not exist.
+    """
+    check_known_names(f"parameter of system {extended.system}", extended.parameters, _names(kind))
+    fitted = extended.parameters
+    own = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
+    values = _coefficients(extended, kind)
+    # Make one instance, so that wrong settings are refused here; it knows the coefficients' bounds.
+    effects, observed = list(extended.effects), list(extended.observe)
+    fresh = kind(extended.constants, observed, effects=effects, **_engine(extended))
+    added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
+    fresh.close()
+    return _class_of(extended, kind, (*own, *added))
+
+
+def _engine(extended: ExtendedSimulator) -> dict[str, Any]:
+    """Return the setting that selects the engine; user-defined simulators have none."""
+    return {"engine": extended.engine} if extended.engine else {}
+
+
+def _class_of(
+    extended: ExtendedSimulator, kind: type[SystemSimulator], parameters: tuple[Parameter, ...]
+) -> type[SystemSimulator]:
+    """Make a subclass of `kind` with all fitted values as defaults."""
+    effects, observed = list(extended.effects), list(extended.observe)
+
+    def __init__(  # noqa: N807
+        self: SystemSimulator,
+        constants: Mapping[str, float] | None = None,
+        observe: Sequence[str] | None = None,
+        **settings: Any,
+    ) -> None:
+        # Engine, sensors and constants may be changed; the effects are fixed.
+        stated = {**extended.constants, **(constants or {})}
+        chosen = {**_engine(extended), **settings}
+        kind.__init__(self, stated, observe or observed, effects=effects, **chosen)
+        # A user-defined simulator refuses to set this attribute twice, so bypass the check.
+        object.__setattr__(self, "parameters", parameters)
+
+    body = {
+        "__init__": __init__,
+        "system": kind.system,
+        "extends": extended.system,
+        # These classes have the same source code and may have the same name. The digest of their
+        # numbers distinguishes them; otherwise a tuner trained in one would count as trained in
+        # another.
+        "source_digest": hashlib.sha256(format_extended(extended).encode()).hexdigest(),
+        # An effect at a place of a robot is derived from the registered effect.
+        "made_of": tuple(library.get_effect(name.partition("@")[0]) for name in effects),
+    }
+    simulator: type[SystemSimulator] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
+    # The base class copies these from the system; replace them by the fitted ones.
+    simulator.name = extended.name
+    what = ", ".join(extended.effects) or "nothing added"
+    simulator.says = f"{extended.system} with {what}, fitted to: {extended.title}"
+    simulator.parameters = parameters
+    return simulator
+
+
+def _names(kind: type[SystemSimulator]) -> list[str]:
+    return [parameter.name for parameter in kind.parameters]
+
+
+def check_not_extended(kind: type[SystemSimulator]) -> None:
+    """Check that a simulator is not extended already, because its effects are fixed.
+
+    Raises:
+        InputError: The simulator is extended already.
+    """
+    if hasattr(kind, "extends"):
+        robot: Any = kind
+        of = f"system it extends, {robot.extends}"
+        if kind.has_model:
+            of = f"model file it extends, --model {robot.robot.path}"
+        raise InputError(f"simulator {kind.name} is extended already; name the {of}")
+
+
+def _coefficients(extended: ExtendedSimulator, kind: type[SystemSimulator]) -> list[FittedValue]:
+    """Return all coefficients in the simulator's order."""
+    values = []
+    for name, numbers in extended.effects.items():
+        effect = library.find_effect(name, kind.system)
+        coefficients = effect.on(kind.system)
+        check_known_names(f"coefficient of effect {name}", numbers, [c.name for c in coefficients])
+        parameters = make_effect_parameters(effect, kind.system, extended.observe)
+        for parameter, coefficient in zip(parameters, coefficients, strict=True):
+            off = FittedValue(0.0, parameter.unit, None, None)
+            values.append(numbers.get(coefficient.name, off))
+    return values
+
+
+def _at(parameter: Parameter, number: FittedValue) -> Parameter:
+    """Set the nominal value of a parameter to a fitted number, with a training range around it."""
+    reach = max(MIN_TRAINING_RANGE_SHARE * abs(number.value), _SMALLEST)
+    if number.low is not None and number.high is not None:
+        reach = max(reach, TRAINING_RANGE_HALF_WIDTHS * (number.high - number.low) / 2.0)
+    low, high = parameter.bounds
+    # The fitted value may be outside the plausible range; extend the bounds to include it.
+    low, high = min(low, number.value), max(high, number.value)
+    inner = (max(low, number.value - reach), min(high, number.value + reach))
+    training = inner if inner[0] < inner[1] else None
+    return replace(parameter, nominal=number.value, bounds=(low, high), training=training)
+
+
+SimulatorLookup = Callable[[str], type[Simulator]]
+"""Function that returns the simulator registered under a name."""
+
+
+def load_extended(path: Path, find: SimulatorLookup) -> type[SystemSimulator]:
+    """Load the extended simulator from a file.
+
+    Args:
+        path: Path of extended.toml.
+        find: Function that returns the simulator of a system.
+
+    Raises:
+        InputError: The file, or the system that it names, is not usable.
+    """
+    return open_extended(path, find)[2]
+
+
+def open_extended(
+    path: Path, find: SimulatorLookup
+) -> tuple[ExtendedSimulator, type[SystemSimulator], type[SystemSimulator]]:
+    """Load a file together with the simulator of its system.
+
+    Args:
+        path: Path of extended.toml.
+        find: Function that returns the simulator of a system.
+
+    Returns:
+        Content of the file, the simulator class of its system, and the extended simulator class.
+
+    Raises:
+        InputError: The file, or the system that it names, is not usable.
+    """
+    extended = read_extended(path)
+    try:
+        kind = extended.robot.make_simulator() if extended.robot else find(extended.system)
+        if not issubclass(kind, SystemSimulator):
+            raise InputError(f"system {extended.system} takes no effects")
+        check_not_extended(kind)
+        return replace(extended, kind=kind), kind, make_simulator_class(extended, kind)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

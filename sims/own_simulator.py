@@ -1,0 +1,303 @@
+"""Base class of user-defined simulators in PyBullet, MuJoCo or any other engine.
+
+Subclass `OwnSimulator`, declare its attributes, and implement `reset`, `step` and
+`simulate_toy_problem`; see
+docs/own-simulator.md. Effects on inputs and sensors are then supported as for any simulator; forces
+and dry friction are supported if it implements `apply_force` and `inertia_repair`.
+"""
+
+from __future__ import annotations
+
+import weakref
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sims.core.simulator import Array, Channel, InputError, Parameter
+from sims.core.system import (
+    SYSTEM_KINDS,
+    Contact,
+    Effect,
+    Engine,
+    Force,
+    Friction,
+    HiddenStateEffect,
+    Level,
+    StateSnapshot,
+    System,
+    SystemKind,
+)
+from sims.core.value_limits import is_plausible_number, truncate_text
+from sims.engines.adapters.bullet_world import import_pybullet
+from sims.own_simulator_engine import OwnSimulatorEngine
+from sims.own_simulator_levels import find_level_effect, make_level_effects
+from sims.system_simulator import SystemSimulator
+
+
+class OwnSimulatorSystem(System):
+    """System of a user-defined simulator, made from its class attributes."""
+
+    name = "own"
+    says = "a user's own simulator"
+    kind: ClassVar[SystemKind] = "linear"
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    channels: ClassVar[tuple[Channel, ...]] = ()
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    rates: ClassVar[tuple[str, ...]] = ()
+    states: ClassVar[Mapping[str, float]] = {}
+    sensed: ClassVar[tuple[str, ...]] = ()
+    simulator: ClassVar[type[OwnSimulator]]
+
+    @classmethod
+    def expand_to_places(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+        """Return an effect on levels once for each level, and any other effect unchanged."""
+        if issubclass(effect, Level) and not effect.misses(cls):
+            return make_level_effects(effect, cls)
+        return super().expand_to_places(effect)
+
+    @classmethod
+    def find_effect(cls, name: str) -> type[Effect] | None:
+        """Return the effect with a name such as ``state.overflow@upper``; None if there is none."""
+        return find_level_effect(name, cls)
+
+    @classmethod
+    def find_unsupported_reason(cls, effect: type[Effect]) -> str:
+        """Return why the simulator cannot have an effect; empty if it can.
+
+        Forces need the method `apply_force`, dry friction also needs `inertia_repair`, levels need
+        `put`; effects on impacts and hidden-state effects are not possible.
+        """
+        if issubclass(effect, Contact):
+            return "an own simulator does not say when it strikes something"
+        if issubclass(effect, Level) and cls.simulator.set_levels is OwnSimulator.set_levels:
+            return "its levels cannot be set (it has no method put)"
+        if issubclass(effect, HiddenStateEffect):
+            return "an own simulator takes forces and no states beside its own"
+        if not issubclass(effect, Force | Friction):
+            return ""
+        if cls.simulator.apply_force is OwnSimulator.apply_force:
+            return "it takes no forces (it has no method apply_force)"
+        if issubclass(effect, Friction) and cls.simulator.inertia is OwnSimulator.inertia:
+            return "it does not say its inertia (it has no method inertia)"
+        try:
+            _ask(effect, cls)
+        except _NotDeclaredError as reason:
+            return str(reason)
+        return ""
+
+    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """Raise an error, because the mass is unknown outside the simulator."""
+        raise _NotDeclaredError("it does not say its mass")
+
+    def weight(self, moment: StateSnapshot) -> Array:
+        """Raise an error, because gravity is unknown outside the simulator."""
+        raise _NotDeclaredError("it does not say what gravity does to it")
+
+    def drive(self, moment: StateSnapshot) -> Array:
+        """Raise an error, because the effect of inputs is unknown outside the simulator."""
+        raise _NotDeclaredError("it does not say what its inputs do to it")
+
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """Return the channels, which are the motion that a user-defined simulator returns."""
+        return {c.name: x[:, :, i] for i, c in enumerate(self.channels)}
+
+
+class _NotDeclaredError(InputError):
+    """Error for a quantity that an effect needs and the simulator does not provide."""
+
+
+def _ask(effect: type[Effect], system: type[OwnSimulatorSystem]) -> None:
+    """Evaluate the effect once, so that a missing quantity of the system raises an error."""
+    # Coefficients and states are zero: only the requested quantities matter, not the result.
+    one = np.ones((1, 1))
+    d = len(system.coordinates)
+    constants = {c.name: c.value * one for c in system.constants}
+    inputs = {c.name: 0.0 * one for c in system.inputs}
+    theta = np.array([[p.nominal for p in system.parameters]])
+    nothing = np.zeros((1, d))
+    moment = StateSnapshot(system(), theta, constants, 0 * one, nothing, nothing, inputs)
+    c = np.zeros((len(effect.coefficients), 1, 1))
+    if issubclass(effect, Force):
+        effect().force(c, moment)
+    elif issubclass(effect, Friction):
+        effect().limit(c, moment)
+
+
+class OwnSimulator(SystemSimulator):
+    """Base class of a user-defined simulator.
+
+    Declare the attributes of `Simulator` (name, says, parameters, channels, constants, inputs,
+    states, requires), then those below where they apply, and implement `reset`, `step` and
+    `simulate_toy_problem`.
+
+    Attributes:
+        time_step: Maximum step, s; `step` is called with this or less, so that each sample time is
+            reached exactly.
+        kind: Unit of forces: ``linear`` in N, ``rotary`` in N m, ``point`` per unit mass.
+        coordinates: States that are the generalised position, for effects that are forces.
+        rates: States that are the rates of the coordinates, in the same order.
+        levels: States that are stored quantities, such as a tank's level, which may overflow; each
+            is also a channel.
+
+    Raises:
+        InputError: The declaration is contradictory.
+    """
+
+    system = OwnSimulatorSystem
+    own_engine = True
+    time_step: ClassVar[float] = 1 / 240
+    kind: ClassVar[SystemKind] = "linear"
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    rates: ClassVar[tuple[str, ...]] = ()
+    levels: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        _check(cls)
+        forced = {*cls.coordinates, *cls.rates}
+        # Other states are appended to the rates, because engines pass two vectors only.
+        others = [name for name in cls.states if name not in forced]
+        summary = " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split())
+        shared = ("name", "parameters", "channels", "constants", "inputs", "states")
+        declared = {
+            **{name: getattr(cls, name) for name in shared},
+            "says": cls.__dict__.get("says") or summary,
+            "kind": cls.kind,
+            "coordinates": cls.coordinates,
+            "rates": (*cls.rates, *others),
+            "levels": cls.levels,
+            "sensed": tuple(c.name for c in cls.channels),
+            "simulator": cls,
+        }
+        # Each simulator has its own system class: effects query the class, not an instance.
+        system: Any = type(f"{cls.__name__}System", (OwnSimulatorSystem,), declared)
+        cls.system = system
+        super().__init_subclass__(**kwargs)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        # Otherwise a user's `self.engine = ...` would break the base class far from its cause.
+        if name in _TAKEN and name in self.__dict__:
+            raise InputError(
+                f"simulator {self.name}: the attribute '{name}' is the base class's; name yours"
+                " otherwise"
+            )
+        super().__setattr__(name, value)
+
+    @abstractmethod
+    def reset(
+        self,
+        theta: Mapping[str, float],
+        constants: Mapping[str, float],
+        initial: Mapping[str, float],
+    ) -> None:
+        """Start a run.
+
+        All that an earlier run may have changed must be set, so that runs are independent.
+
+        Args:
+            theta: Parameters by name.
+            constants: Constants by name.
+            initial: Initial state by name.
+        """
+
+    @abstractmethod
+    def step(self, inputs: Mapping[str, float], seconds: float) -> None:
+        """Advance the simulation.
+
+        Args:
+            inputs: Inputs by name, constant during the step.
+            seconds: Length of the step, s.
+        """
+
+    @abstractmethod
+    def observe(self) -> Mapping[str, float]:
+        """Return the current sensor values by name.
+
+        They must include every channel; for effects that are forces, also the coordinates and
+        rates.
+        """
+
+    def apply_force(self, force: Array) -> None:
+        """Add a generalised force to the next step only (optional).
+
+        Args:
+            force: (D,) one value for each coordinate: N, N m, or m/s^2 for ``point``.
+        """
+        raise NotImplementedError
+
+    def inertia(self) -> float | Array:
+        """Return the current generalised inertia, which dry friction needs (optional).
+
+        Returns:
+            The inertia matrix (D, D) of the coordinates, or a number if all coordinates have the
+            same inertia and are not coupled; kg, kg m^2, or 1 for ``point``.
+        """
+        raise NotImplementedError
+
+    def set_levels(self, levels: Mapping[str, float]) -> None:
+        """Set some levels to new values and continue from there; other states stay (optional)."""
+        raise NotImplementedError
+
+    def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+        if name is not None:
+            raise InputError(f"simulator {self.name} steps itself; it has no engine '{name}'")
+        step = dict(settings).pop("time_step", self.time_step)
+        if extra := [key for key in settings if key != "time_step"]:
+            raise InputError(
+                f"simulator {self.name} has no setting '{extra[0]}'; there is: time_step"
+            )
+        if not (is_plausible_number(step) and step > 0):
+            found = truncate_text(str(step))
+            raise InputError(f"time_step must be a positive number of seconds, found {found}")
+        return OwnSimulatorEngine(self, step)
+
+    def close(self) -> None:
+        """Release resources of the simulator."""
+
+
+_TAKEN = ("channels", "columns", "constant_values", "effects", "engine", "fixed", "parameters")
+"""Attributes that are set once, by the base classes."""
+
+
+def _check(cls: type[OwnSimulator]) -> None:
+    if not isinstance(getattr(cls, "name", None), str) or cls.name == OwnSimulatorSystem.name:
+        raise InputError(f'class {cls.__name__}: expected name = "..."')
+    if not cls.channels or not cls.parameters:
+        raise InputError(f"simulator {cls.name}: expected at least one parameter and one channel")
+    if cls.kind not in SYSTEM_KINDS:
+        kinds = ", ".join(SYSTEM_KINDS)
+        raise InputError(f"simulator {cls.name}: kind: expected {kinds}, found {cls.kind!r:.40}")
+    if len(cls.coordinates) != len(cls.rates):
+        raise InputError(
+            f"simulator {cls.name}: expected a rate for each of {cls.coordinates}, found"
+            f" {cls.rates}"
+        )
+    for name in (*cls.coordinates, *cls.rates):
+        if name not in cls.states:
+            known = ", ".join(cls.states) or "(none)"
+            raise InputError(f"simulator {cls.name}: {name} is not among its states {known}")
+    shown = [c.name for c in cls.channels]
+    for name in cls.levels:
+        if name not in cls.states or name not in shown:
+            raise InputError(f"simulator {cls.name}: level {name} must be a state and a channel")
+
+
+class BulletWorld:
+    """PyBullet world with the functions of ``pybullet`` as methods.
+
+    It prints nothing, and is disconnected when its last reference is deleted.
+    """
+
+    def __init__(self) -> None:
+        self._engine = import_pybullet()
+        self._client: int = self._engine.connect(self._engine.DIRECT)
+        # Not `__del__`, which may run after the interpreter has unloaded the module.
+        weakref.finalize(self, self._engine.disconnect, self._client)
+
+    def __getattr__(self, name: str) -> Any:
+        member = getattr(self._engine, name)  # a function, or a constant such as JOINT_REVOLUTE
+        return partial(member, physicsClientId=self._client) if callable(member) else member

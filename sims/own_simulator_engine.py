@@ -1,0 +1,311 @@
+"""Engine that steps a user-defined simulator and applies effects to it.
+
+Dry friction is the force that would stop the motion within the next step of length h, up to
+its limit L. With the inertia matrix M (D, D), the velocity v (D,), the forces F (D,) of
+effects and the simulator's own force P, which is unknown and estimated from the previous step,
+
+    P = M (v - v_before) / h_before - F_before                             (1)
+    S = -(M v / h + P + F)                                                 (2)
+    friction = S where |S| <= L, else L S / |S|                            (3)
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError
+from sims.core.system import (
+    Force,
+    Friction,
+    IntegrationBatch,
+    Level,
+    StateSnapshot,
+    System,
+    Trajectories,
+)
+from sims.engines.external.external_engine import equalise_steps
+
+
+class SteppableSimulator(Protocol):
+    """Protocol of a steppable simulator; `own_simulator.OwnSimulator` describes the methods."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def coordinates(self) -> tuple[str, ...]: ...
+
+    @property
+    def rates(self) -> tuple[str, ...]: ...
+
+    def reset(
+        self,
+        theta: Mapping[str, float],
+        constants: Mapping[str, float],
+        initial: Mapping[str, float],
+    ) -> None: ...
+
+    def step(self, inputs: Mapping[str, float], seconds: float) -> None: ...
+
+    def observe(self) -> Mapping[str, float]: ...
+
+    def apply_force(self, force: Array) -> None: ...
+
+    def inertia(self) -> float | Array: ...
+
+    def set_levels(self, levels: Mapping[str, float]) -> None: ...
+
+
+class OwnSimulatorEngine:
+    """Engine that steps a user-defined simulator, one batch element after another."""
+
+    name = "own"
+    requires: tuple[str, ...] = ()
+
+    def __init__(self, world: SteppableSimulator, step: float) -> None:
+        self.world = world
+        self.largest_step = float(step)
+
+    def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
+        """Return an empty text, because every system is supported."""
+        return ""
+
+    def close(self) -> None:
+        """Do nothing, because there are no resources."""
+
+    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+        """Return readings (L, R, C) instead of positions.
+
+        There is one row before the first step, and one after every `lanes.every` steps.
+
+        Raises:
+            InputError: A method of the simulator raised an exception or returned a wrong value.
+        """
+        count = lanes.steps.shape[1] // lanes.steps_per_sample + 1
+        width = len(lanes.system.channels)
+        shape = len(lanes.theta), count, width
+        result = np.full(shape, np.nan)
+        for lane in range(len(lanes.theta)):
+            try:
+                rows = self._run(lanes, lane)
+            except InputError:
+                raise
+            except Exception as error:
+                raise _fault(self.world, error) from error
+            if rows is not None and np.isfinite(rows).all():
+                result[lane] = rows
+        return Trajectories(result, result, result)
+
+    def _run(self, lanes: IntegrationBatch, lane: int) -> Array | None:
+        system = lanes.system
+        world = self.world
+        names = [p.name for p in system.parameters]
+        theta = dict(zip(names, lanes.theta[lane].tolist(), strict=True))
+        constants = {name: float(value[lane, 0]) for name, value in lanes.constants.items()}
+        states = (*system.coordinates, *system.rates)
+        start = [*lanes.x[lane].tolist(), *lanes.v[lane].tolist()]
+        initial = dict(zip(states, start, strict=True))
+        # Never pass NaN to a user's model: it may hang or never recover.
+        given = [*theta.values(), *constants.values(), *initial.values()]
+        if not np.isfinite(given).all():
+            return None
+        world.reset(theta, constants, initial)
+        forces = _Forces(lanes, lane, world)
+        rims = _LevelLimits(lanes, lane, world)
+        rims.keep()
+        steps = lanes.steps[lane].copy()
+        # Steps of zero length, in which this batch element waits for others, are skipped.
+        moving = steps > 0
+        steps[moving] = equalise_steps(steps[moving], lanes.steps_per_sample)
+        row = self._row(system)
+        t = 0.0
+        moved = False
+        rows = [row]
+        for i, seconds in enumerate(steps.tolist()):
+            if seconds > 0:
+                inputs = {name: float(u[lane, i]) for name, u in lanes.inputs.items()}
+                if forces.any:
+                    world.apply_force(forces.at(t, inputs, seconds))
+                world.step(inputs, seconds)
+                rims.keep()
+                t = t + seconds
+                moved = True
+            # Without a step, the previous row is still valid.
+            if (i + 1) % lanes.steps_per_sample == 0:
+                row = self._row(system) if moved else row
+                moved = False
+                rows.append(row)
+        return np.array(rows)
+
+    def _row(self, system: System) -> list[float]:
+        seen = self.world.observe()
+        return [observed(self.world, seen, c.name) for c in system.channels]
+
+
+def _fault(world: SteppableSimulator, error: Exception) -> InputError:
+    """Make the error for an exception in the simulator's code, with its line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    module = sys.modules.get(type(world).__module__)
+    own = [frame for frame in frames if frame.filename == getattr(module, "__file__", None)]
+    frame = (own or list(frames))[-1]
+    what = f"{type(error).__name__}: {error}"
+    at = f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
+    return InputError(f"simulator {world.name}: {what} ({at})")
+
+
+def observed(world: SteppableSimulator, seen: Mapping[str, float], name: str) -> float:
+    """Return one value of the result of `simulate_toy_problem`.
+
+    Args:
+        world: Simulator.
+        seen: Result of its `simulate_toy_problem`.
+        name: Name of a channel, coordinate, rate or level.
+
+    Raises:
+        InputError: The value is missing, or not a number.
+    """
+    try:
+        value = seen[name]
+    except (KeyError, TypeError, IndexError):
+        raise _unobserved(world, seen, name) from None
+    if isinstance(value, float):  # shortcut (NumPy floats, too), because the general test is slow
+        return float(value)
+    if shape := np.shape(value):
+        raise InputError(
+            f"simulator {world.name}: observe(), {name}: expected a number, found shape {shape}"
+        )
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"simulator {world.name}: observe(), {name}: expected a number, found {value!r:.40}"
+        ) from None
+
+
+def _unobserved(world: SteppableSimulator, seen: object, name: str) -> InputError:
+    """Make the error for a value that `simulate_toy_problem` did not return."""
+    if not isinstance(seen, Mapping):
+        found = type(seen).__name__
+        return InputError(
+            f"simulator {world.name}: observe(): expected a dictionary, found {found}"
+        )
+    return InputError(
+        f"simulator {world.name}: observe() gave no '{name}'; it gave: {', '.join(seen)}"
+    )
+
+
+def inertia_of(world: SteppableSimulator) -> float | Array:
+    """Return the current generalised inertia of a simulator.
+
+    Returns:
+        A number, which applies to every coordinate, or a matrix (D, D).
+
+    Raises:
+        InputError: `inertia_repair` returned neither.
+    """
+    given = world.inertia()
+    if isinstance(given, float):
+        return float(given)
+    d = len(world.coordinates)
+    try:
+        matrix = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"simulator {world.name}: inertia: expected numbers; {error}") from None
+    if not matrix.shape:
+        return float(matrix)
+    if matrix.shape == (d, d):
+        return matrix
+    joints = ", ".join(world.coordinates)
+    raise InputError(
+        f"simulator {world.name}: inertia: expected shape {(d, d)} (joints × joints; here: "
+        f"{joints}) or a number, found {matrix.shape}"
+    )
+
+
+class _LevelLimits:
+    """Limits of the levels of one batch element."""
+
+    def __init__(self, lanes: IntegrationBatch, lane: int, world: SteppableSimulator) -> None:
+        self.acting = []
+        for effect, c in lanes.effects:
+            own = c[:, lane : lane + 1]
+            if isinstance(effect, Level) and own.any():
+                self.acting.append((effect, own, effect.place or lanes.system.levels[0]))
+        self.world = world
+
+    def keep(self) -> None:
+        """Limit the levels."""
+        if not self.acting:
+            return
+        seen = self.world.observe()
+        for effect, c, name in self.acting:
+            level = np.array([[observed(self.world, seen, name)]])
+            kept = float(effect.limit_level(c, level)[0, 0])
+            if kept != level[0, 0]:
+                self.world.set_levels({name: kept})
+
+
+class _Forces:
+    """Forces of the effects on one batch element."""
+
+    def __init__(self, lanes: IntegrationBatch, lane: int, world: SteppableSimulator) -> None:
+        here = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
+        acting = [(effect, c) for effect, c in here if c.any()]
+        self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]
+        self.frictions = [(effect, c) for effect, c in acting if isinstance(effect, Friction)]
+        self.any = bool(self.forces or self.frictions)
+        self.world = world
+        self.system = lanes.system
+        self.theta = lanes.theta[lane : lane + 1]
+        self.constants = {name: value[lane : lane + 1] for name, value in lanes.constants.items()}
+        self._last: tuple[Array, Array, float] | None = None
+
+    def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
+        """Return the sum (D,) of the effects' forces for the next step.
+
+        Args:
+            t: Time since the start of the run, s.
+            inputs: Inputs by name.
+            seconds: Length of the step, s.
+        """
+        seen = self.world.observe()
+        x = self._state(seen, self.world.coordinates)
+        v = self._state(seen, self.world.rates)
+        felt = {name: np.array([[value]]) for name, value in inputs.items()}
+        now = np.array([[t]])
+        moment = StateSnapshot(self.system, self.theta, self.constants, now, x, v, felt)
+        force = np.zeros(x.shape[1])
+        for effect, c in self.forces:
+            force = force + effect.force(c, moment)[0]
+        if self.frictions:
+            force = force + self._friction(moment, force, seconds)
+        return force
+
+    def _friction(self, moment: StateSnapshot, force: Array, seconds: float) -> Array:
+        """Return the force (D,) that stops the motion within the step, up to the limit.
+
+        The simulator's own force is estimated from the last step.
+        """
+        inertia = inertia_of(self.world)
+        v = moment.v[0]
+        own = np.zeros_like(force)
+        if self._last is not None:
+            before, applied, took = self._last
+            own = np.dot(inertia, v - before) / took - applied  # (1)
+        limit = sum(float(effect.limit(c, moment)[0, 0]) for effect, c in self.frictions)
+        stop = -(np.dot(inertia, v) / seconds + own + force)  # (2)
+        size = float(np.linalg.norm(stop))
+        friction: Array = stop if size <= limit else stop * (limit / size)  # (3)
+        self._last = v, force + friction, seconds
+        return friction
+
+    def _state(self, seen: Mapping[str, float], names: Sequence[str]) -> Array:
+        values = [observed(self.world, seen, name) for name in names]
+        state: Array = np.array([values])
+        return state

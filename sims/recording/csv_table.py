@@ -1,0 +1,334 @@
+"""Read the table `MAX_NAME_LENGTH.csv` of a recording cell by cell; errors state row and column.
+
+Rows are lines of the file, counted from 1 with the header, as in an editor.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+
+from sims.core.atomic_files import require_file
+from sims.core.simulator import Array, InputError, make_read_only
+from sims.core.toml_validation import format_value
+from sims.core.value_limits import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
+from sims.recording.fast_csv import MIN_FAST_PARSE_BYTES, read_csv_fast
+
+_CHUNK = 1 << 13
+"""Number of rows that are converted to numbers at once, which limits the memory for their text."""
+_YEAR = 365.25 * 86400
+"""Seconds per year."""
+_NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
+"""Pattern of a number as instruments write it, without `inf` or `1_000`, which float() accepts."""
+
+
+class CsvRun(NamedTuple):
+    """Rows of one run.
+
+    Attributes:
+        name: Name of the run.
+        times: (T,) times, in the unit of the table.
+        columns: Other columns by name, each (T,); NaN where missing.
+        notes: Remarks on rows that were left out.
+    """
+
+    name: str
+    times: Array
+    columns: dict[str, Array]
+    notes: tuple[str, ...] = ()
+
+
+def read_table(
+    path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()
+) -> list[CsvRun]:
+    """Read the runs of a table in order of appearance.
+
+    Args:
+        path: Path of the table.
+        channels: Names of the measured signals; cells may be empty.
+        inputs: Names of the inputs; no cell may be empty.
+        extra: Names of other columns; cells may be empty.
+
+    Raises:
+        InputError: The table is malformed; the message is one line.
+    """
+    require_file(path)
+    try:
+        return Table(path, channels, inputs, extra).read()
+    except UnicodeDecodeError:
+        raise _not_text(path) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def has_run_column(path: Path) -> bool:
+    """Return whether the header of a table has the column `run`, as tables of simgap have."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            return "run" in file.readline().strip().split(",")
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _not_text(path: Path) -> InputError:
+    """Make the error for a table that is not UTF-8."""
+    data = path.read_bytes()
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return InputError(f"{path}: expected UTF-8 text, found UTF-16; save it as UTF-8")
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row, byte = data.count(b"\n", 0, error.start) + 1, data[error.start]
+        return InputError(
+            f"{path}, row {row}: expected UTF-8 text, found the byte 0x{byte:02x}; save it as UTF-8"
+        )
+    return InputError(f"{path}: expected UTF-8 text")
+
+
+class Table:
+    """Table of a CSV file, and the checks of runs that apply to every kind of table (`runs`).
+
+    Args:
+        path: Path of the table, for messages.
+        channels: Names of the measured signals; cells may be empty.
+        inputs: Names of the inputs; no cell may be empty.
+        extra: Names of other columns; cells may be empty.
+    """
+
+    def __init__(
+        self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]
+    ) -> None:
+        self.path = path
+        self.wanted = ["run", "t", *inputs, *channels, *extra]
+        self.gaps = {*channels, *extra}
+        self.channels, self.inputs = channels, inputs
+
+    def read(self) -> list[CsvRun]:
+        """Return the runs of the file."""
+        records = self._records()
+        header = self._header(next(records, []))
+        quick = None
+        if self.path.stat().st_size >= MIN_FAST_PARSE_BYTES:
+            quick = read_csv_fast(self.path, header, self.wanted[1:], self.gaps)
+        # If the fast reader gives up, read cell by cell to locate the error.
+        names, columns = quick or self._cells(header, records)
+        return self.runs(names, columns)
+
+    def _cells(
+        self, header: list[str], records: Iterator[list[str]]
+    ) -> tuple[list[str], dict[str, Array]]:
+        """Convert the rows below the header to run names and numeric columns (T,)."""
+        names: list[str] = []
+        parts: list[list[Array]] = []
+        while rows := list(islice(records, _CHUNK)):
+            even = self._even(rows, len(header), len(names))
+            by_column = zip(*even, strict=True)
+            cells = dict(zip(header, by_column, strict=True))
+            parts.append([self._numbers(name, cells[name], len(names)) for name in self.wanted[1:]])
+            names += [name.strip() for name in cells["run"]]
+        numeric = self.wanted[1:]
+        if not parts:
+            return names, {name: np.empty(0) for name in numeric}
+        columns = map(np.concatenate, zip(*parts, strict=True))
+        return names, dict(zip(numeric, columns, strict=True))
+
+    def _records(self) -> Iterator[list[str]]:
+        """Iterate over header and rows; skip blank lines."""
+        with self.path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True, skipinitialspace=True)
+            try:
+                yield from (row for row in reader if row)
+            except csv.Error as error:
+                raise InputError(
+                    f"{self.path}, row {reader.line_num}: not a CSV table: {error}"
+                ) from None
+
+    def _header(self, cells: list[str]) -> list[str]:
+        """Check the names of the columns against the declared ones, and return them."""
+        header = [cell.strip() for cell in cells]
+        # A single column is most likely due to another separator.
+        if len(header) < 2:
+            text = "".join(header)
+            marks = [name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text]
+            found = f"{marks[0]} (save it with commas)" if marks else format_value(text)
+            raise InputError(
+                f"{self.path}, row 1: expected columns {', '.join(self.wanted)} between commas, "
+                f"found {found}"
+            )
+        for place, name in enumerate(header):
+            if not name:
+                raise InputError(f"{self.path}, row 1: column {place + 1} has no name")
+            if name in header[:place]:
+                raise InputError(f"{self.path}, row 1: column {format_value(name)} stands twice")
+        for name in self.wanted:
+            if name not in header:
+                raise InputError(
+                    f"{self.path}: expected column '{name}', found columns {_listed(header)}"
+                )
+        for name in header:
+            if name not in self.wanted:
+                there = f"{self.path.with_suffix('.toml').name} declares {_listed(self.wanted[2:])}"
+                raise InputError(
+                    f"{self.path}: column {format_value(name)} is not declared; {there}"
+                )
+        return header
+
+    def _even(self, rows: list[list[str]], width: int, first: int) -> list[list[str]]:
+        """Check that all rows have as many cells as the header, and return them.
+
+        Args:
+            rows: Cells of each row.
+            width: Number of cells of the header.
+            first: Number of the first of these rows, counted from 0.
+        """
+        if set(map(len, rows)) != {width}:
+            record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
+            raise InputError(
+                f"{self.path}, row {self._line(first + record)}: "
+                f"expected {width} cells as in the header, found {len(row)}"
+            )
+        return rows
+
+    def _numbers(self, name: str, cells: Sequence[str], first: int) -> Array:
+        """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.
+
+        Args:
+            name: Name of the column.
+            cells: Text of each cell.
+            first: Number of the first of these rows, counted from 0.
+        """
+        try:
+            values = np.array(list(map(float, cells)))
+        except ValueError:
+            values = np.array([float(c) if _NUMBER.fullmatch(c) else math.nan for c in cells])
+        suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
+        joined = "".join(cells)
+        # float() also accepts 1_000 and digits of other scripts.
+        if "_" in joined or not joined.isascii():
+            suspects = range(len(cells))
+        for i in suspects:
+            if cells[i].strip() or name not in self.gaps:
+                self._check(name, cells[i], first + i)
+        return values
+
+    def _check(self, name: str, cell: str, record: int) -> None:
+        if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
+            missing = name in self.inputs and not cell.strip()
+            more = "; an input has no missing samples" if missing else ""
+            self.fault(record, name, f"expected a finite number, found {format_value(cell)}{more}")
+
+    def runs(self, names: list[str], columns: dict[str, Array]) -> list[CsvRun]:
+        """Split the rows into runs, each a block of rows with the same name, and check them.
+
+        Args:
+            names: Name of the run of each row.
+            columns: Times ``t`` and all other columns by name, each (T,); NaN where a cell is
+                empty.
+
+        Raises:
+            InputError: There are no rows; a run has no name, too few rows or no sample; or time
+                does not increase.
+        """
+        if not names:
+            raise InputError(f"{self.path}: expected rows of data, found none")
+        for name in self.channels:
+            if np.isnan(columns[name]).all():
+                raise InputError(f"{self.path}: column {name} has no sample; leave the channel out")
+        edges = [0, *(i + 1 for i, (a, b) in enumerate(pairwise(names)) if a != b), len(names)]
+        self._increasing(columns["t"], edges)
+        runs: dict[str, CsvRun] = {}
+        for begin, end in pairwise(edges):
+            name = names[begin]
+            if not name:
+                self.fault(begin, "run", "expected the name of a run, found none")
+            if len(name) > MAX_NAME_LENGTH:
+                wanted = f"a name of at most {MAX_NAME_LENGTH} characters"
+                self.fault(begin, "run", f"expected {wanted}, found {format_value(name)}")
+            if name in runs:
+                self.fault(
+                    begin,
+                    "run",
+                    f"run {format_value(name)} goes on after another began; expected its rows together",
+                )
+            part = {c: make_read_only(columns[c][begin:end]) for c in self.wanted[2:]}
+            if end - begin < 2:
+                self.fault(
+                    begin, "run", f"run {format_value(name)} has one row; expected at least two"
+                )
+            if not any(np.isfinite(part[c]).any() for c in self.channels):
+                self.fault(
+                    begin,
+                    self.channels[0],
+                    f"run {format_value(name)} has no sample of any channel",
+                )
+            self._seconds(columns["t"], begin, end - 1)
+            runs[name] = CsvRun(name, make_read_only(columns["t"][begin:end]), part)
+        return list(runs.values())
+
+    def _seconds(self, t: Array, first: int, last: int) -> None:
+        """Check that the stamps of a run can be seconds, and not milliseconds."""
+        latest = max(-t[first], t[last])
+        if latest > MAX_TIMESTAMP_SECONDS:
+            years = f"{latest:.4g}, which would be {latest / _YEAR:.2g} years"
+            self.fault(
+                last, "t", f"expected seconds, found {years}; are these milliseconds or less?"
+            )
+        lasts = t[last] - t[first]
+        if lasts < MIN_RUN_SECONDS:
+            self.fault(last, "t", f"expected seconds, found a run of {lasts:.3g} s")
+
+    def _increasing(self, t: Array, edges: list[int]) -> None:
+        """Check that the times increase within each run.
+
+        Args:
+            t: (T,) times.
+            edges: First row of each run, and the number of rows.
+        """
+        bad = t[1:] <= t[:-1]
+        # A run may begin earlier than the previous one ended.
+        begins = np.array(edges[1:-1], dtype=int)
+        bad[begins - 1] = False
+        if bad.any():
+            i = int(np.argmax(bad))
+            self.fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
+
+    def fault(self, record: int, column: str, message: str) -> NoReturn:
+        """Raise the error for a cell.
+
+        Args:
+            record: Number of the row, counted from 0.
+            column: Name of the column.
+            message: Expected and found content of the cell.
+
+        Raises:
+            InputError: Always.
+        """
+        raise InputError(f"{self.row(record)}, column {column}: {message}")
+
+    def row(self, record: int) -> str:
+        """Return the location of row `record` (counted from 0) for a message."""
+        return f"{self.path}, row {self._line(record)}"
+
+    def _line(self, record: int) -> int:
+        """Return the line on which row `record` (counted from 0) ends; reads the file again."""
+        with self.path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True, skipinitialspace=True)
+            with suppress(csv.Error):  # the fast reader accepts such cells
+                next(islice((row for row in reader if row), record + 1, None))
+            return reader.line_num
+
+
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    """Join names for a message; only the first `most` of many."""
+    text = ", ".join(names[:most])
+    if len(names) > most:
+        text += f" and {len(names) - most} more"
+    return text

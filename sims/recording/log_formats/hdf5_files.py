@@ -1,0 +1,140 @@
+"""Read HDF5 files as logs: a plain file is one log, a robomimic file has one log per run.
+
+A column is named by the path of its dataset, ``obs/joint_pos``. The log of a run is addressed as if
+its group were a folder, ``demo.hdf5/data/demo_3``. The package h5py is imported when a file is
+read.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError, make_read_only
+from sims.recording.log_formats.parquet_columns import MAX_COLUMNS
+
+ENDINGS = (".h5", ".hdf5", ".hdf")
+"""Endings of the names of HDF5 files."""
+LARGEST_DATASET = 250_000_000
+"""Maximum number of entries of a dataset that is read (2 GB of 64-bit numbers)."""
+_RUN = re.compile(r"[A-Za-z_ -]*\d+")
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether a path is an HDF5 file, by its ending."""
+    return path.suffix.lower() in ENDINGS and path.is_file()
+
+
+def group_of(path: Path) -> tuple[Path, str] | None:
+    """Split a path into an HDF5 file and a group in it; None if it is not inside such a file."""
+    if is_hdf5(path):
+        return path, "/"
+    for parent in path.parents:
+        if parent.exists():
+            return (parent, path.relative_to(parent).as_posix()) if is_hdf5(parent) else None
+    return None
+
+
+def runs_in(path: Path) -> list[Path]:
+    """List the log of each run of a file: its numbered groups, or the file itself.
+
+    Raises:
+        InputError: The file cannot be read, or h5py is not installed.
+    """
+    with _opened(path) as file:
+        for name in ("", "data"):
+            group = file.get(name or "/")
+            groups = [key for key, own in _items(group) if hasattr(own, "items")]
+            runs = [key for key in groups if _RUN.fullmatch(key)]
+            if runs and len(runs) == len(groups):
+                return [path / name / run for run in sorted(runs, key=_natural)]
+    return [path]
+
+
+def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list[str]]]:
+    """Read the datasets of a group.
+
+    Args:
+        path: HDF5 file.
+        group: Path of the group in it.
+
+    Returns:
+        Numbers by dataset name, (T,) or (T, k), and the texts of each other dataset, empty where it
+        holds something else.
+
+    Raises:
+        InputError: There is no such group, or the file cannot be read.
+    """
+    columns: dict[str, Array] = {}
+    texts: dict[str, list[str]] = {}
+    with _opened(path) as file:
+        own = file.get(group)
+        if own is None or not hasattr(own, "items"):
+            raise InputError(
+                f"{path}: unknown group '{group}'; there are: {', '.join(_groups(file)) or 'none'}"
+            )
+        datasets: dict[str, Any] = {}
+        own.visititems(lambda name, one: datasets.update({name: one}))
+        for name, one in datasets.items():
+            if not hasattr(one, "dtype"):
+                continue
+            wide = one.ndim > 1 and one.shape[1] > MAX_COLUMNS
+            if one.dtype.kind not in "fiub" or one.ndim not in (1, 2) or wide:
+                texts[name] = _texts(one)
+            elif one.size > LARGEST_DATASET:
+                raise InputError(f"{path}: {name} has {one.size} entries; at most 250 million")
+            else:
+                columns[name] = make_read_only(np.asarray(one[()], dtype=np.float64))
+    return columns, texts
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file, and convert the errors of its reader to one line."""
+    try:
+        import h5py
+    except ImportError:
+        raise InputError(
+            f"{path}: needs h5py to read it, not installed (pip install h5py)"
+        ) from None
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (InputError, MemoryError, KeyboardInterrupt):
+        raise
+    except Exception as error:  # with a damaged file, h5py raises many kinds of errors
+        what = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not an HDF5 file that can be read: {what[:200]}") from None
+
+
+def _items(group: Any) -> list[tuple[str, Any]]:
+    """Return the members of a group; empty if it is not a group."""
+    return list(group.items()) if hasattr(group, "items") else []
+
+
+def _groups(file: Any) -> list[str]:
+    """List the names of the first groups of a file."""
+    found: list[str] = []
+    file.visititems(lambda name, one: found.append(name) if hasattr(one, "items") else None)
+    return found[:12]
+
+
+def _texts(dataset: Any) -> list[str]:
+    """Return the texts of a dataset that is a list of texts; empty for another dataset."""
+    if dataset.ndim != 1 or dataset.dtype.kind not in "OSU" or dataset.size > MAX_COLUMNS:
+        return []
+    return [
+        one.decode("utf-8", errors="replace") if isinstance(one, bytes) else str(one)
+        for one in dataset[()].tolist()
+    ]
+
+
+def _natural(name: str) -> tuple[str, int]:
+    """Return a sort key by the number at the end of a name: ``demo_2`` before ``demo_10``."""
+    digits = re.search(r"\d+$", name)
+    return (name[: digits.start()], int(digits[0])) if digits else (name, 0)

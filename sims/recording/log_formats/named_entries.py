@@ -1,0 +1,175 @@
+"""Name the numbers of a log by the names of joints in the same log.
+
+A message of joint states has a list of names and lists of numbers in the same order, which may
+differ from the order of the model: ROS drivers sort names alphabetically. Logs store the names as
+columns (``field.name0`` next to ``field.position0`` of ``rostopic echo -p``), as a text in each row
+(``['base', 'elbow']``), or as an array of texts (NumPy). A number then gets the name of its joint:
+``field.position.base``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sims.core.simulator import Array, make_read_only
+
+_NAMES_WORD = r"(?:joint[_ ]?|motor[_ ]?)?names?"
+_PLACED = re.compile(r"(?P<stem>.*?)(?P<left>[\[(._]?)(?P<place>\d{1,4})(?P<right>[\])]?)")
+_NAMES_COLUMN = re.compile(rf"(?:(?P<prefix>.*?)[._/ ])??{_NAMES_WORD}", re.IGNORECASE)
+_LIST_OF_TEXTS = re.compile(r"[\[(](?P<inside>.*)[\])]")
+
+
+def entries_by_name(
+    columns: Mapping[str, Array], texts: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, Array], frozenset[str]]:
+    """Name the numbered columns of a table by the columns that hold their names.
+
+    Names are looked up in each row, because some loggers change their order.
+
+    Args:
+        columns: Numbers (T,) by column name.
+        texts: Texts (T,) by column name.
+
+    Returns:
+        The numbers by the names of their joints, and the numbered columns that they replace.
+    """
+    groups: dict[tuple[str, str, str], dict[int, str]] = {}
+    for column in texts:
+        match = _PLACED.fullmatch(column)
+        stem = _NAMES_COLUMN.fullmatch(match["stem"]) if match else None
+        if match and stem:
+            prefix = column[: len(stem["prefix"]) + 1] if stem["prefix"] else ""
+            style = prefix, match["left"], match["right"]
+            groups.setdefault(style, {})[int(match["place"])] = column
+    named: dict[str, Array] = {}
+    unlisted: set[str] = set()
+    for style, places in groups.items():
+        names = [list(texts[places[place]]) for place in sorted(places)]
+        for siblings, own in _numbered(columns, *style).items():
+            if set(own) != set(places):
+                continue
+            values = np.column_stack([columns[own[place]] for place in sorted(own)])
+            found = _by_name(values, names, f"{siblings}.")
+            if found and not found.keys() & columns.keys():
+                named |= found
+                unlisted |= set(own.values())
+    return named, frozenset(unlisted)
+
+
+def lists_by_name(
+    columns: Mapping[str, Array], texts: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, Array], frozenset[str]]:
+    """Name the entries of lists by a column that holds a list of names in each row.
+
+    Args:
+        columns: Numbers (T,) or (T, k) by column name.
+        texts: Texts (T,) by column name.
+
+    Returns:
+        The numbers by the names of their joints, and the lists that they replace.
+    """
+    named: dict[str, Array] = {}
+    unlisted: set[str] = set()
+    for names_column, cells in texts.items():
+        stem = _NAMES_COLUMN.fullmatch(names_column)
+        lists = [_texts_of(cell) for cell in cells] if stem else []
+        if not lists or not lists[0] or len({len(one) for one in lists}) > 1:
+            continue
+        names = [list(own) for own in zip(*lists, strict=True)]
+        for name, values in columns.items():
+            if values.ndim == 2 and values.shape[1] == len(names):
+                found = _by_name(values, names, f"{name}.")
+                if found and not found.keys() & columns.keys():
+                    named |= found
+                    unlisted.add(name)
+    return named, frozenset(unlisted)
+
+
+def arrays_by_name(
+    columns: Mapping[str, Array], names: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, Array], frozenset[str]]:
+    """Name the entries of arrays by an array of names of the same length.
+
+    Args:
+        columns: Numbers (T,) or (T, k) by array name.
+        names: Texts (k,) by array name.
+
+    Returns:
+        The numbers by the names of their joints, and the arrays that they replace.
+    """
+    named: dict[str, Array] = {}
+    unlisted: set[str] = set()
+    for array, own in names.items():
+        if not re.search(r"name|joint|motor|label", array, re.IGNORECASE):
+            continue
+        for name, values in columns.items():
+            if values.ndim == 2 and values.shape[1] == len(own) == len(set(own)):
+                named |= {
+                    f"{name}.{one}": make_read_only(values[:, k]) for k, one in enumerate(own)
+                }
+                unlisted.add(name)
+    return named, frozenset(unlisted)
+
+
+def _numbered(
+    columns: Mapping[str, Array], prefix: str, left: str, right: str
+) -> dict[str, dict[int, str]]:
+    """Group numbered columns by the text before their number.
+
+    Args:
+        columns: Numbers by column name.
+        prefix: Required beginning of the names.
+        left: Required character before the number.
+        right: Required character after the number.
+
+    Returns:
+        Column names by number, for each text before the number.
+    """
+    found: dict[str, dict[int, str]] = {}
+    for column, values in columns.items():
+        match = _PLACED.fullmatch(column)
+        if match is None or values.ndim > 1 or not column.startswith(prefix):
+            continue
+        if (match["left"], match["right"]) == (left, right):
+            found.setdefault(match["stem"], {})[int(match["place"])] = column
+    return found
+
+
+def _by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict[str, Array]:
+    """Sort numbers into columns by name, looking up the names in each row.
+
+    Args:
+        values: Numbers (T, k).
+        names: Names (k, T), one for each number in each row.
+        prefix: Beginning of the names of the new columns.
+
+    Returns:
+        Columns (T,) by name, NaN in rows without the name; empty if a row has a name twice.
+    """
+    every = list(dict.fromkeys(name for own in names for name in own if name))
+    if not every or len(every) > 4 * len(names):
+        return {}
+    table = np.array(names, dtype=object).T
+    found: dict[str, Array] = {}
+    for name in every:
+        mask = table == name
+        if (mask.sum(axis=1) > 1).any():
+            return {}
+        found[prefix + name] = make_read_only(np.where(mask, values, 0.0).sum(axis=1))
+        missing = ~mask.any(axis=1)
+        if missing.any():
+            own = found[prefix + name].copy()
+            own[missing] = np.nan
+            found[prefix + name] = make_read_only(own)
+    return found
+
+
+def _texts_of(cell: str) -> list[str]:
+    """Return the texts of a list that is written in a cell as ``['base', 'elbow']``."""
+    match = _LIST_OF_TEXTS.fullmatch(cell.strip())
+    if not match:
+        return []
+    return [part.strip(" '\"") for part in re.split(r"[,;]", match["inside"])]

@@ -1,0 +1,254 @@
+"""Find the layout of a text table from its first lines.
+
+Comments and notes may precede the header, the header may be a comment itself (as NumPy writes it),
+and a row of units may follow it. The separator is the one with which the largest share of the cells
+are numbers.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sims.core.simulator import InputError
+from sims.core.toml_validation import format_value
+from sims.recording.log_formats.unit_names import read_unit
+
+SEPARATORS = (",", ";", "\t", "|", " ")
+"""Possible separators of the cells of a table; a blank means any number of blanks."""
+_HEAD_BYTES = 1 << 22
+"""Maximum number of bytes from which the layout is found."""
+_HEAD_LINES = 400
+"""Maximum number of lines from which the layout is found."""
+COMMENT = re.compile(r"\s*(#+|%+|//+|!+)\s*")
+"""Pattern of the beginning of a comment line."""
+NUMBER = re.compile(
+    r"[+-]?(\d+([.,]\d+)*\.?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE
+)
+"""Pattern of a number with a decimal point or comma."""
+NUMBERS = re.compile(r"[\[\(](?P<inside>[^\]\)]*)[\]\)]")
+"""Pattern of a list of numbers in one cell."""
+INSTANT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d{1,9})?\s*(Z|UTC|[+-]\d\d:?\d\d)?")
+"""Pattern of a date with a time, in ISO 8601."""
+NO_NUMBER = frozenset({"nan", "null", "none", "na", "n/a", "#n/a", "nil"})
+"""Cells that stand for a missing number."""
+_NAME = re.compile(r"[^\W\d][\w./\[\](){}°%-]*")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout of a text table.
+
+    Attributes:
+        encoding: Encoding of the text.
+        separator: One of `SEPARATORS`.
+        names: Names of the columns; empty if the file has none.
+        units: Unit of each column, from the row of units below the header.
+        header: Line of the header, counted from 1; 0 if there is none.
+        first: Line of the first data row, counted from 1.
+        width: Number of cells per row.
+    """
+
+    encoding: str
+    separator: str
+    names: tuple[str, ...]
+    units: Mapping[str, str]
+    header: int
+    first: int
+    width: int
+
+
+def find_layout(path: Path) -> Layout:
+    """Find the layout of a table from its first lines.
+
+    Raises:
+        InputError: The table has no rows, or its header has another number of cells than its rows.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+        whole = not file.read(1)
+    encoding = _encoding(path, head)
+    lines = head.decode(encoding, errors="replace").splitlines()
+    if not whole and len(lines) > 1:
+        lines.pop()  # the last line is incomplete
+    lines = lines[:_HEAD_LINES]
+    if not any(line.strip() for line in lines):
+        raise InputError(f"{path}: expected a table with a header and rows, found an empty file")
+    body = [line for line in lines if line.strip() and not COMMENT.match(line)]
+    separator = _separator(body)
+    rows = {n: _split(line, separator) for n, line in enumerate(lines, start=1) if line.strip()}
+    width = _width([row for n, row in rows.items() if not COMMENT.match(lines[n - 1])])
+    columns = _numeric_columns(rows.values(), width)
+    first = next((n for n, row in rows.items() if _is_data(row, width, columns)), 0)
+    above = [n for n in rows if n < first] if first else list(rows)
+    units_row: dict[int, str] = {}
+    if above and first and (found := _units(_filled(rows[above[-1]], width), columns)):
+        units_row = found
+        above.pop()
+    for n in reversed(above):
+        names = _header(lines[n - 1], separator, width, columns)
+        if names is not None:
+            units = {names[place]: unit for place, unit in units_row.items()}
+            return Layout(encoding, separator, names, units, n, first or n + 1, width)
+    if not first:
+        what = format_value(lines[0].strip())
+        raise InputError(f"{path}: expected a header and rows of numbers, found {what}")
+    above = [n for n in above if not COMMENT.match(lines[n - 1])]
+    if not above and (own := _counted(rows, first)):
+        return Layout(encoding, separator, own, {}, first, first + 1, width)
+    if above and len(rows[above[-1]]) > 1 and width > 1:
+        n = above[-1]
+        raise InputError(
+            f"{path}, row {n}: expected {width} names, one for each cell of row {first}, found "
+            f"{len(rows[n])}; give each column a name"
+        )
+    return Layout(encoding, separator, (), {}, 0, first, width)
+
+
+def _encoding(path: Path, head: bytes) -> str:
+    """Return the encoding of a text: UTF-8, UTF-16 with a byte order mark, or Windows-1252."""
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if b"\0" in head:
+        raise InputError(f"{path}: expected a table of text, found binary data")
+    try:
+        # Ignore the last line, which may be cut within a character.
+        head[: head.rfind(b"\n") + 1 or None].decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
+
+
+def _split(line: str, separator: str) -> list[str]:
+    """Split a line into its cells."""
+    if separator == " ":
+        return line.split()
+    try:
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:  # for example a quoted cell without end
+        return [line]
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """Return the separator with which the largest share of the cells are numbers."""
+    best, best_score = ",", (-1.0, 0.0)
+    for separator in SEPARATORS:
+        rows = [_split(line, separator) for line in lines]
+        width = _width(rows)
+        if width < 2:
+            continue
+        even = [row for row in rows if len(row) == width]
+        numeric = np.mean([is_numeric(cell) for row in even for cell in row if cell.strip()] or 0)
+        score = (round(float(numeric) * len(even) / len(rows), 6), float(width))
+        if score > best_score:
+            best, best_score = separator, score
+    return best
+
+
+def _width(rows: Sequence[Sequence[str]]) -> int:
+    """Return the most frequent number of cells per row, including empty ones at the end."""
+    counts = Counter(len(row) for row in rows)
+    return max(counts, key=lambda count: (counts[count], count), default=0)
+
+
+def _filled(row: Sequence[str], width: int) -> list[str]:
+    """Strip the cells of a row, and shorten or extend it to `width` cells."""
+    return [cell.strip() for cell in [*row, *[""] * width][:width]]
+
+
+def _numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
+    """Return the positions of the columns in which at least half of the cells are numbers."""
+    even = [row for row in rows if len(row) == width]
+    # The second half of the inspected rows is data, whatever precedes it.
+    body = even[len(even) // 2 :]
+    result = []
+    for place in range(width):
+        filled = [row[place] for row in body if row[place].strip()]
+        if filled and 2 * sum(map(is_numeric, filled)) >= len(filled):
+            result.append(place)
+    return result
+
+
+def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
+    """Return whether a row contains numbers rather than names, notes or units."""
+    if len(row) != width:
+        return False
+    cells = [row[place].strip() for place in columns]
+    numbers = [is_numeric(cell) for cell in cells]
+    texts = [bool(cell) and not number for cell, number in zip(cells, numbers, strict=True)]
+    return any(numbers) and (not any(texts) or numbers[0])
+
+
+def _header(
+    line: str, separator: str, width: int, columns: Sequence[int]
+) -> tuple[str, ...] | None:
+    """Return the column names in a line; None if it is not a header."""
+    comment = COMMENT.match(line)
+    # `%time,field.data` of rostopic begins with a name, `% t q1` of Matlab with a comment.
+    marked = comment is not None and not re.match(r"%\w", line.strip())
+    text = line[comment.end() :] if comment is not None and marked else line
+    names = _split(text, separator)
+    while len(names) > width and not names[-1].strip():
+        names.pop()
+    if len(names) != width and marked:
+        # NumPy writes the header as given by the user, who may use a separator other than that of
+        # the rows.
+        for other in SEPARATORS:
+            parts = [part.strip() for part in _split(text, other)]
+            if len(parts) == width and all(map(_NAME.fullmatch, parts)):
+                names = parts
+    if len(names) != width:
+        return None
+    stripped = [name.strip(", ;\t" if separator == " " else None) for name in names]
+    missing = sum(not stripped[place] for place in columns)
+    numbers = [stripped[place] for place in columns if is_numeric(stripped[place])]
+    if missing > 1 or (columns and is_numeric(stripped[columns[0]])):
+        return None
+    # Joints may be numbered, `time,1,2,3`, but a note with a number is not a header, `Rate;100`.
+    if not all(number.isdigit() for number in numbers) or len(set(numbers)) < len(numbers):
+        return None
+    return tuple(stripped)
+
+
+def _units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
+    """Return the units by position if a row contains units only; otherwise nothing."""
+    found = {}
+    for place in columns:
+        text = row[place].strip("[](){}<> ") if row[place] else ""
+        if not text:
+            continue
+        unit = read_unit(text)
+        if unit is None or is_numeric(row[place]):
+            return {}
+        found[place] = unit[0]
+    return found
+
+
+def _counted(rows: Mapping[int, Sequence[str]], first: int) -> tuple[str, ...]:
+    """Return the column numbers that pandas writes for unnamed columns; otherwise nothing."""
+    own = tuple(cell.strip() for cell in rows[first])
+    numbers = own[1:] if own and not own[0] else own
+    counts = [tuple(str(start + k) for k in range(len(numbers))) for start in (0, 1)]
+    if len(numbers) < 3 or numbers not in counts:
+        return ()
+    # A first row 0, 1, 2, ... may also be data, unless the following rows contain fractions.
+    following = [row for line, row in rows.items() if line > first]
+    fractions = any("." in cell or "," in cell for row in following for cell in row)
+    return own if fractions else ()
+
+
+def is_numeric(cell: str) -> bool:
+    """Return whether a cell holds a number, a list of numbers, a time or a missing-number mark."""
+    text = cell.strip()
+    if NUMBER.fullmatch(text) or text.lower() in NO_NUMBER:
+        return True
+    match = NUMBERS.fullmatch(text)
+    if match:
+        return all(map(NUMBER.fullmatch, match["inside"].replace(",", " ").split()))
+    return INSTANT.fullmatch(text) is not None

@@ -1,0 +1,361 @@
+"""Read text tables, as loggers and spreadsheets write them, into numeric columns by name.
+
+Decimal commas are read where the separator or the cells of the file make them unambiguous. A cell
+that does not fit its column is refused with the number of its row.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError, make_read_only
+from sims.core.toml_validation import format_value
+from sims.recording.log_formats.named_entries import entries_by_name, lists_by_name
+from sims.recording.log_formats.parquet_columns import MAX_COLUMNS
+from sims.recording.log_formats.table_layout import (
+    COMMENT,
+    INSTANT,
+    NO_NUMBER,
+    NUMBER,
+    NUMBERS,
+    Layout,
+    find_layout,
+    is_numeric,
+)
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Columns of a text table.
+
+    Attributes:
+        columns: Numeric columns by name, (T,) or (T, k), NaN where a cell is missing.
+        texts: Names of the columns that hold text.
+        units: Unit of each column for which a row of the table states one.
+        unlisted: Columns that are also available under the name of their joint.
+        named: Whether the file names its columns.
+        first: Line of the first data row, counted from 1.
+    """
+
+    columns: Mapping[str, Array]
+    texts: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    unlisted: frozenset[str] = frozenset()
+    named: bool = True
+    first: int = 2
+
+
+def read_text_table(path: Path) -> TextTable:
+    """Read a text table and find its layout (separator, header, rows of units) automatically.
+
+    Raises:
+        InputError: The file is not a table, or a cell does not fit its column; the one-line message
+            states the row.
+    """
+    layout = find_layout(path)
+    cells = _cells(path, layout)
+    columns: dict[str, Array] = {}
+    texts: dict[str, list[str]] = {}
+    kinds = [_CellKind(column, layout.separator) for column in cells]
+    # One column may resolve an ambiguity of another: `1,234` is 1.234 in a file that has `0,5`.
+    commas = any(kind.has_decimal_commas for kind in kinds)
+    for name, kind in zip(_names(layout), kinds, strict=True):
+        values = kind.numbers(path, layout, name, commas)
+        if values is None:
+            texts[name] = kind.texts.tolist()
+        else:
+            columns[name] = make_read_only(values)
+    named, unlisted = entries_by_name(columns, texts)
+    listed, replaced = lists_by_name(columns, texts)
+    return TextTable(
+        {**columns, **named, **listed},
+        tuple(texts),
+        layout.units,
+        unlisted | replaced,
+        bool(layout.names),
+        layout.first,
+    )
+
+
+def _names(layout: Layout) -> list[str]:
+    """Make the column names unique as pandas does: ``q``, ``q.1``, ``Unnamed: 3``."""
+    names = layout.names or tuple(f"column {place + 1}" for place in range(layout.width))
+    result: list[str] = []
+    for place, name in enumerate(names):
+        own = name or f"Unnamed: {place}"
+        number = 1
+        while own in result:
+            own, number = f"{name}.{number}", number + 1
+        result.append(own)
+    return result
+
+
+def _cells(path: Path, layout: Layout) -> list[Any]:
+    """Read the text cells of each column."""
+    import pandas
+
+    separator = r"\s+" if layout.separator == " " else layout.separator
+    for encoding in (layout.encoding, "cp1252"):
+        try:
+            with path.open(encoding=encoding, newline="") as file:
+                # A quotation mark in a note above the header must not swallow the rows.
+                for _ in range(layout.first - 1):
+                    next(file, "")
+                table = pandas.read_csv(
+                    file,
+                    sep=separator,
+                    header=None,
+                    dtype=str,
+                    keep_default_na=False,
+                    skipinitialspace=True,
+                )
+            break
+        except UnicodeDecodeError:  # a byte after the inspected head of the file
+            continue
+        except pandas.errors.EmptyDataError:
+            return [np.array([], dtype=object)] * layout.width
+        except (pandas.errors.ParserError, ValueError) as error:
+            raise _uneven(path, layout) or _not_a_table(path, layout, error) from None
+    else:
+        raise InputError(f"{path}: expected UTF-8 text; save it as UTF-8")
+    comment = table[0].str.match(COMMENT.pattern)
+    if comment.any():
+        table = table[~comment.to_numpy(dtype=bool)]
+    # pandas fills up rows that are too short.
+    if (table[table.columns[-1]].fillna("") == "").any() and (fault := _uneven(path, layout)):
+        raise fault
+    while table.shape[1] > layout.width and (table[table.columns[-1]].fillna("") == "").all():
+        table = table.iloc[:, :-1]
+    if table.shape[1] > MAX_COLUMNS:
+        raise InputError(f"{path}: expected at most {MAX_COLUMNS} columns, found {table.shape[1]}")
+    if table.shape[1] != layout.width:
+        raise InputError(
+            f"{path}, row {layout.first}: expected {layout.width} cells, found {table.shape[1]}"
+        )
+    return [table[name].fillna("").to_numpy(dtype=object) for name in table.columns]
+
+
+def _not_a_table(path: Path, layout: Layout, error: Exception) -> InputError:
+    """Make the error for a file whose rows pandas cannot split."""
+    opened = re.search(r"EOF inside string starting at row (\d+)", str(error))
+    if opened:
+        row = layout.first + int(opened[1])
+        return InputError(
+            f"{path}, row {row}: a quotation mark opens a cell and none closes it; close or "
+            "delete it"
+        )
+    return InputError(
+        f"{path}, row {layout.first}: expected rows of {layout.width} cells between commas, "
+        "semicolons, tabs or blanks; save the file as CSV"
+    )
+
+
+def _uneven(path: Path, layout: Layout) -> InputError | None:
+    """Make the error for the first row with a wrong number of cells; None if all rows are even."""
+    line = layout.first
+    try:
+        for line, last, row in _rows(path, layout):
+            filled = len(row)
+            while filled > layout.width and not row[filled - 1].strip():
+                filled -= 1
+            if filled == layout.width:
+                continue
+            if last > line:
+                return InputError(
+                    f"{path}, row {line}: a quotation mark opens a cell that ends in row {last}; "
+                    "close or delete it"
+                )
+            where = f"as in the header, row {layout.header}" if layout.header else "as above"
+            remedy = "correct or delete this row"
+            if filled < layout.width and line >= _last_line(path, layout):
+                remedy = "the log was cut off there: delete this row"
+            return InputError(
+                f"{path}, row {line}: expected {layout.width} cells {where}, found {filled}; "
+                f"{remedy}"
+            )
+    except csv.Error:  # such as a cell of more than 131,072 characters
+        return InputError(
+            f"{path}, row {line + 1}: expected cells of numbers or short texts, found a cell that "
+            "is too long; is a quotation mark not closed?"
+        )
+    return None
+
+
+def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
+    """Iterate over the data rows with their first and last lines; skip comments and blank lines."""
+    with path.open(encoding=layout.encoding, errors="replace", newline="") as file:
+        if layout.separator == " ":
+            for line, text in enumerate(file, start=1):
+                if line >= layout.first and text.strip() and not COMMENT.match(text):
+                    yield line, line, text.split()
+            return
+        for _ in range(layout.first - 1):
+            next(file, "")
+        reader = csv.reader(file, delimiter=layout.separator, skipinitialspace=True)
+        before = layout.first - 1
+        for row in reader:
+            last = layout.first - 1 + reader.line_num
+            if any(row) and not COMMENT.match(row[0]):
+                yield before + 1, last, row
+            before = last
+
+
+def _last_line(path: Path, layout: Layout) -> int:
+    """Return the line of the last data row."""
+    last = 0
+    for line, *_ in _rows(path, layout):
+        last = line
+    return last
+
+
+def _line_of(path: Path, layout: Layout, record: int) -> int:
+    """Return the line of a data row, counted from 1 as in an editor."""
+    for number, (line, *_) in enumerate(_rows(path, layout)):
+        if number == record:
+            return line
+    return layout.first + record
+
+
+MAX_SAMPLED_CELLS = 1000
+"""Maximum number of cells with commas per column inspected to distinguish text from numbers."""
+
+
+class _CellKind:
+    """Cells of one column and the kind of numbers that they hold."""
+
+    def __init__(self, cells: Any, separator: str) -> None:
+        import pandas
+
+        self.cells = cells
+        self.series = pandas.Series(cells, dtype=object).astype(str).str.strip()
+        self.texts = self.series.to_numpy(dtype=object)
+        self.filled = self.series[self.series != ""]
+        self.has_commas, self.has_decimal_commas, self.is_thousands = False, False, False
+        commas = self.filled[self.filled.str.contains(",", regex=False)]
+        some = commas.iloc[:: max(len(commas) // MAX_SAMPLED_CELLS, 1)]
+        # Lists and texts may contain commas, too.
+        if commas.empty or 2 * sum(map(bool, map(NUMBER.fullmatch, some))) < len(some):
+            return
+        self.has_commas = True
+        several = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
+        self.is_thousands = bool(several.any())
+        if separator != ",":
+            self.has_decimal_commas = not self.is_thousands
+        else:
+            # Three digits after a comma may be a group of thousands, unless other cells show
+            # decimals.
+            groups = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
+            self.has_decimal_commas = not bool(groups.all()) and not self.is_thousands
+
+    def numbers(self, path: Path, layout: Layout, name: str, commas: bool) -> Array | None:
+        """Convert the cells to numbers.
+
+        Args:
+            path: Path of the table, for messages.
+            layout: Layout of the table.
+            name: Name of the column, for messages.
+            commas: Whether another column of the file has decimal commas.
+
+        Returns:
+            Numbers (T,) or (T, k); None if the column holds text.
+
+        Raises:
+            InputError: A cell is not a number, or its comma is ambiguous.
+        """
+        import pandas
+
+        if self.filled.empty:
+            return np.full(len(self.series), np.nan)
+        first = self.filled.iloc[0]
+        if NUMBERS.fullmatch(first) and is_numeric(first):
+            return self._lists(path, layout, name)
+        if INSTANT.fullmatch(first):
+            return self._instants(path, layout, name)
+        texts = self.series
+        if self.has_commas:
+            if self.has_decimal_commas or (commas and not self.is_thousands):
+                texts = self._decimal_points(path, layout, name)
+            elif self.is_thousands:
+                texts = texts.str.replace(",", "", regex=False)
+            else:
+                row = int(np.flatnonzero(texts.str.contains(",", regex=False))[0])
+                raise self._fault(
+                    path, layout, name, row, "a number with a decimal point",
+                    "; its comma may divide decimals or thousands",
+                )  # fmt: skip
+        values = pandas.to_numeric(texts.where(texts != "", "nan"), errors="coerce")
+        result = np.asarray(values, dtype=np.float64)
+        known = (texts == "") | texts.str.lower().isin(NO_NUMBER)
+        bad = np.flatnonzero(np.isnan(result) & ~known.to_numpy(dtype=bool))
+        if bad.size == 0:
+            return result
+        if bad.size > 0.5 * len(self.filled):
+            return None
+        raise self._fault(path, layout, name, int(bad[0]), "a number")
+
+    def _decimal_points(self, path: Path, layout: Layout, name: str) -> Any:
+        """Return the cells with decimal points instead of decimal commas."""
+        grouped = self.filled.str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")
+        if self.filled.str.contains(r"\..*,", regex=True).any():
+            texts = self.series.str.replace(r"\.(?=\d{3}(\D|$))", "", regex=True)
+        else:
+            points = self.filled.str.contains(".", regex=False)
+            if points.any():
+                # With a decimal comma, 1.234 is more than a thousand; with a decimal point, it is
+                # about one.
+                row = int(points.index.to_numpy()[points.to_numpy().argmax()])
+                more = "; other cells of this column have decimal commas"
+                if not grouped[points].all():
+                    raise self._fault(path, layout, name, row, "a decimal comma", more)
+                raise self._fault(path, layout, name, row, "a number without a point", more)
+            texts = self.series
+        return texts.str.replace(",", ".", n=1, regex=False)
+
+    def _instants(self, path: Path, layout: Layout, name: str) -> Array | None:
+        """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970."""
+        import pandas
+
+        empty = (self.series == "").to_numpy(dtype=bool)
+        texts = self.series.str.replace(",", ".", regex=False).str.replace("UTC", "Z", regex=False)
+        known = self.series.str.fullmatch(INSTANT.pattern).to_numpy(dtype=bool) | empty
+        if not known.all():
+            row = int(np.flatnonzero(~known)[0])
+            raise self._fault(path, layout, name, row, f"an instant as {self.filled.iloc[0]}")
+        stamps = pandas.to_datetime(
+            texts.where(texts != "", None), utc=True, format="ISO8601", errors="coerce"
+        )
+        whole = stamps.astype("datetime64[ns, UTC]").astype("int64").to_numpy(dtype=np.int64)
+        return np.where(stamps.isna().to_numpy(), np.nan, whole * 1e-9)
+
+    def _lists(self, path: Path, layout: Layout, name: str) -> Array:
+        """Convert cells such as ``[0.1, 0.2]`` to an array (T, k)."""
+        rows: list[list[float]] = []
+        for number, text in enumerate(self.texts):
+            match = NUMBERS.fullmatch(text)
+            try:
+                inside = match["inside"].replace(",", " ").split() if match else None
+                row = [float(part) for part in inside] if inside is not None else None
+            except ValueError:
+                row = None
+            if row is None or (rows and len(row) != len(rows[0])) or len(row) > MAX_COLUMNS:
+                wanted = f"a list of {len(rows[0])} numbers" if rows else "a list of numbers"
+                raise self._fault(path, layout, name, number, wanted)
+            rows.append(row)
+        return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+
+    def _fault(
+        self, path: Path, layout: Layout, name: str, record: int, wanted: str, more: str = ""
+    ) -> InputError:
+        """Make the error for a cell that does not fit its column."""
+        line = _line_of(path, layout, record)
+        found = format_value(self.cells[record])
+        return InputError(
+            f"{path}, row {line}, column {name}: expected {wanted}, found {found}{more}"
+        )

@@ -1,0 +1,579 @@
+"""Read and check the description `NAME.toml` of a recording.
+
+It states the signal and unit of each column and what is known about each run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+from sims.core.atomic_files import require_file
+from sims.core.simulator import Channel, InputError, Simulator
+from sims.core.system import System
+from sims.core.toml_validation import (
+    check_finite,
+    check_known_names,
+    check_table,
+    check_text,
+    check_type,
+    make_error,
+    read_toml,
+)
+from sims.recording.column_mapping import RecordingSources, read_sources
+from sims.recording.drive_switches import (
+    DriveSwitch,
+    check_switches,
+    read_switches,
+    without_switches,
+)
+from sims.recording.unit_conversion import UnitScale, compute_unit_scale
+
+DeclaredSignals: TypeAlias = type[Simulator] | type[System]
+"""System or simulator that declares the channels, inputs, constants and states of a recording."""
+
+_KEYS = (
+    "system",
+    "model",
+    "actuators",
+    "engine",
+    "free",
+    "title",
+    "channels",
+    "inputs",
+    "constants",
+    "runs",
+    "extra",
+    "time",
+)
+"""Keys allowed at the top level of the file."""
+
+HOLD_MODES = ("zero", "linear")
+"""How an input continues between two samples: it is held (zero order) or interpolated linearly."""
+
+_NEVER = 1e12
+"""Limit of plausible sensor noise, as a factor above and below the typical size of its channel."""
+
+
+class _Column(NamedTuple):
+    """Conversion of a column to SI units, and the table of the description that states it."""
+
+    scale: UnitScale
+    table: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class RunMetadata:
+    """Metadata of one run in the description; `held_out` is None where it is not stated."""
+
+    constants: Mapping[str, float]
+    initial: Mapping[str, float]
+    held_out: bool | None
+
+
+@dataclass(frozen=True)
+class RecordingDescription:
+    """Checked description of a recording.
+
+    Attributes:
+        system: Name of the system.
+        title: Title in one line.
+        channels: Conversion of each channel's column to SI units.
+        inputs: Conversion of each input's column to SI units.
+        noise: Standard deviation of each channel's noise where stated, SI units.
+        constants: Known constants, SI units.
+        runs: Metadata by run name, only for the runs that the description mentions.
+        extra: Units, as written, of columns that belong to no channel or input.
+        initial_pose_scales: Conversion to SI units of those extra columns that hold poses of
+            floating bodies. The first cell in a run is the initial state, which no channel shows.
+        linear: Inputs that are interpolated linearly between samples.
+        sources: Files and columns from which the signals are read.
+        wrapped: Angles whose whole turns are restored, each with the input that determines the
+            turn.
+        switches: Columns that say when drives are on.
+    """
+
+    system: str
+    title: str
+    channels: Mapping[str, UnitScale]
+    inputs: Mapping[str, UnitScale]
+    noise: Mapping[str, float]
+    constants: Mapping[str, float]
+    runs: Mapping[str, RunMetadata]
+    extra: Mapping[str, str]
+    initial_pose_scales: Mapping[str, UnitScale]
+    linear: frozenset[str]
+    sources: RecordingSources
+    switches: tuple[DriveSwitch, ...] = ()
+    wrapped: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ModelFileReference:
+    """Model file of the robot that was recorded, with the settings of the description.
+
+    Attributes:
+        path: Path of the model file.
+        actuators: Actuators that are missing in the file, by name.
+        engine: Time step and integrator, where they differ from those of the file.
+        free: Unknown parameters that are estimated unless others are requested.
+    """
+
+    path: Path
+    actuators: Mapping[str, Any]
+    engine: Mapping[str, Any]
+    free: tuple[str, ...] = ()
+
+
+def read_model_reference(
+    path: str | Path, model: str | Path | None = None
+) -> ModelFileReference | None:
+    """Read the model file that a recording's description states; None if it states a system.
+
+    Args:
+        path: Table of the recording, `NAME.csv`.
+        model: Model file to use instead of the stated one.
+
+    Raises:
+        InputError: The description is missing or malformed, or states both system and model.
+    """
+    return model_in(*read_meta(Path(path)), model)
+
+
+def model_in(
+    description: Path, meta: Mapping[str, Any], model: str | Path | None = None
+) -> ModelFileReference | None:
+    """Return the model file that a description states; None if it states a system.
+
+    Args:
+        description: Path of the description, for messages; the path of the model file is relative
+            to its folder.
+        meta: Content of the description.
+        model: Model file to use instead of the stated one.
+
+    Raises:
+        InputError: The description is malformed, or states both system and model.
+    """
+    if model is None and "model" not in meta:
+        return None
+    if model is None:
+        if "system" in meta:
+            raise InputError(f"{description}: expected system or model, found both; leave one out")
+        model = description.parent / check_text(description, "model", meta["model"])
+    actuators = without_switches(check_table(description, "actuators", meta.get("actuators", {})))
+    engine = check_table(description, "engine", meta.get("engine", {}))
+    return ModelFileReference(Path(model), actuators, engine, _free(description, meta))
+
+
+def _free(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the robot parameters that the description leaves free."""
+    given = meta.get("free", [])
+    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+        raise make_error(path, "free", 'names, as ["damping@*"]', given)
+    return tuple(given)
+
+
+def read_system_name(path: str | Path) -> str:
+    """Read the name of the system that a recording's description states.
+
+    Args:
+        path: Table of the recording, `NAME.csv`.
+
+    Raises:
+        InputError: The description is missing or malformed, or states no system.
+    """
+    return _system(*read_meta(Path(path)))
+
+
+def get_description_path(table: Path) -> Path:
+    """Return the path of the description `NAME.toml` of a table.
+
+    A path of the description itself is returned unchanged.
+
+    Raises:
+        InputError: `check_table` has no file name.
+    """
+    if not table.name:
+        raise InputError(f"expected a recording's table, NAME.csv, found '{table}'")
+    return table.with_suffix(".toml")
+
+
+def stated_columns(path: Path, declared: DeclaredSignals) -> dict[str, tuple[str, float, float]]:
+    """Read the unit and the conversion to SI units of each channel and input.
+
+    Args:
+        path: Table of the recording, `NAME.csv`.
+        declared: System of the recording.
+
+    Returns:
+        By channel and input: the stated unit, the factor from the numbers of the column to SI
+        units, and the stated `compute_unit_scale`, which is part of that factor.
+
+    Raises:
+        InputError: The description is missing or malformed.
+    """
+    description = get_description_path(path)
+    meta = read_toml(description)
+    columns = {
+        **_columns(description, "channel", meta, declared.channels),
+        **_columns(description, "input", meta, declared.inputs),
+    }
+    return {
+        name: (str(c.table["unit"]), c.scale.gain, float(c.table.get("scale", 1.0)))
+        for name, c in columns.items()
+    }
+
+
+def read_meta(table: Path) -> tuple[Path, dict[str, Any]]:
+    """Read the description of a recording.
+
+    Args:
+        table: `NAME.csv`, or `NAME.toml` itself.
+
+    Returns:
+        Path and content of the description.
+
+    Raises:
+        InputError: The recording or its description is missing, or it is not TOML.
+    """
+    description = get_description_path(table)
+    try:
+        missing = not description.exists()
+    except (OSError, ValueError):  # not a valid path; `require_file` reports the reason
+        missing = True
+    if missing:
+        # The message refers to the file that the user named.
+        require_file(table, "a recording, NAME.csv with NAME.toml beside it")
+        raise InputError(
+            f"{description}: no such file; expected the description of {table.name}: its system or "
+            "model, its channels and their units"
+        )
+    return description, read_toml(description)
+
+
+def check_description(
+    path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
+) -> RecordingDescription:
+    """Check a description against the system's channels, inputs, constants and states.
+
+    Args:
+        path: Path of the description, for messages.
+        meta: Content of the description, as in `NAME.toml`.
+        declared: System, or simulator of it.
+
+    Returns:
+        The checked description.
+
+    Raises:
+        InputError: The description is malformed; the message is one line.
+    """
+    _known(path, "", meta, _KEYS)
+    if "free" in meta and "model" not in meta:
+        raise make_error(path, "free", "it with model = FILE alone (else --free A,B)", meta["free"])
+    title = check_text(path, "title", meta.get("title", path.stem))
+    _refuse_poses(path, meta, declared)
+    channels = _columns(path, "channel", meta, declared.channels)
+    _refuse_inputs(path, meta, declared)
+    inputs = _columns(path, "input", meta, declared.inputs)
+    if not channels:
+        raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
+    constants = _constants(path, "constants", meta.get("constants", {}), declared)
+    _possible(path, "constants", constants, declared)
+    # The names of the runs are checked after the table was read (`check_run_names`).
+    marks = check_table(path, "runs", meta.get("runs", {}))
+    runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
+    # A robot has no system name: its model file is stated instead.
+    robotic = declared.has_model
+    extra = _extra(path, meta, declared)
+    sources = read_sources(
+        path,
+        meta,
+        {name: column.table for name, column in (*channels.items(), *inputs.items())},
+    )
+    switches = _switches(path, meta, declared, sources)
+    extra = {**{switch.column: "1" for switch in switches}, **extra}
+    return RecordingDescription(
+        system=declared.name if robotic else _system(path, meta),
+        title=title,
+        channels={name: column.scale for name, column in channels.items()},
+        inputs={name: column.scale for name, column in inputs.items()},
+        noise=_noises(path, channels, declared),
+        constants=constants,
+        runs=runs,
+        extra=extra,
+        initial_pose_scales=_begins(path, extra, declared),
+        linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
+        sources=sources,
+        switches=switches,
+        wrapped=_wrapped(path, channels, inputs, declared),
+    )
+
+
+def _wrapped(
+    path: Path,
+    channels: Mapping[str, _Column],
+    inputs: Mapping[str, _Column],
+    declared: DeclaredSignals,
+) -> dict[str, str]:
+    """Return the channels whose whole turns are restored.
+
+    Each has the name of the input that determines the turn, or an empty name.
+    """
+    units = {channel.name: channel.unit for channel in declared.channels}
+    result = {}
+    for name, column in channels.items():
+        value = column.table.get("unwrap", False)
+        where = f"channels.{name}.unwrap"
+        if not isinstance(value, (bool, str)):
+            raise make_error(
+                path, where, "true, or the name of the command that tells the turn", value
+            )
+        if isinstance(value, str):
+            check_known_names(f"{where} of {path}", [value], inputs)
+        if value and units[name] != "rad":
+            raise make_error(
+                path, where, f"it with an angle alone ({name} is in {units[name]})", value
+            )
+        if value:
+            result[name] = value if isinstance(value, str) else ""
+    return result
+
+
+def _switches(
+    path: Path, meta: Mapping[str, Any], declared: DeclaredSignals, sources: RecordingSources
+) -> tuple[DriveSwitch, ...]:
+    """Read and check the columns that say when drives are on."""
+    switches = read_switches(path, meta)
+    names = [signal.name for signal in (*declared.channels, *declared.inputs)]
+    actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
+    check_switches(path, switches, actuators, ["run", "t", *names], sources.stated)
+    return switches
+
+
+def check_run_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None:
+    """Check that all runs in the description exist in the table.
+
+    Args:
+        path: Path of the description, for messages.
+        marked: Names of the runs in the description.
+        there: Names of the runs in the table.
+
+    Raises:
+        InputError: The description mentions another run.
+    """
+    _known(path, "runs", marked, there)
+
+
+def _known(path: Path, where: str, given: Iterable[str], allowed: Iterable[str]) -> None:
+    check_known_names(f"entry {f'in [{where}] ' if where else ''}of {path}", given, allowed)
+
+
+def _system(path: Path, meta: Mapping[str, Any]) -> str:
+    system = meta.get("system")
+    if not isinstance(system, str):
+        raise make_error(path, "", 'system = "NAME"', system)
+    return system
+
+
+def get_floating_state_units(declared: DeclaredSignals) -> Mapping[str, str]:
+    """Return the units of the states of floating bodies, by name; empty if there are none."""
+    units: Mapping[str, str] = getattr(_system_of(declared), "afloat", {})
+    return units
+
+
+def _system_of(declared: DeclaredSignals) -> object:
+    """Return the system of a simulator, or the system itself."""
+    return getattr(declared, "system", declared)
+
+
+def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
+    """Refuse inputs whose effect depends on quantities that a recording does not contain."""
+    reasons: Mapping[str, str] = getattr(_system_of(declared), "refused_inputs", {})
+    given = dotted(check_table(path, "inputs", meta.get("inputs", {})), reasons)
+    for name in (name for name in reasons if name in given):
+        raise InputError(f"{path}: input {name}: {reasons[name]}")
+
+
+def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> None:
+    """Refuse poses of floating bodies among the channels, and explain where to state them."""
+    units = get_floating_state_units(declared)
+    given = dotted(check_table(path, "channels", meta.get("channels", {})), units)
+    for name in (name for name in units if name in given):
+        raise InputError(
+            f"{path}: channel {name}: expected a joint or a sensor, found where a body floats; as "
+            f'[extra."{name}"] the column\'s first cell says where a run begins'
+        )
+
+
+def _columns(
+    path: Path, kind: str, meta: Mapping[str, Any], declared: Sequence[Channel]
+) -> dict[str, _Column]:
+    """Return the conversion of each column of one kind ("channel" or "input")."""
+    units = {signal.name: signal.unit for signal in declared}
+    given = dotted(check_table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
+    check_known_names(f"{kind} in {path}", given, units)
+    return {name: _column(path, kind, name, own, units[name]) for name, own in given.items()}
+
+
+def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Flatten entries whose names contain dots.
+
+    TOML reads unquoted dotted names as nested tables: ``[channels.q.elbow]`` becomes the entry
+    ``q.elbow``.
+
+    Args:
+        given: Entries as read from TOML.
+        names: Names that may contain dots.
+
+    Returns:
+        The entries by their full names.
+    """
+    result: dict[str, Any] = {}
+    for name, value in given.items():
+        inside = isinstance(value, dict) and name not in names
+        if inside and any(known.startswith(f"{name}.") for known in names):
+            within = {f"{name}.{key}": entry for key, entry in value.items()}
+            result.update(dotted(within, names))
+        else:
+            result[name] = value
+    return result
+
+
+def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
+    where, usual = f"{kind} {name}", f'unit = "{unit}"'
+    own = check_table(path, where, value, f"a table with {usual}")
+    # Noise of an input is not allowed, because simulations cannot use it.
+    allowed = (
+        "unit",
+        "scale",
+        "offset",
+        "column",
+        "file",
+        *(("noise", "unwrap") if kind == "channel" else ("hold",)),
+    )
+    _known(path, f"{kind}s.{name}", own, allowed)
+    # The unit is required: a log in degrees without a unit would be read as radians.
+    stated = check_text(path, where, own.get("unit"), f"{usual} or one that converts to it")
+    try:
+        converted = compute_unit_scale(stated, unit)
+    except InputError as error:
+        raise InputError(f"{path}: {where}: {error}") from None
+    if not {"scale", "offset"} & own.keys():
+        return _Column(converted, own)
+    factor = check_finite(path, f"{kind}s.{name}.scale", own.get("scale", 1.0))
+    if factor == 0:
+        raise make_error(path, f"{kind}s.{name}.scale", "a factor that is not zero", own["scale"])
+    # The offset is in the stated unit, so that the zero of an encoder can be copied from its log.
+    offset = check_finite(path, f"{kind}s.{name}.offset", own.get("offset", 0.0))
+    gain = factor * converted.gain
+    return _Column(UnitScale(gain, converted.gain * offset + converted.offset), own)
+
+
+def _hold(path: Path, name: str, column: _Column) -> bool:
+    """Return whether an input is interpolated linearly between samples."""
+    hold = column.table.get("hold", "zero")
+    if hold not in HOLD_MODES:
+        raise make_error(
+            path, f"inputs.{name}.hold", " or ".join(f'"{one}"' for one in HOLD_MODES), hold
+        )
+    return bool(hold == "linear")
+
+
+def _noises(
+    path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
+) -> dict[str, float]:
+    """Return the noise of each channel where stated, SI units."""
+    sizes = {channel.name: channel.scale for channel in declared.channels}
+    noises = {}
+    for name, column in channels.items():
+        if "noise" not in column.table:
+            continue
+        # A standard deviation has no offset and no sign.
+        noises[name] = abs(column.scale.gain) * _noise(path, name, column.table["noise"])
+        if not 1 / _NEVER < noises[name] / sizes[name] < _NEVER:
+            wanted = f"that of values of about {sizes[name]:g} in SI units"
+            raise make_error(path, f"channels.{name}.noise", wanted, column.table["noise"])
+    return noises
+
+
+def _noise(path: Path, name: str, value: Any) -> float:
+    where = f"channels.{name}.noise"
+    noise = check_finite(path, where, value)
+    if noise <= 0:
+        raise make_error(path, where, "more than 0 (leave it out if unknown)", value)
+    return noise
+
+
+def _extra(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> dict[str, str]:
+    """Return the units of the columns that belong to no channel or input."""
+    # A forgotten channel must not be accepted as an unused column.
+    taken = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
+    units = {}
+    given = dotted(
+        check_table(path, "extra", meta.get("extra", {})), get_floating_state_units(declared)
+    )
+    for name, entry in given.items():
+        if name in taken:
+            remedy = "declare it as channel or input"
+            raise InputError(f"{path}: extra.{name}: is a column of its own right; {remedy}")
+        unit = entry.get("unit") if isinstance(entry, dict) else None
+        if not isinstance(unit, str):
+            raise make_error(path, f"extra {name}", 'a table with unit = "TEXT"', entry)
+        _known(path, f"extra.{name}", entry, ("unit",))
+        units[name] = unit
+    return units
+
+
+def _begins(
+    path: Path, extra: Mapping[str, str], declared: DeclaredSignals
+) -> dict[str, UnitScale]:
+    """Return the conversion to SI units of the columns with initial poses of floating bodies."""
+    begins = {}
+    for name, unit in get_floating_state_units(declared).items():
+        if name in extra:
+            try:
+                begins[name] = compute_unit_scale(extra[name], unit)
+            except InputError as error:
+                raise InputError(f"{path}: extra {name}: {error}") from None
+    return begins
+
+
+def _run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> RunMetadata:
+    where = f"runs.{name}"
+    own = check_table(path, where, value)
+    allowed = [c.name for c in declared.constants]
+    _known(path, where, own, ("constants", "initial", "held_out", "folder", "file", *allowed))
+    held_out = own.get("held_out")
+    if held_out is not None:
+        check_type(path, f"{where}.held_out", held_out, bool, "true or false")
+    # The constants of a run may be in a table of their own or among its other entries.
+    constants = _constants(path, f"{where}.constants", own.get("constants", {}), declared)
+    direct = {key: number for key, number in own.items() if key in allowed}
+    for twice in constants.keys() & direct.keys():
+        raise InputError(f"{path}: {where}: constant {twice} stands twice")
+    constants |= _constants(path, where, direct, declared)
+    _possible(path, where, constants, declared)
+    states = [*declared.states, *getattr(_system_of(declared), "activations", ())]
+    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), states)
+    return RunMetadata(constants, initial, held_out)
+
+
+def _constants(path: Path, where: str, value: Any, declared: DeclaredSignals) -> dict[str, float]:
+    return _numbers(path, where, value, [c.name for c in declared.constants])
+
+
+def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
+    given = dotted(check_table(path, where, value), allowed)
+    _known(path, where, given, allowed)
+    return {name: check_finite(path, f"{where}.{name}", number) for name, number in given.items()}
+
+
+def _possible(
+    path: Path, where: str, constants: Mapping[str, float], declared: DeclaredSignals
+) -> None:
+    for c in declared.constants:
+        if c.name in constants and (wanted := c.wanted(constants[c.name])):
+            value = constants[c.name]
+            raise InputError(f"{path}: {where}.{c.name}: expected {wanted}, found {value:g}")

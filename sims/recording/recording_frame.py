@@ -1,0 +1,265 @@
+"""Read recordings from pandas data frames.
+
+Columns of a ``DataFrame`` are checked by the same rules as those of `NAME.csv`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError, make_unknown_name_error, similar
+from sims.core.toml_validation import check_table, format_value
+from sims.core.value_limits import is_plausible_number
+from sims.recording.csv_table import CsvRun, Table
+from sims.recording.drive_switches import read_switches
+from sims.recording.recording_description import (
+    DeclaredSignals,
+    RecordingDescription,
+    dotted,
+    get_floating_state_units,
+)
+
+
+@runtime_checkable
+class Frame(Protocol):
+    """Protocol of the parts of a pandas ``DataFrame`` that are used here, without pandas."""
+
+    @property
+    def attrs(self) -> Any:
+        """Metadata that the user attached to the frame."""
+
+    @property
+    def columns(self) -> Any:
+        """Names of the columns."""
+
+    @property
+    def index(self) -> Any:
+        """Labels of the rows."""
+
+    @property
+    def iloc(self) -> Any:
+        """Access to rows by number."""
+
+
+def with_index(path: Path, frame: Frame) -> Any:
+    """Return the frame with ``run`` and ``t`` as columns if they are levels of its index.
+
+    Args:
+        path: Name of the frame, for messages.
+        frame: Data frame.
+
+    Raises:
+        InputError: The name of a column is not a text, or is not unique.
+    """
+    whole: Any = frame
+    levels = [name for name in whole.index.names if name in ("run", "t")]
+    levels = [name for name in levels if name not in whole.columns]
+    if levels:
+        whole = whole.reset_index(level=levels)
+    names = list(whole.columns)
+    for place, name in enumerate(names):
+        if not isinstance(name, str):
+            raise InputError(f"{path}: column {format_value(name)}: expected a name, found no text")
+        if name in names[:place]:
+            raise InputError(f"{path}: column {format_value(name)} stands twice")
+    return whole
+
+
+def described(
+    path: Path,
+    frame: Frame,
+    declared: DeclaredSignals,
+    meta: Mapping[str, Any],
+    units: Mapping[str, str],
+) -> dict[str, Any]:
+    """Build the description of a frame's columns, as it would be written in `NAME.toml`.
+
+    A column is the channel or input of its name unless `meta` says otherwise. Its unit is taken
+    from `units`, from `meta`, or from ``frame.attrs["units"]``.
+
+    Args:
+        path: Name of the frame, for messages.
+        frame: Data frame with columns as returned by `with_index`.
+        declared: System, or simulator of it.
+        meta: Statements of the user, with the keys of `NAME.toml`.
+        units: Units of columns, by name.
+
+    Returns:
+        The complete description.
+
+    Raises:
+        InputError: A column belongs to no signal, or a unit is missing.
+    """
+    result: dict[str, Any] = _plain(meta)
+    poses = get_floating_state_units(declared)
+    usual = {**poses, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
+    columns = [name for name in frame.columns if name != "run"]
+    for name in units:
+        # The same dict of units may be used for frames with different columns.
+        if name not in columns and name not in usual:
+            raise make_unknown_name_error(f"column in units of {path}", name, columns)
+    channels = dotted(check_table(path, "channels", result.get("channels", {})), usual)
+    inputs = dotted(check_table(path, "inputs", result.get("inputs", {})), usual)
+    extra = dotted(check_table(path, "extra", result.get("extra", {})), poses)
+    time = check_table(path, "time", result.get("time", {}))
+    tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
+
+    switches = [switch.column for switch in read_switches(path, result)]
+    stamps = _column("t", time)
+    taken = {stamps, *extra}
+    taken.update(_column(name, own) for name, own in (*channels.items(), *inputs.items()))
+    for name in (name for name in columns if name not in taken):
+        if name in _names(declared.channels):
+            channels[name] = {}
+        elif name in _names(declared.inputs):
+            inputs[name] = {}
+        elif name in poses:
+            extra[name] = {}
+        elif name in switches:
+            extra[name] = {"unit": "1"}
+        else:
+            raise _belongs_to_nothing(path, name, declared)
+
+    noted = frame.attrs.get("units", {})
+    noted = noted if isinstance(noted, Mapping) else {}
+    _state_unit(time, stamps, units, noted)
+    missing = {}
+    for name, own in (*channels.items(), *inputs.items(), *extra.items()):
+        # Entries that are not tables are refused when the description is checked.
+        if isinstance(own, dict) and not _state_unit(own, _column(name, own), units, noted):
+            missing[_column(name, own)] = usual.get(name, "1")
+    if missing:
+        raise InputError(
+            f"{path}: expected the unit of each column, found none of "
+            f"{', '.join(map(str, missing))}; pass units={missing}, if these are the units"
+        )
+    return {**result, **{key: entries for key, entries in tables.items() if entries}}
+
+
+def _column(name: str, own: Any) -> str:
+    """Return the column of a signal; entries of a wrong type are refused elsewhere."""
+    column = own.get("column") if isinstance(own, dict) else None
+    return column if isinstance(column, str) else name
+
+
+def _state_unit(
+    own: dict[str, Any], column: str, units: Mapping[str, str], noted: Mapping[str, Any]
+) -> bool:
+    """Write the unit of a column into its table, and return whether a unit is known."""
+    if column in units:
+        own["unit"] = units[column]
+    elif "unit" not in own and column in noted:
+        own["unit"] = noted[column]
+    return "unit" in own
+
+
+def _plain(value: Any) -> Any:
+    """Copy a value with plain Python dicts, lists and numbers, as TOML gives them."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _names(signals: Iterable[Any]) -> list[str]:
+    return [signal.name for signal in signals]
+
+
+def _belongs_to_nothing(path: Path, name: str, declared: DeclaredSignals) -> InputError:
+    """Make the error for a column that is neither channel nor input."""
+    channels, inputs = _names(declared.channels), _names(declared.inputs)
+    there = f"channels {', '.join(channels)}"
+    there += f" and inputs {', '.join(inputs)}" if inputs else " and no inputs"
+    near = similar(name, [*channels, *inputs])
+    return InputError(
+        f"{path}: column {format_value(name)}: expected a channel or input of {declared.name}, which has "
+        f"{there}{near}; rename the column, drop it, or state what it is with "
+        f"description={{'extra': {{{name!r}: {{'unit': '1'}}}}}}"
+    )
+
+
+def read_frame(path: Path, frame: Frame, about: RecordingDescription) -> list[CsvRun]:
+    """Read the runs of a frame in order of appearance.
+
+    Args:
+        path: Name of the frame, for messages.
+        frame: Data frame with columns as returned by `with_index`; it is one run if it has no
+            column ``run``.
+        about: Checked description of the frame.
+
+    Raises:
+        InputError: The frame is malformed; the message is one line.
+    """
+    sources = about.sources
+    if sources.folders or any(source.file for source in sources.signals.values()):
+        raise InputError(f"{path}: expected no file and no folder in the description of a frame")
+    return _FrameTable(path, list(about.channels), list(about.inputs), list(about.extra)).of(
+        frame, about
+    )
+
+
+class _FrameTable(Table):
+    """Table of a recording in a data frame."""
+
+    def row(self, record: int) -> str:
+        """Return the location of row `record` (counted from 0) for a message."""
+        return f"{self.path}.iloc[{record}]"
+
+    def of(self, frame: Frame, about: RecordingDescription) -> list[CsvRun]:
+        """Return the runs of a frame.
+
+        Args:
+            frame: Data frame.
+            about: Checked description of the frame.
+        """
+        sources = about.sources
+        signals = {name: source.column for name, source in sources.signals.items()}
+        places = {"t": sources.time, **signals, **{name: name for name in about.extra}}
+        for name in places.values():
+            if name not in frame.columns:
+                raise InputError(
+                    f"{self.path}: expected column '{name}', found columns "
+                    f"{', '.join(map(str, frame.columns))}"
+                )
+        columns = {name: self._values(name, frame, column) for name, column in places.items()}
+        if sources.second != 1.0:
+            columns["t"] = sources.second * columns["t"]
+        return self.runs(self._run_names(frame, len(columns["t"])), columns)
+
+    def _run_names(self, frame: Any, count: int) -> list[str]:
+        """Return the name of the run of each row."""
+        if "run" not in frame.columns:
+            return ["1"] * count
+        cells = frame["run"]
+        missing = cells.isna().to_numpy()
+        if missing.any():
+            self.fault(int(np.argmax(missing)), "run", "expected the name of a run, found none")
+        # A column of integers that once had missing cells has the type float.
+        whole = cells.dtype.kind == "f"
+        return [f"{cell:g}" if whole else str(cell).strip() for cell in cells]
+
+    def _values(self, name: str, frame: Any, column: str) -> Array:
+        """Return a column as numbers (T,); NaN where a cell is missing."""
+        cells = frame[column]
+        if name == "t" and cells.dtype.kind == "M":  # absolute time stamps
+            cells = cells - cells.min()
+        if name == "t" and cells.dtype.kind == "m":
+            cells = cells.dt.total_seconds()
+        missing = cells.isna().to_numpy()
+        if cells.dtype.kind not in "iuf":
+            for record, cell in enumerate(cells):
+                if not missing[record] and not is_plausible_number(cell):
+                    self.fault(record, column, f"expected a number, found {format_value(cell)}")
+        values: Array = cells.to_numpy(dtype=float, na_value=np.nan)
+        bad = np.isinf(values) if name in self.gaps else ~np.isfinite(values)
+        if bad.any():
+            record = int(np.argmax(bad))
+            more = "; an input has no missing samples" if name in self.inputs else ""
+            found = "none" if missing[record] else f"{values[record]}"
+            self.fault(record, column, f"expected a finite number, found {found}{more}")
+        return values

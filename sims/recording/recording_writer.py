@@ -1,0 +1,191 @@
+"""Write recordings, `NAME.csv` and `NAME.toml`.
+
+Either all files are written or none, and existing files are never overwritten.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sims.core.atomic_files import Content, write_new_files
+from sims.core.simulator import Array, InputError, make_unknown_name_error
+from sims.recording.recording import DeclaredSignals, Recording, Run
+from sims.recording.recording_description import get_description_path
+
+_EXACT = 17
+"""Number of significant digits with which a number is written without loss."""
+
+
+def write_recording(
+    path: str | Path,
+    recording: Recording,
+    declared: DeclaredSignals,
+    *,
+    digits: int = _EXACT,
+    beside: Mapping[Path, Content] | None = None,
+) -> None:
+    """Write a recording such that `read_recording` gives it back unchanged, in SI units.
+
+    Args:
+        path: Table to write; `recording.path` is not used.
+        recording: Recording to write; its runs have different names and the same columns.
+        declared: System, for the units.
+        digits: Significant digits of a number; with 17, nothing is lost.
+        beside: Other files to write together with it, all or none.
+
+    Raises:
+        InputError: A file exists already or cannot be written, or the runs do not fit into one
+            table.
+    """
+    table = Path(path)
+    if table.suffix != ".csv":
+        raise InputError(f"{table}: expected a name that ends in .csv")
+    if not recording.runs:
+        raise InputError(f"{table}: expected at least one run, found none")
+    texts: dict[Path, Content] = {
+        table: _table(recording.runs, digits),
+        get_description_path(table): _description(recording, declared, table.parent),
+    }
+    write_files({**texts, **(beside or {})})
+
+
+def write_files(contents: Mapping[Path, Content]) -> None:
+    """Write all files or none; readers never see a partly written file.
+
+    Raises:
+        InputError: A file exists already, or cannot be written.
+    """
+    check_absent(contents)
+    try:
+        write_new_files(contents)
+    except FileExistsError as error:
+        raise _exists(error.filename) from None
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be written ({error.strerror})") from None
+
+
+def check_absent(paths: Iterable[Path]) -> None:
+    """Check that none of the files exists.
+
+    Raises:
+        InputError: A file exists already.
+    """
+    for path in paths:
+        if path.exists():
+            raise _exists(path)
+
+
+def _exists(path: Path | str) -> InputError:
+    return InputError(
+        f"{path}: exists already; recordings are never overwritten, name another file"
+    )
+
+
+def _table(runs: Sequence[Run], digits: int) -> str:
+    inputs, channels = list(runs[0].inputs), list(runs[0].channels)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    extra = list(runs[0].extra)
+    # The columns are those of the first run, and all other runs must have the same.
+    writer.writerow(["run", "t", *inputs, *channels, *extra])
+    seen: set[str] = set()
+    for run in runs:
+        if run.name in seen:
+            raise InputError(f"two runs are called {run.name!r}; expected different names")
+        seen.add(run.name)
+        for names, there, kind in _signals(run, inputs, channels, extra):
+            if set(names) != set(there):
+                raise make_unknown_name_error(
+                    f"{kind} of run {run.name}",
+                    ", ".join(set(names) ^ set(there)),
+                    names or ["none"],
+                )
+        columns = [
+            run.times,
+            *(
+                there[n]
+                for names, there, _ in _signals(run, inputs, channels, extra)
+                for n in names
+            ),
+        ]
+        writer.writerows(
+            zip([run.name] * len(run.times), *(_cells(c, digits) for c in columns), strict=True)
+        )
+    return text.getvalue()
+
+
+def _signals(
+    run: Run, inputs: list[str], channels: list[str], extra: list[str]
+) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
+    return (
+        (inputs, run.inputs, "input"),
+        (channels, run.channels, "channel"),
+        (extra, run.extra, "extra column"),
+    )
+
+
+def _cells(values: Array, digits: int) -> list[str]:
+    # repr gives the shortest text that is read back as the same number; a missing sample is an
+    # empty cell.
+    shortest = repr if digits >= _EXACT else f"{{:.{digits}g}}".format
+    return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
+
+
+def _of(recording: Recording, beside: Path) -> dict[str, Any]:
+    """Return the keys that state what was recorded: a system, or a model file.
+
+    Args:
+        recording: Recording.
+        beside: Folder to which the path of the model file is relative.
+    """
+    model = recording.model
+    if model is None:
+        return {"system": recording.system}
+    try:
+        file = os.path.relpath(model.path, beside)
+    except ValueError:  # on another drive
+        file = str(model.path.resolve())
+    stated = {"actuators": model.actuators, "engine": model.engine}
+    return {"model": Path(file).as_posix(), **{k: dict(v) for k, v in stated.items() if v}}
+
+
+def _description(recording: Recording, declared: DeclaredSignals, beside: Path) -> str:
+    import tomli_w
+
+    units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}
+    first = recording.runs[0]
+    document: dict[str, Any] = {**_of(recording, beside), "title": recording.title}
+    document["channels"] = {
+        n: {"unit": units[n], **_stated(recording.noise, n)} for n in first.channels
+    }
+    if first.inputs:
+        document["inputs"] = {
+            n: {"unit": units[n], **({"hold": "linear"} if n in first.linear else {})}
+            for n in first.inputs
+        }
+    if first.offset:
+        document["time"] = {"offset": first.offset}
+    if first.extra:
+        document["extra"] = {n: {"unit": recording.extra.get(n, "1")} for n in first.extra}
+    if recording.constants:
+        document["constants"] = dict(recording.constants)
+    runs = {run.name: _marks(run) for run in recording.runs}
+    if any(runs.values()):
+        document["runs"] = {name: marks for name, marks in runs.items() if marks}
+    return tomli_w.dumps(document)
+
+
+def _stated(noise: Mapping[str, float], name: str) -> dict[str, float]:
+    return {"noise": noise[name]} if noise.get(name) else {}
+
+
+def _marks(run: Run) -> dict[str, Any]:
+    marks: dict[str, Any] = {"held_out": True} if run.held_out else {}
+    marks |= dict(run.constants)
+    return {**marks, "initial": dict(run.initial)} if run.initial else marks

@@ -1,0 +1,117 @@
+"""Convert units, so that a recording may use its own.
+
+Angles have their own dimension here: with the SI definition, hertz would be accepted as radians per
+second, and a plain number as an angle.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from sims.core.simulator import InputError
+
+_LONGEST = 60
+"""Maximum number of characters of a unit."""
+_ROUNDING = 1e-9
+"""Relative deviation from a linear conversion that is accepted as rounding error."""
+# Allow names, 1 and small powers only, so that the parser of pint cannot be made to compute for
+# long.
+_TOKEN = re.compile(
+    r"\s*(?:(?P<power>(?:\*\*|\^)\s*[+-]?\d{1,2}(?!\d)|⁻?[¹²³⁴])"
+    r"|(?P<operator>[*/·⋅])|(?P<bracket>[()])"
+    r"|(?P<name>[^\W\d][\w°%]*|[°%Ω℃]\w*|1(?![\d.])))\s*"
+)
+
+
+class UnitScale(NamedTuple):
+    """Linear conversion of a unit: value * gain + offset."""
+
+    gain: float
+    offset: float
+
+
+IDENTITY_SCALE = UnitScale(1.0, 0.0)
+"""Identity conversion, which leaves values unchanged bit for bit."""
+
+
+@lru_cache(maxsize=256)
+def compute_unit_scale(unit: str, target: str) -> UnitScale:
+    """Return the conversion from `unit` to `target`.
+
+    Args:
+        unit: Unit of the values.
+        target: Unit to convert them to.
+
+    Raises:
+        InputError: `unit` is not a unit or does not convert to `target`; the message names neither
+            file nor channel, so that the caller can put them in front.
+    """
+    if unit == target:
+        return IDENTITY_SCALE
+    if len(unit) > _LONGEST or not _plain(unit):
+        raise InputError(f"expected a unit that converts to {target}, found {unit[:_LONGEST]!r}")
+    registry = _registry()
+    try:
+        parsed = registry.parse_units(unit or "1")
+    except Exception:
+        # The parser raises many kinds of errors.
+        raise InputError(f"unknown unit {unit!r}; expected one that converts to {target}") from None
+    try:
+        # Three values determine gain and offset, and show whether the conversion is linear.
+        zero, one, two = (
+            float(registry.Quantity(v, parsed).to(target).magnitude) for v in (0.0, 1.0, 2.0)
+        )
+    except Exception:
+        # The dimensions differ, or the unit is logarithmic.
+        hint = "; standard gravity is g_0" if unit == "g" else ""
+        raise InputError(
+            f"expected a unit that converts to {target}, found {unit!r}{hint}"
+        ) from None
+    gain = one - zero
+    if abs(two - one - gain) > _ROUNDING * abs(gain):
+        raise InputError(f"expected a unit that converts to {target} in proportion, found {unit!r}")
+    # A gain that differs from 1 by rounding is 1.
+    return IDENTITY_SCALE if zero == 0.0 and abs(gain - 1.0) < 1e-12 else UnitScale(gain, zero)
+
+
+def is_unit(unit: str) -> bool:
+    """Return whether `unit` can be converted, which means that pint knows every name in it."""
+    if len(unit) > _LONGEST or not _plain(unit):
+        return False
+    try:
+        _registry().parse_units(unit)
+    except Exception:
+        # The parser raises many kinds of errors.
+        return False
+    return True
+
+
+def _plain(unit: str) -> bool:
+    """Return whether a text is a simple unit.
+
+    A simple unit consists of names and 1, joined by * / or spaces, each with at most one small
+    power.
+    """
+    place, before = 0, "operator"
+    while place < len(unit):
+        token = _TOKEN.match(unit, place)
+        if token is None or (token.lastgroup == "power" and before in ("power", "operator")):
+            return False
+        place, before = token.end(), str(token.lastgroup)
+    return before != "operator"
+
+
+@lru_cache(maxsize=1)
+def _registry() -> Any:
+    # Imported here: it takes a second, and most recordings are in SI units.
+    import pint
+
+    registry: Any = pint.UnitRegistry(on_redefinition="ignore")
+    registry.define("radian = [angle] = rad")
+    # In pint, Nm is the count of a yarn by default.
+    registry.define("newton_meter = newton * meter = Nm")
+    # Clear the cache, in which an angle is still a plain number.
+    registry._build_cache()
+    return registry

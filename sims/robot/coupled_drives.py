@@ -1,0 +1,119 @@
+"""Drives that act on two joints, modelled by a fixed tendon in place of the joint transmission.
+
+Let q be the position of the drive's own joint, p that of the preceding joint, c the coefficient,
+and U(l, l') the actuator force at the transmission length l:
+
+    l = q + c p,   tau_q = U(l, l'),   tau_p = c U(l, l')                                      (1)
+
+by virtual work. This is MuJoCo's fixed tendon with coefficients 1 and c (documentation,
+"Computation", actuation model). So MuJoCo integrates it like any actuator, and a model file can
+state it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, Joint, RobotModel, cache_per_robot
+
+COUPLING_EFFECT = "joint.coupling"
+COUPLING_PLACEHOLDER = ("", COUPLING_EFFECT)
+"""Entry for all coupled drives in the list of effects in series (`dynamics.series_joints`).
+
+One model has a tendon for each drive that can be coupled; c is zero where none is.
+"""
+
+
+def find_preceding_joint(robot: RobotModel, name: str) -> Joint | None:
+    """Find the preceding joint, in the joint's own body or in the nearest ancestor with joints.
+
+    Args:
+        robot: robot whose joints are meant.
+        name: joint.
+
+    Returns:
+        The preceding joint; None if there is none or if it is of another kind.
+    """
+    model, own = robot.compiled, robot.joint(name)
+    body = int(model.jnt_bodyid[own.id])
+    first, behind = int(model.body_jntadr[body]), own.id
+    while body > 0:
+        there = [robot.joints[i] for i in range(first, behind)]
+        there = [joint for joint in there if joint.name not in robot.series]
+        if there:
+            return there[-1] if there[-1].kind == own.kind else None
+        body = int(model.body_parentid[body])
+        first = int(model.body_jntadr[body])
+        behind = first + int(model.body_jntnum[body])
+    return None
+
+
+@cache_per_robot
+def list_coupling_places(robot: RobotModel) -> tuple[str, ...]:
+    """List the joints whose drives can be coupled to the preceding joint."""
+    driven = {actuator.joint for actuator in robot.actuators}
+    return tuple(
+        joint.name
+        for joint in robot.joints
+        if joint.has_one_coordinate
+        and joint.name in driven
+        and find_preceding_joint(robot, joint.name) is not None
+    )
+
+
+def name_unnamed_elements(spec: Any, robot: RobotModel) -> dict[int, Any]:
+    """Name the unnamed joints and actuators of a spec as the robot names them.
+
+    Their default names contain their numbers, which change when elements are added.
+
+    Args:
+        spec: the mujoco.MjSpec; it is changed in place.
+        robot: robot that was read from this spec.
+
+    Returns:
+        The joints of the spec by their numbers.
+    """
+    if all(element.name for element in (*spec.joints, *spec.actuators)):
+        return {robot.joint(joint.name).id: joint for joint in spec.joints}
+    # Elements have numbers only after compilation.
+    with capture_mujoco_warnings():
+        spec.compile()
+    joints = {joint.id: joint for joint in spec.joints}
+    for joint in robot.joints:
+        joints[joint.id].name = joint.name
+    for actuator in spec.actuators:
+        actuator.name = robot.actuators[actuator.id].name
+    return joints
+
+
+def make_coupled_robot(robot: RobotModel, coefficients: Mapping[str, float]) -> RobotModel:
+    """Make a robot with tendons in place of joint transmissions, without changing element names.
+
+    Args:
+        robot: robot as read from its model file.
+        coefficients: c of (1) by joint; the joints are among `list_coupling_places`.
+    """
+    import mujoco
+
+    spec = robot.spec.copy()
+    name_unnamed_elements(spec, robot)
+    for name, c in coefficients.items():
+        first = find_preceding_joint(robot, name)
+        assert first is not None
+        tendon = spec.add_tendon(name=name + COUPLING_TENDON_SUFFIX)
+        tendon.wrap_joint(name, 1.0)
+        tendon.wrap_joint(first.name, c)
+        for actuator in spec.actuators:
+            if robot.actuators[actuator.id].joint == name:
+                actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
+                actuator.target = tendon.name
+                if actuator.inheritrange > 0:
+                    # A tendon has no range to inherit, so the control range of the joint is written
+                    # instead.
+                    actuator.inheritrange = 0.0
+                    actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+                    actuator.ctrlrange = robot.compiled.actuator_ctrlrange[actuator.id]
+    return replace(robot, spec=spec, coupled=tuple(coefficients))

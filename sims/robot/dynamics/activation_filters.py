@@ -1,0 +1,175 @@
+"""First-order filters before actuators: MuJoCo's dyntype ``filter`` and ``filterexact``.
+
+With the control u, the activation a that replaces it, the time constant T and the step h,
+
+    filter        a[k+1] = a[k] + (h / T) (u[k] - a[k])                                         (1)
+    filterexact   a[k+1] = a[k] + (1 - exp(-h / T)) (u[k] - a[k])                               (2)
+
+The activation at the start of a run is not recorded. It is the first of these that is available:
+the value that the recording specifies; the result of (1) or (2) for the known commands before the
+run; the first command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array, Scenario
+from sims.effects.first_order_lag import apply_recursion
+from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+from sims.robot.robot_model import Actuator, RobotModel, cache_per_robot, filters
+
+STATE = "act."
+"""Prefix of the names under which a recording specifies activations."""
+SHORTEST = 1e-15
+"""Smallest time constant in seconds, MuJoCo's mjMINVAL."""
+SETTLED = 10.0
+"""Number of time constants after which a wrong initial activation has no effect.
+
+The remaining share exp(-10) is less than the accuracy of a simulation.
+"""
+
+
+class ActivationFilter(NamedTuple):
+    """A filter before an actuator.
+
+    Attributes:
+        actuator: the actuator.
+        address: address of its activation in MuJoCo's ``act``.
+        seconds: time constant in seconds.
+        exact: whether (2) applies instead of (1).
+        limits: lowest and highest activation; infinite if not limited.
+    """
+
+    actuator: Actuator
+    address: int
+    seconds: float
+    exact: bool
+    limits: tuple[float, float]
+
+    @property
+    def state(self) -> str:
+        """Name under which a recording specifies the activation."""
+        return STATE + self.actuator.name
+
+    def clipped(self, controls: Array) -> Array:
+        """Return controls limited to the control range, as the filter receives them."""
+        if self.actuator.range is None:
+            return controls
+        clipped: Array = np.clip(controls, *self.actuator.range)
+        return clipped
+
+    def activations(self, controls: Array, begun: Array, step: float, fourth: bool) -> Array:
+        """Compute activations at the beginnings of steps, by (1) or (2).
+
+        Args:
+            controls: (n, S) controls of the steps.
+            begun: (n,) initial activations.
+            step: step length in seconds.
+            fourth: whether the integrator is of fourth order, for which (1) and (2) agree.
+
+        Returns:
+            (n, S + 1) activations; the last one is after the last step.
+        """
+        ratio = step / max(self.seconds, SHORTEST)
+        kept = float(np.exp(-ratio)) if self.exact or fourth else 1.0 - ratio
+        taken = self.clipped(controls)
+        decay = np.full_like(taken, kept)
+        ends = apply_recursion(decay, (1.0 - decay) * taken, begun[:, None])
+        # MuJoCo applies a limit within the recursion. But commands that reach the limit stay beyond
+        # it for longer than a step, so the difference only lasts as long as the filter's time
+        # constant.
+        result: Array = np.clip(np.concatenate([begun[:, None], ends], axis=1), *self.limits)
+        return result
+
+
+@cache_per_robot
+def activation_filters(robot: RobotModel) -> tuple[ActivationFilter, ...]:
+    """Return the filters before those actuators of a robot that have one control."""
+    import mujoco
+
+    model = robot.compiled
+    exact = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    found = []
+    for actuator in robot.actuators:
+        i = actuator.id
+        if int(model.actuator_dyntype[i]) not in filters() or actuator.controls != 1:
+            continue
+        limited = bool(model.actuator_actlimited[i])
+        low, high = model.actuator_actrange[i] if limited else (-np.inf, np.inf)
+        found.append(
+            ActivationFilter(
+                actuator,
+                int(model.actuator_actadr[i]),
+                float(model.actuator_dynprm[i, 0]),
+                int(model.actuator_dyntype[i]) == exact,
+                (float(low), float(high)),
+            )
+        )
+    return tuple(found)
+
+
+def is_fourth_order(integrator: int) -> bool:
+    """Return whether MuJoCo's integrator of this number is of fourth order."""
+    return integrator == RK4_INTEGRATOR_ID
+
+
+def stated_activations(robot: RobotModel, initial: Mapping[str, float]) -> dict[str, float]:
+    """Return the activations among the initial states of a run, by name.
+
+    Args:
+        robot: robot with the filters.
+        initial: initial states of the run, by name.
+    """
+    names = {one.state for one in activation_filters(robot)}
+    return {name: value for name, value in initial.items() if name in names}
+
+
+def longest_settling(robot: RobotModel, initial: Mapping[str, float]) -> float:
+    """Return the time in seconds after which no filter depends on its initial activation.
+
+    Filters whose initial activation is specified are ignored.
+
+    Args:
+        robot: robot with the filters.
+        initial: initial states of the run, by name.
+    """
+    unknown = [one for one in activation_filters(robot) if one.state not in initial]
+    return SETTLED * max((one.seconds for one in unknown), default=0.0)
+
+
+def with_history(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:
+    """Extend a scenario into the time before the run for which its inputs are known.
+
+    Args:
+        scenario: scenario of the run.
+        step: step length in seconds.
+
+    Returns:
+        The scenario that begins a whole number of steps earlier, and this number; None if the
+        inputs before the run are not known for at least one step.
+    """
+    names = [name for name in scenario.inputs if name in scenario.before]
+    stamps = scenario.before[names[0]][0] if names else np.empty(0)
+    steps = int(np.floor(-stamps[0] / step)) if stamps.size else 0
+    # The inputs of one run must be known at equal times.
+    alike = all(np.array_equal(scenario.before[name][0], stamps) for name in names)
+    if steps < 1 or len(names) < len(scenario.inputs) or not alike:
+        return None
+    first = -steps * step
+    later = stamps > first
+    times = np.concatenate([[first], stamps[later], scenario.times - scenario.times[0]])
+    inputs = {}
+    for name, values in scenario.inputs.items():
+        own = scenario.before[name][1]
+        if name in scenario.linear:
+            ends = np.append(stamps, 0.0), np.append(own, values[0])
+            begun = float(np.interp(first, *ends))
+        else:
+            begun = float(own[np.flatnonzero(stamps <= first)[-1]])
+        inputs[name] = np.concatenate([[begun], own[later], values])
+    return replace(scenario, times=times - first, inputs=inputs, before={}, off={}), steps

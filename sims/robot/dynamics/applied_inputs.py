@@ -1,0 +1,241 @@
+"""Inputs of a robot as applied to the plant over each simulation step."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array, Scenario
+from sims.core.system import ActiveEffects, Input
+from sims.engines.time_grid import ScenarioGroups, TimeGrid
+from sims.engines.time_grid import compute_applied_inputs as felt_inputs
+from sims.robot.dynamics.active_effects import slice_active_effects
+from sims.robot.dynamics.midpoint_state import Mask, Places
+
+SAME_INSTANT_SHARE = 1e-6
+"""Share of a step, from its beginning, over which the input counts as its initial value."""
+STEP_COUNT_TOLERANCE = 1e-6
+"""Tolerance, as a share of a step, within which a time counts as the end of a step."""
+STEP_SUBDIVISION: Array = np.array([0.25, 0.5, 0.75, 1.0])
+"""Fractions of a step at which it is subdivided, to resolve changes of a command within it."""
+CACHE_BYTES = 64 * 2**20
+"""Maximum size of cached applied inputs, in bytes."""
+NO_SUBDIVISION: Array = np.array([1.0])
+"""Fractions of a step that is not subdivided."""
+SINGLE_INPUT_NAME = "u"
+"""Name given to an input that is evaluated separately."""
+MAX_BATCH_SIZE = 128
+"""Maximum number of batch elements whose inputs are evaluated together."""
+
+
+class _LruCache:
+    """Cache of arrays that is emptied when it exceeds `CACHE_BYTES` bytes."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[object, ...], Array] = {}
+        self._bytes = 0
+
+    def get(self, key: tuple[object, ...], make: Callable[[], Array]) -> Array:
+        """Return the cached array, or make and cache it."""
+        if key not in self._kept:
+            made = make()
+            self._bytes += made.nbytes
+            if self._bytes > CACHE_BYTES:
+                self._kept.clear()
+                self._bytes = made.nbytes
+            self._kept[key] = made
+        return self._kept[key]
+
+
+_applied_input_cache = _LruCache()
+"""Cache of applied inputs without input effects.
+
+Thousands of simulations share the same commands.
+"""
+
+
+def _digest(times: Array, signal: Array) -> bytes:
+    """Compute the digest of a signal and its sample times."""
+    digest = hashlib.blake2b(times.tobytes(), digest_size=16)
+    digest.update(signal.tobytes())
+    return digest.digest()
+
+
+def compute_applied_inputs(
+    step: float,
+    scenario: Scenario,
+    commands: Mapping[str, Array],
+    acting: ActiveEffects,
+    n: int,
+    steps: int,
+    share: float = 1.0,
+) -> dict[str, Array]:
+    """Compute the applied inputs of n batch elements over S steps.
+
+    Args:
+        step: step length in seconds.
+        scenario: scenario of the run.
+        commands: commanded inputs (T,) by name.
+        acting: active effects with their coefficients (K, n, 1).
+        n: number of batch elements.
+        steps: number S of steps.
+        share: share of each step, from its beginning, over which the input is averaged. The default
+            1.0 gives the value to apply over the whole step.
+
+    Returns:
+        Applied inputs (n, S) by name.
+    """
+    times = scenario.times - scenario.times[0] + scenario.offset
+    # If commands change only at step ends, the mean describes each step completely.
+    places = times / step
+    aligned = bool((np.abs(places - np.rint(places)) < STEP_COUNT_TOLERANCE).all())
+    seen = np.zeros(steps + 1, dtype=bool)
+    seen[np.clip(np.rint(places).astype(np.intp), 0, steps)] = True
+    usual = NO_SUBDIVISION if aligned else STEP_SUBDIVISION
+    if share < 1.0:
+        usual = np.array([share, 1.0])
+    felt: dict[str, Array] = {}
+    asked: list[_InputRequest] = []
+    for name, signal in commands.items():
+        earlier = scenario.before[name].tobytes() if name in scenario.before else b""
+        read = name in scenario.linear, scenario.offset, earlier
+        key = step, steps, usual.tobytes(), *read, _digest(scenario.times, signal)
+        bare = _InputRequest(name, signal, np.zeros(1, dtype=np.intp), ())
+        plain = _applied_input_cache.get(
+            key, partial(_given, step, scenario, [bare], steps, seen, usual)
+        )
+        felt[name] = np.repeat(plain, n, axis=0)
+        passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
+        # Inputs are grouped by effects, so that the value of a batch element does not depend on
+        # others.
+        asked += [_InputRequest(name, signal, *part) for part in _by_kinds(passed, n)]
+    cuts = STEP_SUBDIVISION if usual is NO_SUBDIVISION else usual
+    for group in _groups(asked):
+        values = _given(step, scenario, group, steps, seen, cuts)
+        ends = np.cumsum([one.lanes.size for one in group])
+        for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
+            felt[one.name][one.lanes] = rows
+    return felt
+
+
+class _InputRequest(NamedTuple):
+    """Request for one applied input.
+
+    Attributes:
+        name: name of the input.
+        signal: (T,) commanded values.
+        lanes: batch elements in which input effects are active.
+        acting: these effects, with coefficients for the batch elements.
+    """
+
+    name: str
+    signal: Array
+    lanes: Places
+    acting: ActiveEffects
+
+
+def _alone(scenario: Scenario, name: str) -> Scenario:
+    """Restrict a scenario to one input, under the name `SINGLE_INPUT_NAME`."""
+    return replace(
+        scenario,
+        inputs={},
+        linear=frozenset({SINGLE_INPUT_NAME} if name in scenario.linear else ()),
+        before={SINGLE_INPUT_NAME: scenario.before[name]} if name in scenario.before else {},
+    )
+
+
+def _by_kinds(passed: ActiveEffects, n: int) -> Iterator[tuple[Places, ActiveEffects]]:
+    """Group batch elements by their active effects."""
+    there = np.array([(c != 0).any(axis=(0, 2)) for _, c in passed], dtype=bool).reshape(-1, n)
+    kinds, of = np.unique(there, axis=1, return_inverse=True)
+    for number, kind in enumerate(kinds.T):
+        if kind.any():
+            lanes = np.flatnonzero(of.ravel() == number)
+            yield lanes, slice_active_effects(passed, lanes)
+
+
+def _groups(asked: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
+    """Group requests with equal sequences of effect types, of at most `MAX_BATCH_SIZE` batch elements.
+
+    Effects with a state are integrated step by step, and a step costs about the same for few and
+    for many batch elements.
+    """
+    alike: dict[tuple[str, ...], list[_InputRequest]] = {}
+    for one in asked:
+        alike.setdefault(tuple(e.of or e.name for e, _ in one.acting), []).append(one)
+    for group in alike.values():
+        sizes = np.cumsum([one.lanes.size for one in group])
+        parts = (sizes - 1) // MAX_BATCH_SIZE
+        for part in np.unique(parts):
+            yield [group[k] for k in np.flatnonzero(parts == part)]
+
+
+def _together(asked: Sequence[_InputRequest]) -> ActiveEffects:
+    """Concatenate the effects of a group of requests along the batch elements."""
+    first = [effect for effect, _ in asked[0].acting]
+    rows = zip(*([c for _, c in one.acting] for one in asked), strict=True)
+    return tuple((effect, np.concatenate(c, axis=1)) for effect, c in zip(first, rows, strict=True))
+
+
+def _given(
+    step: float,
+    scenario: Scenario,
+    asked: Sequence[_InputRequest],
+    steps: int,
+    seen: Mask,
+    cuts: Array,
+) -> Array:
+    """Compute the applied inputs (N, S) of requests, with steps subdivided at `cuts`."""
+    acting = _together(asked)
+    of = np.repeat(np.arange(len(asked)), [one.lanes.size for one in asked])
+    runs = ScenarioGroups(tuple(_alone(scenario, one.name) for one in asked), of)
+    plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
+    commands = [{SINGLE_INPUT_NAME: one.signal} for one in asked]
+    values = felt_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]
+    parts = values.reshape(of.size, steps, cuts.size)
+    return parts[:, :, 0] if cuts.size < STEP_SUBDIVISION.size else compute_step_inputs(parts, seen)
+
+
+def _parts_of_steps(step: float, steps: int, n: int, cuts: Array, alike: bool) -> TimeGrid:
+    """Make the plan of steps that are subdivided at the given fractions."""
+    begins: Array = step * np.arange(float(steps))
+    ends = (begins[:, None] + step * cuts).ravel()
+    lengths = np.diff(ends, prepend=0.0)
+    rows = np.zeros((n, 1), dtype=np.intp)
+    shape = n, ends.size
+    whole = np.broadcast_to(lengths, shape), np.broadcast_to(ends, shape)
+    return TimeGrid(*whole, 1, rows, has_uniform_steps=alike)
+
+
+def compute_step_inputs(parts: Array, seen: Mask) -> Array:
+    """Compute the inputs of steps (n, S) from their means (n, S, 4) over the quarters of each step.
+
+    A step of length h has one constant control. Its mean is that of the command. The first moment
+    of the command about the middle of the step,
+
+        D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
+
+    is reproduced by adding -D to the step and +D to the next one. If a sample is at the end of the
+    step and none at its beginning, -D is added to the previous step and +D to this one, since only
+    the states at samples are observed. So a command that changes within a step is applied neither
+    early nor late by a fraction of the step.
+
+    Args:
+        parts: (n, S, 4) means over the quarters.
+        seen: (S + 1,) whether a sample is at the beginning of the first step and at each step end.
+    """
+    weights = (np.arange(4.0) + 0.5) / 4.0 - 0.5
+    moments = (parts * weights).mean(axis=2)  # (1)
+    given: Array = parts.mean(axis=2)
+    last = parts.shape[1] - 1
+    for way, allowed in ((1, ~seen[1:]), (-1, seen[1:] & ~seen[:-1])):
+        steps = np.flatnonzero(allowed)
+        steps = steps[(steps + way >= 0) & (steps + way <= last)]
+        given[:, steps] -= way * moments[:, steps]
+        given[:, steps + way] += way * moments[:, steps]
+    return given

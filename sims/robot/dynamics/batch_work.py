@@ -1,0 +1,167 @@
+"""Batches of robot runs: initial states, inputs and results of their batch elements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array, Scenario
+from sims.core.system import ActiveEffects, Sensor
+from sims.engines.time_grid import ScenarioGroups
+from sims.robot.dynamics.midpoint_state import Mask, Places
+from sims.robot.floating_joints import FloatingState
+
+Number = TypeVar("Number", bound=np.generic)
+
+BEYOND, LATE = 1.1, 0.2
+"""Maximum simulated time after the last time stamp if sensors sample early.
+
+A run is simulated for at most `BEYOND` times its duration plus `LATE` seconds.
+"""
+
+
+class RobotRunBatch(NamedTuple):
+    """Batch elements of one run.
+
+    Attributes:
+        scenario: scenario of the run.
+        commands: inputs (T,) by name.
+        acting: effects at one place each, with coefficients (K, n, 1).
+        x: (n, D) initial positions.
+        v: (n, D) initial velocities.
+    """
+
+    scenario: Scenario
+    commands: Mapping[str, Array]
+    acting: ActiveEffects
+    x: Array
+    v: Array
+
+    @property
+    def times(self) -> Array:
+        """Sample times (T,) in seconds since the start."""
+        result: Array = self.scenario.times - self.scenario.times[0]
+        return result
+
+
+def list_last_read_times(work: RobotRunBatch) -> Array:
+    """Return the last time, (1,), at which a sensor is read in a run, in seconds since the start.
+
+    With a slow clock the true time passes the last time stamp.
+    """
+    end = work.times[-1:]
+    latest = float(end[0])
+    for effect, c in work.acting:
+        if isinstance(effect, Sensor):
+            latest = max(latest, float(np.max(effect.times(c, np.broadcast_to(end, c[0].shape)))))
+    # Implausible values that a fit tries must not cost thousands of steps.
+    return np.array([min(latest, BEYOND * float(end[0]) + LATE)])
+
+
+class BatchStart(NamedTuple):
+    """Initial states of n batch elements, and the effects active on them.
+
+    Attributes:
+        x: (n, D) initial positions.
+        v: (n, D) initial velocities.
+        acting: effects with their coefficients (K, n, 1).
+        floating_state: initial poses and velocities of floating bodies.
+    """
+
+    x: Array
+    v: Array
+    acting: ActiveEffects
+    floating_state: FloatingState
+
+
+class BatchInputs(NamedTuple):
+    """Precomputed inputs of n batch elements over S steps.
+
+    Attributes:
+        controls: (n, S, nu) mean controls over each step.
+        forces: (n, S, nv) generalised forces.
+        applied_inputs: applied inputs (n, S) by name; after an activation filter, the activation.
+        instant: (n, S, nu) controls at the beginning of each step.
+        activations: (n, na) initial activations of the actuators.
+        off: (n, S, K) whether each actuator is switched off.
+    """
+
+    controls: Array
+    forces: Array
+    applied_inputs: Mapping[str, Array]
+    instant: Array
+    activations: Array
+    off: Mask
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[BatchInputs]) -> BatchInputs:
+        """Concatenate the inputs of several runs; shorter runs repeat their last inputs."""
+        if len(parts) == 1:
+            return parts[0]
+        steps = max(part.controls.shape[1] for part in parts)
+        names = parts[0].applied_inputs
+        return cls(
+            np.concatenate([_lasting(part.controls, steps) for part in parts]),
+            np.concatenate([_lasting(part.forces, steps) for part in parts]),
+            {
+                n: np.concatenate([_lasting(part.applied_inputs[n], steps) for part in parts])
+                for n in names
+            },
+            np.concatenate([_lasting(part.instant, steps) for part in parts]),
+            np.concatenate([part.activations for part in parts]),
+            np.concatenate([_lasting(part.off, steps) for part in parts]),
+        )
+
+
+def _lasting(values: NDArray[Number], steps: int) -> NDArray[Number]:
+    """Extend values (n, S', ...) to S steps by repeating the last one."""
+    more = steps - values.shape[1]
+    if not more:
+        return values
+    return np.concatenate([values, np.repeat(values[:, -1:], more, axis=1)], axis=1)
+
+
+def group_by_run(runs: ScenarioGroups, lanes: Places) -> list[tuple[int, Places]]:
+    """Group consecutive batch elements by their runs.
+
+    Args:
+        runs: runs of all batch elements.
+        lanes: indices of the batch elements.
+
+    Returns:
+        For each group, the number of the run and the indices of its batch elements.
+    """
+    if not lanes.size:
+        return []
+    borders = np.flatnonzero(np.diff(runs.scenario_index[lanes])) + 1
+    return [(int(runs.scenario_index[own[0]]), own) for own in np.split(lanes, borders)]
+
+
+class BatchResult(NamedTuple):
+    """Simulation results of n batch elements.
+
+    Attributes:
+        x: (n, S + 1, D) positions at the beginning and after every step.
+        v: (n, S + 1, D) velocities at the beginning and after every step.
+        fields: recorded fields of MuJoCo's data in each step, (n, S, ...) by name.
+        initial_activations: (n, na) initial activations.
+        failed: (n,) whether the simulation failed.
+        series: positions and velocities (n, S + 1, H) of joints in series with others.
+    """
+
+    x: Array
+    v: Array
+    fields: Mapping[str, Array]
+    initial_activations: Array
+    failed: Mask
+    series: tuple[Array, Array]
+
+    def select(self, lanes: slice) -> BatchResult:
+        """Return the results of some batch elements."""
+        fields = {name: values[lanes] for name, values in self.fields.items()}
+        series = self.series[0][lanes], self.series[1][lanes]
+        rest = self.initial_activations[lanes], self.failed[lanes], series
+        return BatchResult(self.x[lanes], self.v[lanes], fields, *rest)

@@ -1,0 +1,321 @@
+"""Effect forces on a batch of robots by a compiled program.
+
+With numpy, each effect is evaluated separately, which takes longer than MuJoCo's step. Here the
+computation of the effects is traced once, as for the systems of `sims.engines.compiled`, and
+written as instructions on registers with one column for each batch element. Effects that cannot be
+traced, or that give other numbers then, are evaluated with numpy.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+from sims.core.system import Effect, HiddenState, HiddenStateEffect
+from sims.engines.compiled.expression_graph import LANE, MOMENT, ExpressionGraph
+from sims.engines.compiled.force_program import (
+    InstructionList,
+    collect_nodes,
+    emit_instructions,
+    make_input_vector,
+)
+from sims.engines.compiled.kernel import CompiledKernel, get_kernel
+from sims.engines.compiled.node_arrays import NotTraceableError
+from sims.robot.dynamics.effect_forces import (
+    EffectForces,
+    compute_effect_forces,
+    compute_friction_limits,
+    compute_hidden_state_forces,
+    make_snapshot,
+)
+from sims.robot.dynamics.midpoint_state import JointStates, predict_midpoint
+from sims.robot.robot_system import RobotSystem
+
+MAX_PROGRAM_DEVIATION = 1e-9
+"""Maximum deviation of a program from its source, as a share of the largest number."""
+CHECKED_INSTANTS = 16
+"""Maximum number of times at which a program is compared with its source."""
+MAX_CACHED_PROGRAMS = 500
+"""Maximum number of cached programs for one robot and set of inputs."""
+
+
+class _Asked(NamedTuple):
+    """An effect prepared for tracing.
+
+    Attributes:
+        effect: the effect.
+        c: (K, 1, 1) traced coefficients.
+        state: traced hidden state; None for effects without one.
+    """
+
+    effect: Effect
+    c: Any
+    state: HiddenState | None
+
+
+class _Program(NamedTuple):
+    """Forces of effects as instructions.
+
+    Attributes:
+        written: instructions on groups of registers: time at the beginning and at the middle of a
+            step, step length, integration interval of hidden states, motion, inputs, stiffness,
+            coefficients, hidden states.
+        force: (D,) registers of the forces.
+        limit: (D,) registers of the limits of dry friction.
+        states: (2 H,) registers of the hidden states after the step.
+    """
+
+    written: InstructionList
+    force: NDArray[np.intp]
+    limit: NDArray[np.intp]
+    states: NDArray[np.intp]
+
+
+class _Tracing:
+    """Traced state of a robot, and programs of the effects that are evaluated at it.
+
+    Args:
+        system: system of the robot.
+        inputs: names of the inputs.
+    """
+
+    def __init__(self, system: RobotSystem, inputs: tuple[str, ...]) -> None:
+        graph = ExpressionGraph()
+        joints = len(system.coordinates)
+        self._graph = graph
+        self._t, self._after, self._step, self._past = (
+            make_input_vector(graph, 1, MOMENT) for _ in range(4)
+        )
+        parts = [make_input_vector(graph, joints, MOMENT) for _ in JointStates._fields]
+        self._motion = parts
+        self._inputs = {name: make_input_vector(graph, 1, MOMENT) for name in inputs}
+        self._stiffness = make_input_vector(graph, joints, LANE)
+        look = JointStates(*parts)
+        instants = [(self._t, look.x, look.v, look.transmission_loads)]
+        instants.append(
+            (self._after, *predict_midpoint(look.x, look.v, look.a, self._step), look.at_midpoint)
+        )
+        self._begin, self._middle = (
+            make_snapshot(system, t, x, v, dict(self._inputs), np.stack(sides), self._stiffness)
+            for t, x, v, sides in instants
+        )
+        self._asked: dict[tuple[type[Effect], int], _Asked] = {}
+        self._programs: dict[tuple[type[Effect], ...], _Program] = {}
+        self.known: dict[type[Effect], bool] = {}
+
+    def program(self, effects: Sequence[Sequence[Effect]]) -> _Program:
+        """Return the program for forces, frictions and effects with hidden states.
+
+        Raises:
+            UntracedError: an effect cannot be traced, or there are too many effects.
+        """
+        key = tuple(type(effect) for group in effects for effect in group)
+        if key not in self._programs:
+            if len(self._programs) == MAX_CACHED_PROGRAMS:
+                self._programs.clear()
+            self._programs[key] = self._composed(effects)
+        return self._programs[key]
+
+    def _composed(self, effects: Sequence[Sequence[Effect]]) -> _Program:
+        before: Counter[type[Effect]] = Counter()
+        asked: list[list[_Asked]] = []
+        for group in effects:
+            asked.append([])
+            for effect in group:
+                # An effect may occur twice: alone, and as a member of a family in other batch
+                # elements.
+                asked[-1].append(self._of(effect, before[type(effect)]))
+                before[type(effect)] += 1
+        forces, frictions, hidden = ([(one.effect, one.c) for one in group] for group in asked)
+        states = [one.state for one in asked[2] if one.state is not None]
+        force: Any = compute_effect_forces(forces, self._middle)  # type: ignore[arg-type]
+        later: list[HiddenState] = []
+        if hidden:
+            moments = self._begin, self._middle
+            more, later = compute_hidden_state_forces(hidden, moments, states, self._past)  # type: ignore[arg-type]
+            force = force + more
+        limit: Any = compute_friction_limits(frictions, self._middle)  # type: ignore[arg-type]
+        after: Any = [part for state in later for part in (state.x, state.v)]
+        outputs = [self._nodes(values) for values in (force, limit, *after)]
+        begun: Any = [part for state in states for part in (state.x, state.v)]
+        coefficients = [one.c for group in asked for one in group]
+        clock = self._t, self._after, self._step, self._past
+        groups = [*((part,) for part in clock), *((part,) for part in self._motion)]
+        groups += [tuple(self._inputs.values()), (self._stiffness,), tuple(coefficients)]
+        groups.append(tuple(begun))
+        written = emit_instructions(
+            [collect_nodes(*group) for group in groups],
+            [node for nodes in outputs for node in nodes],
+        )
+        places = [
+            np.array([written.place[node] for node in nodes], dtype=np.intp) for nodes in outputs
+        ]
+        after_all = np.concatenate([np.empty(0, dtype=np.intp), *places[2:]])
+        return _Program(written, places[0], places[1], after_all)
+
+    def _of(self, effect: Effect, number: int) -> _Asked:
+        """Return the traced form of an effect, for its given occurrence in a program."""
+        kind = type(effect), number
+        if kind not in self._asked:
+            if getattr(effect, "__dict__", None):
+                raise NotTraceableError("it has a state of its own")
+            c = make_input_vector(self._graph, len(effect.coefficients), LANE).T[:, :, None]
+            state = None
+            if isinstance(effect, HiddenStateEffect):
+                state = HiddenState(*(make_input_vector(self._graph, 1, MOMENT) for _ in range(2)))
+            self._asked[kind] = _Asked(effect, c, state)
+        return self._asked[kind]
+
+    @staticmethod
+    def _nodes(values: Any) -> list[Any]:
+        """Return the nodes of a traced value; the shape of a hidden state may have changed."""
+        if not hasattr(values, "nodes"):
+            raise NotTraceableError("it gives numbers that hang on nothing")
+        return collect_nodes(values)
+
+
+class CompiledForces:
+    """Effect forces computed by a program, with the interface of `effect_forces.EffectForces`.
+
+    Attributes:
+        has_dry_friction: as in `EffectForces`.
+        addresses: as in `EffectForces`.
+        loaded: as in `EffectForces`.
+
+    Args:
+        forces: effects to evaluate.
+        program: program of these effects.
+        run_by: functions that execute programs.
+    """
+
+    def __init__(self, forces: EffectForces, program: _Program, run_by: CompiledKernel) -> None:
+        self.has_dry_friction = forces.has_dry_friction
+        self.addresses = forces.addresses
+        self.loaded = forces.loaded
+        self._of = forces
+        self._program = program
+        written = program.written
+        lanes, joints = forces.stiffness.shape
+        self._r = r = np.zeros((len(written.place), lanes))
+        r[written.first : written.first + written.values.size] = written.values[:, None]
+        *clock, u, stiffness, c, states = written.rows
+        self._t, self._after, step, self._past, *motion = clock
+        self._motion = [slice(first, first + joints) for first in motion]
+        self._u = slice(u, stiffness)
+        self._states = slice(states, written.first)
+        r[step] = forces.step
+        r[stiffness:c] = forces.stiffness.T
+        coefficients = [own[:, :, 0] for _, own in _effects(forces)]
+        r[c:states] = np.concatenate(coefficients)
+        first, moment, end, _ = written.ends.tolist()
+        run_by.make_instruction_runner(written.code, first, moment, r)()
+        self._run = run_by.make_instruction_runner(written.code, moment, end, r)
+
+    @cached_property
+    def _felt(self) -> Array:
+        """Applied inputs (S, U, L)."""
+        return np.ascontiguousarray(np.stack(list(self._of.felt.values())).transpose(2, 0, 1))
+
+    def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
+        """Compute forces and friction limits over step k, see `EffectForces.compute`."""
+        r = self._r
+        for rows, values in zip(self._motion, look, strict=True):
+            r[rows] = values.T
+        r[self._t] = k * self._of.step
+        r[self._after] = (k + 0.5) * self._of.step
+        if self._of.felt:
+            r[self._u] = self._felt[k]
+        hidden = self._of.hidden
+        if hidden and k < 2:
+            r[self._past] = self._of.step if k else 0.5 * self._of.step
+        if hidden and not k:
+            moment = self._of.make_step_snapshot(0, look)
+            states = [effect.get_initial_state(c, moment) for effect, c in hidden]
+            begun = [part for state in states for part in (state.x, state.v)]
+            r[self._states] = np.concatenate(begun, axis=1).T
+        self._run()
+        if hidden:
+            r[self._states] = r[self._program.states]
+        return r[self._program.force].T, r[self._program.limit].T
+
+
+def compile_forces(forces: EffectForces) -> CompiledForces | None:
+    """Compile effect forces; return None if an effect cannot be compiled."""
+    run_by = get_kernel()
+    groups = [[effect for effect, _ in group] for group in _groups(forces)]
+    if run_by is None or not any(groups):
+        return None
+    inputs = tuple(forces.felt)
+    tracings = forces.system.traced
+    if inputs not in tracings:
+        tracings[inputs] = _Tracing(forces.system, inputs)
+    tracing = tracings[inputs]
+    if not all(_compiles(tracing, forces, effect, run_by) for effect, _ in _effects(forces)):
+        return None
+    try:
+        return CompiledForces(forces, tracing.program(groups), run_by)
+    except NotTraceableError:  # The program is too large; the effects themselves are valid.
+        return None
+
+
+def _compiles(
+    tracing: _Tracing, forces: EffectForces, effect: Effect, run_by: CompiledKernel
+) -> bool:
+    """Return whether an effect can be compiled; if not, report it once."""
+    kind = type(effect)
+    if kind not in tracing.known:
+        tracing.known[kind] = False
+        try:
+            _check(tracing, _alone(forces, effect), run_by)
+            tracing.known[kind] = True
+        # An effect of a user may raise any exception when it is evaluated with traced values.
+        except Exception as reason:
+            text = str(reason) or type(reason).__name__
+            sys.stderr.write(
+                f"simgap: effect {effect.name} is asked without the compiler: {text}\n"
+            )
+    return tracing.known[kind]
+
+
+def _check(tracing: _Tracing, forces: EffectForces, run_by: CompiledKernel) -> None:
+    """Compare an effect's program with numpy at random states.
+
+    Raises:
+        UntracedError: the results differ.
+    """
+    program = tracing.program([[effect for effect, _ in group] for group in _groups(forces)])
+    quick = CompiledForces(forces, program, run_by)
+    rng = np.random.default_rng(0)
+    steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.felt.values())])
+    for k in range(steps):
+        seen = (len(JointStates._fields), *forces.stiffness.shape)
+        look = JointStates(*(rng.normal(size=seen) * rng.choice([0.01, 1.0, 10.0])))
+        for found, expected in zip(quick.compute(k, look), forces.compute(k, look), strict=True):
+            close = MAX_PROGRAM_DEVIATION * np.abs(expected[np.isfinite(expected)]).max(initial=0.0)
+            if not np.allclose(
+                found, expected, rtol=MAX_PROGRAM_DEVIATION, atol=close, equal_nan=True
+            ):
+                raise NotTraceableError("compiled it gives other numbers")
+
+
+def _groups(forces: EffectForces) -> list[Sequence[tuple[Effect, Array]]]:
+    return [forces.forces, forces.frictions, forces.hidden]
+
+
+def _effects(forces: EffectForces) -> list[tuple[Effect, Array]]:
+    return [pair for group in _groups(forces) for pair in group]
+
+
+def _alone(forces: EffectForces, effect: Effect) -> EffectForces:
+    """Return the forces of one of the effects only."""
+    own = tuple(pair for pair in _effects(forces) if pair[0] is effect)
+    return EffectForces(
+        forces.system, own, forces.felt, forces.addresses, forces.stiffness, forces.step
+    )

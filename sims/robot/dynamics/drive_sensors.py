@@ -1,0 +1,128 @@
+"""Readings of drive-force sensors, with corrections that MuJoCo's own sensors do not contain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import ActiveEffects
+from sims.robot.coupled_drives import find_preceding_joint as joint_before
+from sims.robot.dynamics.activation_filters import activation_filters
+from sims.robot.dynamics.active_effects import find_active_elements, slice_active_effects
+from sims.robot.dynamics.batch_work import BatchInputs
+from sims.robot.dynamics.disabled_drives import working_servos
+from sims.robot.dynamics.effect_forces import (
+    compute_drive_effect_forces,
+    is_in_drive,
+    make_snapshot,
+)
+from sims.robot.dynamics.mujoco_batch import MujocoBatch
+from sims.robot.model_field_effects import COUPLING_FIELD, get_coupling_address
+from sims.robot.robot_model import Actuator, RobotModel
+from sims.robot.robot_system import RobotSystem
+
+
+@dataclass(frozen=True)
+class DriveSensorModel:
+    """Drive-force readings of the batch elements of one MuJoCo batch.
+
+    Attributes:
+        robot: robot that is simulated.
+        system: system of the robot.
+        batch: MuJoCo batch.
+        given: inputs of the batch elements.
+        step: step length in seconds.
+    """
+
+    robot: RobotModel
+    system: RobotSystem
+    batch: MujocoBatch
+    given: BatchInputs
+    step: float
+
+    def shift_to_step_begin(self, readings: Array) -> None:
+        """Shift readings (n, S, k) from the mean command of a step to its initial command.
+
+        The readings are changed in place.
+        """
+        given, bench = self.given, self.batch
+        n = len(readings)
+        for actuator in self.robot.actuators:
+            apart = given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
+            apart = np.where(given.off[:, :, actuator.id], 0.0, apart)
+            if actuator.joint not in bench.drives or not apart.any():
+                continue
+            column = readings[:, :, bench.drives[actuator.joint]]
+            before = column.copy()
+            column += apart * self._by_control(actuator)[:n, None]
+            np.clip(column, *self._limits(actuator), out=column)
+            if actuator.joint in bench.robot.coupled:
+                first = joint_before(self.robot, actuator.joint)
+                assert first is not None
+                arms: Array = bench.fields[COUPLING_FIELD][
+                    :n, get_coupling_address(bench.robot, actuator.joint)
+                ]
+                readings[:, :, bench.drives[first.name]] += arms[:, None] * (column - before)
+
+    def add_drive_effects(self, readings: Array, x: Array, v: Array, acting: ActiveEffects) -> None:
+        """Add the forces of effects in the drives, such as a dead zone or a voltage drop.
+
+        The simulation applies these effects as external forces, so MuJoCo's sensors do not contain
+        them.
+
+        Args:
+            readings: (n, S, k) sensor readings; changed in place.
+            x: (n, S + 1, D) positions.
+            v: (n, S + 1, D) velocities.
+            acting: active effects with their coefficients.
+        """
+        lanes = np.flatnonzero(find_active_elements(acting, len(x), is_in_drive))
+        if not lanes.size:
+            return
+        bench, given, steps = self.batch, self.given, readings.shape[1]
+        columns = [bench.drives[name.removeprefix("q.")] for name in self.system.coordinates]
+        shown = readings[lanes][:, :, columns]
+
+        def flat(values: Array) -> Array:
+            """Stack all sample times of the selected batch elements into one axis."""
+            return values[lanes, :steps].reshape(lanes.size * steps, -1)
+
+        inputs = {name: flat(u) for name, u in given.applied_inputs.items()}
+        for one in self.robot.actuators:
+            # The output of an activation filter does not change within a step.
+            if not self._is_filtered(one):
+                inputs[f"u.{one.name}"] = flat(given.instant[:, :, one.control])
+        t = np.tile(self.step * np.arange(float(steps)), lanes.size)[:, None]
+        drive = shown.reshape(lanes.size * steps, -1)
+        carried = np.stack([drive, np.zeros_like(drive)])
+        stiffness = np.repeat(bench.get_servo_stiffness(bench.places)[lanes], steps, axis=0)
+        if given.off.any():
+            on = working_servos(bench.robot, bench.places.velocities, given.off[lanes, :steps])
+            stiffness = stiffness * on.reshape(stiffness.shape)
+        moment = make_snapshot(self.system, t, flat(x), flat(v), inputs, carried, stiffness)
+        own = slice_active_effects(tuple((e, c) for e, c in acting if is_in_drive(e)), lanes)
+        every = tuple((e, np.repeat(c, steps, axis=1)) for e, c in own)
+        shown += compute_drive_effect_forces(every, moment).reshape(shown.shape)
+        readings[lanes[:, None, None], np.arange(steps)[:, None], columns] = shown
+
+    def _by_control(self, actuator: Actuator) -> Array:
+        """Return the immediate joint force per unit of an actuator's control, (LANES,)."""
+        gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
+        gain: Array = self.batch.fields["actuator_gainprm"][:, actuator.id, 0]
+        direct = actuator.kind in ("motor", "position", "velocity")
+        direct = direct and not self._is_filtered(actuator)
+        return gear * gain if direct else np.zeros_like(gain)
+
+    def _is_filtered(self, actuator: Actuator) -> bool:
+        """Return whether a filter precedes the actuator, so that controls act with a delay."""
+        return any(one.actuator == actuator for one in activation_filters(self.robot))
+
+    def _limits(self, actuator: Actuator) -> tuple[float, float]:
+        """Return lower and upper limit of an actuator's joint force; infinite if unspecified."""
+        gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
+        low, high = actuator.force or (-np.inf, np.inf)
+        assert actuator.joint is not None
+        effort = self.robot.joint(actuator.joint).effort or np.inf
+        return max(gear * low, -effort), min(gear * high, effort)

@@ -1,0 +1,252 @@
+"""Effect forces on batches of a robot, precomputed or evaluated in every step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
+from sims.robot.dynamics.hidden_state_integration import advance_state
+from sims.robot.dynamics.midpoint_state import JointStates, Mask, predict_midpoint
+from sims.robot.dynamics.mujoco_batch import JointAddresses
+from sims.robot.dynamics.series_joints import is_series_effect
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.places.effect_places import SHARED_ACTUATOR_EFFECTS
+from sims.robot.robot_system import RobotSystem
+from sims.robot.state_snapshots import RobotSnapshot
+
+TIME_DEPENDENT_EFFECTS = frozenset({"force.bias", "force.periodic"})
+"""Effects whose force depends on time alone."""
+
+LOAD_DEPENDENT_EFFECTS = frozenset(
+    {
+        "friction.load",
+        "friction.load_direction",
+        "friction.load_quadratic",
+        "supply.braking",
+        "supply.sag",
+    }
+)
+"""Effects that depend on the loads of transmissions."""
+
+
+def make_snapshot(
+    system: RobotSystem,
+    t: Array,
+    x: Array,
+    v: Array,
+    inputs: Mapping[str, Array],
+    carried: Array,
+    stiffness: Array | None = None,
+) -> RobotSnapshot:
+    """Make a snapshot of batch elements.
+
+    Args:
+        system: system of the robot.
+        t: (L, 1) time since the start in seconds.
+        x: (L, D) positions.
+        v: (L, D) velocities.
+        inputs: applied inputs (L, 1) by name.
+        carried: (2, L, D) forces on both sides of the transmissions.
+        stiffness: (L, D) stiffness of position servos; no servo is active if None.
+    """
+    theta = np.zeros((len(x), 0))
+    stiff = np.zeros((0, 0)) if stiffness is None else stiffness
+    drives, servos = dict(system.drives), dict(system.servos)
+    joints = system.alone, drives, servos, stiff
+    return RobotSnapshot(system, theta, {}, t, x, v, inputs, carried, *joints)
+
+
+def compute_time_dependent_forces(
+    system: RobotSystem, acting: ActiveEffects, t: Array, size: int, lanes: int
+) -> Array:
+    """Compute the forces (L, S, D) of effects that depend on time alone.
+
+    Args:
+        system: system of the robot.
+        acting: active effects with their coefficients (K, L, 1).
+        t: (S,) beginnings of the steps in seconds; forces are evaluated half a step later.
+        size: number D of coordinates.
+        lanes: number L of batch elements.
+    """
+    result = np.zeros((lanes, t.size, size))
+    half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
+    nothing = np.zeros((t.size, size))
+    # The force at the middle of a step gives the momentum of the force over the step, to second
+    # order.
+    moment = make_snapshot(
+        system, (t + half)[:, None], nothing, nothing, {}, np.stack([nothing] * 2)
+    )
+    for effect, c in acting:
+        if effect.of not in TIME_DEPENDENT_EFFECTS or not isinstance(effect, Force):
+            continue
+        for lane in np.flatnonzero((c != 0).any(axis=0)[:, 0]):
+            own = np.repeat(c[:, lane : lane + 1], t.size, axis=1)
+            result[lane] += effect.force(own, moment)
+    return result
+
+
+class EffectForces:
+    """State-dependent effect forces on a batch.
+
+    Attributes:
+        has_dry_friction: (L, D) whether an effect adds dry friction.
+        loaded: (L,) whether an effect depends on the loads of transmissions.
+        system: system of the robot.
+        felt: applied inputs (L, S) by name.
+        addresses: addresses of the joints.
+        stiffness: (L, D) stiffness of the position servos.
+        step: step length in seconds.
+        forces: effects with a force, with their coefficients (K, L, 1).
+        frictions: effects with dry friction, with their coefficients.
+        hidden: effects with hidden states, with their coefficients.
+        working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None if all are
+            on.
+
+    Args:
+        system: see the attributes.
+        acting: effects at one place each.
+        felt: see the attributes.
+        addresses: see the attributes.
+        stiffness: see the attributes.
+        step: see the attributes.
+    """
+
+    def __init__(
+        self,
+        system: RobotSystem,
+        acting: ActiveEffects,
+        felt: Mapping[str, Array],
+        addresses: JointAddresses,
+        stiffness: Array,
+        step: float,
+    ) -> None:
+        self.system = system
+        self.felt = felt
+        self.addresses = addresses
+        self.stiffness = stiffness
+        self.step = step
+        asked = [
+            (e, c) for e, c in acting if e.hook == "force" and e.of not in TIME_DEPENDENT_EFFECTS
+        ]
+        self.forces = [
+            (e, c) for e, c in asked if isinstance(e, Force) and e.of not in MODEL_FIELD_EFFECTS
+        ]
+        self.frictions = [
+            (e, c) for e, c in asked if isinstance(e, Friction) and e.of not in MODEL_FIELD_EFFECTS
+        ]
+        self.has_dry_friction: Mask = np.zeros(
+            (len(stiffness), len(addresses.velocities)), dtype=bool
+        )
+        for effect, c in self.frictions:
+            self.has_dry_friction[:, effect.coordinate] |= (c != 0).any(axis=0)[:, 0]
+        self.hidden = [
+            (e, c)
+            for e, c in acting
+            if isinstance(e, HiddenStateEffect) and not is_series_effect(e)
+        ]
+        self.loaded: Mask = np.zeros(len(stiffness), dtype=bool)
+        for loading, c in asked:
+            if loading.of in LOAD_DEPENDENT_EFFECTS:
+                self.loaded |= (c != 0).any(axis=0)[:, 0]
+        self.working: Array | None = None
+        self._states: list[HiddenState] = []
+
+    def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
+        """Compute forces and dry friction limits (L, D) at the middle of step k.
+
+        Args:
+            k: number of the step; must increase by one from call to call.
+            look: joint states at the beginning of the step.
+        """
+        x, v = predict_midpoint(look.x, look.v, look.a, self.step)
+        moment = self._moment(k + 0.5, k, (x, v, *look.at_midpoint))
+        force = compute_effect_forces(self.forces, moment)
+        if self.hidden:
+            begun = self.make_step_snapshot(k, look)
+            self._states = self._states or [e.get_initial_state(c, begun) for e, c in self.hidden]
+            # Hidden states advance from the middle of the previous step to the middle of this one.
+            step = self.step if k else 0.5 * self.step
+            more, self._states = compute_hidden_state_forces(
+                self.hidden, (begun, moment), self._states, step
+            )
+            force += more
+        return force, compute_friction_limits(self.frictions, moment)
+
+    def make_step_snapshot(self, k: int, look: JointStates) -> RobotSnapshot:
+        """Return the snapshot at the beginning of step k."""
+        return self._moment(k, k, (look.x, look.v, *look.transmission_loads))
+
+    def _moment(self, steps: float, k: int, motion: Sequence[Array]) -> RobotSnapshot:
+        """Return the snapshot after a number of steps, with the inputs of step k."""
+        x, v, *sides = motion
+        now = np.full((len(x), 1), steps * self.step)
+        inputs = {name: u[:, k, None] for name, u in self.felt.items()}
+        stiffness = self.stiffness
+        if self.working is not None:
+            stiffness = stiffness * self.working[:, k]
+        return make_snapshot(self.system, now, x, v, inputs, np.stack(sides), stiffness)
+
+
+def is_in_drive(effect: Effect) -> bool:
+    """Return whether the force of an effect is part of the drive force that a sensor reads."""
+    return isinstance(effect, Force) and (
+        effect.at == "actuator" or effect.of in SHARED_ACTUATOR_EFFECTS
+    )
+
+
+def compute_drive_effect_forces(acting: ActiveEffects, moment: RobotSnapshot) -> Array:
+    """Compute the forces (L, D) that effects in drives add to the drives."""
+    return compute_effect_forces(
+        [(e, c) for e, c in acting if isinstance(e, Force) and is_in_drive(e)], moment
+    )
+
+
+def compute_effect_forces(forces: Sequence[tuple[Force, Array]], moment: RobotSnapshot) -> Array:
+    """Compute the total force (L, D) of effects."""
+    total = np.zeros_like(moment.x)
+    for effect, c in forces:
+        total = total + effect.force(c, moment)
+    return total
+
+
+def compute_friction_limits(
+    frictions: Sequence[tuple[Friction, Array]], moment: RobotSnapshot
+) -> Array:
+    """Compute the total limits (L, D) of dry friction."""
+    limit = np.zeros_like(moment.x)
+    for effect, c in frictions:
+        joint = effect.coordinate
+        assert joint is not None
+        limit[:, joint] = limit[:, joint] + effect.limit(c, moment)[:, 0]
+    return limit
+
+
+def compute_hidden_state_forces(
+    hidden: Sequence[tuple[HiddenStateEffect, Array]],
+    moments: tuple[RobotSnapshot, RobotSnapshot],
+    states: Sequence[HiddenState],
+    step: float,
+) -> tuple[Array, list[HiddenState]]:
+    """Advance hidden states of effects, and compute their forces afterwards.
+
+    Args:
+        hidden: effects with their coefficients.
+        moments: snapshots at the middle and at the end of the interval.
+        states: hidden states at the beginning.
+        step: length of the interval in seconds.
+
+    Returns:
+        Total force (L, D) and hidden states at the end of the interval.
+    """
+    between, end = moments
+    total = np.zeros_like(end.x)
+    later = []
+    for (effect, c), state in zip(hidden, states, strict=True):
+        after = advance_state(effect, c, between, state, step)
+        force, _ = effect.compute_force_and_rate(c, end, after)
+        total = total + np.where(c[0] > 0, force, 0.0)
+        later.append(after)
+    return total, later

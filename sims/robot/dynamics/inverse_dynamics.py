@@ -1,0 +1,63 @@
+"""Joint forces along a measured motion, by MuJoCo's inverse dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.robot.robot_model import Joint
+
+
+class MotionForces(NamedTuple):
+    """Forces at J joints at T times, (T, J) each.
+
+    Attributes:
+        needed: forces that the motion requires by inverse dynamics, in addition to gravity and the
+            passive forces of the model.
+        driven: forces that the actuators of the model exert.
+    """
+
+    needed: Array
+    driven: Array
+
+
+def motion_forces(
+    model: Any,
+    joints: Sequence[Joint],
+    motion: Array,
+    controls: Array,
+    activations: Array | None = None,
+) -> MotionForces:
+    """Compute the joint forces of a motion by inverse dynamics.
+
+    Joints that are not in `joints` rest in the reference pose of the model.
+
+    Args:
+        model: compiled mujoco.MjModel.
+        joints: J joints with one coordinate each.
+        motion: (3, T, J) positions, velocities and accelerations of the joints.
+        controls: (T, nu) controls of all actuators.
+        activations: (T, na) activations of all actuators; zero if None.
+
+    Returns:
+        The required forces and the actuator forces, (T, J) each.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    positions = [joint.position for joint in joints]
+    dofs = [joint.velocity for joint in joints]
+    needed, driven = np.zeros(motion.shape[1:]), np.zeros(motion.shape[1:])
+    for k in range(motion.shape[1]):
+        data.qpos[positions], data.qvel[dofs], data.qacc[dofs] = motion[:, k]
+        mujoco.mj_inverse(model, data)
+        needed[k] = data.qfrc_inverse[dofs]
+        data.ctrl[:] = controls[k]
+        if activations is not None:
+            data.act[:] = activations[k]
+        mujoco.mj_fwdActuation(model, data)
+        driven[k] = data.qfrc_actuator[dofs]
+    return MotionForces(needed, driven)

@@ -1,0 +1,447 @@
+"""Linearisation of a robot's model about a measured motion, from sample to sample.
+
+`dynamics.run_linearisation` linearises about a simulated motion, which may be far from the data.
+Here the
+motion is given, such as a smoothed measurement, with the state x̄[t] at step t. The model's step F
+differs from it by the defect
+
+    d[t] = x̄[t+1] - F(x̄[t], u[t])                                                            (1)
+
+so that a deviation δ = x - x̄ of the true state follows, to first order,
+
+    δ[t+1] = A[t] δ[t] - d[t] + B[t] (f[t] + Σ_k c_k φ_k[t])                                   (2)
+
+with a generalised force f that the model lacks, and the force φ_k of a candidate effect k with
+coefficient c_k. Composed over the steps between two samples i and i + 1,
+
+    δ[i+1] = A_i δ[i] - d_i + G_i f_i + Σ_k c_k b_ik                                           (3)
+    y[i] = h(x̄[i]) + H_i δ[i] + Σ_k c_k ψ_ik                                                   (4)
+
+where f_i is constant between samples, and ψ is the direct change of a reading by an effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array, Scenario
+from sims.core.system import ActiveEffects, Input, Sensor, members_of
+from sims.robot.dynamics.effect_forces import LOAD_DEPENDENT_EFFECTS
+from sims.robot.dynamics.linearisation_points import (
+    LINEARISATION_INTERVAL_SECONDS,
+    TRANSMISSION_FORCE_FIELDS,
+    LinearisationPoints,
+    RobotMotion,
+)
+from sims.robot.dynamics.midpoint_state import Places, forces_are_at_step_end
+from sims.robot.dynamics.run_linearisation import EffectWithCoefficients, RunLinearisation
+from sims.robot.dynamics.series_joints import is_series_effect
+from sims.robot.dynamics.tangent_propagation import Perturbation
+from sims.robot.floating_joints import FloatingState
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.system_simulator import SystemSimulator
+
+SingleArray = NDArray[np.float32]
+
+FARTHEST = 1e3
+"""Maximum deviation of a smoothed state from the measured motion, in SI units."""
+BLOCK = 64
+"""Number of candidates whose responses are computed together."""
+LONGEST_HELD = 0.02
+"""Maximum time, in seconds, for which a Jacobian is reused."""
+SMALL = 1e-4
+"""Size of the state difference for finite-difference derivatives of readings."""
+
+
+class Trajectory(NamedTuple):
+    """States of one run at the beginnings of all steps and at the end.
+
+    Attributes:
+        x: (S + 1, D) positions of the joints.
+        v: (S + 1, D) velocities of the joints.
+        afloat: (S + 1, P) poses and (S + 1, F) velocities of floating joints.
+    """
+
+    x: Array
+    v: Array
+    afloat: FloatingState
+
+
+@dataclass(frozen=True)
+class IntervalMaps:
+    """The linear model (3) and (4) of one run with T samples.
+
+    There are Z state components, E forces, and C channels.
+
+    Attributes:
+        states: A (T - 1, Z, Z).
+        defects: d (T - 1, Z).
+        forces: G (T - 1, Z, E).
+        inputs: (T - 1, Z, E + nu) responses to constant forces and controls.
+        readings: H (T, C, Z).
+        predicted: h(x̄) (T, C).
+        step_errors: (T - 1, Z) discretisation errors of the integrator.
+        jumps: (T - 1, Z) standard deviations of state jumps at force limits of servos.
+    """
+
+    states: Array
+    defects: Array
+    forces: Array
+    inputs: Array
+    readings: Array
+    predicted: Array
+    step_errors: Array
+    jumps: Array
+
+
+class MeasuredLinear(RunLinearisation):
+    """The linear model of one run about a given motion.
+
+    Args:
+        simulator: simulator of the robot.
+        theta: (dim,) parameters.
+        scenario: scenario of the run.
+        start: (D,) positions and velocities at which the simulated motion begins.
+        trajectory: given motion.
+        measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
+            samples, by joint number; all other joints follow the simulation.
+        nearby: linear model of a similar motion, whose commands and readings are reused.
+        is_alike: whether its Jacobians are reused as well.
+    """
+
+    def __init__(
+        self,
+        simulator: SystemSimulator,
+        theta: Array,
+        scenario: Scenario,
+        start: tuple[Array, Array],
+        trajectory: Trajectory | None = None,
+        measured: Mapping[int, Array] | None = None,
+        nearby: MeasuredLinear | None = None,
+        is_alike: bool = True,
+    ) -> None:
+        self._given, self._measured, self._nearby = trajectory, measured or {}, nearby
+        if nearby is not None and is_alike:
+            self.quotients = nearby._tangent.quotients
+        spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
+        self.held = float(np.clip(spacing, LINEARISATION_INTERVAL_SECONDS, LONGEST_HELD))
+        super().__init__(simulator, theta, scenario, *start)
+        if self._names:
+            # The readings belong to the given motion, not to the simulated one.
+            with np.errstate(all="ignore"), capture_mujoco_warnings():
+                read = self._tangent.motion_readings
+            self._readings = {name: read[:, i] for i, name in enumerate(self._names)}
+        nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
+        unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            self.observed = self._seen(nothing, unread, [()])[0]
+        knots = np.rint(self._times / self._simulator.time_step).astype(np.intp)
+        self.knots: Places = np.clip(knots, 0, self._steps)
+
+    @property
+    def step(self) -> float:
+        """Time step of the simulator in seconds."""
+        return self._motion.step
+
+    @property
+    def positions(self) -> int:
+        """Number of positions in a state, including joints in series."""
+        return int(self._motion.x.shape[1])
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion about which the model is linearised."""
+        return Trajectory(self._motion.x, self._motion.v, self._motion.afloat)
+
+    def _nominal(self) -> RobotMotion:
+        motion = self._near() or super()._nominal()
+        given = self._given or self._from_samples(motion)
+        # Joints in series are not measured, so they keep the simulated motion.
+        own = given.x.shape[1]
+        x, v = motion.x.copy(), motion.v.copy()
+        x[:, :own], v[:, :own] = given.x, given.v
+        return self._with_loads(replace(motion, x=x, v=v, afloat=given.afloat))
+
+    def _near(self) -> RobotMotion | None:
+        """Return the motion of `nearby` with the commands of this model, which saves a simulation.
+
+        The result is None if there is no such motion, or if more than the given joints moves.
+        """
+        if self._nearby is None or self._given is None:
+            return None
+        motion, steps = self._nearby._motion, self._steps + 1
+        joints = len(self._simulator.addresses.positions)
+        alone = motion.x.shape[1] == joints and not motion.act.size and not motion.afloat.pose.size
+        if not alone or any(is_series_effect(effect) for effect, _ in self._work.acting):
+            return None
+        self._readings = dict(self._nearby._readings)
+        return replace(
+            motion, **self._commanded(self._simulator.compute_controls(self._work, steps))
+        )
+
+    def _from_samples(self, motion: RobotMotion) -> Trajectory:
+        """Interpolate the measured joints between samples by quintic Hermite polynomials."""
+        # Joints that are not recorded may diverge in the simulation.
+        x, v = (np.clip(np.nan_to_num(u), -FARTHEST, FARTHEST) for u in (motion.x, motion.v))
+        steps: Array = self._simulator.time_step * np.arange(float(len(x)))
+        for joint, samples in self._measured.items():
+            x[:, joint], v[:, joint] = quintic(self._times, samples, steps)
+        own = len(self._simulator.addresses.positions)
+        return Trajectory(x[:, :own], v[:, :own], motion.afloat)
+
+    def _with_loads(self, motion: RobotMotion) -> RobotMotion:
+        """Return the motion with the loads of the transmissions, if any effect depends on them."""
+        effects = [m for effect in self._simulator.effects for m in members_of(effect)]
+        if not any((e.of or e.name) in LOAD_DEPENDENT_EFFECTS for e in effects):
+            return motion
+        simulator = self._simulator
+        bench = simulator.make_linearisation_batch(self._work.acting)
+        outputs = [
+            (name, int(c)) for name in TRANSMISSION_FORCE_FIELDS for c in bench.whole.velocities
+        ]
+        acting = self._work.acting
+        at = LinearisationPoints(bench, simulator.robotic, motion, acting, outputs, bench.whole)
+        _, loads = at.compute_accelerations(acting)
+        size = motion.x.shape[1]
+        carried = np.stack([loads[at.of, :size], loads[at.of, size:]])
+        return replace(motion, carried=carried)
+
+    # -- the model from sample to sample
+
+    def interval_maps(self) -> IntervalMaps:
+        """Compose the steps between samples into the maps of (3) and (4)."""
+        tangent, size = self._tangent, self._tangent.state_size
+        forces = tangent.quotients.forces.shape[2]
+        intervals = self.knots.size - 1
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            defects = self._tangent.defects
+        states = np.tile(np.eye(size), (intervals, 1, 1))
+        defect = np.zeros((intervals, size))
+        force = np.zeros((intervals, size, forces))
+        missed = np.zeros((intervals, size))
+        errors = self._step_errors()
+        of, quotients = tangent.looked_at, tangent.quotients
+        for steps, active in self._within():
+            a = quotients.states[of[steps]]
+            states[active] = a @ states[active]
+            defect[active] = np.einsum("izy,iy->iz", a, defect[active]) + defects[steps]
+            force[active] = a @ force[active] + quotients.forces[of[steps]]
+            missed[active] = np.einsum("izy,iy->iz", a, missed[active]) + errors[of[steps]]
+        count = self._motion.x.shape[0]
+        moved = np.broadcast_to(SMALL * np.eye(size)[:, None, :], (size, count, size))
+        read = np.zeros((size, count, len(self._names)))
+        if self._names:
+            rows = of[np.minimum(np.arange(count), of.size - 1)]
+            read = SMALL * np.moveaxis(quotients.read_states[rows], 2, 0)
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            seen = self._seen(moved, read, [()] * size)
+        readings = np.moveaxis((seen - self.observed) / SMALL, 0, 2)
+        return IntervalMaps(
+            states, defect, force, self._composed, readings, self.observed, missed, self._jumps()
+        )
+
+    def _jumps(self) -> Array:
+        """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""
+        bench = self._simulator.make_linearisation_batch(self._work.acting)
+        limits = bench.force_limits
+        result = np.zeros((self.knots.size - 1, self._tangent.state_size))
+        if not limits.outputs:
+            return result
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            reached = np.abs(self._tangent.limited_forces) >= limits.sizes
+        own = limits.jumps[:, bench.places.velocities]
+        for steps, active in self._within():
+            result[active, : own.shape[1]] += reached[steps] @ own
+        # A position servo returns from a jump of position within the interval or later.
+        lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.time_step
+        moved = self.positions
+        result[:, moved : 2 * moved] = result[:, :moved] / lengths
+        return result
+
+    def _step_errors(self) -> Array:
+        """Return the discretisation errors (N, Z); zero for the fourth-order Runge-Kutta."""
+        simulator, tangent = self._simulator, self._tangent
+        if forces_are_at_step_end(simulator.make_linearisation_batch(self._work.acting).model):
+            return np.zeros((tangent.looks_at, tangent.state_size))
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            return tangent.step_errors(simulator.half_steps(self._work.acting))
+
+    def _within(self) -> list[tuple[Places, Places]]:
+        """Return the active intervals of the first step, then of the second, and so on.
+
+        Each entry contains the step numbers, and the numbers of the intervals that have such a
+        step.
+        """
+        lengths = np.diff(self.knots)
+        result = []
+        for number in range(int(lengths.max(initial=0))):
+            active = np.flatnonzero(lengths > number)
+            result.append((self.knots[:-1][active] + number, active))
+        return result
+
+    def added(
+        self, effects: Sequence[EffectWithCoefficients], predicted: Array
+    ) -> tuple[SingleArray, SingleArray]:
+        """Compute what candidate effects add to (3) and (4).
+
+        A force is replaced by its mean over the interval between two samples. Sensor effects are
+        applied to predicted readings: a gain applied to the recorded reading would contain the
+        noise that it has to explain.
+
+        Args:
+            effects: K effects with their coefficients; those in series with a joint add nothing.
+            predicted: δ (T, Z) at the samples, each predicted from the preceding samples.
+
+        Returns:
+            Mean forces and controls (T - 1, E + nu, K), which `IntervalMaps.inputs` convert to b;
+            and ψ (T, C, K); both in single precision.
+        """
+        count, samples = len(effects), self.knots.size
+        quotients = self._tangent.quotients
+        inputs = quotients.forces.shape[2] + quotients.controls.shape[2]
+        means = np.zeros((samples - 1, inputs, count), dtype=np.float32)
+        readings = np.zeros((samples, self.observed.shape[1], count), dtype=np.float32)
+        driven = self._driven([(e, c) for e, c in effects])
+        for begin in range(0, count, BLOCK):
+            part = range(begin, min(begin + BLOCK, count))
+            changes: list[Perturbation] = []
+            sensors: list[ActiveEffects] = []
+            for owner, number in enumerate(part):
+                effect, c = effects[number]
+                parts = effect.parts(c[:, None, None])
+                sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
+                for one, k in parts:
+                    known = isinstance(one, (Sensor, Input)) or is_series_effect(one)
+                    if not known and k.any():
+                        changes += self._changes(owner, one, k)
+                changes += [c._replace(owner=owner) for c in driven.get(number, ())]
+            own = slice(begin, part.stop)
+            with np.errstate(all="ignore"):
+                pushed, read = self._tangent.pushed(changes, len(part))
+                means[:, :, own] = self._means(pushed)
+                readings[:, :, own] = self._read_directly(read, sensors, predicted)
+        return means, readings
+
+    def _means(self, pushed: Array) -> Array:
+        """Return interval means (T - 1, E + nu, K) of forces and controls (S, E + nu, K)."""
+        lengths = np.diff(self.knots)
+        some = np.flatnonzero(lengths)
+        result = np.zeros((lengths.size, *pushed.shape[1:]))
+        sums = np.add.reduceat(pushed[: self.knots[-1]], self.knots[:-1][some], axis=0)
+        result[some] = sums / lengths[some][:, None, None]
+        return result
+
+    @cached_property
+    def _composed(self) -> Array:
+        """State changes (T - 1, Z, E + nu) per constant force or control over an interval."""
+        tangent = self._tangent
+        of, quotients = tangent.looked_at, tangent.quotients
+        by = np.concatenate([quotients.forces, quotients.controls], axis=2)
+        result = np.zeros((self.knots.size - 1, *by.shape[1:]))
+        for steps, active in self._within():
+            looked = of[steps]
+            result[active] = quotients.states[looked] @ result[active] + by[looked]
+        return result
+
+    def _read_directly(
+        self, read: Array, sensors: Sequence[ActiveEffects], predicted: Array
+    ) -> Array:
+        """Compute the direct changes ψ (T, C, K) of readings.
+
+        Args:
+            read: (S, O, K) direct changes of readings by effects in the model.
+            sensors: sensor effects of each of the K candidates.
+            predicted: (T, Z) predicted deviations, to whose readings sensor effects are applied.
+        """
+        result = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
+        some = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
+        if not some:
+            return result
+        sensed = np.array([bool(sensors[k]) for k in some])
+        # The last row has no sensor effects; it is the reference for the others.
+        states = np.zeros((len(some) + 1, self._motion.x.shape[0], self._tangent.state_size))
+        if sensed.any():
+            forces = self._tangent.quotients.forces.shape[2]
+            unforced = np.zeros((self.knots.size - 1, forces))
+            states[np.append(sensed, True)] = self.propagated(predicted, unforced)
+        changes = np.concatenate(
+            [np.moveaxis(read[:, :, some], 2, 0), np.zeros((1, *read.shape[:2]))]
+        )
+        seen = self._seen(states, changes, [*(sensors[k] for k in some), ()])
+        plain = np.where(sensed[:, None, None], seen[-1], self.observed)
+        result[:, :, some] = np.moveaxis(seen[:-1] - plain, 0, 2)
+        return result
+
+    def propagated(self, begun: Array, forces: Array) -> Array:
+        """Return deviations (S + 1, Z) at all steps by (2), from those at samples.
+
+        Args:
+            begun: δ (T, Z) at the samples.
+            forces: f (T - 1, E), constant between samples.
+        """
+        tangent = self._tangent
+        of, quotients = tangent.looked_at, tangent.quotients
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            defects = tangent.defects
+        result = np.zeros((self._motion.x.shape[0], tangent.state_size))
+        now = begun[:-1].copy()
+        with np.errstate(all="ignore"):
+            for steps, active in self._within():
+                result[steps] = now[active]
+                ahead = np.einsum("izy,iy->iz", quotients.states[of[steps]], now[active])
+                push = np.einsum("ize,ie->iz", quotients.forces[of[steps]], forces[active])
+                now[active] = ahead - defects[steps] + push
+        result[self.knots[-1] :] = begun[-1]
+        return result
+
+    def moved(self, deviations: Array) -> Trajectory:
+        """Return the motion with deviations (S + 1, Z) of states added."""
+        # The motion is not changed where the linear model diverges.
+        deviations = np.where(np.abs(deviations) < FARTHEST, deviations, 0.0)
+        own, motion = len(self._simulator.addresses.positions), self._motion
+        size, na = motion.x.shape[1], motion.act.shape[1]
+        floating = self._simulator.make_linearisation_batch(self._work.acting).floating
+        first = 2 * size + na + len(self._tangent.remembering)
+        moves = motion.afloat.rate.shape[1]
+        pose = motion.afloat.pose
+        if moves:
+            pose = floating.displaced(pose, deviations[:, first : first + moves])
+        rate = motion.afloat.rate + deviations[:, first + moves : first + 2 * moves]
+        return Trajectory(
+            motion.x[:, :own] + deviations[:, :own],
+            motion.v[:, :own] + deviations[:, size : size + own],
+            FloatingState(pose, rate),
+        )
+
+
+def quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:
+    """Interpolate by quintic Hermite polynomials, and extrapolate linearly.
+
+    Args:
+        times: (T,) sample times, ascending.
+        samples: (T, 3) values, first and second derivatives.
+        instants: (n,) times at which to interpolate.
+
+    Returns:
+        Values and first derivatives (n,).
+    """
+    within = np.clip(instants, times[0], times[-1])
+    below = np.clip(np.searchsorted(times, within, side="right") - 1, 0, times.size - 2)
+    h = times[below + 1] - times[below]
+    s = (within - times[below]) / h
+    (x0, v0, a0), (x1, v1, a1) = samples[below].T, samples[below + 1].T
+    v0, a0, v1, a1 = h * v0, h * h * a0, h * v1, h * h * a1
+    # Coefficients of the polynomial in s with these values at 0 and at 1.
+    c2 = 0.5 * a0
+    c3 = 10.0 * (x1 - x0) - 6.0 * v0 - 4.0 * v1 - 1.5 * a0 + 0.5 * a1
+    c4 = -15.0 * (x1 - x0) + 8.0 * v0 + 7.0 * v1 + 1.5 * a0 - a1
+    c5 = 6.0 * (x1 - x0) - 3.0 * (v0 + v1) - 0.5 * a0 + 0.5 * a1
+    value = x0 + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))))
+    slope = (v0 + s * (2.0 * c2 + s * (3.0 * c3 + s * (4.0 * c4 + 5.0 * s * c5)))) / h
+    return value + (instants - within) * slope, slope

@@ -1,0 +1,182 @@
+"""Predicted state at the middle of a step, from the state at its beginning.
+
+MuJoCo holds applied forces constant over a step. A force evaluated at the beginning is half a step
+late, an error of first order. Evaluated at the middle, it gives the momentum of the force over the
+step, to second order (the midpoint rule: E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary
+Differential Equations I, section II.1). With the step h, the last acceleration a that MuJoCo
+computed, and the load d of a transmission at the beginning of step k and at the end of step k - 1,
+
+    v(h / 2) = v + h/2 a,    x(h / 2) = x + h/2 v + h²/8 a                                       (1)
+    d(h / 2) = d_k + (d_{k-1, end} - d_{k-1}) / 2                                                (2)
+
+In (2) both terms of the difference have the same command: a jump with a command only appears in
+d_k.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+
+Places = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+class JointStates(NamedTuple):
+    """States of joints in a batch at the beginning of a step, (L, D) each.
+
+    Attributes:
+        x: positions.
+        v: velocities.
+        a: last accelerations that MuJoCo computed.
+        drive: forces of the actuators on the joints.
+        bias: forces by gravity and the motion of the other bodies.
+        later_drive: forces of the actuators at the middle of the step.
+        later_bias: forces by gravity and motion at the middle of the step.
+    """
+
+    x: Array
+    v: Array
+    a: Array
+    drive: Array
+    bias: Array
+    later_drive: Array
+    later_bias: Array
+
+    @property
+    def transmission_loads(self) -> tuple[Array, Array]:
+        """Forces on both sides of the transmissions."""
+        return self.drive, self.bias
+
+    @property
+    def at_midpoint(self) -> tuple[Array, Array]:
+        """Forces on both sides of the transmissions at the middle of the step."""
+        return self.later_drive, self.later_bias
+
+
+def predict_midpoint(x: Array, v: Array, a: Array, step: Array | float) -> tuple[Array, Array]:
+    """Predict positions and velocities half a step later, by (1).
+
+    Args:
+        x: positions.
+        v: velocities.
+        a: accelerations.
+        step: step length in seconds.
+    """
+    half = 0.5 * step
+    later = v + half * a
+    # A reversal within half a step cannot be predicted by a linear extrapolation.
+    later = np.where(later * v < 0.0, v, later)
+    return x + half * (v + (0.5 * half) * a), later
+
+
+class MidpointPredictor:
+    """Predictor of joint states at the middle of each step, for the first elements of a batch.
+
+    It must be created before MuJoCo's first evaluation of the batch, since fields that are bound
+    later are not updated.
+
+    Attributes:
+        of: addresses of the joints' velocities.
+
+    Args:
+        batch: the mujoco.batch.Batch.
+        positions: addresses of the joints' positions.
+        velocities: addresses of the joints' velocities.
+        loaded: (L,) whether the load of transmissions matters; L is the number of elements in use.
+    """
+
+    def __init__(self, batch: Any, positions: Places, velocities: Places, loaded: Mask) -> None:
+        self._batch = batch
+        self._ends = forces_are_at_step_end(batch.model)
+        self._loaded, self._any = loaded, bool(loaded.any())
+        self._first = True
+        self.of = to_slice_if_contiguous(velocities)
+        self._fields = [(batch.bind("qpos")[: len(loaded)], to_slice_if_contiguous(positions))]
+        for name in ("qvel", "qacc", "qfrc_actuator", "qfrc_bias"):
+            self._fields.append((batch.bind(name)[: len(loaded)], self.of))
+        self._last = np.zeros((2, len(loaded), len(velocities)))
+        # Factor of the load change in (2), zero where loads do not matter.
+        self._share = 0.5 * loaded[:, None]
+
+    def read_joint_states(self, anew: Mask) -> JointStates:
+        """Return the joint states at the beginning of a step.
+
+        Args:
+            anew: (L,) whether commands have changed since the previous step; they are already set.
+        """
+        x, v, a, drive, bias = self._shown()
+        # The initial acceleration lacks the applied forces, so it is not used for prediction.
+        first, self._first = self._first, False
+        a = np.zeros_like(a) if first else a
+        if not self._any:
+            return JointStates(x, v, a, drive, bias, drive, bias)
+        begun, later = self._sides(anew, first)
+        return JointStates(x, v, a, *begun, *later)
+
+    def _shown(self) -> list[Array]:
+        """Return the present values of the fields, (L, D) each."""
+        return [field[:, places] for field, places in self._fields]
+
+    def _sides(self, anew: Mask, first: bool) -> tuple[Array, Array]:
+        """Return the transmission loads (2, L, D) at the beginning and at the middle of a step."""
+        ended = self._carried()
+        begun, last = ended, self._last
+        asked = self._loaded & anew if self._ends else self._loaded
+        # At the first step MuJoCo has already evaluated the batch.
+        if not first and asked.any():
+            # Only these batch elements are evaluated, so that no element depends on others.
+            self._batch.forward(np.flatnonzero(asked))
+            begun = self._carried()
+        self._last = begun
+        if first or not self._ends:
+            return begun, begun
+        return begun, begun + self._share * (ended - last)  # (2)
+
+    def _carried(self) -> Array:
+        """Return a copy of the drive and bias forces, (2, L, D)."""
+        (drive, of), (bias, _) = self._fields[3:]
+        lanes, joints = len(self._loaded), self._last.shape[-1]
+        result = np.empty((2, lanes, joints))
+        result[0] = drive[:, of]
+        result[1] = bias[:, of]
+        return result
+
+
+def forces_are_at_step_end(model: Any) -> bool:
+    """Return whether the forces left in MuJoCo's data after a step are those of its end.
+
+    The last evaluation of Runge-Kutta is at the end of the step, that of the other integrators at
+    its beginning.
+    """
+    return bool(model.opt.integrator == RK4_INTEGRATOR_ID)
+
+
+def compute_midpoint_loads(ended: Array, controls: Array) -> Array:
+    """Compute transmission loads (2, S, D) at the middle of every step of a motion.
+
+    Args:
+        ended: (2, S, D) loads at the ends of the steps, each with its own command.
+        controls: (S, nu) commands.
+    """
+    grown = np.diff(ended, axis=1, prepend=ended[:, :1])
+    jumps: Mask = np.any(np.diff(controls, axis=0, prepend=np.nan) != 0, axis=1)
+    # A jump with a command is no growth within the step, so the growth of the next step is used.
+    after = np.append(jumps[1:], True)
+    grown[:, jumps & after] = 0.0
+    then = np.flatnonzero(jumps & ~after)
+    grown[:, then] = grown[:, then + 1]
+    result: Array = ended - 0.5 * grown
+    return result
+
+
+def to_slice_if_contiguous(places: Places) -> Places | slice:
+    """Return indices as a slice if they are contiguous, since numpy does not copy slices."""
+    first = int(places[0]) if places.size else 0
+    alike = np.array_equal(places, np.arange(first, first + places.size))
+    return slice(first, first + places.size) if alike else places

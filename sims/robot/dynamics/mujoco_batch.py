@@ -1,0 +1,456 @@
+"""Batch of MuJoCo simulations of one robot, on `mujoco.batch.Batch`, with model fields for effects.
+
+The fields of each batch element are initialised from the model file, and effects are written into
+them. Fields from which MuJoCo derives others (masses) have a separate batch, so that simulations
+without such a change keep exactly the constants of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import ActiveEffects
+from sims.robot.dynamics.disabled_drives import FORCE_FIELDS, ForceRanges, constant_stretches
+from sims.robot.dynamics.midpoint_state import JointStates, Mask, MidpointPredictor, Places
+from sims.robot.dynamics.series_joints import USED_FIELDS as SERIES
+from sims.robot.dynamics.series_joints import (
+    WRITTEN_FIELDS,
+    compute_rest_positions,
+    convert_flank_parameters,
+    is_series_effect,
+)
+from sims.robot.dynamics.series_joints import write_series_effects as in_series
+from sims.robot.dynamics.servo_force_limits import ForceLimits, stiff_force_limits
+from sims.robot.floating_joints import FloatingJoints, FloatingState
+from sims.robot.model_field_effects import (
+    COUPLING_FIELD,
+    MODEL_FIELD_EFFECTS,
+    make_batch_spec,
+    write_friction_form,
+)
+from sims.robot.parsing import contact_exclusion
+from sims.robot.robot_model import RobotModel
+
+BATCH_SIZE = 64
+"""Batch size; the data of a larger batch exceed the processor cache."""
+BATCH_SIZES = (1, 8, BATCH_SIZE)
+"""Available batch sizes."""
+MAX_UNINTERRUPTED_STEPS = 40_000
+"""Maximum number of steps, summed over batch elements, in one call.
+
+A call then takes a fraction of a second, after which Ctrl-C is handled.
+"""
+
+
+class JointAddresses:
+    """Addresses of joints with one coordinate in MuJoCo's vectors.
+
+    Attributes:
+        positions: (D,) addresses in qpos.
+        velocities: (D,) addresses in qvel.
+
+    Args:
+        robot: robot with the joints.
+        series: select the joints in series instead of those of the robot's file.
+        both: select the joints of the file, followed by those in series.
+    """
+
+    def __init__(self, robot: RobotModel, series: bool = False, both: bool = False) -> None:
+        singles = [joint for joint in robot.joints if joint.has_one_coordinate]
+        own = [joint for joint in singles if joint.name not in robot.series]
+        second = [robot.joint(name) for name in robot.series]
+        joints = [*own, *second] if both else second if series else own
+        self.positions: Places = np.array([j.position for j in joints], dtype=np.intp)
+        self.velocities: Places = np.array([j.velocity for j in joints], dtype=np.intp)
+
+
+class StepwiseForces(Protocol):
+    """Effects whose forces are evaluated in every step, such as `effect_forces.EffectForces`."""
+
+    has_dry_friction: Mask
+    addresses: JointAddresses
+    loaded: Mask
+
+    def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
+        """Compute forces and limits of dry friction over step k."""
+        ...
+
+
+DRIVE_SENSOR_PREFIX = "simgap.drive."
+"""Prefix of the names of sensors that are added to a model."""
+
+
+def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
+    """Compile the model of a batch, with a sensor of the actuator force on each joint.
+
+    A sensor shows the beginning of a step for every integrator. MuJoCo's data would contain the
+    last evaluation of the integrator.
+
+    Args:
+        robot: robot to simulate.
+        derived: whether masses and centres of mass differ between batch elements.
+    """
+    import mujoco
+
+    spec = make_batch_spec(robot) if derived else robot.spec.copy()
+    for joint in robot.joints:
+        if joint.has_one_coordinate and joint.name not in robot.series:
+            spec.add_sensor(
+                name=DRIVE_SENSOR_PREFIX + joint.name,
+                type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                objname=joint.name,
+            )
+    return robot.compile(spec)
+
+
+def find_drive_sensors(model: Any, robot: RobotModel) -> dict[str, int]:
+    """Return the addresses of actuator forces in the sensor data of a batch model, by joint."""
+    own = [joint.name for joint in robot.joints if joint.has_one_coordinate]
+    singles = [name for name in own if name not in robot.series]
+    return {name: int(model.sensor(DRIVE_SENSOR_PREFIX + name).adr[0]) for name in singles}
+
+
+def with_integrator_settings(robot: RobotModel, settings: Mapping[str, float]) -> RobotModel:
+    """Return the robot with other options of its model; the robot itself if they are equal.
+
+    Args:
+        robot: robot with the model file.
+        settings: options by name, such as ``timestep``.
+    """
+    option = robot.compiled.opt
+    if all(getattr(option, name) == value for name, value in settings.items()):
+        return robot
+    spec = robot.spec.copy()
+    for name, value in settings.items():
+        setattr(spec.option, name, value)
+    return replace(robot, spec=spec)
+
+
+class MujocoBatch:
+    """Batch of simulations of a robot.
+
+    Attributes:
+        fields: present model fields of the batch elements, (LANES, ...) by name.
+        batch: the mujoco.batch.Batch.
+        places: addresses of the joints of the robot's file.
+        second: addresses of the joints in series with them.
+        whole: addresses of all these joints, in this order.
+        floating: free and ball joints.
+        drives: columns of the sensor data with actuator forces, by joint.
+
+    Args:
+        robot: robot to simulate.
+        derived: whether masses or armatures change, from which MuJoCo derives constants.
+        settings: options of the model: timestep (seconds), integrator (its number).
+        count: batch size.
+    """
+
+    def __init__(
+        self,
+        robot: RobotModel,
+        derived: bool,
+        settings: Mapping[str, float],
+        count: int = BATCH_SIZE,
+    ) -> None:
+        import mujoco
+        from mujoco import batch
+
+        # Fields that effects write depend on the time step, so it is set first.
+        self.robot = robot = with_integrator_settings(robot, settings)
+        self.derived = derived
+        self.count = count
+        self.places, self.second = JointAddresses(robot), JointAddresses(robot, series=True)
+        self.whole = JointAddresses(robot, both=True)
+        self.floating = FloatingJoints.from_robot(robot)
+        model = compile_batch_model(robot, derived)
+        # A failed simulation must become NaN; an automatic reset by MuJoCo would hide the failure.
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if not contact_exclusion.can_collide(model):
+            # Collision detection without possible contacts takes a third of a step of one joint.
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self.drives = find_drive_sensors(model, robot)
+        self.batch: Any = batch.Batch(model, count, 1)
+        names = {
+            field
+            for native in MODEL_FIELD_EFFECTS.values()
+            if derived or not native.changes_derived_constants
+            for field in native.fields
+        }
+        names |= set(SERIES) if robot.series else set()
+        names -= set() if robot.coupled else {COUPLING_FIELD}
+        self.fields: dict[str, Any] = {name: self.batch.expand(name) for name in sorted(names)}
+        self._stated = {name: values[:1].copy() for name, values in self.fields.items()}
+        self._changed: set[str] = set()
+
+    @property
+    def model(self) -> Any:
+        """The mujoco.MjModel that the batch elements share, except for their fields."""
+        return self.batch.model
+
+    @cached_property
+    def force_limits(self) -> ForceLimits:
+        """Force limits of stiff servos."""
+        return stiff_force_limits(self.model)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes of the batch's model, and of its elements' fields and states."""
+        own = [*self.fields.values(), *self._stated.values(), self.batch.state]
+        return int(self.model.nbuffer + sum(values.nbytes for values in own))
+
+    def write_effects(self, acting: ActiveEffects) -> None:
+        """Write model-field effects, with coefficients (K, LANES, 1), into the batch's fields."""
+        for name in self._changed:
+            self.fields[name][...] = self._stated[name]
+        was_derived = any(self._derives(name) for name in self._changed)
+        self._changed.clear()
+        derives = was_derived or bool(self.robot.series)
+        for effect, c in acting:
+            if not c.any() or is_series_effect(effect):
+                continue
+            native = MODEL_FIELD_EFFECTS[effect.of or effect.name]
+            native.write(self.fields, self.robot, effect.place, c[:, :, 0])
+            self._changed.update(native.fields)
+            derives = derives or native.changes_derived_constants
+        if self.robot.series:
+            # This follows the armature effects, since each drive takes its share of the armature.
+            in_series(self.fields, self.robot, acting)
+            self._changed.update(WRITTEN_FIELDS)
+        if derives:
+            self.batch.set_const()
+        if self.robot.series:
+            convert_flank_parameters(self.fields, self.robot)
+        self._loaded_friction = self.fields["dof_frictionloss"].copy()
+
+    @staticmethod
+    def _derives(field: str) -> bool:
+        return any(
+            field in native.fields and native.changes_derived_constants
+            for native in MODEL_FIELD_EFFECTS.values()
+        )
+
+    def set_initial_state(
+        self, positions: Array, velocities: Array, afloat: FloatingState
+    ) -> tuple[Array, Array]:
+        """Set the initial states of the first n batch elements.
+
+        Args:
+            positions: (n, D) positions of the joints of the file.
+            velocities: (n, D) velocities of the joints of the file.
+            afloat: poses and velocities of floating bodies.
+
+        Returns:
+            Initial positions and velocities (n, H) of joints in series: the equilibrium of the
+            links while their drives are held, at rest.
+        """
+        self.batch.reset(stage=0)
+        qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        n = len(positions)
+        qpos[:n, self.places.positions] = positions
+        qvel[:n, self.places.velocities] = velocities
+        qpos[:n, self.floating.positions] = afloat.pose
+        qvel[:n, self.floating.velocities] = afloat.rate
+        second = self.second
+        begun = np.zeros((n, second.positions.size))
+        if begun.size:
+            passive, bias = self.batch.bind("qfrc_passive"), self.batch.bind("qfrc_bias")
+            self.batch.forward(self._ids(n))
+            pulls = (passive - bias)[:n, second.velocities].T
+            begun[:] = np.stack(
+                compute_rest_positions(self.fields, self.robot, list(pulls)), axis=1
+            )
+            qpos[:n, second.positions] = begun
+        return begun, np.zeros_like(begun)
+
+    def map_forces(self, forces: Array) -> Array:
+        """Map generalised forces (..., nv) of the file's model to this batch's model."""
+        if self.model.nv == forces.shape[-1]:
+            return forces
+        own = np.setdiff1d(np.arange(self.model.nv), self.second.velocities)
+        result = np.zeros((*forces.shape[:-1], self.model.nv))
+        result[..., own] = forces
+        return result
+
+    def activate(self, activations: Array) -> None:
+        """Set the initial activations (n, na) of the first n batch elements."""
+        if self.model.na:
+            self.batch.bind("act")[: len(activations)] = activations
+
+    def step(
+        self, controls: Array, forces: Array, record: Sequence[str], off: Mask | None = None
+    ) -> dict[str, Array]:
+        """Step n batch elements S times.
+
+        Args:
+            controls: (n, S, nu) controls.
+            forces: (n, S, nv) generalised forces.
+            record: fields of MuJoCo's data to record.
+            off: (n, S, K) whether each actuator is switched off; none is by default.
+
+        Returns:
+            Recorded fields (n, S, ...) by name.
+        """
+        import mujoco
+
+        state = mujoco.mjtState
+        spec = int(state.mjSTATE_CTRL)
+        given = controls
+        if forces.any():
+            spec |= int(state.mjSTATE_QFRC_APPLIED)
+            given = np.concatenate([controls, forces], axis=2)
+        n, steps, _ = controls.shape
+        result = self._begun(n, steps, record)
+        for part in self._switched(n, steps, off):
+            done = self.batch.rollout(
+                part.stop - part.start, given[:, part], spec, tuple(record), self._ids(n)
+            )
+            for name, values in done.items():
+                result[name][:, part] = values
+        self._fails(n)
+        return result
+
+    def _switched(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
+        """Yield consecutive parts of all steps, while actuators that are off are switched off."""
+        if off is None or not off.any():
+            yield from self._parts(n, steps)
+            return
+        ranges = self.force_ranges()
+        for stretch in constant_stretches(off):
+            ranges.write(off[:, stretch.start])
+            for part in self._parts(n, stretch.stop - stretch.start):
+                yield slice(stretch.start + part.start, stretch.start + part.stop)
+        ranges.restore()
+
+    def force_ranges(self) -> ForceRanges:
+        """Return the force ranges of the batch, to switch actuators off until the next `write_effects`."""
+        self._changed.update(FORCE_FIELDS)
+        return ForceRanges(self.fields)
+
+    def step_with_forces(
+        self,
+        controls: Array,
+        forces: Array,
+        asking: StepwiseForces,
+        record: Sequence[str],
+        off: Mask | None = None,
+    ) -> dict[str, Array]:
+        """Step n batch elements S times with effects that are evaluated in every step.
+
+        Args:
+            controls: (n, S, nu) controls.
+            forces: (n, S, nv) generalised forces.
+            asking: effects to evaluate.
+            record: fields of MuJoCo's data to record.
+            off: (n, S, K) whether each actuator is switched off; none is by default.
+
+        Returns:
+            Recorded fields (n, S, ...) by name.
+        """
+        n, steps, _ = controls.shape
+        dofs = asking.addresses.velocities
+        bind = self.batch.bind
+        ctrl, applied = bind("ctrl"), bind("qfrc_applied")
+        loss = self.fields["dof_frictionloss"]
+        own = loss[:n, dofs].copy()
+        rubs = bool(asking.has_dry_friction.any())
+        if rubs:
+            # Where no effect adds friction, the file's friction keeps its solver parameters.
+            lanes, joints = np.nonzero(asking.has_dry_friction)
+            write_friction_form(self.fields, self.robot, lanes, dofs[joints])
+            self._changed.update(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
+        result = self._begun(n, steps, record)
+        shown = {name: bind(name)[:n] for name in record}
+        ids = self._ids(n)
+        # This precedes MuJoCo's first evaluation, since fields that are bound later would not
+        # contain it.
+        lanes_at = MidpointPredictor(self.batch, asking.addresses.positions, dofs, asking.loaded)
+        changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
+        of = lanes_at.of
+        ctrl[:n] = controls[:, 0]
+        switches = (
+            {}
+            if off is None or not off.any()
+            else {stretch.start: off[:, stretch.start] for stretch in constant_stretches(off)}
+        )
+        ranges = self.force_ranges() if switches else None
+        if ranges is not None:
+            ranges.write(switches[0])
+        self.batch.forward(ids)
+        for k in range(steps):
+            ctrl[:n] = controls[:, k]
+            if ranges is not None and k in switches:
+                ranges.write(switches[k])
+                changes[:, k] = True
+            force, limit = asking.compute(k, lanes_at.read_joint_states(changes[:, k]))
+            applied[:n] = forces[:, k]
+            applied[:n, of] += force
+            if rubs:
+                loss[:n, of] = own + np.maximum(limit, 0.0)
+            self.batch.step(ids)
+            for name, values in result.items():
+                values[:, k] = shown[name]
+        if ranges is not None:
+            ranges.restore()
+        self._fails(n)
+        return result
+
+    def get_servo_stiffness(self, places: JointAddresses) -> Array:
+        """Return the force of position servos per unit of their errors, with effects.
+
+        Args:
+            places: addresses of D joints.
+
+        Returns:
+            (LANES, D) stiffness; zero for joints without a position servo.
+        """
+        robot = self.robot
+        result = np.zeros((self.count, len(places.velocities)))
+        columns = {int(place): i for i, place in enumerate(places.velocities)}
+        for actuator in robot.actuators:
+            if actuator.kind == "position" and actuator.joint is not None:
+                gear = float(robot.compiled.actuator_gear[actuator.id, 0])
+                gain = self.fields["actuator_gainprm"][:, actuator.id, 0]
+                result[:, columns[robot.joint(actuator.joint).velocity]] += gear * gain
+        return result
+
+    def set_dry_friction(self, n: int, dof: int, limit: Array) -> None:
+        """Add dry friction at one joint to the loaded friction of the first n batch elements.
+
+        Friction that was added before is replaced.
+
+        Args:
+            n: number of batch elements.
+            dof: index of the joint's velocity.
+            limit: (n,) friction limits to add.
+        """
+        loss = self.fields["dof_frictionloss"]
+        changed = MODEL_FIELD_EFFECTS["friction.coulomb"].fields
+        if not self._changed.issuperset(changed):
+            self._changed.update(changed)
+        loss[:n, dof] = self._loaded_friction[:n, dof] + limit
+        write_friction_form(self.fields, self.robot, slice(n), dof)
+
+    def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
+        """Allocate arrays for recorded fields."""
+        return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
+
+    def _ids(self, n: int) -> Places | None:
+        return None if n == self.count else np.arange(n)
+
+    def _fails(self, n: int) -> None:
+        """Record which batch elements have failed: MuJoCo no longer moves those with a warning."""
+        self.failed = (self.batch.warning[:n, :, 1] > 0).any(axis=1)
+
+    @staticmethod
+    def _parts(lanes: int, steps: int) -> Iterator[slice]:
+        """Yield parts of all steps that take a fraction of a second, to allow Ctrl-C between."""
+        largest = max(MAX_UNINTERRUPTED_STEPS // max(lanes, 1), 1)
+        for begin in range(0, steps, largest):
+            yield slice(begin, min(begin + largest, steps))

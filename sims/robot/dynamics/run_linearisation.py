@@ -1,0 +1,365 @@
+"""First-order responses of a run's observations to effects (`dynamics.tangent_propagation`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array, Scenario
+from sims.core.system import ActiveEffects, Effect, Input, Sensor
+from sims.robot.dynamics.applied_inputs import SAME_INSTANT_SHARE
+from sims.robot.dynamics.applied_inputs import compute_applied_inputs as felt_over
+from sims.robot.dynamics.batch_work import BatchInputs, RobotRunBatch
+from sims.robot.dynamics.linearisation_points import (
+    LINEARISATION_INTERVAL_SECONDS,
+    LinearisationPoints,
+    RobotMotion,
+)
+from sims.robot.dynamics.midpoint_state import compute_midpoint_loads, forces_are_at_step_end
+from sims.robot.dynamics.sensor_sampling import (
+    apply_sensor_effects,
+    find_sample_steps,
+    preserves_time,
+    sample_readings,
+)
+from sims.robot.dynamics.series_joints import is_series_effect
+from sims.robot.dynamics.tangent_propagation import (
+    MAX_SIMULTANEOUS_CHANGES,
+    DifferenceQuotients,
+    Perturbation,
+    TangentModel,
+)
+from sims.robot.floating_joints import FloatingState
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.places.typical_forces import compute_floating_forces, compute_joint_scales
+from sims.robot.robot_simulator import RobotSimulator
+from sims.system_simulator import SystemSimulator
+
+EffectWithCoefficients = tuple[Effect, Array]
+"""An effect with its coefficients (k,)."""
+FORCE_EVALUATED_EFFECTS = frozenset({"drag.linear", "drag.quadratic", "friction.coulomb"})
+"""Model-field effects whose force the effect library computes as well, so that it is used here."""
+SPRING_EFFECTS = frozenset({"spring.linear", "spring.cubic"})
+"""Model-field effects whose force the library computes if the joint's spring rests at zero."""
+
+
+class RunLinearisation:
+    """Linearisation of one run of a robot.
+
+    Args:
+        simulator: simulator of the robot.
+        theta: (dim,) parameters.
+        scenario: scenario of the run.
+        x: (D,) initial positions.
+        v: (D,) initial velocities.
+
+    Attributes:
+        held: time in seconds for which difference quotients are reused.
+        quotients: difference quotients of another motion nearby, to be reused.
+        observed: (T, C) observations of the run.
+    """
+
+    held = LINEARISATION_INTERVAL_SECONDS
+    quotients: DifferenceQuotients | None = None
+
+    def __init__(
+        self, simulator: SystemSimulator, theta: Array, scenario: Scenario, x: Array, v: Array
+    ) -> None:
+        assert isinstance(simulator, RobotSimulator), "a robot"
+        self._simulator = simulator
+        self._clock = float(scenario.times[0])
+        self._times = scenario.times - self._clock
+        self._steps = simulator.count_steps(self._times)
+        acting = simulator.get_active_effects(theta[None])
+        commands = simulator.run_inputs(scenario)
+        self._work = RobotRunBatch(scenario, commands, acting, x[None], v[None])
+        self._names = [c.name for c in simulator.channels if c.name.startswith(("tau.", "s."))]
+        with np.errstate(all="ignore"), capture_mujoco_warnings():
+            self._motion = self._nominal()
+            self._tangent = self._neighbourhood()
+            self._built = self._tangent.placed_element_count
+        self._known: dict[tuple[str, bytes], Perturbation] = {}
+        nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.state_size))
+        unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
+        self.observed: Array = self._seen(nothing, unread, [()])[0]
+        # The joints of the file come first; joints in series follow them.
+        self._joints = len(simulator.addresses.positions)
+
+    def _nominal(self) -> RobotMotion:
+        """Simulate the motion of the run, plus one step that begins at the run's end."""
+        simulator = self._simulator
+        steps = self._steps + 1
+        given = simulator.compute_controls(self._work, steps)
+        more = ("qfrc_actuator", "qfrc_bias", "act")
+        made = simulator.step_batch(self._work, given, more)
+        wide = simulator.make_linearisation_batch(self._work.acting)
+        dofs = wide.whole.velocities
+        sides = ("qfrc_actuator", "qfrc_bias")
+        controls = given.controls[0]
+        left = np.stack([made.fields[name][0][:, dofs] for name in sides])
+        carried = (
+            compute_midpoint_loads(left, controls) if forces_are_at_step_end(wide.model) else left
+        )
+        act = made.fields["act"][0]
+        first = made.initial_activations[0][None]
+        data = made.fields["sensordata"][0] if self._names else np.zeros((steps, 0))
+        self._readings = {name: data[:, simulator.get_sensor_address(name)] for name in self._names}
+        return RobotMotion(
+            x=np.concatenate([made.x[0], made.series[0][0]], axis=1),
+            v=np.concatenate([made.v[0], made.series[1][0]], axis=1),
+            act=np.concatenate([first, act[:-1]]),
+            carried=carried,
+            afloat=self._afloat(made.fields),
+            step=simulator.time_step,
+            **self._commanded(given),
+        )
+
+    def _commanded(self, given: BatchInputs) -> dict[str, Any]:
+        """Return the fields of a motion that follow from the commands of the run."""
+        return {
+            "controls": given.controls[0],
+            "forces": self._simulator.make_linearisation_batch(self._work.acting).map_forces(
+                given.forces[0]
+            ),
+            "instant": given.instant[0],
+            "inputs": {name: u[0] for name, u in given.applied_inputs.items()},
+            "off": given.off[0],
+        }
+
+    def _afloat(self, fields: Mapping[str, Array]) -> FloatingState:
+        """Return states of floating bodies, at the beginnings of steps and at the end."""
+        begun = self._simulator.get_floating_start(self._work)
+        floating = self._simulator.make_linearisation_batch(self._work.acting).floating
+        pose = fields["qpos"][0][:, floating.positions]
+        rate = fields["qvel"][0][:, floating.velocities]
+        return FloatingState(
+            np.concatenate([begun.pose[None], pose]), np.concatenate([begun.rate[None], rate])
+        )
+
+    def _neighbourhood(self) -> TangentModel:
+        simulator = self._simulator
+        outputs = [("sensordata", simulator.get_sensor_address(name)) for name in self._names]
+        bench = simulator.make_linearisation_batch(self._work.acting)
+        sizes = compute_joint_scales(simulator.robot).force
+        # A joint in series transmits the force of its joint.
+        second = [self._joint(name) for name in bench.robot.series]
+        at = LinearisationPoints(
+            bench,
+            simulator.robotic,
+            self._motion,
+            self._work.acting,
+            outputs,
+            bench.whole,
+            [self._driven_joint(name) for name in self._names],
+            self.held,
+        )
+        sizes = np.concatenate([sizes, sizes[second], compute_floating_forces(simulator.robot)])
+        return TangentModel(at, sizes, self.quotients)
+
+    def _driven_joint(self, channel: str) -> int:
+        """Return the number of the joint whose drive force a channel observes; -1 if none."""
+        kind, _, joint = channel.partition(".")
+        return self._simulator.system.coordinates.index(f"q.{joint}") if kind == "tau" else -1
+
+    def _joint(self, second: str) -> int:
+        """Return the number of the joint with which a joint is in series."""
+        coordinates = self._simulator.system.coordinates
+        return coordinates.index(f"q.{second.rpartition('_')[0]}")
+
+    def compute_effect_responses(
+        self, added: Sequence[EffectWithCoefficients]
+    ) -> tuple[Array, int]:
+        """Compute the changes of the run's observations by each effect, to first order.
+
+        Effects in series with joints have no small size, so they are simulated.
+
+        Args:
+            added: effects with their coefficients.
+
+        Returns:
+            (K, T, C) changes of the observations, and the approximate cost as a number of
+            simulations of the run, including the linearisation itself.
+        """
+        before = self._tangent.placed_element_count - self._built
+        # The cost must not depend on earlier calls.
+        self._known.clear()
+        result = np.zeros((len(added), *self.observed.shape))
+        driven = self._driven(added)
+        apart = [i for i, (effect, _) in enumerate(added) if is_series_effect(effect)]
+        if apart:
+            result[apart] = self._simulated([added[i] for i in apart]) - self.observed
+        for begin in range(0, len(added), MAX_SIMULTANEOUS_CHANGES):
+            part = range(begin, min(begin + MAX_SIMULTANEOUS_CHANGES, len(added)))
+            changes: list[Perturbation] = []
+            sensors: list[ActiveEffects] = []
+            for owner, number in enumerate(part):
+                effect, c = added[number]
+                parts = effect.parts(c[:, None, None])
+                sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
+                for one, k in parts:
+                    if isinstance(one, Sensor) or not k.any():
+                        continue
+                    if isinstance(one, Input) or is_series_effect(one):
+                        continue
+                    changes += self._changes(owner, one, k)
+                changes += [c._replace(owner=owner) for c in driven.get(number, ())]
+            # A change that overflows is one that a fit could not follow.
+            with np.errstate(all="ignore"):
+                states, readings = self._tangent.propagate(changes, len(part))
+                seen = self._seen(states, readings, sensors)
+            own = np.setdiff1d(part, apart).astype(np.intp)
+            result[own] = (seen - self.observed)[own - part.start]
+        looks = self._tangent.placed_element_count - before
+        return result, 1 + len(apart) + looks // len(self._motion.controls)
+
+    def _simulated(self, added: Sequence[EffectWithCoefficients]) -> Array:
+        """Simulate observations (K, T, C) of the run with each effect added.
+
+        An added effect replaces the simpler effects of the run that it contains.
+        """
+        count, work = len(added), self._work
+        acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
+        for lane, (effect, c) in enumerate(added):
+            for simpler, k in acting[: len(work.acting)]:
+                if simpler.name in effect.contains and k[:, lane].any():
+                    c = effect.taking(c, simpler.name, k[:, lane, 0].copy())
+                    k[:, lane] = 0.0
+            own = np.zeros((len(c), count, 1))
+            own[:, lane, 0] = c
+            acting.append((effect, own))
+        lanes = np.repeat(work.x, count, axis=0), np.repeat(work.v, count, axis=0)
+        return self._simulator.simulate_observations(
+            work._replace(acting=tuple(acting), x=lanes[0], v=lanes[1])
+        )
+
+    def compute_initial_state_responses(self) -> Array:
+        """Compute observation derivatives (2 D, T, C) by initial positions, then velocities."""
+        with np.errstate(all="ignore"):
+            states, readings = self._tangent.propagate_initial_state()
+        # The changes are small enough for nonlinear sensor effects to be linear.
+        small = 1e-4
+        seen = self._seen(small * states, small * readings, [()] * len(states))
+        result: Array = (seen - self.observed) / small
+        half, own = len(result) // 2, self._joints
+        return np.concatenate([result[:own], result[half : half + own]])
+
+    def _changes(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
+        """Return the perturbations by an effect that acts on neither inputs nor sensors."""
+        name = effect.of or effect.name
+        joint = effect.coordinate
+        if name == "inertia.armature" and joint is not None:
+            series = -float(c[0, 0, 0]) * self._tangent.accelerations[:, joint]
+            return [Perturbation(owner, joint=joint, series=series)]
+        if (
+            name not in MODEL_FIELD_EFFECTS
+            or name in FORCE_EVALUATED_EFFECTS
+            or self._springs(name, joint)
+        ):
+            return self._tangent.perturb_by_force(owner, effect, c)
+        key = effect.name, c.tobytes()
+        if key not in self._known:
+            acting = (*self._work.acting, (effect, c))
+            with capture_mujoco_warnings():
+                bench = self._simulator.make_linearisation_batch(acting)
+                self._known[key] = self._tangent.perturb_model_numbers(0, acting, 1.0, bench)
+        return [self._known[key]._replace(owner=owner)]
+
+    def _springs(self, name: str, joint: int | None) -> bool:
+        if name not in SPRING_EFFECTS or joint is None:
+            return False
+        simulator = self._simulator
+        rest = simulator.robot.compiled.qpos_spring[simulator.addresses.positions[joint]]
+        return bool(rest == 0.0)
+
+    def _driven(self, added: Sequence[EffectWithCoefficients]) -> dict[int, list[Perturbation]]:
+        """Return the changes of applied inputs by input effects, by number of the effect."""
+        rows: list[tuple[int, Effect, Array]] = []
+        for number, (effect, c) in enumerate(added):
+            for one, k in effect.parts(c[:, None, None]):
+                if isinstance(one, Input) and k.any():
+                    rows.append((number, one, k))
+        if not rows:
+            return {}
+        count = len(rows)
+        acting: dict[str, tuple[Effect, Array]] = {}
+        for e, c in self._work.acting:
+            if isinstance(e, Input):
+                acting[e.name] = e, np.repeat(c, count, axis=1)
+        for lane, (_, one, k) in enumerate(rows):
+            if one.name not in acting:
+                acting[one.name] = one, np.zeros((len(k), count, 1))
+            acting[one.name][1][:, lane] = k[:, 0]
+        steps = len(self._motion.controls)
+        simulator = self._simulator
+        given = self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
+        felt = felt_over(simulator.time_step, *given)
+        instant = felt
+        if any(name.startswith("tau.") for name in self._names):
+            instant = felt_over(simulator.time_step, *given, SAME_INSTANT_SHARE)
+        numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
+        result: dict[int, list[Perturbation]] = {}
+        for lane, (number, one, _) in enumerate(rows):
+            if one.signal not in numbers:
+                continue
+            column = numbers[one.signal]
+            series = felt[one.signal][lane] - self._motion.controls[:, column]
+            at_once = instant[one.signal][lane] - self._motion.instant[:, column]
+            change = Perturbation(number, actuator=column, series=series, instant=at_once)
+            result.setdefault(number, []).append(change)
+        return result
+
+    def _seen(self, states: Array, readings: Array, sensors: Sequence[ActiveEffects]) -> Array:
+        """Compute observations (n, T, C) of the perturbed motion, with further sensor effects.
+
+        Args:
+            states: (n, S, Z) changes of the states at the beginnings of steps.
+            readings: (n, S, M) changes of the sensor readings.
+            sensors: further sensor effects of each of the n batch elements.
+        """
+        simulator, count = self._simulator, len(states)
+        upto = self._steps + 1
+        size = self._motion.x.shape[1]
+        own = tuple((e, np.repeat(c, count, axis=1)) for e, c in self._work.acting)
+        columns = []
+        at_ends = find_sample_steps(simulator.time_step, self._times, upto)
+        for channel in simulator.channels:
+            acting = _on(channel.name, own, sensors)
+            # Most channels are needed at the sample times only.
+            some = at_ends if preserves_time(acting) else None
+            rows: slice | NDArray[np.intp] = slice(upto) if some is None else some
+            kind, _, of = channel.name.partition(".")
+            slopes = None
+            if kind in ("q", "qd"):
+                j = simulator.system.coordinates.index(f"q.{of}")
+                place = j if kind == "q" else size + j
+                motion = self._motion.x if kind == "q" else self._motion.v
+                values = motion[rows, j] + states[:, rows, place]
+                if kind == "q" and some is None:
+                    slopes = self._motion.v[rows, j] + states[:, rows, size + j]
+            else:
+                place = self._names.index(channel.name)
+                values = self._readings[channel.name][rows] + readings[:, rows, place]
+            if some is None:
+                step, times = simulator.time_step, self._times
+                columns.append(sample_readings(values, slopes, step, times, acting, self._clock))
+            else:
+                columns.append(apply_sensor_effects(values, self._times, acting, self._clock))
+        return np.stack(columns, axis=2)
+
+
+def _on(channel: str, own: ActiveEffects, more: Sequence[ActiveEffects]) -> ActiveEffects:
+    """Return the sensor effects on a channel: those of the motion, then the additional ones."""
+    acting = [(e, c) for e, c in own if isinstance(e, Sensor) and e.signal in ("", channel)]
+    added: dict[str, tuple[Effect, Array]] = {}
+    for lane, parts in enumerate(more):
+        for effect, c in parts:
+            if effect.signal not in ("", channel):
+                continue
+            if effect.name not in added:
+                added[effect.name] = effect, np.zeros((len(c), len(more), 1))
+            added[effect.name][1][:, lane] = c[:, 0]
+    return (*acting, *added.values())

@@ -1,0 +1,151 @@
+"""Recorded samples of a channel whose values are known after every simulation step.
+
+Between two steps of length h, with values a, b and slopes a', b' at their ends, a position at the
+fraction s of the step is
+
+    y = (1 + 2s)(1 - s)^2 a + s(1 - s)^2 h a' + s^2 (3 - 2s) b - s^2 (1 - s) h b'               (1)
+
+the cubic Hermite interpolant (C. de Boor, A Practical Guide to Splines, 1978, chapter 4). A reading
+with unknown slope is interpolated linearly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+from sims.core.system import ActiveEffects, Sensor, Signal
+from sims.engines.time_grid import is_active
+from sims.system_simulator import apply_sensor_effects as sensed
+
+TIME_TOLERANCE_SHARE = 1e-6
+"""Tolerance, as a share of a step, within which a time counts as the end of a step."""
+
+
+def sample_readings(
+    values: Array,
+    slopes: Array | None,
+    step: float,
+    times: Array,
+    sensors: ActiveEffects,
+    clock: float = 0.0,
+) -> Array:
+    """Compute the recorded readings (L, T) of a channel, including sensor effects.
+
+    Args:
+        values: (L, S + 1) values at the start and at the end of each step.
+        slopes: (L, S + 1) time derivatives of the values; None if unknown.
+        step: step length in seconds.
+        times: (T,) recorded time stamps in seconds since the start.
+        sensors: effects on this channel in the order in which a signal passes them.
+        clock: first recorded time stamp in seconds.
+    """
+    lanes, count = values.shape
+    ends = step * np.arange(count)
+    instants = np.broadcast_to(times, (lanes, times.size))
+    for effect, c in sensors:
+        assert isinstance(effect, Sensor)
+        if type(effect).times is not Sensor.times:
+            instants = np.where(is_active(c), effect.times(c, instants), instants)
+    instants = np.clip(instants, 0.0, ends[-1])
+    result = _at(values, slopes, step, instants)
+    for some, filters in _filtering(sensors):
+        grid = np.broadcast_to(ends, (some.size, count))
+        steps = np.diff(grid, axis=1, prepend=0.0)
+        filtered = sensed(filters, values[some], steps, grid, clock)
+        # The slope of a filtered signal is unknown.
+        result[some] = _at(filtered, None, step, instants[some])
+    return apply_sensor_effects(result, times, sensors, clock)
+
+
+def apply_sensor_effects(
+    readings: Array, times: Array, sensors: ActiveEffects, clock: float = 0.0
+) -> Array:
+    """Apply sensor effects that act on each sample alone, without filters and time shifts.
+
+    Args:
+        readings: (L, T) readings; changed in place.
+        times: (T,) recorded time stamps in seconds since the start.
+        sensors: effects on this channel in the order in which a signal passes them.
+        clock: first recorded time stamp in seconds.
+
+    Returns:
+        The changed readings (L, T).
+    """
+    result = readings
+    stamps = np.broadcast_to(times, result.shape)
+    for effect, c in sensors:
+        assert isinstance(effect, Sensor)
+        if effect.filters or type(effect).read is Sensor.read:
+            continue
+        on = np.flatnonzero(is_active(c))
+        signal = Signal(result[on], np.zeros_like(result[on]), result[on, :1], stamps[on], clock)
+        result[on] = effect.read(c[:, on], signal)
+    return result
+
+
+def find_sample_steps(step: float, times: Array, count: int) -> NDArray[np.intp] | None:
+    """Find the steps at whose ends the samples are taken.
+
+    Args:
+        step: step length in seconds.
+        times: (T,) sample times in seconds since the start.
+        count: number of step ends, including the start.
+
+    Returns:
+        (T,) indices of the step ends; None if any sample is between two of them.
+    """
+    place = np.clip(times / step, 0.0, count - 1.0)
+    nearest = np.rint(place)
+    near = bool((np.abs(place - nearest) < TIME_TOLERANCE_SHARE).all())
+    return nearest.astype(np.intp) if near else None
+
+
+def preserves_time(sensors: ActiveEffects) -> bool:
+    """Return whether the readings depend on the value at the sample time alone."""
+    shown = [e for e, _ in sensors if isinstance(e, Sensor)]
+    return all(type(e).times is Sensor.times and not e.filters for e in shown)
+
+
+def _filtering(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], ActiveEffects]]:
+    """Yield the batch elements with an active filter, and the filters there, if any."""
+    filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
+    on = [is_active(c)[:, 0] for _, c in filters]
+    lanes = np.flatnonzero(np.any(on, axis=0)) if filters else np.empty(0, dtype=np.intp)
+    if lanes.size:
+        yield lanes, tuple((e, c[:, lanes]) for e, c in filters)
+
+
+def _at(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
+    """Interpolate values (L, S + 1) at times (L, T)."""
+    place = instants / step
+    nearest = np.rint(place)
+    near = np.abs(place - nearest) < TIME_TOLERANCE_SHARE
+    if near.all():
+        chosen: Array = np.take_along_axis(values, nearest.astype(np.intp), axis=1)
+        return chosen
+    # A sample at the end of a step returns the stored value bit for bit, whatever times other batch
+    # elements use.
+    place = np.where(near, nearest, place)
+    last = values.shape[1] - 2
+    below = np.clip(np.floor(place), 0, max(last, 0)).astype(np.intp)
+    s = place - below
+    a = np.take_along_axis(values, below, axis=1)
+    b = np.take_along_axis(values, below + 1, axis=1)
+    if slopes is None:
+        linear: Array = a + s * (b - a)
+        return linear
+    begin = step * np.take_along_axis(slopes, below, axis=1)
+    end = step * np.take_along_axis(slopes, below + 1, axis=1)
+    r = 1.0 - s
+    # (1)
+    cubic: Array = (
+        (1.0 + 2.0 * s) * r * r * a
+        + s * r * r * begin
+        + s * s * (3.0 - 2.0 * s) * b
+        - s * s * r * end
+    )
+    return cubic

@@ -1,0 +1,390 @@
+"""Flexible joints and joints with backlash, as a second joint in series in the same body.
+
+Let x be the joint's position on the side of its drive, where the actuator, encoder, specified
+damping and dry friction are, y the position of the links that it carries, J the drive's inertia
+(the armature) and T the transmitted force:
+
+    J x'' = U - T                                                          (1)
+    (M(q) q'' + n(q, q'))_j = T,  q_j = y                                  (2)
+
+(M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860). A second joint
+d = y - x about the same axis makes y the body's position, and
+
+    T = -k d - c d'         for a spring with a damper                     (3)
+    |d| <= gap / 2          for rigid flanks, by MuJoCo's joint limit      (4)
+    T = -k e - c d'         for compliant flanks; e is d beyond the gap    (5)
+
+The shares of inertia and damping refer to M_jj in the pose that the file specifies (q = 0 by
+default). So MuJoCo integrates the second joint like any other, and a model file can state it. In
+(5), T only pushes, and is zero between the flanks. A limit of MuJoCo with impedance s exerts
+
+    -(K e + C d') / (A + R), R = (1 - s) A0 / s                            (6)
+
+for `solref` (-K s, -C s), with the inverse inertia A along d, and its value A0 in the pose of the
+file (MuJoCo's documentation, "Computation", constraint model). At the smallest s, 1e-4, this is a
+spring of stiffness K s / A0 with a relative error of the order of s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+from sims.core.system import ActiveEffects, Effect, HiddenStateEffect, SeriesElement
+from sims.robot.coupled_drives import COUPLING_EFFECT, COUPLING_PLACEHOLDER, name_unnamed_elements
+from sims.robot.coupled_drives import list_coupling_places as coupled_places
+from sims.robot.coupled_drives import make_coupled_robot as coupled_robot
+from sims.robot.dynamics.inertia_matrix import inertia_matrix
+from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+from sims.robot.mujoco_messages import format_mujoco_error
+from sims.robot.reduced_model import strip_shapes
+from sims.robot.robot_model import RobotModel, cache_per_robot
+
+MIN_DRIVE_INERTIA_SHARE = 0.01
+"""Minimum inertia of a drive, as a share of the joint's inertia.
+
+Without inertia of the drive, x in (1) is undetermined.
+"""
+COMPILE_INERTIA_SHARE = 1e-4
+"""Minimum inertia of a drive while a model is compiled, as a share of the joint's inertia."""
+RESOLVED, RESOLVED_BY_RK4 = 1.2, 2.0
+"""Maximum phase, in radians per step, of the oscillation between drive and links.
+
+The second value applies to the Runge-Kutta 4 integrator, the first one to all others.
+"""
+RIGID_FLANK_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Parameter `solimp` of rigid flanks: the hardest value that MuJoCo allows."""
+COMPLIANT_FLANK_SOLIMP = (1e-4, 1e-4, 0.001, 0.5, 2.0)
+"""Parameter `solimp` of compliant flanks: the softest value that MuJoCo allows, see (6)."""
+UNLOADED_FORCE_SHARE = 1e-3
+"""Load, as a multiple of the inertia, below which the links rest between the flanks."""
+WRITTEN_FIELDS = (
+    "dof_armature",
+    "jnt_stiffness",
+    "dof_damping",
+    "jnt_range",
+    "jnt_solref",
+    "jnt_solimp",
+)
+"""Model fields that are written for joints in series."""
+USED_FIELDS = (*WRITTEN_FIELDS, "dof_invweight0")
+"""Model fields that are written for joints in series, and those derived by MuJoCo that are read."""
+
+Flags = NDArray[np.bool_]
+
+SeriesJoints = tuple[tuple[str, str], ...]
+"""Effects in series with joints, as pairs of joint and effect name; a joint may have several."""
+
+
+def make_series_joint_name(joint: str, effects: Collection[str]) -> str:
+    """Make the name of a second joint, such as ``elbow_flexibility``.
+
+    It is ``elbow_transmission`` for several effects.
+
+    Args:
+        joint: name of the joint with which it is in series.
+        effects: names of the effects that it combines.
+    """
+    kind = next(iter(effects)).rpartition(".")[2] if len(effects) == 1 else "transmission"
+    return f"{joint}_{kind}"
+
+
+def find_series_joint(robot: RobotModel, joint: str) -> str:
+    """Return the name of the joint in series with a joint; empty if there is none."""
+    return next((name for name in robot.series if name.rpartition("_")[0] == joint), "")
+
+
+def group_by_joint(added: SeriesJoints) -> dict[str, list[str]]:
+    """Group the effects in series by joint."""
+    effects: dict[str, list[str]] = {}
+    for joint, effect in added:
+        effects.setdefault(joint, []).append(effect)
+    return effects
+
+
+def group_by_series_joints(acting: ActiveEffects, count: int) -> dict[SeriesJoints, list[int]]:
+    """Group batch elements by their effects in series with joints.
+
+    Args:
+        acting: effects with their coefficients (K, L, 1).
+        count: number L of batch elements.
+    """
+    lanes: dict[SeriesJoints, list[int]] = {}
+    there = [(e, (c[0] > 0)[:, 0]) for e, c in acting if is_series_effect(e)]
+    coupled = np.zeros(count, dtype=bool)
+    for e, c in acting:
+        if e.of == COUPLING_EFFECT:
+            coupled |= (c[0] != 0)[:, 0]
+    for lane in range(count):
+        added = tuple((e.place, e.of) for e, on in there if on[lane])
+        if coupled[lane]:
+            added += (COUPLING_PLACEHOLDER,)
+        lanes.setdefault(added, []).append(lane)
+    return lanes
+
+
+def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
+    """Add joints in series to a robot, without changing element names.
+
+    Args:
+        robot: robot as read from its model file.
+        added: joints, each the last one of its body, with the effect in series;
+            `COUPLING_PLACEHOLDER` requests the tendons of coupled drives.
+    """
+    import mujoco
+
+    if COUPLING_PLACEHOLDER in added:
+        robot = coupled_robot(robot, dict.fromkeys(coupled_places(robot), 0.0))
+        added = tuple(one for one in added if one != COUPLING_PLACEHOLDER)
+    if not added:
+        return robot
+    spec = robot.spec.copy()
+    joints = name_unnamed_elements(spec, robot)
+    inertias = _inertias(robot)
+    for name, effects in group_by_joint(added).items():
+        first = joints[robot.joint(name).id]
+        # Default classes of the file apply to the first joint only.
+        nothing = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
+        second = first.parent.add_joint(
+            name=make_series_joint_name(name, effects),
+            type=first.type,
+            axis=first.axis,
+            pos=first.pos,
+        )
+        for attribute, value in nothing.items():
+            setattr(second, attribute, np.full_like(getattr(second, attribute), value))
+        second.springdamper = (0.0, 0.0)
+        second.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        play = any(effect.endswith("backlash") for effect in effects)
+        limited = mujoco.mjtLimited
+        second.limited = limited.mjLIMITED_TRUE if play else limited.mjLIMITED_FALSE
+        if play:
+            second.range = (-1.0, 1.0)
+        # The simulation writes the actual armature; this minimum makes the model compile.
+        first.armature = max(first.armature, COMPILE_INERTIA_SHARE * inertias[name])
+    # Keyframes lack the new coordinates.
+    for key in list(spec.keys):
+        spec.delete(key)
+    series = {
+        make_series_joint_name(name, own): inertias[name]
+        for name, own in group_by_joint(added).items()
+    }
+    return replace(robot, spec=spec, series=series)
+
+
+@cache_per_robot
+def compile_error(robot: RobotModel, added: SeriesJoints) -> str:
+    """Return why the model with joints in series does not compile; empty if it does.
+
+    Args:
+        robot: robot as read from its model file.
+        added: effects in series, as for `add_series_joints`.
+    """
+    try:
+        add_series_joints(strip_shapes(robot), added).compiled  # noqa: B018
+    # MuJoCo raises several kinds of errors, and an effect of a user's plugin may raise any.
+    except Exception as error:
+        return format_mujoco_error(error) or type(error).__name__
+    return ""
+
+
+@cache_per_robot
+def _inertias(robot: RobotModel) -> dict[str, float]:
+    """Return the inertia about each joint, in the pose that the file specifies."""
+    inertias = np.diagonal(inertia_matrix(robot.compiled)).tolist()
+    return {j.name: inertias[j.velocity] for j in robot.joints if j.has_one_coordinate}
+
+
+def is_series_effect(effect: Effect | type[Effect]) -> bool:
+    """Return whether an effect is an element in series with a joint."""
+    kind = effect if isinstance(effect, type) else type(effect)
+    return issubclass(kind, HiddenStateEffect) and bool(kind.between)
+
+
+def write_series_effects(
+    fields: Mapping[str, Any], robot: RobotModel, acting: ActiveEffects
+) -> None:
+    """Write effects in series with joints into the model fields of a batch.
+
+    `convert_flank_parameters` must be called after MuJoCo has derived its constants.
+
+    Args:
+        fields: model fields of the batch elements.
+        robot: robot of `add_series_joints`.
+        acting: effects with coefficients (K, L, 1); other effects are ignored.
+    """
+    made: dict[str, list[SeriesElement]] = {}
+    for effect, c in acting:
+        if not is_series_effect(effect) or not (c[0] > 0).any():
+            continue
+        numbers = dict(zip((one.name for one in effect.coefficients), c[:, :, 0], strict=True))
+        made.setdefault(effect.place, []).append(make_series_element(type(effect), numbers))
+    for place, elements in made.items():
+        write_elements(fields, robot, place, combine_elements(elements))
+
+
+def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> SeriesElement:
+    """Make the series element of an effect from its coefficients (L,).
+
+    Args:
+        kind: class of the effect.
+        numbers: coefficients by name; missing ones are zero.
+    """
+    assert issubclass(kind, HiddenStateEffect)
+    first = next(iter(numbers.values()))
+    values = [numbers.get(one.name, np.zeros_like(first)) for one in kind.between]
+    return kind().make_series_element(np.stack(values))
+
+
+def combine_elements(elements: Sequence[SeriesElement]) -> SeriesElement:
+    """Combine several elements in series with one joint by adding their numbers."""
+    names = ("stiffness", "damping", "gap", "drive")
+    return SeriesElement(*(np.sum([getattr(e, name) for e in elements], axis=0) for name in names))
+
+
+def write_elements(
+    fields: Mapping[str, Any], robot: RobotModel, place: str, made: SeriesElement
+) -> None:
+    """Write elements in series (L,) into model fields.
+
+    Args:
+        fields: model fields of the batch elements.
+        robot: robot of `add_series_joints`.
+        place: joint with which they are in series.
+        made: the elements.
+    """
+    second = robot.joint(find_series_joint(robot, place))
+    inertia = robot.series[second.name]
+    dof = robot.joint(place).velocity
+    stated = fields["dof_armature"][:, dof]
+    drive = np.maximum(stated + made.drive * inertia, MIN_DRIVE_INERTIA_SHARE * inertia)
+    fields["dof_armature"][:, dof] = drive
+    option = robot.compiled.opt
+    step = float(fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep)
+    number = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
+    stiffness, damping = _stepped(made, inertia, drive, step, int(number) == RK4_INTEGRATOR_ID)
+    give = is_compliant_flank(made)
+    fields["jnt_stiffness"][:, second.id] = np.where(give, 0.0, stiffness)
+    fields["dof_damping"][:, second.velocity] = np.where(give, 0.0, damping)
+    if "jnt_range" in fields:
+        half = 0.5 * made.gap
+        fields["jnt_range"][:, second.id] = np.stack([-half, half], axis=1)
+        soft = np.stack([-stiffness, -damping], axis=1)
+        fields["jnt_solref"][:, second.id] = np.where(give[:, None], soft, _hard(step))
+        fields["jnt_solimp"][:, second.id] = np.where(
+            give[:, None], COMPLIANT_FLANK_SOLIMP, RIGID_FLANK_SOLIMP
+        )
+
+
+def is_compliant_flank(made: SeriesElement) -> Flags:
+    """Return whether elements (L,) are compliant flanks: a gap with a spring."""
+    return (made.gap > 0) & (made.stiffness > 0)
+
+
+def convert_flank_parameters(fields: Mapping[str, Any], robot: RobotModel) -> None:
+    """Convert stiffness and damping of compliant flanks to parameters of MuJoCo's limit by (6).
+
+    Args:
+        fields: model fields of the batch elements.
+        robot: robot of `add_series_joints`.
+    """
+    for name in robot.series:
+        second = robot.joint(name)
+        soft = fields["jnt_solimp"][:, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
+        inverse = fields["dof_invweight0"][soft, second.velocity, None]
+        fields["jnt_solref"][soft, second.id] *= inverse  # (6)
+
+
+def _hard(step: float) -> tuple[float, float]:
+    """Return `solref` of rigid flanks: the stiffest value that is stable for a time step."""
+    return 2.0 * step, 1.0
+
+
+def prepare_flanks_for_file(
+    robot: RobotModel, made: Mapping[str, SeriesElement], model: Any = None
+) -> RobotModel:
+    """Set the joint limits that represent flanks, for writing a model file.
+
+    Args:
+        robot: robot of `add_series_joints`.
+        made: elements of one batch element, by the joint with which they are in series.
+        model: model compiled from the robot with all effects; required for compliant flanks.
+    """
+    spec, option = robot.spec.copy(), (model or robot.compiled).opt
+    joints = {joint.name: joint for joint in spec.joints}
+    step, explicit = float(option.timestep), int(option.integrator) == RK4_INTEGRATOR_ID
+    for place, one in made.items():
+        joint = joints[find_series_joint(robot, place)]
+        half = 0.5 * float(one.gap[0])
+        if not half:
+            continue
+        turns = robot.joint(joint.name).kind == "hinge" and spec.compiler.degree
+        half = float(np.rad2deg(half)) if turns else half
+        joint.range = (-half, half)
+        joint.solref_limit, joint.solimp_limit = _hard(step), RIGID_FLANK_SOLIMP
+        if model is not None and is_compliant_flank(one)[0]:
+            inertia, drive = robot.series[joint.name], model.dof_armature
+            drive = drive[[robot.joint(place).velocity]]
+            numbers = np.stack(_stepped(one, inertia, drive, step, explicit))[:, 0]
+            inverse = model.dof_invweight0[robot.joint(joint.name).velocity]
+            joint.solref_limit, joint.solimp_limit = (
+                -numbers * inverse,
+                COMPLIANT_FLANK_SOLIMP,
+            )  # (6)
+    return replace(robot, spec=spec)
+
+
+def _stepped(
+    made: SeriesElement, inertia: float, drive: Array, step: float, explicit: bool
+) -> tuple[Array, Array]:
+    """Limit stiffness and damping (L,) to values that are stable for a time step.
+
+    Args:
+        made: elements in series.
+        inertia: inertia of the joint.
+        drive: (L,) inertia of the drive.
+        step: time step in seconds.
+        explicit: whether the integrator treats damping explicitly (Runge-Kutta 4).
+    """
+    softened = 1.0 / drive + 1.0 / inertia
+    most = ((RESOLVED_BY_RK4 if explicit else RESOLVED) / step) ** 2 / softened
+    stiffness = np.minimum(made.stiffness, most)
+    damping = 2.0 * made.damping * np.sqrt(stiffness * inertia)
+    borne = np.minimum(damping, RESOLVED / step / softened)
+    if explicit:
+        return stiffness, borne
+    # If damping is implicit, so is this stiffness, by the backward Euler rule: k (d + h d').
+    give = is_compliant_flank(made)
+    backward = damping + step * (made.stiffness - stiffness)
+    return np.where(give, stiffness, made.stiffness), np.where(give, borne, backward)
+
+
+def compute_rest_positions(
+    fields: Mapping[str, Any], robot: RobotModel, loads: Sequence[Array]
+) -> list[Array]:
+    """Compute the rest positions (n,) of joints in series while their drives are held.
+
+    Args:
+        fields: model fields of the batch elements.
+        robot: robot of `add_series_joints`.
+        loads: (n,) load at each of these joints.
+    """
+    places = []
+    for (name, inertia), load in zip(robot.series.items(), loads, strict=True):
+        second, n = robot.joint(name), len(load)
+        stiffness = fields["jnt_stiffness"][:n, second.id]
+        soft = fields["jnt_solimp"][:n, second.id, 0] == COMPLIANT_FLANK_SOLIMP[0]
+        inverse = fields["dof_invweight0"][:n, second.velocity]
+        pressed = np.where(
+            soft, -fields["jnt_solref"][:n, second.id, 0] / inverse, stiffness
+        )  # (6)
+        half = fields["jnt_range"][:n, second.id, 1]
+        on_flank = half * np.clip(load / (UNLOADED_FORCE_SHARE * inertia), -1.0, 1.0)
+        away = np.where(pressed > 0, load / np.maximum(pressed, 1e-300), 0.0)
+        places.append(away + np.where(soft | (stiffness <= 0), on_flank, 0.0))
+    return places

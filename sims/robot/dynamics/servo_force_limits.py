@@ -1,0 +1,112 @@
+"""Joints at which a stiff servo makes the motion jump when it reaches its force limit.
+
+MuJoCo's implicit integrators treat the velocity gain kv of a servo implicitly, except in a step in
+which its force F is at a limit (`mjd_smooth_vel`: a clamped force does not depend on the velocity).
+With the step h, the inertia M at the joint, and r = h kv / M, the velocity then changes by h F / M
+instead of h F / (M + h kv), and changes back in the next step. The position jumps by about
+
+    (h² F / M) r / (1 + r)                                                                      (1)
+
+whenever the commanded force crosses the limit. The other joints jump by the reaction. A linearised
+model does not contain such jumps.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.robot.dynamics.inertia_matrix import inertia_matrix
+
+STIFF = 0.1
+"""Minimum r (see the module) of a stiff servo."""
+NEAR = 0.9
+"""Share of a force limit from which the limit counts as possibly reached.
+
+It is below 1 since the state is not known exactly.
+"""
+
+
+class ForceLimits(NamedTuple):
+    """Force limits of K stiff servos.
+
+    Attributes:
+        outputs: limited force of each servo: a field of MuJoCo's data and the column.
+        sizes: (K,) forces from which the limits may be reached, in units of the field.
+        jumps: (K, nv) jumps of all positions; at the servo's own joint by (1).
+    """
+
+    outputs: tuple[tuple[str, int], ...]
+    sizes: Array
+    jumps: Array
+
+
+def stiff_force_limits(model: Any) -> ForceLimits:
+    """Return the force limits of stiff servos at joints of a MuJoCo model."""
+    import mujoco
+
+    kinds = mujoco.mjtIntegrator
+    implicit = (int(kinds.mjINT_IMPLICIT), int(kinds.mjINT_IMPLICITFAST))
+    rows: list[tuple[int, tuple[str, int], float, float]] = []
+    gains = np.zeros(model.nv)
+    if model.opt.integrator in implicit:
+        for k in range(model.nu):
+            dof = _dof(model, k)
+            if dof is None:
+                continue
+            gear = abs(float(model.actuator_gear[k, 0]))
+            gain = -float(model.actuator_biasprm[k, 2]) * gear**2
+            gains[dof] += gain
+            if model.actuator_forcelimited[k] and _is_stiff(model, dof, gain):
+                limit = float(np.abs(model.actuator_forcerange[k]).max())
+                rows.append((dof, ("actuator_force", k), limit, limit * gear))
+        for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
+            dof = int(model.jnt_dofadr[joint])
+            if _is_stiff(model, dof, float(gains[dof])):
+                limit = float(np.abs(model.jnt_actfrcrange[joint]).max())
+                rows.append((dof, ("qfrc_actuator", dof), limit, limit))
+    jumps = [_jump(model, dof, force, gains) for dof, *_, force in rows]
+    return ForceLimits(
+        tuple(output for _, output, *_ in rows),
+        NEAR * np.array([limit for *_, limit, _ in rows]),
+        np.array(jumps).reshape(-1, model.nv),
+    )
+
+
+def _jump(model: Any, dof: int, force: float, gains: Array) -> Array:
+    """Compute the jump of all positions (nv,) in a step in which one servo is at its force limit.
+
+    The servos of the other joints are taken as not limited.
+
+    Args:
+        model: the mujoco.MjModel.
+        dof: degree of freedom of the servo's joint.
+        force: force limit at the joint, in N or N m.
+        gains: (nv,) velocity gains of the servos at the joints.
+    """
+    inertia, step, others = inertia_matrix(model), model.opt.timestep, gains.copy()
+    others[dof] = 0.0
+    unit = np.zeros(model.nv)
+    unit[dof] = force
+    free = np.linalg.solve(inertia + step * np.diag(others), unit)
+    damped = np.linalg.solve(inertia + step * np.diag(gains), unit)
+    jump: Array = step**2 * np.abs(free - damped)
+    return jump
+
+
+def _dof(model: Any, actuator: int) -> int | None:
+    """Return the degree of freedom of an actuator's joint; None if it drives no hinge or slide."""
+    import mujoco
+
+    joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    joint = int(model.actuator_trnid[actuator, 0])
+    if model.actuator_trntype[actuator] not in joints or model.jnt_type[joint] not in single:
+        return None
+    return int(model.jnt_dofadr[joint])
+
+
+def _is_stiff(model: Any, dof: int, gain: float) -> bool:
+    return bool(model.opt.timestep * gain > STIFF * model.dof_M0[dof])

@@ -1,0 +1,410 @@
+"""First-order propagation of small changes along a robot's motion (tangent linear model).
+
+It computes the responses to hundreds of effects at the cost of a few dozen simulations. With the
+state z = (q, v, a), the controls u and generalised forces f, a step of MuJoCo is the map z_{t+1} =
+F(z_t, u_t, f_t; p) with the model parameters p. Along one motion
+
+    A_t = dF/dz,   B_t = dF/df,   C_t = dF/du                                                  (1)
+
+are difference quotients, computed for all steps at once: each batch element makes a step from
+another sample time. A change with forces df, controls du or parameters p + dp then changes the
+motion by
+
+    dz_{t+1} = A_t dz_t + B_t (df_t + M_t da_t) + C_t du_t                                     (2)
+
+with the change da_t of the acceleration at the same state by the changed parameters, and the
+inertia matrix M_t
+
+(the tangent or variational equations; J. Guckenheimer, P. Holmes, Nonlinear Oscillations, 1983,
+section 1.3). Effect forces are evaluated along the motion, for all times at once. Changes of
+readings follow in the same way, with separate quotients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import ActiveEffects, Effect
+from sims.robot.dynamics.effect_forces import is_in_drive
+from sims.robot.dynamics.linearisation_points import LinearisationPoints
+from sims.robot.dynamics.midpoint_state import Mask, Places
+from sims.robot.dynamics.mujoco_batch import MujocoBatch
+
+POSITION, VELOCITY, CONTROL, SHARE = 1e-6, 1e-5, 1e-5, 1e-3
+"""Finite differences of a position (rad or m), a velocity, a control, and a force.
+
+The difference of a force is a share of its typical size.
+"""
+MAX_SIMULTANEOUS_CHANGES = 64
+"""Maximum number of changes that are propagated together; the data of more exceed the CPU cache."""
+
+
+class DifferenceQuotients(NamedTuple):
+    """Difference quotients of (1) and of readings, for S linearisation points.
+
+    There are Z state components, O readings, and E = D + F forces.
+
+    Attributes:
+        states: A (S, Z, Z).
+        forces: B (S, Z, E).
+        controls: C (S, Z, nu).
+        read_states: (S, O, Z) derivatives of readings by states.
+        read_forces: (S, O, E) derivatives of readings by forces.
+        read_controls: (S, O, nu) derivatives of readings by controls.
+    """
+
+    states: Array
+    forces: Array
+    controls: Array
+    read_states: Array
+    read_forces: Array
+    read_controls: Array
+
+
+class Perturbation(NamedTuple):
+    """A perturbation to propagate: of a force or control (S,), or of model parameters.
+
+    Attributes:
+        owner: number of the effect candidate to which it belongs.
+        joint: joint of the force; -1 if it is not a force.
+        actuator: index of the control; -1 if it is not a control.
+        series: (S,) forces or controls; None if model parameters change.
+        instant: (S,) controls at the beginning of each step.
+        forces: (N, E) forces equivalent to changed parameters, at each linearisation point.
+        readings: (N, O) direct changes of readings, at each linearisation point.
+    """
+
+    owner: int
+    joint: int = -1
+    actuator: int = -1
+    series: Array | None = None
+    instant: Array | None = None
+    forces: Array | None = None
+    readings: Array | None = None
+
+
+class TangentModel:
+    """Tangent linear model about one motion.
+
+    Args:
+        at: linearisation points of the motion.
+        sizes: (E,) typical forces.
+        quotients: difference quotients of another motion nearby; computed for this one if None.
+
+    Attributes:
+        quotients: difference quotients in use.
+    """
+
+    def __init__(
+        self, at: LinearisationPoints, sizes: Array, quotients: DifferenceQuotients | None = None
+    ) -> None:
+        self._at, self._motion = at, at.motion
+        self._sizes = sizes
+        self._steps = len(at.motion.controls)
+        numbers = np.arange(self._steps)
+        self._share: Array = (numbers - at.numbers[at.of]) / at.every
+        self._earlier, self._later = _neighbours(at.numbers, at.every)[:, at.of]
+        self._base, self._read = at.step_displaced({}, at.acting)
+        # If commands change at other times, the linearisation points differ.
+        if quotients is None or quotients.states.shape[:2] != self._base.shape:
+            quotients = self._quotients()
+        self.quotients = quotients
+        # Accelerations and readings of the unperturbed motion.
+        self._still = at.compute_accelerations(at.acting)
+
+    @property
+    def placed_element_count(self) -> int:
+        """Number of batch elements that were placed at linearisation points so far."""
+        return self._at.seen
+
+    @property
+    def state_size(self) -> int:
+        """Number of state components.
+
+        They are positions, velocities, activations, hidden states of effects, and displacements and
+        velocities of floating bodies.
+        """
+        return int(self._base.shape[1])
+
+    def _quotients(self) -> DifferenceQuotients:
+        size = self._motion.x.shape[1]
+        afloat = self._sizes.size - size
+        na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]
+        moves: dict[str, list[tuple[str, int, float]]] = {
+            "z": [("q", j, POSITION) for j in range(size)]
+            + [("v", j, VELOCITY) for j in range(size)]
+            + [("a", j, CONTROL) for j in range(na)]
+            + [("w", k, CONTROL) for k in self._at.remembering]
+            + [("p", j, POSITION) for j in range(afloat)]
+            + [("r", j, VELOCITY) for j in range(afloat)],
+            "f": [("f", j, SHARE * float(self._sizes[j])) for j in range(size + afloat)],
+            "u": [("u", j, CONTROL) for j in range(nu)],
+        }
+        found: dict[str, tuple[Array, Array]] = {}
+        for kind, columns in moves.items():
+            states, readings = [], []
+            for name, j, by in columns:
+                state, reading = self._at.step_displaced({name: (j, by)}, self._at.acting)
+                states.append((state - self._base) / by)
+                readings.append((reading - self._read) / by)
+            rows = self._at.numbers.size
+            found[kind] = (
+                np.stack(states, axis=2) if states else np.zeros((rows, self.state_size, 0)),
+                np.stack(readings, axis=2) if readings else np.zeros((*self._read.shape, 0)),
+            )
+        return DifferenceQuotients(*(found[k][i] for i in range(2) for k in ("z", "f", "u")))
+
+    # -- changes
+
+    def perturb_model_numbers(
+        self, owner: int, acting: ActiveEffects, change: float, bench: MujocoBatch
+    ) -> Perturbation:
+        """Return the change by other model parameters, as in (2), per unit of `change`.
+
+        Args:
+            owner: number of the effect candidate.
+            acting: active effects including the one that changes the parameters.
+            change: size of the change.
+            bench: batch whose model has the required elements.
+        """
+        meant = self._meant
+        with self._at.with_batch(bench):
+            accelerations, readings = self._at.compute_accelerations(acting, meant)
+            # External forces change readings of drives immediately, so the other readings are
+            # computed without these forces.
+            if self._at.reads_others:
+                _, readings = self._at.compute_accelerations(acting)
+        # A change of the acceleration is equivalent to a force.
+        apart = (accelerations - self.accelerations[self._at.numbers]) / change
+        force = np.einsum("nij,nj->ni", self._inertias, apart)
+        return Perturbation(owner, forces=force, readings=(readings - self._still[1]) / change)
+
+    @cached_property
+    def _meant(self) -> Array:
+        """Forces (N, E) that convert accelerations at a state to mean accelerations over the step.
+
+        They represent the damping of an implicit integrator, and the motion of other joints within
+        the step.
+        """
+        apart = self.accelerations[self._at.numbers] - self._still[0]
+        forces: Array = np.einsum("nij,nj->ni", self._inertias, apart)
+        return forces
+
+    def perturb_by_force(self, owner: int, effect: Effect, c: Array) -> list[Perturbation]:
+        """Return the changes by an effect's force, one for each joint that it acts on.
+
+        Args:
+            owner: number of the effect candidate.
+            effect: effect with a force.
+            c: coefficients (K, 1, 1).
+        """
+        force = self._at.compute_effect_force(effect, c)
+        joints = np.flatnonzero(np.abs(force).max(axis=0) > 0)
+        changes = [Perturbation(owner, joint=int(j), series=force[:, j]) for j in joints]
+        if is_in_drive(effect) and self._at.reads_drives:
+            changes.append(
+                Perturbation(
+                    owner, readings=self._at.compute_drive_reading_changes(effect, c, self._read)
+                )
+            )
+        return changes
+
+    @cached_property
+    def _inertias(self) -> Array:
+        return self._at.compute_mass_matrices()
+
+    @cached_property
+    def accelerations(self) -> Array:
+        """Mean accelerations (S, E) over each step."""
+        motion = self._motion
+        result: Array = np.diff(motion.velocities, axis=0)[: self._steps] / motion.step
+        return result
+
+    # -- propagation over time
+
+    def propagate(self, changes: Sequence[Perturbation], count: int) -> tuple[Array, Array]:
+        """Propagate changes along the motion, added up for each owner.
+
+        Args:
+            changes: changes with owners from 0 to `count` - 1.
+            count: number of owners n.
+
+        Returns:
+            Changes of states (n, S + 1, Z) and of readings (n, S, O).
+        """
+        q = self.quotients
+        size = q.forces.shape[1]
+        steps = self._steps
+        pushed, read = self.pushed(changes, count)
+        # States, forces and controls are stacked, so that a step is one matrix product.
+        whole = np.zeros((steps + 1, size + pushed.shape[1], count))
+        whole[:-1, size:] = pushed
+        step = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
+        rows = list(whole)
+        for t, look in enumerate(self._at.of.tolist()):
+            np.matmul(step[look], rows[t], out=rows[t + 1][:size])  # (2)
+        if read.shape[1]:
+            read += np.matmul(q.read_states[self._at.of], whole[:-1, :size])
+        states = whole[:, :size]
+        return np.moveaxis(states, 2, 0), np.moveaxis(read, 2, 0)
+
+    def pushed(self, changes: Sequence[Perturbation], count: int) -> tuple[Array, Array]:
+        """Compute what changes add to forces and controls, and to readings directly.
+
+        Args:
+            changes: changes with owners from 0 to `count` - 1.
+            count: number of owners n.
+
+        Returns:
+            Forces and controls (S, E + nu, n); readings (S, O, n) at unchanged states.
+        """
+        q = self.quotients
+        joints = q.forces.shape[2]
+        steps, actuators, outputs = self._steps, q.controls.shape[2], self._read.shape[1]
+        # The series of one owner are contiguous in memory while they are added up.
+        pushed = np.zeros((joints + actuators, count, steps))
+        at_once = np.zeros((actuators, count, steps)) if outputs else pushed[joints:]
+        read = np.zeros((steps, outputs, count))
+        for change in changes:
+            owner = change.owner
+            if change.joint >= 0 and change.series is not None:
+                pushed[change.joint, owner] += change.series
+            if change.actuator >= 0 and change.series is not None:
+                pushed[joints + change.actuator, owner] += change.series
+                instant = change.series if change.instant is None else change.instant
+                if outputs:
+                    at_once[change.actuator, owner] += instant
+            if change.forces is not None:
+                pushed[:joints, owner] += self._between(change.forces).T
+            if change.readings is not None:
+                read[:, :, owner] += self._between(change.readings)
+        whole = np.ascontiguousarray(pushed.transpose(2, 0, 1))
+        if outputs:
+            forces = whole[:, :joints].copy()
+            # Changes of model parameters already contain their effect on readings.
+            forces[:, :, self._numbered(changes, count)] = 0.0
+            read += np.matmul(q.read_forces[self._at.of], forces)
+            instants = np.ascontiguousarray(at_once.transpose(2, 0, 1))
+            read += np.matmul(q.read_controls[self._at.of], instants)
+        return whole, read
+
+    @property
+    def looked_at(self) -> Places:
+        """Index of the linearisation point whose quotients apply to each step, (S,)."""
+        return self._at.of
+
+    @property
+    def looks_at(self) -> int:
+        """Number N of linearisation points."""
+        return int(self._at.numbers.size)
+
+    @property
+    def remembering(self) -> Sequence[int]:
+        """Numbers of the effects with hidden states."""
+        return self._at.remembering
+
+    @property
+    def motion_readings(self) -> Array:
+        """Readings (S, O) of the motion at the beginnings of steps, as computed by the model."""
+        motion, of = self._motion, self._at.of
+        with self._at.every_step():
+            _, read = self._at.compute_accelerations(self._at.acting)
+        # A step applies the mean of a command, while a sensor shows its value at the beginning.
+        apart = motion.instant - motion.controls
+        result: Array = read + np.einsum("sou,su->so", self.quotients.read_controls[of], apart)
+        return result
+
+    def step_errors(self, finer: MujocoBatch) -> Array:
+        """Estimate the discretisation error of a step, (N, Z), by Richardson extrapolation.
+
+        Two steps of half the length leave half the error of one step of a method of first order (L.
+        F. Richardson, 1911, doi:10.1098/rsta.1911.0009).
+
+        Args:
+            finer: batch with half the time step.
+        """
+        with self._at.with_batch(finer):
+            state, _ = self._at.step_displaced({}, self._at.acting, steps=2)
+        return 2.0 * (state - self._base)
+
+    @cached_property
+    def defects(self) -> Array:
+        """Differences (S, Z) between the motion and the model's step from each of its states."""
+        motion, joints = self._motion, self._motion.x.shape[1]
+        base, _ = self._every_step
+        result = np.zeros_like(base)
+        result[:, :joints] = motion.x[1:] - base[:, :joints]
+        result[:, joints : 2 * joints] = motion.v[1:] - base[:, joints : 2 * joints]
+        moves = motion.afloat.rate.shape[1]
+        if moves:
+            # Displacements are relative to the motion itself.
+            result[:, -2 * moves : -moves] = -base[:, -2 * moves : -moves]
+            result[:, -moves:] = motion.afloat.rate[1:] - base[:, -moves:]
+        return result
+
+    @property
+    def limited_forces(self) -> Array:
+        """Forces (S, K) with limits at stiff servos, in each step."""
+        return self._every_step[1]
+
+    @cached_property
+    def _every_step(self) -> tuple[Array, Array]:
+        """States (S, Z) after each step, and the limited forces (S, K)."""
+        with self._at.every_step(), self._at.limited_forces():
+            return self._at.step_displaced({}, self._at.acting)
+
+    def _between(self, values: Array) -> Array:
+        """Interpolate values (N, k) at linearisation points to all steps, (S, k).
+
+        Values are linear between points while a command is constant, and are extrapolated after the
+        last point.
+        """
+        slope = values[self._later] - values[self._earlier]
+        result: Array = values[self._at.of] + self._share[:, None] * slope
+        return result
+
+    @staticmethod
+    def _numbered(changes: Sequence[Perturbation], count: int) -> Mask:
+        """Return which owners (n,) change model parameters."""
+        numbered = np.zeros(count, dtype=bool)
+        numbered[[change.owner for change in changes if change.forces is not None]] = True
+        return numbered
+
+    def propagate_initial_state(self) -> tuple[Array, Array]:
+        """Compute the responses to each initial position and velocity.
+
+        Returns:
+            Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O).
+        """
+        size = 2 * self._motion.x.shape[1]
+        q = self.quotients
+        states = np.zeros((self._steps + 1, self._base.shape[1], size))
+        readings = np.zeros((self._steps, self._read.shape[1], size))
+        states[0, :size] = np.eye(size)
+        for t in range(self._steps):
+            readings[t] = q.read_states[self._at.of[t]] @ states[t]
+            states[t + 1] = q.states[self._at.of[t]] @ states[t]
+        return np.moveaxis(states, 2, 0), np.moveaxis(readings, 2, 0)
+
+
+def _neighbours(looks: Places, every: int) -> Places:
+    """Find the pairs of linearisation points for interpolation, (2, N).
+
+    A pair is `every` steps apart: a point and the next one, or the previous one and the point if a
+    command changes in between. If neither exists, the point itself is given twice.
+
+    Args:
+        looks: (N,) steps of the linearisation points.
+        every: regular number of steps between two points.
+    """
+    numbers = np.arange(looks.size)
+    after = np.append(np.diff(looks) == every, False)
+    before = np.append(False, np.diff(looks) == every)
+    earlier = np.where(after, numbers, np.where(before, numbers - 1, numbers))
+    later = np.where(after, numbers + 1, numbers)
+    return np.stack([earlier, later])

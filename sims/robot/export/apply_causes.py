@@ -1,0 +1,317 @@
+"""Apply causes to a robot's model, as changed numbers of an MjSpec.
+
+This module alone defines the meaning of a cause for a model file. Model-field effects have the same
+meaning as in a simulation (`sims.robot.model_field_effects`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sims import effects as library
+from sims.core.freed_memory import release_free_memory
+from sims.core.system import SeriesElement as Transmission
+from sims.extended_simulator import FittedValue
+from sims.robot.coupled_drives import COUPLING_EFFECT as COUPLED
+from sims.robot.coupled_drives import make_coupled_robot
+from sims.robot.dynamics.series_joints import (
+    add_series_joints,
+    combine_elements,
+    find_series_joint,
+    is_compliant_flank,
+    is_series_effect,
+    make_series_element,
+    prepare_flanks_for_file,
+)
+from sims.robot.dynamics.series_joints import write_elements as state_element
+from sims.robot.export.command_attributes import COMMAND_WRITERS, get_application_order
+from sims.robot.export.mjcf_attributes import (
+    ATTRIBUTES_BY_KIND,
+    ENUM_ATTRIBUTES,
+    FLAG_ATTRIBUTES,
+    INTEGER_ATTRIBUTES,
+    AttributeStatement,
+    Fields,
+    ModelElement,
+    copy_model_fields,
+    find_differing_statements,
+    find_missing_statements,
+)
+from sims.robot.export.model_comparison import format_spec
+from sims.robot.fitted_causes import FittedCause, expand_families, is_gravity_compensated
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.robot_model import RobotModel
+
+MAX_CORRECTION_ROUNDS = 4
+"""Maximum number of rounds that restore values which another change has modified."""
+
+ROUNDING_TOLERANCE = 1e-13
+"""Relative difference between compiled numbers that counts as rounding."""
+
+KEPT_VALUE_NOTE = "as it was: it would move along with another change"
+
+KEYFRAMES_OMITTED_NOTE = "keyframes are left out: they lack the coordinates of joints in series"
+
+COULOMB = "friction.coulomb"
+
+_NOTES = {
+    "joint.flexibility": "joint.flexibility: the joint has a second one in series, whose position "
+    "begins at zero in the file; damping is a share of the critical one",
+    "joint.backlash": "joint.backlash: the joint has a second one in series, which begins in the "
+    "middle of its gap in the file",
+    "joint.coupling": "joint.coupling: the joint's actuator drives a tendon, the joint with 1 and "
+    "the one before it with the coefficient",
+    COULOMB: "friction.coulomb: dry friction is stiff in the file (solreffriction, "
+    "solimpfriction), or it would creep",
+}
+"""Notes about effects that a file contains."""
+_SOFT = (
+    "friction.coulomb: dry friction has MuJoCo's soft form, since solreffriction and "
+    "solimpfriction are left as they were; a joint under load creeps"
+)
+
+
+@dataclass(frozen=True)
+class ModifiedModel:
+    """A robot's model with causes applied.
+
+    Attributes:
+        robot: the robot, with joints in series if causes add some.
+        text: the model as MJCF written by MuJoCo.
+        model: the compiled model.
+        target_values: target fields of the compiled model.
+        comments: causes that change an element, by element.
+        held: causes that the model contains.
+        notes: notes about causes that it cannot contain, and about differences of those it
+            contains.
+    """
+
+    robot: RobotModel
+    text: str
+    model: Any
+    target_values: Fields
+    comments: Mapping[ModelElement, Sequence[str]]
+    held: tuple[FittedCause, ...]
+    notes: tuple[str, ...]
+
+
+def apply_causes(
+    robot: RobotModel, causes: Mapping[str, Mapping[str, FittedValue]], recording: str = ""
+) -> ModifiedModel:
+    """Apply causes to a robot's model.
+
+    Args:
+        robot: robot as read from its model file; it is not changed.
+        causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
+        recording: title of the recording to which they were fitted, for comments.
+
+    Raises:
+        InputError: the robot has no place of that name.
+        RuntimeError: the model does not accept a change; this is a program error.
+    """
+    found = expand_families(robot, causes)
+    said = []
+    couplings = {c.place: float(c.coefficients[0]) for c in found if c.effect == COUPLED}
+    robot = make_coupled_robot(robot, couplings) if couplings else robot
+    series = _in_series(found)
+    if series:
+        said += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
+        added = tuple((c.place, c.effect) for c in found if _is_in_series(c))
+        robot = prepare_flanks_for_file(add_series_joints(robot, added), series)
+    wanted = copy_model_fields(robot.compiled)
+    comments: dict[ModelElement, list[str]] = {}
+    held: list[FittedCause] = []
+    # Elements in series take their share of armatures, so they are written last.
+    for cause in sorted(found, key=lambda c: (get_application_order(c), _is_in_series(c))):
+        before = {name: values.copy() for name, values in wanted.items()}
+        done = {one.place for one in held if _is_in_series(one)}
+        answer = _write(wanted, robot, cause, series if cause.place not in done else {})
+        if answer and not answer.startswith("+"):
+            said.append(f"{cause.format(recording)}: not in the file: {answer}")
+            continue
+        held.append(cause)
+        note = f"{cause.effect}: {answer[1:]}" if answer else _note(robot, cause)
+        if note and note not in said:
+            said.append(note)
+        changed = [
+            one.element for one in find_differing_statements(robot.compiled, before, wanted, 0.0)
+        ]
+        if _is_in_series(cause):
+            second = ModelElement("joint", robot.joint(find_series_joint(robot, cause.place)).id)
+            changed += [] if second in changed else [second]
+        for one in changed:
+            comments.setdefault(one, []).append(cause.format(recording))
+        if cause.effect == COUPLED:
+            for actuator in (a for a in robot.actuators if a.joint == cause.place):
+                element = ModelElement("actuator", actuator.id)
+                comments.setdefault(element, []).append(cause.format(recording))
+    spec, model = _compiled(robot, wanted)
+    if any(is_compliant_flank(made)[0] for made in series.values()):
+        # The solver parameters of compliant flanks depend on all causes, so they are computed
+        # again.
+        robot = prepare_flanks_for_file(robot, series, model)
+        spec, model = _compiled(robot, wanted)
+    # Only the text is stored, since a compiled spec holds all meshes a second time.
+    text = format_spec(spec, robot.path.resolve().parent)
+    del spec
+    release_free_memory()
+    return ModifiedModel(robot, text, model, wanted, comments, tuple(held), tuple(said))
+
+
+def _note(robot: RobotModel, cause: FittedCause) -> str | None:
+    """Return the note about an effect that the file contains; None if there is none."""
+    if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
+        return _SOFT
+    return _NOTES.get(cause.effect)
+
+
+def _is_in_series(cause: FittedCause) -> bool:
+    return cause.effect in library.list_names() and is_series_effect(
+        library.get_effect(cause.effect)
+    )
+
+
+def _in_series(causes: Sequence[FittedCause]) -> dict[str, Transmission]:
+    """Combine the elements that causes put in series with joints, by joint."""
+    elements: dict[str, list[Transmission]] = {}
+    for cause in causes:
+        if _is_in_series(cause):
+            elements.setdefault(cause.place, []).append(_element(cause))
+    return {place: combine_elements(own) for place, own in elements.items()}
+
+
+def _element(cause: FittedCause) -> Transmission:
+    numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
+    return make_series_element(library.get_effect(cause.effect), numbers)
+
+
+def _write(
+    wanted: Fields, robot: RobotModel, cause: FittedCause, series: Mapping[str, Transmission]
+) -> str | None:
+    """Apply a cause to the fields; `series` contains the elements in series not yet written."""
+    # A coupling is an element of the robot, which has been added before.
+    if cause.effect == COUPLED:
+        return None
+    if is_gravity_compensated(cause.effect, cause.numbers):
+        for body in robot.bodies:
+            wanted["body_gravcomp"][0, body.id] = 1.0
+        return "+gravity is compensated: the bodies have gravcomp = 1, and gravity is as it was"
+    if cause.effect in MODEL_FIELD_EFFECTS:
+        MODEL_FIELD_EFFECTS[cause.effect].write(
+            wanted, robot, cause.place, cause.coefficients[:, None]
+        )
+        return None
+    if _is_in_series(cause):
+        if cause.place in series:
+            state_element(wanted, robot, cause.place, series[cause.place])
+        return None
+    if cause.effect in COMMAND_WRITERS:
+        return COMMAND_WRITERS[cause.effect](wanted, robot, cause)
+    if cause.effect.startswith(("sensor.", "clock.")):
+        return "what a sensor shows is no part of the model"
+    return "MuJoCo has no such element"
+
+
+def _compiled(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
+    """Return a spec that compiles to the wanted fields, and the compiled model."""
+    spec, model = robot.spec.copy(), robot.compiled
+    by_id = SpecElements(spec, robot)
+    tolerance = 0.0
+    for _ in range(MAX_CORRECTION_ROUNDS):
+        statements = find_missing_statements(model, wanted, tolerance)
+        if not statements:
+            return spec, model
+        for statement in statements:
+            set_attributes(by_id.get_element(statement.element), statement)
+        if any(statement.element.kind == "body" for statement in statements):
+            _keep_masses(spec, wanted)
+        model, tolerance = spec.compile(), ROUNDING_TOLERANCE
+    left = find_missing_statements(model, wanted, tolerance)
+    if left:
+        raise RuntimeError(f"{robot.path}: the model does not take {left[0]}")
+    return spec, model
+
+
+def _keep_masses(spec: Any, wanted: Fields) -> None:
+    """Change compiler settings so that MuJoCo uses inertials as specified."""
+    import mujoco
+
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    if spec.compiler.settotalmass > 0:
+        spec.compiler.settotalmass = float(wanted["body_mass"].sum())
+
+
+class SpecElements:
+    """The elements of a spec by their numbers in the compiled model."""
+
+    def __init__(self, spec: Any, robot: RobotModel) -> None:
+        self.spec = spec
+        # Elements have numbers only after compilation.
+        spec.compile()
+        self.joints = {joint.id: joint for joint in spec.joints}
+        self.bodies = {body.id: body for body in spec.bodies}
+        self.actuators = {actuator.id: actuator for actuator in spec.actuators}
+        self.robot = robot
+
+    def get_element(self, element: ModelElement) -> Any:
+        """Return the spec's element for an element of the compiled model."""
+        if element.kind == "option":
+            return self.spec.option
+        of_kind = {"joint": self.joints, "actuator": self.actuators}
+        return of_kind.get(element.kind, self.bodies)[element.id]
+
+
+def set_attributes(element: Any, statement: AttributeStatement) -> None:
+    """Set the attributes of a statement in an element of a spec.
+
+    Args:
+        element: element of a mujoco.MjSpec; it is changed in place.
+        statement: attributes in MuJoCo's units.
+    """
+    import mujoco
+
+    kind = statement.element.kind
+    known = {attribute.name: attribute.spec for attribute in ATTRIBUTES_BY_KIND[kind]}
+    for name, values in statement.values.items():
+        if name in ENUM_ATTRIBUTES:
+            value: Any = getattr(mujoco, ENUM_ATTRIBUTES[name])(int(values[0]))
+        elif name in FLAG_ATTRIBUTES:
+            limited = mujoco.mjtLimited
+            value = limited.mjLIMITED_TRUE if values[0] else limited.mjLIMITED_FALSE
+        elif name in INTEGER_ATTRIBUTES:
+            value = int(values[0])
+        else:
+            value = _numbers(element, name, known[name], values)
+        setattr(element, known[name], value)
+    if kind == "body":
+        _explicit(element)
+    if kind == "joint" and {"damping", "stiffness"} & set(statement.values):
+        element.springdamper = (0.0, 0.0)
+
+
+def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
+    """Convert values to the form of a spec attribute: a number, or an array of its length."""
+    import mujoco
+
+    if name == "springref" and element.type == mujoco.mjtJoint.mjJNT_HINGE:
+        return float(np.rad2deg(values[0])) if element.compiler.degree else values[0]
+    now = np.asarray(getattr(element, attribute))
+    if now.ndim == 0:
+        return values[0]
+    padded = np.zeros(now.shape)
+    padded[: len(values)] = values[: len(padded)]
+    return padded
+
+
+def _explicit(body: Any) -> None:
+    """Make the compiler use the inertial that was set."""
+    import mujoco
+
+    body.explicitinertial = True
+    body.fullinertia = np.full(6, np.nan)
+    body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT

@@ -1,0 +1,251 @@
+"""Input effects and constant forces as fields of a compiled model.
+
+With the command u, the actuator input w = clip((1 + a) u + b, -s, s), the control range [l, h] of
+the actuator, and force = g w + bias:
+
+* (1) force = g (1 + a) v + g b + bias, with
+* (2) v = clip(u, ...) between ((L - b) / (1 + a), (H - b) / (1 + a)), where [L, H] is the
+  intersection of [-s, s] and the control range
+
+so gain, bias and saturation become MuJoCo's gain, bias and control range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import ceil
+from typing import Any
+
+import numpy as np
+
+from sims.robot.export.mjcf_attributes import Fields
+from sims.robot.fitted_causes import FittedCause
+from sims.robot.robot_model import RobotModel
+
+UnstatableReason = str | None
+"""Reason why a cause cannot be written; None if it is written.
+
+A text that begins with ``+`` is a note about a cause that is written.
+"""
+
+MIN_GAIN_FACTOR = 1e-12
+"""Minimum factor 1 + a, since a gain error cannot reverse the sign of a command."""
+
+
+class _Actuator:
+    """The fields of one actuator, and its properties."""
+
+    def __init__(self, fields: Fields, robot: RobotModel, place: str) -> None:
+        import mujoco
+
+        self.id = robot.actuator(place).id
+        self.control = int(robot.compiled.actuator_ctrladr[self.id])
+        self.single = int(robot.compiled.actuator_ctrlnum[self.id]) == 1
+        self.fields = fields
+        self.direct = self._of("actuator_dyntype") == int(mujoco.mjtDyn.mjDYN_NONE)
+        self.clamped = bool(robot.compiled.actuator_actlimited[self.id])
+        self.fixed = self._of("actuator_gaintype") == int(mujoco.mjtGain.mjGAIN_FIXED)
+        self.gain = fields["actuator_gainprm"][0, self.id]
+        self.bias = fields["actuator_biasprm"][0, self.id]
+        # The factor 1 + a and the offset b of (1) from causes that are in the fields already.
+        self.command = fields.setdefault("command", _commands(robot))[0, self.id]
+
+    def _of(self, name: str) -> int:
+        return int(self.fields[name][0, self.id])
+
+    @property
+    def linear(self) -> bool:
+        """Whether the force is a gain times one control (possibly filtered) plus a bias."""
+        return self.single and (self.direct or self.filtered) and self.fixed and self.steady
+
+    @property
+    def steady(self) -> bool:
+        """Whether the bias has a constant term, or can be given one."""
+        import mujoco
+
+        kinds = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+        return self._of("actuator_biastype") in kinds
+
+    @property
+    def filtered(self) -> bool:
+        """Whether a linear filter without limits precedes the actuator."""
+        import mujoco
+
+        kinds = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
+        return self._of("actuator_dyntype") in kinds and not self.clamped
+
+    def shift(self, force: float) -> None:
+        """Add a constant to the force."""
+        import mujoco
+
+        if self._of("actuator_biastype") == int(mujoco.mjtBias.mjBIAS_NONE):
+            # Bias parameters of an actuator without a bias type have no effect.
+            self.bias[:] = 0.0
+            self.fields["actuator_biastype"][0, self.id] = int(mujoco.mjtBias.mjBIAS_AFFINE)
+        self.bias[0] += force
+
+    def limits(self) -> tuple[float, float]:
+        """Return the lower and upper limit of the control."""
+        if not self.fields["actuator_ctrllimited"][0, self.control]:
+            return -np.inf, np.inf
+        low, high = self.fields["actuator_ctrlrange"][0, self.control]
+        return float(low), float(high)
+
+    def limit(self, low: float, high: float) -> None:
+        """Set the limits of the control; infinite limits are ignored."""
+        if np.isfinite(low) and np.isfinite(high):
+            self.fields["actuator_ctrllimited"][0, self.control] = True
+            self.fields["actuator_ctrlrange"][0, self.control] = (low, high)
+
+
+def _commands(robot: RobotModel) -> Any:
+    """Return the unchanged factor and offset (1, N, 2) of each actuator's command."""
+    return np.array([[(1.0, 0.0)] * len(robot.compiled.actuator_ctrlnum)])
+
+
+_NOT_LINEAR = "its actuator is not a gain and a bias of one control"
+
+
+def _gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
+    scaled = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
+    if not scaled:
+        return _NOT_LINEAR
+    if 1.0 + a < MIN_GAIN_FACTOR:
+        return "a gain below zero turns the control range round"
+    low, high = actuator.limits()
+    actuator.limit(low / (1.0 + a), high / (1.0 + a))  # (2)
+    actuator.gain[0] *= 1.0 + a  # (1)
+    actuator.command[0] *= 1.0 + a
+    return None
+
+
+def _bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    actuator, (b,) = _Actuator(fields, robot, cause.place), cause.coefficients
+    if not actuator.linear:
+        return _NOT_LINEAR
+    share, _ = actuator.command
+    low, high = actuator.limits()
+    actuator.limit(low - b / share, high - b / share)  # (2)
+    actuator.shift(float(actuator.gain[0] / share * b))  # (1)
+    actuator.command[1] += b
+    return None
+
+
+def _saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    actuator, (s,) = _Actuator(fields, robot, cause.place), cause.coefficients
+    if s <= 0:
+        return None
+    if not actuator.linear:
+        return _NOT_LINEAR
+    share, b = actuator.command
+    low, high = actuator.limits()
+    low, high = max(low, (-s - b) / share), min(high, (s - b) / share)
+    if low >= high:
+        return "nothing is left of the control range"
+    actuator.limit(low, high)  # (2)
+    return None
+
+
+def _delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    actuator, (delay,) = _Actuator(fields, robot, cause.place), cause.coefficients
+    step = float(fields["opt.timestep"][0])
+    if delay == 0:
+        return None
+    if delay < 0:
+        return "a control cannot be felt before it is set"
+    if fields["actuator_delay"][0, actuator.id] > 0:
+        return "the file states a delay already"
+    fields["actuator_delay"][0, actuator.id] = delay
+    # MuJoCo interpolates linearly between past controls. This equals the mean, over a step, of
+    # delayed controls that are constant over their steps.
+    fields["actuator_history"][0, actuator.id] = (ceil(delay / step) + 1, 1)
+    late = "" if delay >= step else f", delays it by a whole step, {step:g} s"
+    return (
+        f"+MuJoCo takes a control that is delayed for 0 before the first one{late} "
+        "(mj_initCtrlHistory sets another)"
+    )
+
+
+def _lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    import mujoco
+
+    actuator, (lag,) = _Actuator(fields, robot, cause.place), cause.coefficients
+    if lag <= 0:
+        return None
+    if not (actuator.direct and actuator.fixed and actuator.single):
+        return "its actuator has dynamics already"
+    fields["actuator_dyntype"][0, actuator.id] = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    parameters = fields["actuator_dynprm"][0, actuator.id]
+    parameters[:] = 0.0
+    parameters[0] = lag
+    return (
+        "+MuJoCo filters the control after its range, from 0 on (set data.act to the first control)"
+        ", and holds the filtered one over each step"
+    )
+
+
+def _force(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    """Write a constant force at a joint, as a spring rest position or an actuator bias."""
+    joint, (force,) = robot.joint(cause.place), cause.coefficients
+    stiffness = fields["jnt_stiffness"][0, joint.id]
+    stated = robot.compiled.ntendon - len(robot.coupled)
+    plain = not fields["jnt_stiffnesspoly"][0, joint.id].any() and not stated
+    if (
+        joint.has_one_coordinate
+        and stiffness > 0
+        and plain
+        and not robot.compiled.jnt_springyield[joint.id]
+    ):
+        fields["qpos_spring"][0, joint.position] += force / stiffness
+        return None
+    for driving in robot.actuators:
+        actuator = _Actuator(fields, robot, driving.name)
+        alone = joint.name not in robot.coupled
+        unlimited = driving.force is None and joint.effort is None and alone
+        if driving.joint == joint.name and actuator.single and actuator.steady and unlimited:
+            gear = robot.compiled.actuator_gear[actuator.id]
+            if not fields["actuator_forcelimited"][0, actuator.id] and gear[0]:
+                actuator.shift(float(force / gear[0]))
+                return f"+it stands as a bias of actuator {driving.name}, and counts as its force"
+    return "MuJoCo has no constant force at a joint without a spring or an actuator free of limits"
+
+
+def _step(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+    (step,) = cause.coefficients
+    fields["opt.timestep"][0] = step
+    return None
+
+
+def _integrator(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+    (number,) = cause.coefficients
+    fields["opt.integrator"][0] = int(number)
+    return None
+
+
+CommandWriter = Callable[[Fields, RobotModel, FittedCause], UnstatableReason]
+
+COMMAND_WRITERS: Mapping[str, CommandWriter] = {
+    "numerics.step": _step,
+    "numerics.integrator": _integrator,
+    "input.gain": _gain,
+    "input.bias": _bias,
+    "input.saturation": _saturation,
+    "input.delay": _delay,
+    "input.lag": _lag,
+    "force.bias": _force,
+}
+"""Writers by effect: model changes, then effects in the order in which a command passes them."""
+
+
+def get_application_order(cause: FittedCause) -> Any:
+    """Return the sort key of a cause in the order of application.
+
+    Integrator settings come first, then causes in the model, then input effects in the order in
+    which a command passes them.
+    """
+    # The stiffness of dry friction depends on the time step.
+    if cause.effect.startswith("numerics."):
+        return -2
+    names = list(COMMAND_WRITERS)
+    return names.index(cause.effect) if cause.effect in names else -1

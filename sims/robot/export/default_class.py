@@ -1,0 +1,142 @@
+"""A joint with its actuator as an MJCF default class, and a model file that uses the class."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from sims.robot.export.apply_causes import ModifiedModel
+from sims.robot.export.mjcf_attributes import (
+    ATTRIBUTES_BY_KIND,
+    ModelElement,
+    Values,
+    list_all_attributes,
+)
+from sims.robot.export.mjcf_document import FILE_ELEMENTS, MjcfDocument
+from sims.robot.export.mjcf_writer import SHORTCUT_ATTRIBUTES, format_attributes
+from sims.robot.export.model_comparison import find_first_difference
+from sims.robot.export.write_model_file import ROUNDING_TOLERANCE, compile_mjcf
+from sims.robot.export.xml_editing import NotEditableError, format_number
+from sims.robot.robot_model import RobotModel
+
+_USUAL: Mapping[str, Values] = {
+    "solreffriction": (0.02, 1.0),
+    "solimpfriction": (0.9, 0.95, 0.001, 0.5, 2.0),
+}
+"""MuJoCo's default values of attributes; all other attributes default to zero."""
+_OF_THE_POSE = frozenset({"springref"})
+"""Attributes that stay with a joint since they depend on its pose."""
+_NONE, _FIXED, _AFFINE = 0.0, 0.0, 1.0
+"""MuJoCo's enumeration values of a position servo: no dynamics, fixed gain, affine bias."""
+
+
+def render_default_class(
+    applied: ModifiedModel, joint: int, actuator: int | None, name: str, notes: Sequence[str] = ()
+) -> str:
+    """Render a default class as ``<default class="NAME">``, with a comment for each cause.
+
+    Args:
+        applied: model with the causes applied.
+        joint: number of the joint in the model.
+        actuator: number of the actuator of the joint; None if there is none.
+        name: name of the class.
+        notes: further comments.
+    """
+    lines = [f'<default class="{name}">', *(f"  {_comment(note)}" for note in notes)]
+    elements = [ModelElement("joint", joint)]
+    elements += [] if actuator is None else [ModelElement("actuator", actuator)]
+    for element in elements:
+        told = applied.comments.get(element, [])
+        lines += [f"  {_comment(text)}" for text in dict.fromkeys(told)]
+        tag, stated = _stated(
+            element, list_all_attributes(applied.model, element, applied.target_values)
+        )
+        said = "".join(f' {key}="{value}"' for key, value in stated.items())
+        lines.append(f"  <{tag}{said}/>")
+    return "\n".join([*lines, "</default>"])
+
+
+def _stated(element: ModelElement, values: Mapping[str, Values]) -> tuple[str, dict[str, str]]:
+    """Return the tag of an element in a default class, and its attributes as text."""
+    own = {
+        name: value
+        for name, value in values.items()
+        if name not in _OF_THE_POSE and not _is_usual(name, value)
+    }
+    if element.kind == "joint":
+        if not values["frictionloss"][0]:
+            own = {name: value for name, value in own.items() if not name.startswith("sol")}
+        return "joint", format_attributes(own)
+    ranges = {"ctrlrange": "ctrllimited", "forcerange": "forcelimited"}
+    own = {k: v for k, v in own.items() if k not in ranges or values[ranges[k]][0]}
+    if not _is_servo(values):
+        return "general", format_attributes(
+            {**own, **{k: values[k] for k in ("gaintype", "biastype")}}
+        )
+    gains = {"kp": format_number(values["gainprm"][0]), "kv": format_number(-values["biasprm"][2])}
+    return "position", gains | format_attributes(
+        {k: v for k, v in own.items() if not k.startswith(("gain", "bias", "dyn"))}
+    )
+
+
+def _is_usual(name: str, values: Values) -> bool:
+    return values == _USUAL[name] if name in _USUAL else not any(values)
+
+
+def _is_servo(values: Mapping[str, Values]) -> bool:
+    """Return whether actuator attributes are those of MJCF's ``position`` shortcut."""
+    kinds = values["dyntype"][0], values["gaintype"][0], values["biastype"][0]
+    offset, stiffness = values["biasprm"][:2]
+    return kinds == (_NONE, _FIXED, _AFFINE) and offset == 0 and stiffness == -values["gainprm"][0]
+
+
+def render_model_using_class(
+    robot: RobotModel,
+    applied: ModifiedModel,
+    joint: int,
+    actuator: int | None,
+    name: str,
+    text: str,
+) -> str:
+    """Render the model file with all causes, where a joint and its actuator use the class.
+
+    Args:
+        robot: robot as read from its model file.
+        applied: model with the causes applied.
+        joint: number of the joint in the model.
+        actuator: number of the actuator of the joint; None if there is none.
+        name: name of the class.
+        text: the class, from `render_default_class`.
+
+    Raises:
+        UnfitError: the rendered file differs from the modified model; states the field.
+    """
+    document = MjcfDocument(applied.text.encode(), robot.path)
+    tags = document.map_to_compiled_ids(applied.model)
+    tag = tags[ModelElement("joint", joint)]
+    tag.new["class"] = name
+    tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["joint"]} - _OF_THE_POSE
+    if actuator is not None:
+        element = ModelElement("actuator", actuator)
+        tag = tags[element]
+        tag.new["class"] = name
+        tag.removed |= {a.name for a in ATTRIBUTES_BY_KIND["actuator"]} | set(SHORTCUT_ATTRIBUTES)
+        tag.renamed, _ = _stated(
+            element, list_all_attributes(applied.model, element, applied.target_values)
+        )
+    if not any(one.name in FILE_ELEMENTS for one in document.walk()):
+        for compiler in document.find_elements("compiler"):
+            compiler.removed |= {"meshdir", "texturedir"}
+    document.root.within.insert(
+        0, ([], "<default>\n    " + text.replace("\n", "\n    ") + "\n  </default>")
+    )
+    written = document.to_text()
+    differs = find_first_difference(compile_mjcf(written), applied.model, ROUNDING_TOLERANCE)
+    if differs:
+        raise NotEditableError(differs)
+    return written
+
+
+def _comment(text: str) -> str:
+    # Two hyphens would end an XML comment early.
+    safe = text.replace("--", "- -")
+    return f"<!-- {safe} -->"

@@ -1,0 +1,277 @@
+"""MJCF attributes of model elements, and the fields of the compiled model that store them.
+
+With this map a number of the compiled model can be written to a file, or set in a spec.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+Kind = Literal["joint", "body", "weight", "actuator", "option", "compiler"]
+"""Kinds of model elements.
+
+Kind ``weight`` is the gravity compensation of a body, separate from its inertial.
+"""
+
+Fields = dict[str, Any]
+"""Fields of a compiled model by name, arrays (1, ...) for one batch element."""
+
+Values = tuple[float, ...]
+
+
+class ModelElement(NamedTuple):
+    """An element of a model file.
+
+    Attributes:
+        kind: kind of the element.
+        id: number in the compiled model.
+    """
+
+    kind: Kind
+    id: int
+
+
+@dataclass
+class AttributeStatement:
+    """Attribute values that a file should specify for one element.
+
+    Attributes:
+        element: the element.
+        values: values by MJCF attribute, in MuJoCo's units (angles in rad).
+        insisted: whether related attributes must be written as well, since the values alone had no
+            effect.
+    """
+
+    element: ModelElement
+    values: dict[str, Values] = field(default_factory=dict)
+    insisted: bool = False
+
+
+class MjcfAttribute(NamedTuple):
+    """An MJCF attribute.
+
+    Attributes:
+        name: name in the file.
+        spec: name in an MjSpec.
+        read: reads its values from the model fields and the addresses of an element.
+    """
+
+    name: str
+    spec: str
+    read: Callable[[Fields, Any], Any]
+
+
+def _of(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
+    return lambda fields, where: fields[name][0, getattr(where, address)]
+
+
+class FieldAddress(NamedTuple):
+    """Addresses of an element in the fields of a compiled model.
+
+    Attributes:
+        id: number of the element.
+        velocity: address of a joint's velocity (dof).
+        position: address of a joint's position.
+        control: address of an actuator's control.
+    """
+
+    id: int
+    velocity: int = 0
+    position: int = 0
+    control: int = 0
+
+
+def _polynomial(
+    first: str, others: str, address: str = "id"
+) -> Callable[[Fields, Any], list[float]]:
+    def read(fields: Fields, where: Any) -> list[float]:
+        at = getattr(where, address)
+        return [fields[first][0, at], *fields[others][0, at]]
+
+    return read
+
+
+ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
+    "joint": (
+        MjcfAttribute(
+            "damping", "damping", _polynomial("dof_damping", "dof_dampingpoly", "velocity")
+        ),
+        MjcfAttribute("frictionloss", "frictionloss", _of("dof_frictionloss", "velocity")),
+        MjcfAttribute("solreffriction", "solref_friction", _of("dof_solref", "velocity")),
+        MjcfAttribute("solimpfriction", "solimp_friction", _of("dof_solimp", "velocity")),
+        MjcfAttribute("stiffness", "stiffness", _polynomial("jnt_stiffness", "jnt_stiffnesspoly")),
+        MjcfAttribute("springref", "springref", _of("qpos_spring", "position")),
+        MjcfAttribute("armature", "armature", _of("dof_armature", "velocity")),
+    ),
+    "body": (
+        MjcfAttribute("pos", "ipos", _of("body_ipos")),
+        MjcfAttribute("quat", "iquat", _of("body_iquat")),
+        MjcfAttribute("mass", "mass", _of("body_mass")),
+        MjcfAttribute("diaginertia", "inertia", _of("body_inertia")),
+    ),
+    "weight": (MjcfAttribute("gravcomp", "gravcomp", _of("body_gravcomp")),),
+    "actuator": (
+        MjcfAttribute("dyntype", "dyntype", _of("actuator_dyntype")),
+        MjcfAttribute("dynprm", "dynprm", _of("actuator_dynprm")),
+        MjcfAttribute("gaintype", "gaintype", _of("actuator_gaintype")),
+        MjcfAttribute("gainprm", "gainprm", _of("actuator_gainprm")),
+        MjcfAttribute("biastype", "biastype", _of("actuator_biastype")),
+        MjcfAttribute("biasprm", "biasprm", _of("actuator_biasprm")),
+        MjcfAttribute("ctrllimited", "ctrllimited", _of("actuator_ctrllimited", "control")),
+        MjcfAttribute("ctrlrange", "ctrlrange", _of("actuator_ctrlrange", "control")),
+        MjcfAttribute("forcelimited", "forcelimited", _of("actuator_forcelimited")),
+        MjcfAttribute("forcerange", "forcerange", _of("actuator_forcerange")),
+        MjcfAttribute("delay", "delay", _of("actuator_delay")),
+        MjcfAttribute("nsample", "nsample", lambda f, where: f["actuator_history"][0, where.id, 0]),
+        MjcfAttribute("interp", "interp", lambda f, where: f["actuator_history"][0, where.id, 1]),
+    ),
+    "option": (
+        MjcfAttribute("timestep", "timestep", lambda f, _: f["opt.timestep"][0]),
+        MjcfAttribute("integrator", "integrator", lambda f, _: f["opt.integrator"][0]),
+        MjcfAttribute("gravity", "gravity", lambda f, _: f["opt.gravity"][0]),
+    ),
+    "compiler": (),
+}
+"""MJCF attributes by kind of element; those of an inertial belong to its body."""
+
+_NAMES = (
+    *("dof_damping", "dof_dampingpoly", "dof_frictionloss", "dof_solref", "dof_solimp"),
+    *("jnt_stiffness", "jnt_stiffnesspoly", "qpos_spring", "dof_armature"),
+    *("body_ipos", "body_iquat", "body_mass", "body_inertia", "body_gravcomp"),
+    *("actuator_dyntype", "actuator_dynprm", "actuator_gaintype", "actuator_gainprm"),
+    *("actuator_biastype", "actuator_biasprm", "actuator_ctrllimited", "actuator_ctrlrange"),
+    *("actuator_forcelimited", "actuator_forcerange", "actuator_delay", "actuator_history"),
+)
+
+FLAG_ATTRIBUTES = frozenset({"ctrllimited", "forcelimited"})
+INTEGER_ATTRIBUTES = frozenset({"nsample", "interp"})
+ENUM_ATTRIBUTES: Mapping[str, str] = {
+    "dyntype": "mjtDyn",
+    "gaintype": "mjtGain",
+    "biastype": "mjtBias",
+    "integrator": "mjtIntegrator",
+}
+"""Attributes whose values are words, and the MuJoCo enumerations of these words."""
+
+
+def copy_model_fields(model: Any) -> Fields:
+    """Copy the fields of a compiled model that store attributes."""
+    found = {name: np.array(getattr(model, name))[None] for name in _NAMES}
+    for name in ("timestep", "integrator", "gravity"):
+        found[f"opt.{name}"] = np.array(getattr(model.opt, name))[None]
+    return found
+
+
+def get_field_address(model: Any, element: ModelElement) -> FieldAddress:
+    """Return the addresses of an element in the fields of a compiled model."""
+    i = element.id
+    if element.kind == "joint":
+        return FieldAddress(i, int(model.jnt_dofadr[i]), int(model.jnt_qposadr[i]))
+    if element.kind == "actuator":
+        return FieldAddress(i, control=int(model.actuator_ctrladr[i]))
+    return FieldAddress(i)
+
+
+def list_elements(model: Any) -> list[ModelElement]:
+    """List the elements of a model whose attributes can be written.
+
+    They are joints with one coordinate, bodies, actuators with one control, and the options.
+    """
+    import mujoco
+
+    one = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    found = [ModelElement("joint", i) for i in range(model.njnt) if int(model.jnt_type[i]) in one]
+    found += [ModelElement("body", i) for i in range(1, model.nbody)]
+    found += [ModelElement("weight", i) for i in range(1, model.nbody)]
+    single = [i for i in range(len(model.actuator_ctrlnum)) if int(model.actuator_ctrlnum[i]) == 1]
+    found += [ModelElement("actuator", i) for i in single]
+    return [*found, ModelElement("option", 0)]
+
+
+def find_missing_statements(
+    model: Any, wanted: Fields, tolerance: float
+) -> list[AttributeStatement]:
+    """Find the attributes to write so that a compiled model gets the wanted fields.
+
+    Args:
+        model: compiled model of the present file.
+        wanted: wanted fields.
+        tolerance: relative difference that is ignored.
+
+    Returns:
+        One statement for each element with differences.
+    """
+    return find_differing_statements(model, copy_model_fields(model), wanted, tolerance)
+
+
+def find_differing_statements(
+    model: Any, found: Fields, wanted: Fields, tolerance: float
+) -> list[AttributeStatement]:
+    """Find the attributes in which two sets of model fields differ.
+
+    Args:
+        model: compiled model with the elements.
+        found: present fields.
+        wanted: wanted fields.
+        tolerance: relative difference that is ignored.
+
+    Returns:
+        One statement with the wanted values for each element with differences.
+    """
+    statements = []
+    for element in list_elements(model):
+        at = get_field_address(model, element)
+        values = {}
+        for attribute in ATTRIBUTES_BY_KIND[element.kind]:
+            is_now, should = attribute.read(found, at), attribute.read(wanted, at)
+            if not _same(is_now, should, tolerance):
+                values[attribute.name] = tuple(float(v) for v in np.atleast_1d(should))
+        if element.kind == "body" and values:
+            # An inertial must be written with all its attributes.
+            values = list_all_attributes(model, element, wanted)
+        if values:
+            statements.append(AttributeStatement(element, values))
+    return statements
+
+
+def list_all_attributes(model: Any, element: ModelElement, wanted: Fields) -> dict[str, Values]:
+    """Read the wanted values of all attributes of an element.
+
+    Args:
+        model: compiled model with the element.
+        element: the element.
+        wanted: wanted fields.
+    """
+    at = get_field_address(model, element)
+    return {
+        attribute.name: tuple(float(v) for v in np.atleast_1d(attribute.read(wanted, at)))
+        for attribute in ATTRIBUTES_BY_KIND[element.kind]
+    }
+
+
+def _same(one: Any, other: Any, tolerance: float) -> bool:
+    one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
+    if one.shape != other.shape:
+        return False
+    scale = np.maximum(np.abs(one), np.abs(other)).max(initial=0.0)
+    return bool((np.abs(one - other) <= tolerance * scale).all())
+
+
+def get_enum_word(name: str, value: float) -> str:
+    """Return the MJCF word for a value of an enumeration.
+
+    Args:
+        name: name of the attribute.
+        value: number of the enumeration.
+    """
+    import mujoco
+
+    if name == "interp":
+        return ("zoh", "linear", "cubic")[int(value)]
+    choice = getattr(mujoco, ENUM_ATTRIBUTES[name])(int(value))
+    text = str(choice.name).partition("_")[2].lower()
+    return {"rk4": "RK4", "euler": "Euler"}.get(text, text)

@@ -1,0 +1,177 @@
+"""An MJCF source document with its included files.
+
+It relates the elements of the source text to their numbers in the compiled model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sims.robot.export.mjcf_attributes import ModelElement
+from sims.robot.export.xml_editing import NotEditableError, XmlElement, XmlText
+
+_TWICE = ("replicate", "attach", "composite", "flexcomp", "model")
+"""Elements that generate several elements, or refer to those of another file."""
+
+FILE_ELEMENTS = ("mesh", "texture", "hfield", "skin")
+"""Elements that refer to a file."""
+
+_DIRECTORIES = ("assetdir", "meshdir", "texturedir")
+
+
+class MjcfDocument:
+    """An MJCF with all its included files.
+
+    Attributes:
+        main: text of the outer file.
+        root: root element of the outer file.
+
+    Raises:
+        UnfitError: a file is missing, or is not XML.
+    """
+
+    def __init__(self, text: bytes, path: Path) -> None:
+        self.path = path
+        self.main = XmlText(text, path)
+        self.root = self.main.root
+        self._included: dict[XmlElement, XmlText] = {}
+        self._include(self.root)
+
+    def _include(self, root: XmlElement) -> None:
+        for tag in root.walk():
+            name = tag.attributes.get("file")
+            if tag.name != "include" or not name:
+                continue
+            path = self.path.parent / name
+            try:
+                inner = XmlText(path.read_bytes(), path)
+            except OSError:
+                raise NotEditableError(f"{name} cannot be read") from None
+            self._included[tag] = inner
+            self._include(inner.root)
+
+    def children(self, tag: XmlElement) -> Iterator[XmlElement]:
+        """Yield the children of an element, including those from included files."""
+        for child in tag.children:
+            if child in self._included:
+                yield from self.children(self._included[child].root)
+            else:
+                yield child
+
+    def walk(self, tag: XmlElement | None = None) -> Iterator[XmlElement]:
+        """Yield all descendants of an element; of the root if None."""
+        for child in self.children(tag or self.root):
+            yield child
+            yield from self.walk(child)
+
+    def find_elements(self, *names: str) -> list[XmlElement]:
+        """Return all elements at a path of names from the root."""
+        found = [self.root]
+        for name in names:
+            found = [child for tag in found for child in self.children(tag) if child.name == name]
+        return found
+
+    def map_to_compiled_ids(self, model: Any) -> dict[ModelElement, XmlElement]:
+        """Map element numbers of the compiled model to the elements of the text.
+
+        Raises:
+            UnfitError: the compiled model has other elements than the text.
+        """
+        for tag in self.walk():
+            if tag.name in _TWICE:
+                raise NotEditableError(f"it has an element <{tag.name}>")
+        bodies: list[XmlElement] = []
+        joints: list[XmlElement] = []
+        for world in self.find_elements("worldbody"):
+            self._body(world, bodies, joints)
+        actuators = [
+            child for tag in self.find_elements("actuator") for child in self.children(tag)
+        ]
+        found = {ModelElement("body", i + 1): tag for i, tag in enumerate(bodies)}
+        found |= {ModelElement("joint", i): tag for i, tag in enumerate(joints)}
+        found |= {ModelElement("actuator", i): tag for i, tag in enumerate(actuators)}
+        _compare(found, model, (len(bodies) + 1, len(joints), len(actuators)))
+        return found
+
+    def _body(self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]) -> None:
+        """Collect bodies depth first, and the joints of each body before those of its children."""
+        below: list[XmlElement] = []
+        self._within(tag, below, joints)
+        for body in below:
+            bodies.append(body)
+            self._body(body, bodies, joints)
+
+    def _within(self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]) -> None:
+        for child in self.children(tag):
+            if child.name == "body":
+                bodies.append(child)
+            elif child.name in ("joint", "freejoint"):
+                joints.append(child)
+            elif child.name == "frame":
+                self._within(child, bodies, joints)
+
+    def make_paths_absolute(self, folder: Path) -> bool:
+        """Make asset folders absolute, so that the text can be loaded from anywhere.
+
+        Args:
+            folder: folder of the model file.
+
+        Returns:
+            Whether the text refers to any asset files.
+        """
+        named = any(
+            tag.name in FILE_ELEMENTS and any(key.startswith("file") for key in tag.attributes)
+            for tag in self.walk()
+        )
+        if named:
+            self._directories(folder)
+        return named
+
+    def _directories(self, folder: Path) -> None:
+        stated: dict[str, str] = {}
+        compilers = self.find_elements("compiler")
+        for compiler in compilers:
+            stated |= {
+                key: compiler.attributes[key] for key in _DIRECTORIES if key in compiler.attributes
+            }
+        both = stated.get("assetdir", "")
+        found = {key: str(folder / stated.get(key, both)) for key in ("meshdir", "texturedir")}
+        # The last compiler element takes precedence.
+        if compilers:
+            compilers[-1].new |= found
+        else:
+            said = " ".join(f'{key}="{value}"' for key, value in found.items())
+            self.root.within.append(([], f"<compiler {said}/>"))
+
+    def to_text(self) -> str:
+        """Return the text with all changes; changed files replace their include elements."""
+        self._settle(self.root)
+        return self.main.to_text().decode()
+
+    def _settle(self, root: XmlElement) -> None:
+        for tag in root.walk():
+            inner = self._included.get(tag)
+            if inner is None:
+                continue
+            self._settle(inner.root)
+            name = tag.attributes["file"]
+            if inner.root.has_changes:
+                tag.before = [f"from here: {name}, with changes"]
+                tag.text = inner.inner_text() + f"<!-- to here: {name} -->".encode()
+            else:
+                tag.new["file"] = str((self.path.parent / name).resolve())
+
+
+def _compare(
+    found: dict[ModelElement, XmlElement], model: Any, counts: tuple[int, int, int]
+) -> None:
+    """Raise an error if elements differ from those of the compiled model."""
+    wanted = (model.nbody, model.njnt, len(model.actuator_ctrlnum))
+    if counts != wanted:
+        raise NotEditableError("the compiled model has other elements")
+    for (kind, i), tag in found.items():
+        name = str(getattr(model, kind)(i).name)
+        if tag.attributes.get("name", "") != name:
+            raise NotEditableError(f"the compiled model has its elements in another order ({name})")

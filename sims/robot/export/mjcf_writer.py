@@ -1,0 +1,222 @@
+"""Write attributes and comments into an MJCF source document."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sims.robot.export.mjcf_attributes import (
+    ENUM_ATTRIBUTES,
+    FLAG_ATTRIBUTES,
+    INTEGER_ATTRIBUTES,
+    AttributeStatement,
+    Fields,
+    ModelElement,
+    Values,
+    copy_model_fields,
+    get_enum_word,
+    list_all_attributes,
+)
+from sims.robot.export.mjcf_document import MjcfDocument
+from sims.robot.export.xml_editing import XmlElement, format_number, format_numbers
+
+_ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
+"""Attributes that are alternatives to ``quat`` and ``diaginertia``."""
+
+SHORTCUT_ATTRIBUTES = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
+"""Attributes of MuJoCo's actuator shortcuts that ``general`` does not have."""
+
+_INPUTS = {"position": "pos", "velocity": "vel"}
+"""Values of the attribute ``input`` (MuJoCo 4.0 and later) that replace an actuator shortcut."""
+
+_SERVO = {"gainprm", "biasprm"}
+
+_LISTS = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
+
+
+class MjcfWriter:
+    """Writer of attribute statements into a document.
+
+    Args:
+        document: the MJCF.
+        model: model that the document compiles to.
+        wanted: fields of the model that it should compile to.
+
+    Attributes:
+        degrees: whether the document specifies angles in degrees.
+    """
+
+    def __init__(self, document: MjcfDocument, model: Any, wanted: Fields) -> None:
+        self.document, self.model, self.wanted = document, model, wanted
+        self.tags = document.map_to_compiled_ids(model)
+        self.degrees = True
+        for compiler in document.find_elements("compiler"):
+            self.degrees = compiler.attributes.get("angle", "degree") == "degree"
+
+    def write(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
+        """Write a statement about an element, with comments."""
+        element = statement.element
+        if element.kind == "option":
+            self._option(statement, comments)
+        elif element.kind == "weight":
+            body = self.tags[ModelElement("body", element.id)]
+            _say(body, comments)
+            body.new |= format_attributes(statement.values)
+        elif element.kind == "body":
+            if statement.values:
+                self._keep_masses()
+            self._inertial(self.tags[element], statement, comments)
+        else:
+            tag = self.tags[element]
+            _say(tag, comments)
+            values = self._joint(tag, statement)
+            if element.kind == "actuator":
+                values = self._actuator(tag, statement)
+            tag.new |= values
+
+    def _option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
+        options, values = self.document.find_elements("option"), format_attributes(statement.values)
+        if options:
+            _say(options[-1], comments)
+            options[-1].new |= values
+            return
+        if not values:
+            return
+        said = " ".join(f'{name}="{value}"' for name, value in values.items())
+        self.document.root.within.append((list(comments), f"<option {said}/>"))
+
+    def _keep_masses(self) -> None:
+        """Change compiler settings so that MuJoCo uses inertials as specified."""
+        for compiler in self.document.find_elements("compiler"):
+            if compiler.get_attribute("inertiafromgeom") == "true":
+                compiler.new["inertiafromgeom"] = "auto"
+            if float(compiler.get_attribute("settotalmass") or -1) > 0:
+                compiler.new["settotalmass"] = format_number(float(self.wanted["body_mass"].sum()))
+
+    def _inertial(
+        self, body: XmlElement, statement: AttributeStatement, comments: Sequence[str]
+    ) -> None:
+        values = format_attributes(statement.values)
+        for child in self.document.children(body):
+            if child.name == "inertial":
+                _say(child, comments)
+                if not values:
+                    return
+                before = self._before(statement.element)
+                changed = {
+                    name for name, stated in statement.values.items() if stated != before[name]
+                }
+                if statement.insisted:
+                    changed = set(values)
+                if "diaginertia" in changed:
+                    changed |= {"quat"}
+                    child.removed |= set(_ORIENTATIONS)
+                child.new |= {name: values[name] for name in values if name in changed}
+                return
+        if not values:
+            _say(body, comments)
+            return
+        said = " ".join(f'{name}="{value}"' for name, value in values.items())
+        body.within.append((list(comments), f"<inertial {said}/>"))
+
+    def _before(self, element: ModelElement) -> Mapping[str, Values]:
+        return list_all_attributes(self.model, element, copy_model_fields(self.model))
+
+    def _joint(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
+        values = format_attributes(statement.values)
+        hinge = tag.get_attribute("type") in (None, "hinge")
+        if "springref" in statement.values and hinge and self.degrees:
+            values["springref"] = format_numbers(
+                (float(np.rad2deg(statement.values["springref"][0])),)
+            )
+        if {"damping", "stiffness"} & set(values) and tag.get_attribute("springdamper"):
+            values["springdamper"] = "0 0"
+        return values
+
+    def _actuator(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
+        """Return the attributes of an actuator, as its shortcut if possible, else ``general``."""
+        changed = statement.values
+        before = {} if statement.insisted else self._before(statement.element)
+        own = _shortcut(
+            tag.name,
+            list_all_attributes(self.model, statement.element, self.wanted),
+            changed,
+            before,
+        )
+        if own is not None:
+            if "kv" in own:
+                tag.removed.add("dampratio")
+            return format_attributes({k: v for k, v in changed.items() if k not in _SERVO}) | own
+        if tag.name != "general":
+            tag.renamed = "general"
+            tag.removed |= set(SHORTCUT_ATTRIBUTES)
+            stated = list_all_attributes(self.model, statement.element, self.wanted)
+            changed = {k: v for k, v in stated.items() if k in changed or _needed(k, v)}
+            if tag.name in _INPUTS and hasattr(self.model, "actuator_ctrlspec"):
+                tag.new["input"] = _INPUTS[tag.name]
+        return format_attributes(changed)
+
+
+def _needed(name: str, values: tuple[float, ...]) -> bool:
+    """Return whether ``general`` must specify an attribute that a shortcut implies."""
+    if name in ("dyntype", "gaintype", "biastype", "gainprm", "biasprm"):
+        return True
+    return name in ("dynprm", "ctrllimited", "ctrlrange") and any(values)
+
+
+def _shortcut(
+    name: str,
+    stated: Mapping[str, Values],
+    changed: Mapping[str, Values],
+    before: Mapping[str, Values],
+) -> dict[str, str] | None:
+    """Return the gains of an actuator shortcut as attributes.
+
+    Args:
+        name: name of the shortcut, such as ``position``.
+        stated: all attribute values that the actuator should have.
+        changed: attribute values to write.
+        before: attribute values of the document; empty if all must be written.
+
+    Returns:
+        The attributes; None if the shortcut cannot express the values.
+    """
+    if set(changed) & {"dyntype", "dynprm", "gaintype", "biastype"}:
+        return None
+    if not set(changed) & _SERVO:
+        return {}
+    gain = stated["gainprm"][0]
+    offset, stiffness, damping = stated["biasprm"][:3]
+    if name == "position" and offset == 0 and stiffness == -gain:
+        gains = {} if before and gain == before["gainprm"][0] else {"kp": format_number(gain)}
+        if not before or damping != before["biasprm"][2]:
+            gains["kv"] = format_number(-damping)
+        return gains
+    if name == "velocity" and offset == stiffness == 0 and damping == -gain:
+        return {"kv": format_number(gain)}
+    return None
+
+
+def _say(tag: XmlElement, comments: Sequence[str]) -> None:
+    tag.before += [text for text in comments if text not in tag.before]
+
+
+def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
+    """Format values as text of attributes."""
+    return {name: _text(name, stated) for name, stated in values.items()}
+
+
+def _text(name: str, values: tuple[float, ...]) -> str:
+    if name in ENUM_ATTRIBUTES or name == "interp":
+        return get_enum_word(name, values[0])
+    if name in FLAG_ATTRIBUTES:
+        return "true" if values[0] else "false"
+    if name in INTEGER_ATTRIBUTES:
+        return str(int(values[0]))
+    if name in _LISTS:
+        # Trailing zeros are omitted, since numbers missing in a list are zero.
+        last = max((i for i, value in enumerate(values) if value), default=0)
+        return format_numbers(values[: last + 1])
+    return format_numbers(values)

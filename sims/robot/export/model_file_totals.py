@@ -1,0 +1,146 @@
+"""Values of model-file numbers that coefficients change, before and after the change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.core.system import Effect
+from sims.robot.export.mjcf_attributes import Fields, copy_model_fields
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.robot_model import RobotModel
+
+
+class Total(NamedTuple):
+    """A number of the model file before and after the effects are applied.
+
+    Attributes:
+        stated: value in the model file.
+        total: value with the coefficients applied.
+        unit: unit of both.
+    """
+
+    stated: float
+    total: float
+    unit: str
+
+
+Read = Callable[[Fields, RobotModel, str], Sequence[float]]
+"""Function that reads the numbers that an effect's coefficients change, in their order.
+
+It takes the model fields, the robot and the place.
+"""
+
+
+def _joint(field: str, *index: int) -> Read:
+    return lambda f, r, place: [f[field][(0, r.joint(place).velocity, *index)]]
+
+
+def _spring(field: str, *index: int) -> Read:
+    return lambda f, r, place: [f[field][(0, r.joint(place).id, *index)]]
+
+
+def _servo(term: int) -> Read:
+    return lambda f, r, place: [-f["actuator_biasprm"][0, r.actuator(place).id, term]]
+
+
+def _strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # noqa: ARG001
+    """Return the component of gravity along the direction that the file specifies."""
+    stated = robot.compiled.opt.gravity
+    return [float(f["opt.gravity"][0] @ stated / max(np.linalg.norm(stated), 1e-300))]
+
+
+def _limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
+    number = robot.actuator(place).id
+    limited = f["actuator_forcelimited"][0, number]
+    return [f["actuator_forcerange"][0, number, 1]] if limited else [np.inf]
+
+
+class Reading(NamedTuple):
+    """How a number is read from the model fields, and its unit.
+
+    Attributes:
+        read: function that reads the numbers.
+        hinge: unit at a hinge; the unit of the coefficient if empty.
+        slide: unit at a slide; the unit at a hinge if empty.
+    """
+
+    read: Read
+    hinge: str = ""
+    slide: str = ""
+
+
+_TOTALS: Mapping[str, Reading] = {
+    "drag.linear": Reading(_joint("dof_damping")),
+    "drag.quadratic": Reading(_joint("dof_dampingpoly", 0)),
+    "friction.coulomb": Reading(_joint("dof_frictionloss")),
+    "inertia.armature": Reading(_joint("dof_armature")),
+    "spring.linear": Reading(_spring("jnt_stiffness")),
+    "spring.cubic": Reading(_spring("jnt_stiffnesspoly", 1)),
+    "actuator.limit": Reading(_limit),
+    "actuator.stiffness": Reading(_servo(1), "N*m/rad", "N/m"),
+    "actuator.damping": Reading(_servo(2), "N*m*s/rad", "N*s/m"),
+    "mass.scale": Reading(lambda f, r, place: [f["body_mass"][0, r.body(place).id]], "kg"),
+    "mass.offset": Reading(lambda f, r, place: f["body_ipos"][0, r.body(place).id]),
+    # The largest of the three principal moments represents the tensor.
+    "inertia.scale": Reading(
+        lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
+    ),
+    "gravity.scale": Reading(_strength, "m/s^2"),
+    "gravity.tilt": Reading(lambda f, *_: f["opt.gravity"][0, :2], "m/s^2"),
+}
+
+
+Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
+"""Effects, each at one place or of the world, with their coefficients."""
+
+
+def totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
+    """Return the numbers of the model file before and after all effects are applied.
+
+    Several effects may change one number, such as the mass and the inertia of one body; a total
+    includes all of them.
+
+    Args:
+        robot: robot with the model file.
+        fitted: effects with their coefficients.
+
+    Returns:
+        For each effect, one entry per coefficient; None if the file has no such number.
+    """
+    stated, after = copy_model_fields(robot.compiled), copy_model_fields(robot.compiled)
+    for effect, values in fitted:
+        if _name(effect) in _TOTALS:
+            c = np.array(values, dtype=float)[:, None]
+            MODEL_FIELD_EFFECTS[_name(effect)].write(after, robot, effect.place, c)
+    return [_totals(robot, effect, len(values), stated, after) for effect, values in fitted]
+
+
+def _name(effect: type[Effect]) -> str:
+    return effect.of or effect.name
+
+
+def _totals(
+    robot: RobotModel, effect: type[Effect], count: int, stated: Fields, after: Fields
+) -> list[Total | None]:
+    """Return the totals of one effect."""
+    if _name(effect) not in _TOTALS:
+        return [None] * count
+    reading = _TOTALS[_name(effect)]
+    found: list[Total | None] = []
+    pairs = (np.array(reading.read(f, robot, effect.place), dtype=float) for f in (stated, after))
+    for c, before, total in zip(effect.coefficients, *pairs, strict=True):
+        unit = (reading.slide if _slides(robot, effect) else "") or reading.hinge or c.units[0]
+        known = np.isfinite([before, total]).all()
+        found.append(Total(float(before), float(total), unit or "1") if known else None)
+    return found
+
+
+def _slides(robot: RobotModel, effect: type[Effect]) -> bool:
+    """Return whether an effect acts at an actuator of a slide joint."""
+    if effect.at != "actuator":
+        return False
+    joint = robot.actuator(effect.place).joint
+    return joint is not None and robot.joint(joint).kind == "slide"

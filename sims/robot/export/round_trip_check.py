@@ -1,0 +1,157 @@
+"""Reload written model files, and compare their numbers and motion with the intended model."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.core.freed_memory import release_free_memory
+from sims.core.simulator import Array
+from sims.robot.export.apply_causes import apply_causes
+from sims.robot.export.model_comparison import find_first_difference
+from sims.robot.export.write_model_file import (
+    ROUNDING_TOLERANCE,
+    CauseCoefficients,
+    WrittenModelFiles,
+)
+from sims.robot.fitted_causes import expand_families
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.parsing.inertia_repair import MIN_MOMENT
+from sims.robot.robot_model import RobotModel
+
+MOTION_TOLERANCE = 1e-9
+"""Tolerance between the positions of two motions, in rad or m (absolute) and relative."""
+
+COMPARED_SECONDS = 1.0
+"""Duration of the compared motion, in seconds."""
+
+MAX_COMPARED_STEPS = 2000
+"""Maximum number of steps of the compared motion."""
+
+_OF_URDF = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
+"""Model fields that a URDF specifies, in addition to the inertia tensors."""
+
+
+def check_written_files(
+    robot: RobotModel, causes: CauseCoefficients, done: WrittenModelFiles
+) -> None:
+    """Reload each written file from a temporary folder, and compare it with the intended model.
+
+    Args:
+        robot: robot as read from its model file.
+        causes: causes that were written.
+        done: the written files.
+
+    Raises:
+        RuntimeError: a number or the motion differs; names the field. This is a program error.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        if done.xml is not None:
+            path = Path(folder) / "extended.xml"
+            path.write_bytes(done.xml.encode())
+            _check_mjcf(done, path)
+            release_free_memory()
+        if done.urdf is not None:
+            path = Path(folder) / "extended.urdf"
+            path.write_bytes(done.urdf.encode())
+            _check_urdf(robot, causes, path)
+
+
+def _check_mjcf(done: WrittenModelFiles, path: Path) -> None:
+    """Compare a written MJCF with the intended model."""
+    import mujoco
+
+    with capture_mujoco_warnings():
+        model = mujoco.MjModel.from_xml_path(str(path))
+    _compare(model, done.applied.model, path.name)
+
+
+def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
+    """Compare a written URDF with the model file with the causes that a URDF can contain."""
+    from sims.robot.export.urdf_writer import UrdfWriter
+    from sims.robot.parsing.read_model_file import read_robot
+
+    writer = UrdfWriter(robot, "")
+    held = {c.name: c.numbers for c in expand_families(robot, causes) if writer.write(c) is None}
+    wanted = apply_causes(read_robot(robot.path), held).model
+    release_free_memory()
+    found = read_robot(path).compiled
+    for name in _OF_URDF:
+        one, other = getattr(found, name), getattr(wanted, name)
+        if one.shape != other.shape or not np.allclose(
+            one, other, rtol=ROUNDING_TOLERANCE, atol=ROUNDING_TOLERANCE
+        ):
+            raise RuntimeError(f"extended.urdf is not as it was meant: {name}")
+    # The axes of two equal moments are arbitrary, so whole tensors are compared.
+    one, other = _tensors(found), _tensors(wanted)
+    if not np.allclose(
+        one,
+        other,
+        rtol=ROUNDING_TOLERANCE,
+        atol=max(MOTION_TOLERANCE * np.abs(other).max(), MIN_MOMENT),
+    ):
+        raise RuntimeError("extended.urdf is not as it was meant: body_inertia")
+    for model in (wanted, found):
+        # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
+        # elsewhere.
+        _without_contacts(model)
+        for name in ("dof_solref", "dof_solimp", "body_inertia", "body_iquat"):
+            getattr(model, name)[:] = getattr(found, name)
+    _compare_motion(found, wanted, "extended.urdf")
+
+
+def _tensors(model: Any) -> Array:
+    """Compute inertia tensors (N, 3, 3) about the centres of mass, in the axes of the bodies."""
+    import mujoco
+
+    turns = np.zeros((model.nbody, 9))
+    for turn, quat in zip(turns, model.body_iquat, strict=True):
+        mujoco.mju_quat2Mat(turn, quat)
+    axes = turns.reshape(-1, 3, 3)
+    result: Array = np.einsum("nij,nj,nkj->nik", axes, model.body_inertia, axes)
+    return result
+
+
+def _without_contacts(model: Any) -> None:
+    import mujoco
+
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+
+
+def _compare(found: Any, wanted: Any, name: str) -> None:
+    differs = find_first_difference(found, wanted, ROUNDING_TOLERANCE)
+    if differs:
+        raise RuntimeError(f"{name} is not as it was meant: {differs}")
+    _compare_motion(found, wanted, name)
+
+
+def _compare_motion(found: Any, wanted: Any, name: str) -> None:
+    one, other = simulate_test_motion(found), simulate_test_motion(wanted)
+    if not np.allclose(one, other, rtol=MOTION_TOLERANCE, atol=MOTION_TOLERANCE, equal_nan=True):
+        error = float(np.nanmax(np.abs(one - other)))
+        raise RuntimeError(f"{name} does not move as it was meant: qpos differs by {error:.2g}")
+
+
+def simulate_test_motion(model: Any) -> Array:
+    """Simulate a test motion (S, nq) from a displaced pose with nonzero controls."""
+    import mujoco
+    from mujoco import rollout
+
+    data = mujoco.MjData(model)
+    # All coordinates get different values, so that swapped coordinates are detected.
+    mujoco.mj_integratePos(model, data.qpos, 0.1 + 0.05 * np.sin(np.arange(model.nv)), 1.0)
+    low, high = model.actuator_ctrlrange.T
+    middle, half = (low + high) / 2.0, (high - low) / 2.0
+    limited = model.actuator_ctrllimited.astype(bool)
+    signs = 0.5 * np.cos(np.arange(model.nu))
+    control = np.where(limited, middle + half * signs, signs)
+    steps = min(int(COMPARED_SECONDS / model.opt.timestep), MAX_COMPARED_STEPS)
+    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    controls = np.tile(control, (1, steps, 1))
+    made, _ = rollout.rollout(model, data, state, controls)
+    result: Array = made[0, :, 1 : 1 + model.nq]
+    return result

@@ -1,0 +1,208 @@
+"""Write causes into a URDF, as far as its elements can express them, each with a comment.
+
+URDF specifies linear damping and dry friction of a joint, and the inertial of a link. A body that
+MuJoCo fused from several links on fixed joints is changed in each of them:
+
+* (1) Mass and inertia tensor of each link are multiplied by 1 + c; the mass, tensor and centre of
+  mass of the body follow.
+* (2) Each centre of mass is moved by R' c, with the link's axes R in the body frame; the body's
+  centre of mass moves by c.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.robot.export.xml_editing import (
+    XmlElement,
+    XmlText,
+    format_heading,
+    format_number,
+    format_numbers,
+)
+from sims.robot.fitted_causes import FittedCause
+from sims.robot.model_field_effects import add_to_stated, compute_factor
+from sims.robot.robot_model import RobotModel
+
+_TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+class UrdfWriter:
+    """Writer of causes into the text of a URDF.
+
+    Args:
+        robot: robot as read from its model file.
+        recording: title of the recording to which the causes were fitted.
+
+    Raises:
+        UnfitError: the file is not XML in UTF-8.
+    """
+
+    def __init__(self, robot: RobotModel, recording: str) -> None:
+        self.robot, self.recording = robot, recording
+        self.markup = XmlText(robot.path.read_bytes(), robot.path)
+        top = self.markup.root.children
+        self.links = {tag.get_attribute("name"): tag for tag in top if tag.name == "link"}
+        self.joints = {tag.get_attribute("name"): tag for tag in top if tag.name == "joint"}
+
+    def write(self, cause: FittedCause) -> str | None:
+        """Write a cause; return the reason if a URDF cannot express it, else None."""
+        known: Mapping[str, Callable[[FittedCause], str | None]] = {
+            "drag.linear": lambda cause: self._dynamics(cause, "damping"),
+            "friction.coulomb": lambda cause: self._dynamics(cause, "friction"),
+            "mass.scale": self._mass,
+            "inertia.scale": self._tensor,
+            "mass.offset": self._offset,
+        }
+        if cause.effect not in known:
+            return "URDF has no word for it"
+        return known[cause.effect](cause)
+
+    def to_text(self, said: list[str]) -> str:
+        """Return the file with all changes.
+
+        Args:
+            said: lines for the comment at the top of the file.
+        """
+        fitted = f", with what was found in {self.recording}" if self.recording else ""
+        comment = format_heading([f"{self.robot.path.name}{fitted}", *said])
+        self.markup.root.within.insert(0, ([comment], ""))
+        return self.markup.to_text().decode()
+
+    def _dynamics(self, cause: FittedCause, attribute: str) -> str | None:
+        joint = self.joints.get(cause.place)
+        if joint is None:
+            return "the file has no joint of this name"
+        stated = _child(joint, "dynamics")
+        before = float((stated.get_attribute(attribute) if stated else None) or 0.0)
+        value = format_number(float(add_to_stated(before, cause.coefficients[0])))
+        self._say(stated or joint, cause)
+        if stated:
+            stated.new[attribute] = value
+        else:
+            self._insert(joint, "dynamics", attribute, value)
+        return None
+
+    def _insert(self, joint: XmlElement, name: str, attribute: str, value: str) -> None:
+        """Insert a child element into a joint, or add an attribute to a child inserted before."""
+        begin = f"<{name} "
+        for i, (comments, element) in enumerate(joint.within):
+            if element.startswith(begin):
+                joint.within[i] = (
+                    comments,
+                    f'{begin}{attribute}="{value}" {element[len(begin) :]}',
+                )
+                return
+        joint.within.append(([], f'{begin}{attribute}="{value}"/>'))
+
+    def _say(self, tag: XmlElement, cause: FittedCause) -> None:
+        tag.before.append(cause.format(self.recording))
+
+    def _inertials(self, cause: FittedCause) -> list[tuple[str, XmlElement]] | None:
+        """Return the links of a body that have a mass, with their inertials.
+
+        A link without mass, such as a frame that carries others on fixed joints, adds nothing. The
+        result is None if the mass of a link follows from its shapes, or if no link has a mass.
+        """
+        body = self.robot.body(cause.place)
+        found = []
+        for name in (body.name, *body.aliases):
+            link = self.links.get(name)
+            inertial = _child(link, "inertial") if link else None
+            if inertial is not None:
+                found += [(name, inertial)] if _has_mass(inertial) else []
+            elif link is None or _child(link, "collision"):
+                return None
+        return found or None
+
+    def _mass(self, cause: FittedCause) -> str | None:
+        inertials = self._inertials(cause)
+        if inertials is None:
+            return "a link of the body states no inertial"
+        factor = float(compute_factor(cause.coefficients[0]))
+        for _, inertial in inertials:
+            self._say(inertial, cause)
+            _scale(inertial, "mass", ("value",), factor)  # (1)
+            _scale(inertial, "inertia", _TENSOR, factor)
+        return None
+
+    def _tensor(self, cause: FittedCause) -> str | None:
+        inertials = self._inertials(cause)
+        if inertials is None or len(inertials) > 1:
+            return "the body is not one link with an inertial"
+        ((_, inertial),) = inertials
+        self._say(inertial, cause)
+        _scale(inertial, "inertia", _TENSOR, float(compute_factor(cause.coefficients[0])))
+        return None
+
+    def _offset(self, cause: FittedCause) -> str | None:
+        inertials = self._inertials(cause)
+        if inertials is None:
+            return "a link of the body states no inertial"
+        body = self.robot.body(cause.place).name
+        for name, inertial in inertials:
+            self._say(inertial, cause)
+            moved = self._axes(name, body).T @ cause.coefficients  # (2)
+            origin = _child(inertial, "origin")
+            if origin is None:
+                inertial.within.append(
+                    ([], f'<origin xyz="{format_numbers(tuple(moved))}" rpy="0 0 0"/>')
+                )
+                continue
+            before = _vector(origin.get_attribute("xyz"))
+            origin.new["xyz"] = format_numbers(tuple(float(v) for v in before + moved))
+        return None
+
+    def _axes(self, link: str, body: str) -> Array:
+        """Return the axes (3, 3) of a link in the frame of the body into which it is fused."""
+        axes = np.eye(3)
+        while link != body:
+            (joint,) = [tag for tag in self.joints.values() if _names(tag, "child") == link]
+            origin = _child(joint, "origin")
+            axes = _turn(_vector(origin.get_attribute("rpy") if origin else None)) @ axes
+            link = _names(joint, "parent")
+        return axes
+
+
+def _child(tag: XmlElement, name: str) -> XmlElement | None:
+    return next((child for child in tag.children if child.name == name), None)
+
+
+def _names(joint: XmlElement, end: str) -> str:
+    """Return the link at one end of a joint."""
+    found = _child(joint, end)
+    return (found.get_attribute("link") or "") if found else ""
+
+
+def _has_mass(inertial: XmlElement) -> bool:
+    """Return whether an inertial specifies a nonzero mass or moment of inertia."""
+    stated = ((_child(inertial, "mass"), ("value",)), (_child(inertial, "inertia"), _TENSOR))
+    return any(float(tag.get_attribute(key) or 0.0) for tag, keys in stated if tag for key in keys)
+
+
+def _scale(inertial: XmlElement, name: str, attributes: tuple[str, ...], factor: float) -> None:
+    child = _child(inertial, name)
+    for attribute in attributes:
+        value = child.get_attribute(attribute) if child else None
+        if child and value is not None:
+            child.new[attribute] = format_number(float(value) * factor)
+
+
+def _vector(text: str | None) -> Array:
+    """Parse a vector (3,); zeros for a missing text."""
+    return np.array([float(word) for word in text.split()]) if text else np.zeros(3)
+
+
+def _turn(rpy: Array) -> Array:
+    """Return the axes (3, 3) rotated about fixed x, y and z in turn, as URDF defines ``rpy``."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )

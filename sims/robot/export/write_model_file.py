@@ -1,0 +1,269 @@
+"""Write the causes found by explain back into the robot's own model file.
+
+An MJCF keeps its author's text: only attributes change, each with a comment that states the reason.
+Where this is impossible (elements that generate several elements, a URDF), MuJoCo writes the model,
+with the same comments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from sims.core.freed_memory import release_free_memory
+from sims.extended_simulator import FittedValue
+from sims.robot.coupled_drives import find_preceding_joint
+from sims.robot.export.apply_causes import (
+    COULOMB,
+    KEPT_VALUE_NOTE,
+    MAX_CORRECTION_ROUNDS,
+    ModifiedModel,
+    apply_causes,
+)
+from sims.robot.export.apply_causes import (
+    ROUNDING_TOLERANCE as CLOSE,
+)
+from sims.robot.export.mjcf_attributes import AttributeStatement, find_missing_statements
+from sims.robot.export.mjcf_document import MjcfDocument
+from sims.robot.export.mjcf_writer import MjcfWriter
+from sims.robot.export.model_comparison import find_first_difference
+from sims.robot.export.urdf_writer import UrdfWriter
+from sims.robot.export.xml_editing import (
+    NotEditableError,
+    format_heading,
+    format_number,
+    format_numbers,
+)
+from sims.robot.fitted_causes import expand_families
+from sims.robot.model_field_effects import get_coupling_address
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
+
+CauseCoefficients = Mapping[str, Mapping[str, FittedValue]]
+"""Coefficients by ``effect@place``, ``effect@*`` or ``effect``."""
+
+ROUNDING_TOLERANCE = 1e-12
+"""Relative difference between numbers of a compiled model that counts as rounding."""
+
+_SOFT_IN_URDF = (
+    "friction.coulomb: a URDF cannot say that dry friction is stiff, and MuJoCo reads it in its "
+    "soft form; extended.xml holds the stiff form"
+)
+
+
+@dataclass(frozen=True)
+class WrittenModelFiles:
+    """Model files of a robot with causes applied.
+
+    Attributes:
+        xml: an MJCF that MuJoCo loads.
+        urdf: a URDF, if the robot was read from one.
+        notes: notes about causes that the files cannot express, and about the written ones.
+        applied: the model that `xml` describes.
+    """
+
+    xml: str | None
+    urdf: str | None
+    notes: tuple[str, ...]
+    applied: ModifiedModel = field(compare=False, repr=False)
+
+
+def write_model_files(
+    robot: RobotModel, causes: CauseCoefficients, recording: str = ""
+) -> WrittenModelFiles:
+    """Write causes into the robot's own model file.
+
+    Args:
+        robot: robot as read from its model file.
+        causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
+        recording: title of the recording, for comments.
+
+    Raises:
+        InputError: the robot has no place of that name.
+    """
+    applied = apply_causes(robot, causes, recording)
+    said = list(applied.notes)
+    try:
+        if robot.format != "mjcf":
+            raise NotEditableError("it is a URDF")
+        if robot.actuator_tables:
+            raise NotEditableError("its actuators are the recording's")
+        text = MjcfEditor(
+            applied.robot, applied, recording, render_with_series_joints(applied)
+        ).to_text()
+    except NotEditableError as unfit:
+        if robot.format == "mjcf":
+            said.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
+        text = MjcfEditor(applied.robot, applied, recording, applied.text.encode()).to_text()
+    urdf = _urdf(robot, causes, recording, said) if robot.format == "urdf" else None
+    return WrittenModelFiles(text, urdf, tuple(said), applied)
+
+
+def render_with_series_joints(applied: ModifiedModel) -> bytes:
+    """Render the model file with joints in series with its own, and tendons of coupled drives.
+
+    Args:
+        applied: model with the causes applied.
+
+    Raises:
+        UnfitError: the text does not contain a required joint or actuator.
+    """
+    robot = applied.robot
+    text = robot.path.read_bytes()
+    if not robot.series and not robot.coupled:
+        return text
+    document = MjcfDocument(text, robot.path)
+    if robot.coupled:
+        _couple(document, applied)
+    tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
+    for second in (joint for joint in robot.spec.joints if joint.name in robot.series):
+        first = tags.get(second.name.rpartition("_")[0])
+        if first is None:
+            raise NotEditableError(f"no joint of its text is in series with {second.name}")
+        first.after.append(_joint(second))
+    return document.to_text().encode()
+
+
+def _couple(document: MjcfDocument, applied: ModifiedModel) -> None:
+    """Add tendons, and let actuators drive them instead of their joints."""
+    robot, model = applied.robot, applied.model
+    tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
+    if len(tags) != len(robot.actuators):
+        raise NotEditableError("the compiled model has other actuators")
+    for name in robot.coupled:
+        first = find_preceding_joint(robot, name)
+        assert first is not None
+        known = {tag.attributes.get("name") for tag in document.walk() if tag.name == "joint"}
+        if not {name, first.name} <= known:
+            raise NotEditableError(f"no joint of its text is called {name} or {first.name}")
+        c = format_number(float(model.wrap_prm[get_coupling_address(robot, name)]))
+        joints = f'<joint joint="{name}" coef="1"/><joint joint="{first.name}" coef="{c}"/>'
+        tendon = f'<fixed name="{name}{COUPLING_TENDON_SUFFIX}">{joints}</fixed>'
+        document.root.within.append(([], f"<tendon>{tendon}</tendon>"))
+        for actuator in (a for a in robot.actuators if a.joint == name):
+            tags[actuator.id].removed |= {"joint", "jointinparent"}
+            tags[actuator.id].new["tendon"] = f"{name}{COUPLING_TENDON_SUFFIX}"
+
+
+def _joint(second: Any) -> str:
+    """Render a joint in series as an element that does not depend on the file's default classes."""
+    kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
+    plays = str(second.limited).endswith("TRUE")
+    attributes = {
+        "name": second.name,
+        "type": kind,
+        "axis": format_numbers(tuple(second.axis)),
+        "pos": format_numbers(tuple(second.pos)),
+        "limited": "true" if plays else "false",
+        "actuatorfrclimited": "false",
+    }
+    if plays:
+        attributes["range"] = format_numbers(tuple(second.range))
+        attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
+        attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
+    attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
+    said = " ".join(f'{name}="{value}"' for name, value in attributes.items())
+    return f"<joint {said}/>"
+
+
+def _urdf(
+    robot: RobotModel, causes: CauseCoefficients, recording: str, said: list[str]
+) -> str | None:
+    """Render the URDF with the causes that it can express, and add notes about all others."""
+    try:
+        writer = UrdfWriter(robot, recording)
+    except NotEditableError as unfit:
+        said.append(f"no URDF is written: {unfit}")
+        return None
+    lines = []
+    for cause in expand_families(robot, causes):
+        answer = writer.write(cause)
+        if answer:
+            lines.append(f"{cause.format(recording)}: not in the URDF: {answer}")
+        elif cause.effect == COULOMB and robot.friction_form == "stiff":
+            lines.append(_SOFT_IN_URDF)
+    lines = list(dict.fromkeys(lines))
+    said += lines
+    return writer.to_text(lines)
+
+
+class MjcfEditor:
+    """Writer of the wanted attributes into an MJCF text.
+
+    Args:
+        robot: robot with the text.
+        applied: model that the text should compile to.
+        recording: title of the recording.
+        text: text of the model file.
+    """
+
+    def __init__(
+        self, robot: RobotModel, applied: ModifiedModel, recording: str, text: bytes
+    ) -> None:
+        self.robot, self.applied, self.recording, self.text = robot, applied, recording, text
+        self.folder = robot.path.resolve().parent
+        self.original = compile_mjcf(self._document().to_text())
+
+    def _document(self) -> MjcfDocument:
+        """Parse the text, with asset folders that are valid from anywhere."""
+        document = MjcfDocument(self.text, self.robot.path)
+        document.make_paths_absolute(self.folder)
+        return document
+
+    def to_text(self) -> str:
+        """Return the text with all wanted attributes.
+
+        Raises:
+            UnfitError: the edited text does not compile to the wanted model.
+        """
+        # An element with comments needs a statement even if its numbers are in the text already.
+        statements = {element: AttributeStatement(element) for element in self.applied.comments}
+        model = self.original
+        for _ in range(MAX_CORRECTION_ROUNDS):
+            for statement in find_missing_statements(model, self.applied.target_values, CLOSE):
+                held = statements.setdefault(
+                    statement.element, AttributeStatement(statement.element)
+                )
+                # Attributes that were written without effect need their related attributes.
+                held.insisted = bool(held.values) or model is not self.original
+                held.values |= statement.values
+            text = self._written(list(statements.values()))
+            model = compile_mjcf(text)
+            if not find_missing_statements(model, self.applied.target_values, CLOSE):
+                break
+        differs = find_first_difference(model, self.applied.model, ROUNDING_TOLERANCE)
+        if differs:
+            raise NotEditableError(f"its attributes do not say all ({differs})")
+        return text
+
+    def _written(self, statements: Sequence[AttributeStatement]) -> str:
+        document = self._document()
+        writer = MjcfWriter(document, self.original, self.applied.target_values)
+        for statement in statements:
+            writer.write(statement, self.applied.comments.get(statement.element, [KEPT_VALUE_NOTE]))
+        document.root.within.insert(0, ([self._heading()], ""))
+        return document.to_text()
+
+    def _heading(self) -> str:
+        """Format the comment at the top: the origin of the file, and notes."""
+        fitted = f", with what was found in {self.recording}" if self.recording else ""
+        return format_heading([f"{self.robot.path.name}{fitted}", *self.applied.notes])
+
+
+def compile_mjcf(text: str) -> Any:
+    """Compile an MJCF text.
+
+    Raises:
+        UnfitError: MuJoCo rejects the text.
+    """
+    import mujoco
+
+    try:
+        with capture_mujoco_warnings():
+            model = mujoco.MjSpec.from_string(text).compile()
+    except ValueError as error:
+        raise NotEditableError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None
+    # The discarded spec held all meshes a second time.
+    release_free_memory()
+    return model

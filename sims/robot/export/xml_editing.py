@@ -1,0 +1,237 @@
+"""Edit XML text in place: attributes and comments change, and all other characters are kept."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+from xml.sax.saxutils import escape
+
+_ATTRIBUTE = re.compile(rb"(\s+)([\w:.-]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
+
+
+class NotEditableError(Exception):
+    """A text cannot be edited in this way; the message states the reason as a clause."""
+
+
+@dataclass(eq=False)
+class XmlElement:
+    """An XML element and the changes to make in it.
+
+    Attributes:
+        name: name of the element.
+        attributes: attributes as read.
+        begin: byte offset at which its start tag begins.
+        inside: byte offset at which its start tag ends.
+        end: byte offset at which its end tag begins; equal to `inside` if it has none.
+        children: child elements in the order of the text.
+        new: new attribute values.
+        removed: attributes to remove.
+        renamed: new name of the element.
+        before: comments to insert before it.
+        within: elements with comments to insert as its first children.
+        after: elements to insert after it.
+        text: text that replaces the element.
+    """
+
+    name: str
+    attributes: dict[str, str]
+    begin: int
+    inside: int = 0
+    end: int = 0
+    children: list[XmlElement] = field(default_factory=list)
+    new: dict[str, str] = field(default_factory=dict)
+    removed: set[str] = field(default_factory=set)
+    renamed: str = ""
+    before: list[str] = field(default_factory=list)
+    within: list[tuple[list[str], str]] = field(default_factory=list)
+    after: list[str] = field(default_factory=list)
+    text: bytes | None = None
+
+    @property
+    def has_changes(self) -> bool:
+        """Whether the element or any of its descendants has changes."""
+        own = self.new or self.removed or self.renamed or self.before or self.within
+        return bool(own or self.after) or any(child.has_changes for child in self.children)
+
+    def get_attribute(self, name: str) -> str | None:
+        """Return the value of an attribute, including changes; None if it is missing."""
+        if name in self.new:
+            return self.new[name]
+        return None if name in self.removed else self.attributes.get(name)
+
+    def walk(self) -> Iterator[XmlElement]:
+        """Yield the element and all its descendants, in the order of the text."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+
+class XmlText:
+    """An XML text with its elements.
+
+    Raises:
+        UnfitError: the text is not XML in UTF-8, or has a document type.
+    """
+
+    def __init__(self, text: bytes, path: Path) -> None:
+        self.text, self.path = text, path
+        self._open: list[XmlElement] = []
+        self._top: XmlElement | None = None
+        self._parser = expat.ParserCreate("utf-8")
+        self._parser.StartElementHandler = self._begin
+        self._parser.EndElementHandler = self._end
+        self._parser.StartDoctypeDeclHandler = self._refuse
+        try:
+            self._parser.Parse(text, True)
+        except expat.ExpatError as error:
+            raise NotEditableError(f"{path.name} is no XML in UTF-8 ({error})") from None
+        # Inserted lines end like those of the file.
+        self._newline = b"\r\n" if b"\r\n" in text else b"\n"
+
+    @property
+    def root(self) -> XmlElement:
+        """Root element."""
+        assert self._top is not None, "well-formed XML has one"
+        return self._top
+
+    def _refuse(self, *what: object) -> None:  # noqa: ARG002
+        raise NotEditableError(f"{self.path.name} has a document type")
+
+    def _begin(self, name: str, attributes: dict[str, str]) -> None:
+        tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
+        tag.inside = tag.end = self._end_of(tag.begin)
+        if self._open:
+            self._open[-1].children.append(tag)
+        else:
+            self._top = tag
+        self._open.append(tag)
+
+    def _end(self, name: str) -> None:  # noqa: ARG002
+        tag = self._open.pop()
+        if not self._closed(tag):
+            tag.end = self._parser.CurrentByteIndex
+
+    def _closed(self, tag: XmlElement) -> bool:
+        """Return whether an element has a self-closing tag."""
+        return self.text[tag.inside - 2 : tag.inside] == b"/>"
+
+    def _end_of(self, begin: int) -> int:
+        """Return the offset after a start tag, at the first ``>`` outside of quotes."""
+        quote = b""
+        for i in range(begin, len(self.text)):
+            one = self.text[i : i + 1]
+            if quote:
+                quote = b"" if one == quote else quote
+            elif one in (b'"', b"'"):
+                quote = one
+            elif one == b">":
+                return i + 1
+        raise NotEditableError(f"{self.path.name} ends within a tag")
+
+    def inner_text(self) -> bytes:
+        """Return the content of the root element, with all changes."""
+        return self._written(self.root.inside, self.root.end, self.root.children)
+
+    def to_text(self) -> bytes:
+        """Return the text with all changes."""
+        return self._written(0, len(self.text), [self.root])
+
+    def _written(self, begin: int, end: int, tags: list[XmlElement]) -> bytes:
+        parts, at = [], begin
+        for tag in tags:
+            if tag.has_changes or tag.text is not None:
+                parts += [self.text[at : tag.begin], self._tag(tag)]
+                at = self._after(tag)
+        return b"".join([*parts, self.text[at:end]])
+
+    def _after(self, tag: XmlElement) -> int:
+        return tag.inside if self._closed(tag) else self._end_of(tag.end)
+
+    def _tag(self, tag: XmlElement) -> bytes:
+        """Return the text of an element with its changes."""
+        indent = self._indent(tag.begin)
+        comments = [self._comment(text) + self._newline + indent for text in tag.before]
+        if tag.text is not None:
+            return b"".join([*comments, tag.text])
+        if self._closed(tag) and tag.within:
+            raise NotEditableError(f"{tag.name} has nothing in it")
+        closing = self.text[tag.end : self._after(tag)] if not self._closed(tag) else b""
+        if tag.renamed:
+            closing = closing.replace(tag.name.encode(), tag.renamed.encode(), 1)
+        inside = self._written(tag.inside, tag.end, tag.children)
+        behind = [self._newline + indent + element.encode() for element in tag.after]
+        whole = [self._start(tag), self._first(tag, indent), inside, closing]
+        return b"".join([*comments, *whole, *behind])
+
+    def _first(self, tag: XmlElement, indent: bytes) -> bytes:
+        """Return the text of the elements inserted before all children."""
+        below = self._indent(tag.children[0].begin) if tag.children else indent + b"  "
+        parts = []
+        for comments, element in tag.within:
+            for line in [*map(self._comment, comments), *([element.encode()] if element else [])]:
+                parts += [self._newline + below, line]
+        return b"".join(parts)
+
+    def _start(self, tag: XmlElement) -> bytes:
+        """Return the changed start tag; unchanged attributes keep their spaces and quotes."""
+        text = self.text[tag.begin : tag.inside]
+        at = 1 + len(tag.name.encode())
+        parts = [b"<", (tag.renamed or tag.name).encode()]
+        written = set()
+        while found := _ATTRIBUTE.match(text, at):
+            name = found[2].decode()
+            if name in tag.new:
+                parts.append(found[1] + _attribute(name, tag.new[name]))
+                written.add(name)
+            elif name not in tag.removed:
+                parts.append(found[0])
+            at = found.end()
+        parts += [
+            b" " + _attribute(name, value) for name, value in tag.new.items() if name not in written
+        ]
+        return b"".join([*parts, text[at:]])
+
+    def _comment(self, text: str) -> bytes:
+        # Two hyphens would end a comment early, and so would a hyphen at its end.
+        safe = re.sub(r"-(?=-)", "- ", text)
+        return f"<!-- {safe} -->".encode().replace(b"\n", self._newline)
+
+    def _indent(self, begin: int) -> bytes:
+        """Return the indentation of an element; empty if other text precedes it on its line."""
+        line = self.text[self.text.rfind(b"\n", 0, begin) + 1 : begin]
+        return line if not line.strip() else b""
+
+
+def _attribute(name: str, value: str) -> bytes:
+    return f'{name}="{escape(value, {chr(34): "&quot;"})}"'.encode()
+
+
+def format_heading(lines: list[str]) -> str:
+    """Format the comment at the top of a written file.
+
+    Args:
+        lines: description of the file, followed by notes.
+    """
+    first, *more = lines
+    return "\n     ".join([f"{first}; written by simgap", *more])
+
+
+def strip_heading(text: str) -> str:
+    """Remove the comment at the top of a written file."""
+    return re.sub(
+        r"<!-- (?:(?!-->).)*?; written by simgap.*?-->", "", text, count=1, flags=re.DOTALL
+    )
+
+
+def format_number(value: float) -> str:
+    """Format a number with the fewest digits that are read back as the same number."""
+    text = repr(float(value))
+    return text[:-2] if text.endswith(".0") else text
+
+
+def format_numbers(values: tuple[float, ...]) -> str:
+    """Format numbers as a list of MJCF or URDF."""
+    return " ".join(format_number(value) for value in values)

@@ -1,0 +1,143 @@
+"""Fitted causes, with effect families resolved to single places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.extended_simulator import FittedValue
+
+if TYPE_CHECKING:
+    from sims.robot.robot_model import RobotModel
+
+ALL_PLACES = "*"
+"""Place of an effect family, which acts at all places of its kind."""
+
+_AXES: Mapping[str, tuple[str, ...]] = {
+    "mass.offset": ("x", "y", "z"),
+    "gravity.tilt": ("x", "y"),
+}
+"""Names of the coefficients of effects with several coefficients, in their order."""
+
+
+COMPENSATED = 0.02
+"""Largest remaining share of gravity at which a robot counts as gravity-compensated."""
+
+GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller carries its weight"
+"""Text for a gravity correction that removes gravity completely."""
+
+
+def is_gravity_compensated(effect: str, numbers: Mapping[str, FittedValue]) -> bool:
+    """Return whether a correction of gravity removes gravity completely.
+
+    The real robot, or its controller, then carries its own weight.
+
+    Args:
+        effect: name of the effect.
+        numbers: fitted numbers by coefficient.
+    """
+    return effect == "gravity.scale" and any(
+        abs(1.0 + number.value) < COMPENSATED for number in numbers.values()
+    )
+
+
+@dataclass(frozen=True)
+class FittedCause:
+    """An effect at one place, with its fitted numbers.
+
+    Attributes:
+        effect: name of the effect, without the place.
+        place: a joint, an actuator, a body or a channel; empty for an effect of the world.
+        numbers: fitted numbers by coefficient; the keys contain no place.
+    """
+
+    effect: str
+    place: str
+    numbers: Mapping[str, FittedValue]
+
+    @property
+    def name(self) -> str:
+        """Name with place, such as ``friction.coulomb@elbow``."""
+        return f"{self.effect}@{self.place}" if self.place else self.effect
+
+    @property
+    def coefficients(self) -> Array:
+        """Coefficients (K,) in the order of the effect; unspecified ones are zero."""
+        axes = _AXES.get(self.effect)
+        if axes is None:
+            return np.array([number.value for number in self.numbers.values()])
+        zero = FittedValue(0.0, "1", None, None)
+        return np.array([self.numbers.get(axis, zero).value for axis in axes])
+
+    def format(self, recording: str) -> str:
+        """Format as ``friction.coulomb@elbow: 0.3 N*m (95 %: 0.28 to 0.32), fitted to log.csv``."""
+        several = len(self.numbers) > 1
+        numbers = [
+            (f"{name} " if several else "") + _told(number) for name, number in self.numbers.items()
+        ]
+        fitted = f", fitted to {recording}" if recording else ""
+        return f"{self.name}: {', '.join(numbers)}{fitted}"
+
+
+def _told(number: FittedValue) -> str:
+    """Format as ``-0.05 N*m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N*m``.
+
+    The last part is the number in the model file before and after.
+    """
+    text = f"{number.value:.4g}{_unit(number.unit)}"
+    if number.low is not None and number.high is not None:
+        text += f" (95 %: {number.low:.4g} to {number.high:.4g})"
+    if number.stated is not None and number.total is not None:
+        unit = _unit(number.total_unit or number.unit)
+        text += f", from {number.stated:.4g} to {number.total:.4g}{unit}"
+    return text
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"
+
+
+def expand_families(
+    robot: RobotModel, causes: Mapping[str, Mapping[str, FittedValue]]
+) -> list[FittedCause]:
+    """Expand effect families to causes at one place each.
+
+    Args:
+        robot: robot whose places a family has if its coefficients name no places.
+        causes: coefficients by ``effect@place``. Those of a family have keys ``coefficient@PLACE``,
+            or keys without a place if they hold for all places.
+    """
+    found = []
+    for name, numbers in causes.items():
+        effect, _, place = name.partition("@")
+        if place == ALL_PLACES:
+            found += _members(robot, effect, numbers)
+        else:
+            found.append(FittedCause(effect, place, dict(numbers)))
+    return found
+
+
+def _members(
+    robot: RobotModel, effect: str, numbers: Mapping[str, FittedValue]
+) -> list[FittedCause]:
+    """Return the causes of one effect family."""
+    by_place: dict[str, dict[str, FittedValue]] = {}
+    for key, number in numbers.items():
+        coefficient, _, place = key.partition("@")
+        places = [place] if place else _places(robot, effect)
+        for one in places:
+            by_place.setdefault(one, {})[coefficient] = number
+    return [FittedCause(effect, place, own) for place, own in by_place.items()]
+
+
+def _places(robot: RobotModel, effect: str) -> list[str]:
+    """List the places of an effect family that has one number for all places."""
+    if effect.startswith("input."):
+        return [actuator.name for actuator in robot.actuators if actuator.joint is not None]
+    if effect.startswith("sensor."):
+        return [ALL_PLACES]
+    return [joint.name for joint in robot.joints]

@@ -1,0 +1,203 @@
+"""Free and ball joints: their initial states and small displacements.
+
+No channel observes one of their coordinates, so none of them is estimated. Each run begins with the
+values that the recording specifies, else with those of the model file. A pose is a position (free
+joints only) and a unit quaternion (w, x, y, z). A small displacement d of it has three numbers for
+each,
+
+    position + d_p,   q exp(d_r / 2),                                                          (1)
+
+along the world's axes for the position, and along the body's axes for the rotation. This is
+MuJoCo's convention for velocities (MuJoCo, *Computation*, "Floating objects"; J. Solà,
+arXiv:1711.02508, eqs. (101) and (190)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array, InputError
+from sims.robot.robot_model import Joint, RobotModel
+
+Places = NDArray[np.intp]
+AXES, TURN, SPIN = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("wx", "wy", "wz")
+MIN_QUATERNION_NORM = 1e-6
+"""Minimum length of a valid quaternion, and of a rotation vector that is not treated as zero."""
+
+
+class FloatingJoint(NamedTuple):
+    """Layout of the numbers of one floating joint.
+
+    Attributes:
+        axes: axes of translation; empty for a ball joint.
+        turn: slice of the quaternion within a pose.
+        first: index of the first number of its displacement.
+    """
+
+    axes: tuple[str, ...]
+    turn: slice
+    first: int
+
+
+class FloatingState(NamedTuple):
+    """Poses (..., P) and velocities (..., F) of all floating joints."""
+
+    pose: Array
+    rate: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FloatingJoints:
+    """The floating joints of a model.
+
+    Attributes:
+        joints: free and ball joints.
+        positions: (P,) addresses in qpos.
+        velocities: (F,) addresses in qvel.
+    """
+
+    joints: tuple[Joint, ...]
+    positions: Places
+    velocities: Places
+
+    @classmethod
+    def from_robot(cls, robot: RobotModel) -> FloatingJoints:
+        """Return the floating joints of a robot."""
+        joints = tuple(joint for joint in robot.joints if not joint.has_one_coordinate)
+        positions = [j.position + k for j in joints for k in range(len(_axes(j) + TURN))]
+        velocities = [j.velocity + k for j in joints for k in range(len(_axes(j) + SPIN))]
+        return cls(joints, np.array(positions, np.intp), np.array(velocities, np.intp))
+
+    def __bool__(self) -> bool:
+        return bool(self.joints)
+
+    def names(self) -> tuple[list[str], list[str]]:
+        """Return the names of positions and velocities, such as ``q.base.qw``, ``qd.base.wx``."""
+        axes = [(joint.name, _axes(joint)) for joint in self.joints]
+        positions = [f"q.{name}.{axis}" for name, own in axes for axis in own + TURN]
+        velocities = [f"qd.{name}.{axis}" for name, own in axes for axis in own + SPIN]
+        return positions, velocities
+
+    def units(self) -> dict[str, str]:
+        """Return the units of positions and velocities by name.
+
+        Positions are in m and velocities in m/s along the world's axes; quaternions have the unit
+        1, and angular velocities rad/s.
+        """
+        units: dict[str, str] = {}
+        for joint in self.joints:
+            units |= {f"q.{joint.name}.{axis}": "m" for axis in _axes(joint)}
+            units |= {f"q.{joint.name}.{axis}": "1" for axis in TURN}
+            units |= {f"qd.{joint.name}.{axis}": "m/s" for axis in _axes(joint)}
+            units |= {f"qd.{joint.name}.{axis}": "rad/s" for axis in SPIN}
+        return units
+
+    def states(self, model: Any) -> dict[str, float]:
+        """Return the default states of the model file, by name."""
+        positions, velocities = self.names()
+        poses = model.qpos0[self.positions].tolist()
+        return dict(zip(positions, poses, strict=True)) | dict.fromkeys(velocities, 0.0)
+
+    def get_initial_state(self, states: Mapping[str, float]) -> FloatingState:
+        """Return the initial state of a run, (P,) and (F,), from known states by name.
+
+        Raises:
+            InputError: a quaternion is zero.
+        """
+        positions, velocities = self.names()
+        pose = np.array([states[name] for name in positions], dtype=float)
+        rate = np.array([states[name] for name in velocities], dtype=float)
+        for joint, (_, turn, _) in zip(self.joints, self._own, strict=True):
+            length = float(np.linalg.norm(pose[turn]))
+            if length < MIN_QUATERNION_NORM:
+                given = ", ".join(f"q.{joint.name}.{axis}" for axis in TURN)
+                raise InputError(f"initial states {given}: expected a quaternion, found zeros")
+            pose[turn] /= length
+        return FloatingState(pose, rate)
+
+    def displace(self, pose: Array, number: int, by: float) -> Array:
+        """Displace poses along one degree of freedom, by (1).
+
+        Args:
+            pose: (n, P) poses.
+            number: index of the degree of freedom, below F.
+            by: displacement in m or rad.
+
+        Returns:
+            The displaced poses (n, P).
+        """
+        result = pose.copy()
+        for axes, turn, first in self._own:
+            # A free joint has its position before its quaternion.
+            own = number - first - len(axes)
+            if -len(axes) <= own < 0:
+                result[:, turn.start + own] += by
+            elif 0 <= own < len(SPIN):
+                small = np.zeros(len(TURN))
+                small[0], small[1 + own] = np.cos(0.5 * by), np.sin(0.5 * by)
+                result[:, turn] = _product(pose[:, turn], small[None])
+        return result
+
+    def displaced(self, pose: Array, moves: Array) -> Array:
+        """Return poses (n, P) after small displacements (n, F), by (1)."""
+        result = pose.copy()
+        for axes, turn, first in self._own:
+            place = slice(turn.start - len(axes), turn.start)
+            result[:, place] += moves[:, first : first + len(axes)]
+            rotation = moves[:, first + len(axes) : first + len(axes) + len(SPIN)]
+            angle = np.linalg.norm(rotation, axis=1, keepdims=True)
+            # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
+            half = 0.5 * np.sinc(angle / (2.0 * np.pi))
+            small = np.concatenate([np.cos(0.5 * angle), half * rotation], axis=1)
+            result[:, turn] = _product(pose[:, turn], small)
+        return result
+
+    def compute_displacement(self, pose: Array, reference: Array) -> Array:
+        """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P)."""
+        parts = []
+        for axes, turn, _ in self._own:
+            place = slice(turn.start - len(axes), turn.start)
+            parts.append(pose[:, place] - reference[:, place])
+            back = reference[:, turn] * np.array([1.0, -1.0, -1.0, -1.0])
+            parts.append(_logarithm(_product(back, pose[:, turn])))
+        return np.concatenate(parts, axis=1) if parts else np.zeros((len(pose), 0))
+
+    @cached_property
+    def _own(self) -> tuple[FloatingJoint, ...]:
+        """Layout of each joint's numbers."""
+        own, end, first = [], 0, 0
+        for axes in map(_axes, self.joints):
+            end += len(axes + TURN)
+            own.append(FloatingJoint(axes, slice(end - len(TURN), end), first))
+            first += len(axes + SPIN)
+        return tuple(own)
+
+
+def _axes(joint: Joint) -> tuple[str, ...]:
+    """Return the axes of translation of a floating joint."""
+    return AXES if joint.kind == "free" else ()
+
+
+def _product(one: Array, other: Array) -> Array:
+    """Compute Hamilton products (n, 4) of quaternions."""
+    a, u = one[:, :1], one[:, 1:]
+    b, v = other[:, :1], other[:, 1:]
+    real = a * b - np.sum(u * v, axis=1, keepdims=True)
+    return np.concatenate([real, a * v + b * u + np.cross(u, v)], axis=1)
+
+
+def _logarithm(turn: Array) -> Array:
+    """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi."""
+    sign = np.where(turn[:, :1] < 0, -1.0, 1.0)
+    real, vector = sign * turn[:, :1], sign * turn[:, 1:]
+    length = np.linalg.norm(vector, axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(length, real)
+    small = length < MIN_QUATERNION_NORM
+    scale = np.where(small, 2.0, angle / np.where(small, 1.0, length))
+    return vector * scale

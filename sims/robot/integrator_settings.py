@@ -1,0 +1,56 @@
+"""Time step and integrator with which MuJoCo simulates a robot."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sims.core.system import IntegrationBatch, System, Trajectories
+from sims.robot.robot_model import RobotModel
+
+INTEGRATOR_IDS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
+"""Numbers of MuJoCo's integrators (mjtIntegrator), by their names in a model file."""
+
+
+class IntegratorSettings(NamedTuple):
+    """Integrator settings of MuJoCo.
+
+    Attributes:
+        timestep: time step in seconds.
+        integrator: name of the integrator, a key of `INTEGRATOR_IDS`.
+    """
+
+    timestep: float
+    integrator: str
+
+    def to_model_options(self) -> dict[str, float]:
+        """Return the settings as fields of a model's options (`mujoco.MjOption`)."""
+        return {"timestep": self.timestep, "integrator": INTEGRATOR_IDS[self.integrator]}
+
+
+class RobotEngine:
+    """MuJoCo at the time step of the model; `RobotSimulator` does the simulation."""
+
+    name = "mujoco"
+    requires: tuple[str, ...] = ("mujoco",)
+
+    def __init__(self, numerics: IntegratorSettings) -> None:
+        self.numerics = numerics
+        self.largest_step = numerics.timestep
+
+    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+        """Raise an error: robots are simulated by `RobotSimulator`, not through this interface."""
+        raise NotImplementedError
+
+    def find_unsupported_reason(self, system: type[System]) -> str:
+        """Return why this engine cannot simulate a system; empty if it can."""
+        return "" if system.has_model else "it has no model file"
+
+    def close(self) -> None:
+        """Do nothing, since the engine holds no resources."""
+
+
+def read_integrator_settings(robot: RobotModel) -> IntegratorSettings:
+    """Return the integrator settings that the robot's model file specifies."""
+    option = robot.compiled.opt
+    names = {number: name for name, number in INTEGRATOR_IDS.items()}
+    return IntegratorSettings(float(option.timestep), names[int(option.integrator)])

@@ -1,0 +1,297 @@
+"""Effects that are written into fields of the compiled MuJoCo model of a batch.
+
+With the coefficient c, and the value that the model file specifies at a joint, an actuator or a
+body:
+
+* (1) Added: value + c, at least zero: damping, dry friction, stiffness, armature.
+* (2) Scaled: value times 1 + c, with 1 + c at least `MIN_FACTOR`.
+* (3) Moved: the centre of mass is moved by c (3 numbers, m) in the body frame.
+* (4) Tilted: gravity plus g c_x along x and g c_y along y, with the magnitude g of the file's
+  gravity.
+* (5) Limited: the file's range restricted to [-c, c]; a limit of zero has no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
+
+FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Parameter `solimp` of stiff dry friction: the hardest value that MuJoCo allows.
+
+With it a joint at rest hardly creeps.
+"""
+SOLREF_PLACEHOLDER_STIFFNESS = -1e-9
+"""Placeholder for the stiffness in `solref` of dry friction, which has no stiffness.
+
+The negative value makes MuJoCo read the second number as a damping.
+"""
+RK4_INTEGRATOR_ID = 1
+"""MuJoCo's number of the Runge-Kutta 4 integrator."""
+
+MIN_FACTOR = 1e-6
+"""Minimum factor of a mass or a gain, so that none becomes zero or negative."""
+
+Fields = Mapping[str, Any]
+"""Model fields of L batch elements by name, arrays (L, ...)."""
+
+FieldWriter = Callable[[Fields, RobotModel, str, Array], None]
+"""Function that changes fields in place, from robot, place and coefficients (K, L)."""
+
+
+@dataclass(frozen=True)
+class ModelFieldEffect:
+    """An effect that is written into fields of the model.
+
+    Attributes:
+        fields: names of the fields, as in ``mujoco.batch.Batch.expand``.
+        write: changes the fields, which contain the values of the file or the result of another
+            effect.
+        changes_derived_constants: whether MuJoCo derives constants from the fields, so that
+            ``set_const`` must be called; this requires a model of `compile_batch_model`.
+    """
+
+    fields: tuple[str, ...]
+    write: FieldWriter
+    changes_derived_constants: bool = False
+
+
+def compile_batch_model(robot: RobotModel) -> Any:
+    """Compile the model such that masses and centres of mass can differ between batch elements.
+
+    MuJoCo stores less for a body that turns about its centre of mass, and then rejects changes of
+    its centre of mass. Here it stores everything. The motion is the same.
+    """
+    return robot.compile(make_batch_spec(robot))
+
+
+def make_batch_spec(robot: RobotModel) -> Any:
+    """Make the mujoco.MjSpec of `compile_batch_model`."""
+    spec = robot.spec.copy()
+    for body in spec.bodies:
+        body.simple = False
+    return spec
+
+
+def get_friction_solref(timestep: float, integrator: int) -> tuple[float, float]:
+    """Return `solref` of stiff dry friction, which stops a velocity within one step.
+
+    Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators stops
+    the velocity completely with b = 1 / h, and overshoots beyond it. The four evaluations of RK4
+    tolerate b = 2.5 / h, and 3 / h chatters. MuJoCo's default time constant, 0.02 s, creeps at
+    rest.
+
+    Args:
+        timestep: time step h in seconds.
+        integrator: MuJoCo's number of the integrator.
+    """
+    return (
+        (SOLREF_PLACEHOLDER_STIFFNESS, -2.5 / timestep)
+        if integrator == RK4_INTEGRATOR_ID
+        else (2.0 * timestep, 1.0)
+    )
+
+
+def get_friction_solref_of_batch(fields: Fields, robot: RobotModel) -> tuple[float, float]:
+    """Return `solref` of stiff dry friction for a batch.
+
+    Time step and integrator are taken from the fields if they contain them, else from the file.
+
+    Args:
+        fields: model fields of the batch elements.
+        robot: robot with the model file.
+    """
+    option = robot.compiled.opt
+    step = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
+    kind = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
+    return get_friction_solref(float(step), int(kind))
+
+
+def write_friction_form(fields: Fields, robot: RobotModel, lanes: Any, dofs: Any) -> None:
+    """Set the solver parameters of dry friction that effects add, in the form of the robot.
+
+    Args:
+        fields: model fields of the batch elements, changed in place.
+        robot: its `friction_form` decides; ``soft`` keeps the parameters of the file.
+        lanes: index of the batch elements.
+        dofs: index of the joints' velocities.
+    """
+    if robot.friction_form == "soft":
+        return
+    fields["dof_solref"][lanes, dofs] = get_friction_solref_of_batch(fields, robot)
+    fields["dof_solimp"][lanes, dofs] = FRICTION_SOLIMP
+
+
+def add_to_stated(stated: Any, c: Any) -> Any:
+    """Add a coefficient to a value by (1); a negative value in the file may remain."""
+    return np.maximum(stated + c, np.minimum(stated, 0.0))
+
+
+def compute_factor(c: Any) -> Any:
+    """Return the factor 1 + c of (2)."""
+    return np.maximum(1.0 + c, MIN_FACTOR)
+
+
+def _add_dof(field: str) -> FieldWriter:
+    """Make a function that adds the coefficient to a field of a joint's degree of freedom."""
+
+    def write(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+        column = robot.joint(place).velocity
+        fields[field][:, column] = add_to_stated(fields[field][:, column], c[0])
+
+    return write
+
+
+def _add_quadratic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    # The first number of the polynomial multiplies |v| v.
+    column = fields["dof_dampingpoly"][:, robot.joint(place).velocity]
+    column[:, 0] = add_to_stated(column[:, 0], c[0])
+
+
+def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    column = robot.joint(place).velocity
+    loss = fields["dof_frictionloss"]
+    # A reduced friction keeps the solver parameters of the file.
+    rubs = c[0] > 0
+    loss[:, column] = add_to_stated(loss[:, column], c[0])
+    write_friction_form(fields, robot, rubs, column)
+
+
+def _add_spring(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    column = fields["jnt_stiffness"]
+    number = robot.joint(place).id
+    column[:, number] = add_to_stated(column[:, number], c[0])
+
+
+def _add_cubic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    # The second number of the polynomial multiplies x^3. It has no lower limit, since a spring may
+    # soften.
+    fields["jnt_stiffnesspoly"][:, robot.joint(place).id, 1] += c[0]
+
+
+def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    number = robot.body(place).id
+    fields["body_mass"][:, number] *= compute_factor(c[0])
+    fields["body_inertia"][:, number] *= compute_factor(c[0])[:, None]
+
+
+def _scale_inertia(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    fields["body_inertia"][:, robot.body(place).id] *= compute_factor(c[0])[:, None]
+
+
+def _offset_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    fields["body_ipos"][:, robot.body(place).id] += c.T  # (3)
+
+
+def _scale_stiffness(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    number = robot.actuator(place).id
+    gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
+    bias[:, 1] *= compute_factor(c[0])
+    if gain_pulls(robot, number, 1):
+        gain[:, 0] *= compute_factor(c[0])
+
+
+def _scale_damping(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    number = robot.actuator(place).id
+    gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
+    bias[:, 2] *= compute_factor(c[0])
+    if gain_pulls(robot, number, 2):
+        gain[:, 0] *= compute_factor(c[0])
+
+
+def gain_pulls(robot: RobotModel, number: int, term: int) -> bool:
+    """Return whether an actuator's control is a set point of position (1) or velocity (2).
+
+    Args:
+        robot: robot with the actuator.
+        number: number of the actuator.
+        term: index in `biasprm`: 1 for the position, 2 for the velocity.
+    """
+    import mujoco
+
+    model = robot.compiled
+    gain, bias = model.actuator_gainprm[number], model.actuator_biasprm[number]
+    fixed = int(model.actuator_gaintype[number]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    # With a position gain as well, the set point is multiplied by the position gain.
+    return bool(fixed and gain[0] == -bias[term] and (term == 1 or bias[1] == 0))
+
+
+def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
+    gravity = fields["opt.gravity"]
+    # The tilt that another effect added is not scaled.
+    gravity += c[0][:, None] * robot.compiled.opt.gravity
+
+
+def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
+    size = float(np.linalg.norm(robot.compiled.opt.gravity))
+    fields["opt.gravity"][:, :2] += size * c.T  # (4)
+
+
+def get_coupling_address(robot: RobotModel, place: str) -> int:
+    """Return the address in `wrap_prm` of the coupling coefficient of a joint's drive.
+
+    Args:
+        robot: robot with coupled drives.
+        place: joint of the drive.
+    """
+    model = robot.compiled
+    return int(model.tendon_adr[model.tendon(place + COUPLING_TENDON_SUFFIX).id]) + 1
+
+
+def _couple(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    fields["wrap_prm"][:, get_coupling_address(robot, place)] = c[0]
+
+
+def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    number = robot.actuator(place).id
+    limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
+    limits = c[0] > 0
+    free = limits & ~limited[:, number].astype(bool)
+    ranges[free, number] = (-np.inf, np.inf)
+    cut = np.stack([-c[0], c[0]], axis=1)[limits]
+    low, high = ranges[limits, number].T
+    ranges[limits, number] = np.clip(cut, low[:, None], high[:, None])  # (5)
+    limited[limits, number] = True
+
+
+COUPLING_FIELD = "wrap_prm"
+"""Model field of coupling coefficients, which a model without tendons lacks."""
+_SERVO = ("actuator_gainprm", "actuator_biasprm")
+
+MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
+    "drag.linear": ModelFieldEffect(("dof_damping",), _add_dof("dof_damping")),
+    "drag.quadratic": ModelFieldEffect(("dof_dampingpoly",), _add_quadratic),
+    "friction.coulomb": ModelFieldEffect(
+        ("dof_frictionloss", "dof_solref", "dof_solimp"), _add_friction
+    ),
+    "spring.linear": ModelFieldEffect(("jnt_stiffness",), _add_spring),
+    "spring.cubic": ModelFieldEffect(("jnt_stiffnesspoly",), _add_cubic),
+    "inertia.armature": ModelFieldEffect(
+        ("dof_armature",), _add_dof("dof_armature"), changes_derived_constants=True
+    ),
+    "mass.scale": ModelFieldEffect(
+        ("body_mass", "body_inertia"), _scale_mass, changes_derived_constants=True
+    ),
+    "mass.offset": ModelFieldEffect(("body_ipos",), _offset_mass, changes_derived_constants=True),
+    "inertia.scale": ModelFieldEffect(
+        ("body_inertia",), _scale_inertia, changes_derived_constants=True
+    ),
+    "actuator.stiffness": ModelFieldEffect(_SERVO, _scale_stiffness),
+    "actuator.damping": ModelFieldEffect(_SERVO, _scale_damping),
+    "gravity.scale": ModelFieldEffect(("opt.gravity",), _scale_gravity),
+    "gravity.tilt": ModelFieldEffect(("opt.gravity",), _tilt_gravity),
+    "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _couple),
+    "actuator.limit": ModelFieldEffect(
+        ("actuator_forcelimited", "actuator_forcerange"), _limit_force
+    ),
+}
+"""Model-field effects by name.
+
+Each acts at a place of its kind, and those of the world at any place, such as ``""``.
+"""

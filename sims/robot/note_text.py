@@ -1,0 +1,35 @@
+"""Lists of names and items in the text of notes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from sims.core.value_limits import truncate_text
+
+MAX_LISTED_NAMES = 12
+"""Maximum number of names that a note lists."""
+MAX_LISTED_WITH_NUMBERS = 4
+"""Maximum number of items that a note lists if each item contains numbers."""
+
+
+def format_name_list(
+    names: Iterable[str], most: int = MAX_LISTED_NAMES, between: str = ", "
+) -> str:
+    """Format names as a list without duplicates.
+
+    Args:
+        names: names to list; each is shortened to 200 characters.
+        most: maximum number of names to list.
+        between: separator.
+
+    Returns:
+        The first `most` names, followed by the number of the remaining ones ("and 3 more").
+    """
+    each = list(dict.fromkeys(names))
+    more = f" and {len(each) - most} more" if len(each) > most else ""
+    return between.join(truncate_text(name, 200) for name in each[:most]) + more
+
+
+def format_item_list(things: Sequence[str]) -> str:
+    """Format at most `MAX_LISTED_WITH_NUMBERS` items that contain numbers, with the number of further ones."""
+    return format_name_list(things, MAX_LISTED_WITH_NUMBERS, "; ")

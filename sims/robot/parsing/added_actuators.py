@@ -1,0 +1,198 @@
+"""Actuators and engine settings that a recording adds to a model file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypedDict
+
+from sims.core import toml_validation
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.toml_validation import Range
+from sims.core.value_limits import truncate_text
+
+
+class ActuatorTable(TypedDict, total=False):
+    """Table ``[actuators.NAME]`` of a recording."""
+
+    joint: str
+    kind: str
+    kp: float
+    ki: float
+    kd: float
+    kv: float
+    gear: float
+    control_range: Range
+    force_range: Range
+    # These two are read with the recording (`sims.recording.drive_switches`). They are listed here
+    # so that error messages name them.
+    enable: str
+    disable: str
+
+
+class EngineTable(TypedDict, total=False):
+    """Table ``[engine]`` of a recording."""
+
+    timestep: float
+    integrator: str
+
+
+COMMON_ACTUATOR_KEYS = ("joint", "kind", "gear", "control_range", "force_range")
+GAIN_KEYS_BY_KIND: Mapping[str, tuple[str, ...]] = {
+    "motor": (),
+    "position": ("kp", "kv"),
+    "velocity": ("kv",),
+    "pid": ("kp", "ki", "kd", "kv"),
+}
+"""Gains by kind of actuator; the first one is required."""
+INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
+"""Names of integrators, in the order of MuJoCo's mjtIntegrator."""
+SHORTEST, LONGEST = 1e-9, 1.0
+"""Smallest and largest allowed time step, in seconds."""
+
+
+def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[str, ...]:
+    """Add actuators to a model.
+
+    With the gear times the joint's position l, its rate v and the control u, they exert
+
+        motor     u                                                                             (1)
+        position  kp (u - l) - kv v                                                             (2)
+        velocity  kv (u - v)                                                                    (3)
+        pid       kp (u - l) + ki ∫(u - l) dt - kv v                                            (4)
+        pid       kp (u - l) + ki ∫(u - l) dt + kd (du/dt - v)                                  (5)
+
+    within their force range. The joint receives the gear times this force. In (5), which applies if
+    kd is given, the actuator has a second control, the rate of u; the caller that steps the model
+    must set it.
+
+    Args:
+        spec: a mujoco.MjSpec; it is changed in place.
+        tables: tables as in a recording's TOML, by name of the actuator.
+        source: beginning of error messages.
+
+    Returns:
+        The names of the actuators with kd.
+
+    Raises:
+        InputError: a table is invalid; existing names are listed.
+    """
+    rated = []
+    for name, given in tables.items():
+        where = f"actuators.{name}"
+        table = toml_validation.check_entries(
+            source, where, given, toml_validation.get_type_hints_of(ActuatorTable)
+        )
+        _check(spec, source, where, name, table)
+        _add(spec, name, table)
+        rated += [name] if "kd" in table else []
+    return tuple(rated)
+
+
+def _check(spec: Any, source: str, where: str, name: str, table: Mapping[str, Any]) -> None:
+    for key in ("joint", "kind"):
+        if key not in table:
+            raise InputError(f"{source}: {where} states no {key}")
+    kind = table["kind"]
+    if kind not in GAIN_KEYS_BY_KIND:
+        raise InputError(
+            f"{source}: {where}: {make_unknown_name_error('kind', kind, list(GAIN_KEYS_BY_KIND))}"
+        )
+    joints = [joint.name for joint in spec.joints if _single(joint)]
+    if table["joint"] not in joints:
+        raise InputError(
+            f"{source}: {where}: {make_unknown_name_error('joint', table['joint'], joints or ['none'])}"
+        )
+    if name in [actuator.name for actuator in spec.actuators]:
+        raise InputError(
+            f"{source}: {where}: the model has an actuator {truncate_text(name)} already"
+        )
+    allowed = (*COMMON_ACTUATOR_KEYS, *GAIN_KEYS_BY_KIND[kind])
+    toml_validation.check_known_names(f"entry of [{where}], of kind {kind}", table, allowed)
+    for key in GAIN_KEYS_BY_KIND[kind][:1]:
+        if key not in table:
+            raise InputError(
+                f"{source}: {where}: kind {kind} needs {key}; free it if it is a guess"
+            )
+    if "kd" in table and "kv" in table:
+        raise InputError(
+            f"{source}: {where}: kd acts on the error's rate, kv on the joint's: give one"
+        )
+    for key in ("kp", "ki", "kd", "kv", "gear"):
+        if key in table:
+            value = toml_validation.check_finite(source, f"{where}.{key}", table[key])
+            if value < 0 and key != "gear":
+                raise toml_validation.make_error(source, f"{where}.{key}", "0 or more", value)
+
+
+def _single(joint: Any) -> bool:
+    import mujoco
+
+    return joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _add(spec: Any, name: str, table: Mapping[str, Any]) -> None:
+    import mujoco
+
+    actuator = spec.add_actuator(
+        name=name, target=table["joint"], trntype=mujoco.mjtTrn.mjTRN_JOINT
+    )
+    gains = {key: float(table[key]) for key in ("kp", "ki", "kv") if key in table}
+    if table["kind"] == "motor":
+        actuator.set_to_motor()
+    elif table["kind"] == "position":
+        actuator.set_to_position(**gains)
+    elif table["kind"] == "velocity":
+        actuator.set_to_velocity(**gains)
+    else:
+        _set_pid(actuator, gains, table.get("kd"))
+    actuator.gear = [float(table.get("gear", 1.0)), 0, 0, 0, 0, 0]
+    if "control_range" in table:
+        actuator.ctrlrange = list(table["control_range"])
+        actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    if "force_range" in table:
+        actuator.forcerange = list(table["force_range"])
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
+    import mujoco
+
+    if not hasattr(actuator, "set_to_pid"):
+        raise InputError(f"kind pid needs MuJoCo 4, found {mujoco.__version__}")
+    inputs = int(mujoco.mjtCtrlInput.mjINPUT_POS)
+    if kd is not None:
+        inputs |= int(mujoco.mjtCtrlInput.mjINPUT_VEL)
+        gains["kv"] = float(kd)
+    actuator.set_to_pid(**gains, ctrlspec=inputs)
+
+
+def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> None:
+    """Apply the time step and integrator of a recording to a model.
+
+    Args:
+        spec: a mujoco.MjSpec; it is changed in place.
+        table: ``timestep`` in s, ``integrator`` by MuJoCo's name.
+        source: beginning of error messages.
+
+    Raises:
+        InputError: the table is invalid.
+    """
+    import mujoco
+
+    given = toml_validation.check_entries(
+        source, "engine", table, toml_validation.get_type_hints_of(EngineTable)
+    )
+    if "timestep" in given:
+        step = toml_validation.check_finite(source, "engine.timestep", given["timestep"])
+        if not SHORTEST <= step <= LONGEST:
+            raise toml_validation.make_error(
+                source, "engine.timestep", f"{SHORTEST:g} to {LONGEST:g} s", step
+            )
+        spec.option.timestep = step
+    if "integrator" in given:
+        name = given["integrator"]
+        if name not in INTEGRATORS:
+            raise InputError(
+                f"{source}: engine: {make_unknown_name_error('integrator', name, INTEGRATORS)}"
+            )
+        spec.option.integrator = int(mujoco.mjtIntegrator(INTEGRATORS.index(name)))

@@ -1,0 +1,296 @@
+"""Convex hulls of collision meshes, which contain all mesh data that MuJoCo's contacts need.
+
+A compiled mesh consists of vertices, faces, normals and a bounding volume hierarchy of its faces.
+Contacts of convex geoms only read the vertices of the convex hull, the graph of the hull's edges
+and its polygons (MuJoCo's documentation, "Computation", collision detection). The rest, nine tenths
+of the memory, is for rendering, rays and signed distances.
+
+MuJoCo's compiler would compute another hull from rounded vertices, and contacts would differ in
+their eighth digit. So the graph, the polygons and the bounds of the original mesh are copied into
+each compiled model, and contacts are bitwise equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+
+MIN_FACES = 200
+"""Minimum number of faces of a mesh that is replaced by its hull to save memory."""
+CORE = 2.0**-6
+"""Size of the box inside a hull that replaces its faces, as a share of the hull's half sizes."""
+CORE_FACES = (
+    (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
+    (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
+)  # fmt: skip
+"""Triangles of a box whose corners are numbered by the signs of x, y and z."""
+RESERVE = "simgap.reserve"
+"""Prefix of the names of meshes that reserve memory for hulls that are copied into a model."""
+LARGEST = ("npolygonmax", "nmeshdegmax")
+"""Size fields by which MuJoCo allocates buffers.
+
+They are the maximum number of corners of a polygon, and of polygons at a vertex.
+"""
+TESTED = "4.0."
+"""Version prefix of MuJoCo whose compiled meshes have the layout that `write_hulls` writes.
+
+With other versions, colliding meshes are kept unchanged.
+"""
+
+MEASURED = ("geom_size", "geom_aabb", "geom_rbound")
+"""Geom fields that MuJoCo computes from vertices before it rounds them to single precision."""
+
+Integers = NDArray[np.int32]
+
+
+class Lists(NamedTuple):
+    """Lists of integers, concatenated in one array.
+
+    Attributes:
+        values: all values.
+        sizes: size of each list.
+    """
+
+    values: Integers
+    sizes: Integers
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """The convex hull of a compiled mesh.
+
+    Attributes:
+        vertices: (V, 3) float32, in the mesh's own frame.
+        graph: MuJoCo's `mesh_graph` of the hull; vertices are numbered from 0 to V - 1.
+        normals: (P, 3) normals of its polygons.
+        polygons: vertices of each polygon.
+        around: polygons around each vertex.
+        extrema: (27,) start vertices of the search for the furthest vertex in a direction.
+    """
+
+    vertices: NDArray[np.float32]
+    graph: Integers
+    normals: Array
+    polygons: Lists
+    around: Lists
+    extrema: Integers
+
+
+def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
+    """Read the hull of a compiled mesh.
+
+    Args:
+        model: the mujoco.MjModel.
+        mesh: number of the mesh.
+        whole: keep vertices that are not on the hull, and the numbers of all vertices.
+
+    Returns:
+        The hull; None if the mesh has none, since no geom with it collides.
+    """
+    begin = int(model.mesh_graphadr[mesh])
+    if begin < 0:
+        return None
+    count, faces = model.mesh_graph[begin : begin + 2].tolist()
+    graph: Integers = model.mesh_graph[begin : begin + 2 + 3 * count + 6 * faces].copy()
+    every = np.arange(model.mesh_vertnum[mesh], dtype=np.int32)
+    # The vertices keep their order, as MuJoCo may compare the numbers of two vertices.
+    ids = every if whole else np.sort(graph[2 + count : 2 + 2 * count])
+    new = np.full(every.size, -1, dtype=np.int32)
+    new[ids] = np.arange(ids.size)
+    for part in (slice(2 + count, 2 + 2 * count), slice(graph.size - 3 * faces, graph.size)):
+        graph[part] = new[graph[part]]
+    first = int(model.mesh_polyadr[mesh])
+    rows = slice(first, first + int(model.mesh_polynum[mesh]))
+    at = int(model.mesh_vertadr[mesh]) + ids
+    polygons = _gather(
+        model.mesh_polyvert, model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
+    )
+    return Hull(
+        vertices=model.mesh_vert[at],
+        graph=graph,
+        normals=model.mesh_polynormal[rows].copy(),
+        polygons=polygons._replace(values=new[polygons.values]),
+        around=_gather(model.mesh_polymap, model.mesh_polymapadr[at], model.mesh_polymapnum[at]),
+        extrema=model.mesh_extrema[mesh].copy(),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionShapes:
+    """Data that models compiled from hulls copy from the model with the whole meshes.
+
+    Attributes:
+        hulls: hulls by name of the mesh.
+        geoms: fields of geoms that have such a mesh, by the geom's name and the field.
+        bounds: (N, 6) `bvh_aabb` of the bounding volume hierarchies of bodies, by body number.
+    """
+
+    hulls: Mapping[str, Hull]
+    geoms: Mapping[str, Mapping[str, Array]]
+    bounds: Mapping[int, Array]
+
+    @classmethod
+    def read(cls, model: Any, hulls: Mapping[str, Hull], geoms: Mapping[str, int]) -> Self:
+        """Read the data from the model with the whole meshes.
+
+        Args:
+            model: model with the whole meshes.
+            hulls: hulls by name of the mesh.
+            geoms: numbers of the geoms in that model, by geom name.
+        """
+        fields = {
+            name: {field: getattr(model, field)[i].copy() for field in MEASURED}
+            for name, i in geoms.items()
+        }
+        bodies = {int(model.geom_bodyid[i]) for i in geoms.values()}
+        return cls(hulls, fields, {body: _bounds(model, body).copy() for body in bodies})
+
+    def write(self, model: Any) -> None:
+        """Write the data into a model compiled with meshes of `add_hull` and `add_reserve`."""
+        write_hulls(model, self.hulls)
+        for name, fields in self.geoms.items():
+            for field, values in fields.items():
+                getattr(model, field)[model.geom(name).id] = values
+        for body, bounds in self.bounds.items():
+            there = _bounds(model, body)
+            # The numbers of bounds differ if geoms that cannot collide were removed; then the
+            # compiler's own bounds are equally valid.
+            if there.shape == bounds.shape:
+                there[:] = bounds
+
+
+def _bounds(model: Any, body: int) -> Array:
+    """Return the bounding volumes (N, 6) of a body, as a view into the model."""
+    first = int(model.body_bvhadr[body])
+    view: Array = model.bvh_aabb[first : first + int(model.body_bvhnum[body])]
+    return view
+
+
+def add_hull(spec: Any, name: str, hull: Hull) -> None:
+    """Add a mesh to a spec that compiles to the hull's vertices in the hull's frame.
+
+    MuJoCo moves a mesh into the principal frame of its faces. The added faces are those of a small
+    box around the origin, whose frame is the hull's, so that no vertex moves.
+
+    Args:
+        spec: the mujoco.MjSpec; it is changed in place.
+        name: name of the mesh.
+        hull: hull to add.
+    """
+    import mujoco
+
+    half = float(np.abs(hull.vertices).max()) * CORE
+    # The principal moments must decrease from x to z, else MuJoCo would exchange the axes.
+    sides = 2.0 ** np.floor(np.log2(half)) * np.array([0.25, 0.5, 1.0])
+    signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    vertices = np.concatenate([hull.vertices.astype(float), sides * np.array(signs)])
+    faces = np.array(CORE_FACES) + len(hull.vertices)
+    mesh = spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
+
+
+def add_reserve(spec: Any, model: Any, whole: Any, hulls: Mapping[str, Hull]) -> None:
+    """Add meshes that reserve memory for `write_hulls` in compiled models, if there is too little.
+
+    Args:
+        spec: the mujoco.MjSpec with the meshes of `add_hull`; it is changed in place.
+        model: model compiled from `spec`.
+        whole: model with the whole meshes.
+        hulls: hulls by name of the mesh.
+    """
+    found = [read_hull(model, model.mesh(name).id) for name in hulls]
+    lacking = _sizes(hulls.values()) - _sizes(hull for hull in found if hull)
+    if lacking.max() > 0:
+        # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers
+        # in its graph, 2 n - 4 polygons and 6 n - 12 corners. MuJoCo merges some of them.
+        count = int(1.5 * np.max(lacking / (15, 2, 6))) + 8
+        height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+        x, y = np.sqrt(1.0 - height**2) * _turns(np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)))
+        sphere = np.stack([x, y, height], axis=1)
+        spec.add_mesh(name=f"{RESERVE}.sphere", uservert=sphere.ravel())
+    if any(getattr(model, size) < getattr(whole, size) for size in LARGEST):
+        # The base of a pyramid is a polygon with as many corners as the apex has sides.
+        count = 8 + max(getattr(whole, size) for size in LARGEST)
+        x, y = _turns(2.0 * np.pi * np.arange(count) / count)
+        base = np.stack([x, y, np.zeros(count)], axis=1)
+        pyramid = np.concatenate([base, [[0.0, 0.0, 1.0]]])
+        spec.add_mesh(name=f"{RESERVE}.pyramid", uservert=pyramid.ravel())
+
+
+def _turns(angles: Array) -> Array:
+    """Return cosines and sines, (2, n)."""
+    return np.stack([np.cos(angles), np.sin(angles)])
+
+
+def has_room(model: Any, whole: Any) -> bool:
+    """Return whether MuJoCo's contact buffers for a model are at least those for the whole meshes.
+
+    With smaller buffers MuJoCo would write beyond their ends.
+
+    Args:
+        model: model with hulls.
+        whole: model with the whole meshes.
+    """
+    sizes = [name for name in dir(whole) if name.startswith("n") and name.endswith("max")]
+    return all(getattr(model, name) >= getattr(whole, name) for name in sizes)
+
+
+def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
+    """Replace the hulls that MuJoCo's compiler has computed.
+
+    Args:
+        model: model compiled from a spec with meshes of `add_hull` and `add_reserve`.
+        hulls: hulls by name of the mesh.
+    """
+    names = [model.mesh(i).name for i in range(model.nmesh)]
+    # All hulls are read before the first is written, since they move within MuJoCo's arrays.
+    wanted = [hulls.get(name) or read_hull(model, i, whole=True) for i, name in enumerate(names)]
+    graph = polygon = corner = mapped = 0
+    for i, (name, hull) in enumerate(zip(names, wanted, strict=True)):
+        model.mesh_graphadr[i] = -1
+        model.mesh_polyadr[i], model.mesh_polynum[i] = polygon, 0
+        if hull is None or name.startswith(RESERVE):
+            continue
+        model.mesh_graphadr[i] = graph
+        model.mesh_extrema[i] = hull.extrema
+        model.mesh_graph[graph : graph + hull.graph.size] = hull.graph
+        graph += hull.graph.size
+        rows = slice(polygon, polygon + hull.polygons.sizes.size)
+        model.mesh_polynum[i] = hull.polygons.sizes.size
+        model.mesh_polynormal[rows] = hull.normals
+        begins, counts = model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows]
+        corner = _put(model.mesh_polyvert, begins, counts, hull.polygons, corner)
+        polygon = rows.stop
+        at = int(model.mesh_vertadr[i])
+        model.mesh_polymapnum[at : at + int(model.mesh_vertnum[i])] = 0
+        rows = slice(at, at + hull.around.sizes.size)
+        begins, counts = model.mesh_polymapadr[rows], model.mesh_polymapnum[rows]
+        mapped = _put(model.mesh_polymap, begins, counts, hull.around, mapped)
+
+
+def _sizes(hulls: Iterable[Hull]) -> Array:
+    """Return the total numbers (3,) of graph integers, polygons and polygon corners of hulls."""
+    sizes = [(h.graph.size, h.polygons.sizes.size, h.polygons.values.size) for h in hulls]
+    total: Array = np.sum(np.array(sizes, dtype=float).reshape(-1, 3), axis=0)
+    return total
+
+
+def _gather(values: Integers, begins: Integers, sizes: Integers) -> Lists:
+    """Copy lists out of an array, given their begins and sizes."""
+    ends = np.cumsum(sizes)
+    places = np.repeat(begins - ends + sizes, sizes) + np.arange(ends[-1] if ends.size else 0)
+    return Lists(values[places], sizes.copy())
+
+
+def _put(values: Integers, begins: Integers, sizes: Integers, lists: Lists, first: int) -> int:
+    """Write lists into an array from index `first` on; return the end index."""
+    ends = first + np.cumsum(lists.sizes)
+    begins[:], sizes[:] = ends - lists.sizes, lists.sizes
+    values[first : first + lists.values.size] = lists.values
+    return first + lists.values.size

@@ -1,0 +1,145 @@
+"""Automatic repairs that make a model compile: moments of inertia, massless bodies, meshes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError
+from sims.robot.mujoco_messages import format_mujoco_error
+from sims.robot.note_text import format_item_list, format_name_list
+from sims.robot.parsing import inertia_repair
+from sims.robot.parsing.missing_meshes import OmittedShapes, remove_mesh, remove_texture
+from sims.robot.parsing.xml_files import ModelFileReader
+
+DEFAULT_BODY_MASS = 1e-6
+"""Mass, in kg, given to a moving body without a mass."""
+MESH_ERROR_PATTERN = re.compile(r"mesh|vert|face|stl|obj|msh|hull|volume", re.IGNORECASE)
+TEXTURE_ERROR_PATTERN = re.compile(r"png|ktx|texture|image", re.IGNORECASE)
+
+
+@dataclass
+class CompileRepairs:
+    """Repairs made while a spec was compiled.
+
+    Attributes:
+        files: reader of the model file and its assets.
+        left: omitted shapes.
+        balanced: bodies whose principal moments were changed, with the values before and after.
+        massless: bodies that were given a mass, by whether other bodies are attached to them.
+        slight: bodies that were given moments of inertia.
+    """
+
+    files: ModelFileReader
+    left: OmittedShapes
+    balanced: list[str] = field(default_factory=list)
+    massless: dict[bool, list[str]] = field(default_factory=dict)
+    slight: list[str] = field(default_factory=list)
+
+    def compile(self, spec: Any) -> tuple[Any, Any]:
+        """Compile a spec, and repair what MuJoCo rejects.
+
+        Args:
+            spec: a mujoco.MjSpec; it must not be used afterwards.
+
+        Returns:
+            The repaired spec, copied before compilation since a compiled spec holds all meshes
+            twice; and the compiled model.
+
+        Raises:
+            InputError: MuJoCo rejects the model; contains MuJoCo's message.
+        """
+        for _ in range(2 * (len(spec.bodies) + len(spec.meshes) + len(spec.textures)) + 2):
+            try:
+                before = spec.copy()
+                return before, spec.compile()
+            except InputError:
+                raise
+            except Exception as error:
+                said = format_mujoco_error(error)
+                if not self._mended(spec, said):
+                    break
+        raise self.files.make_mujoco_error(said)
+
+    def _mended(self, spec: Any, said: str) -> bool:
+        found = re.search(r"Element name '(.*?)', id", said)
+        name = found[1] if found else ""
+        if "balanceinertia" in said:
+            return self._balance(spec)
+        if "mass and inertia of moving bodies" in said:
+            return self._weigh(spec, name)
+        why = f"is refused by MuJoCo ({re.sub(r'; Element.*|Error: ', '', said)})"
+        if TEXTURE_ERROR_PATTERN.search(why) and remove_texture(spec, name, why, self.left):
+            return True
+        return bool(MESH_ERROR_PATTERN.search(why)) and remove_mesh(spec, name, why, self.left)
+
+    def _balance(self, spec: Any) -> bool:
+        before = len(self.balanced)
+        for body in spec.bodies:
+            moments, axes = _moments(body)
+            if inertia_repair.compute_triangle_violation(moments) > 0:
+                after = inertia_repair.find_nearest_valid_moments(moments)
+                _state(body, after, axes)
+                self.balanced.append(f"{body.name} {inertia_repair.format_moments(moments, after)}")
+        return len(self.balanced) > before
+
+    def _weigh(self, spec: Any, name: str) -> bool:
+        for body in [body for body in spec.bodies if body.name == name]:
+            mass, (moments, axes) = float(np.nan_to_num(body.mass)), _moments(body)
+            light, thin = (
+                mass < DEFAULT_BODY_MASS,
+                min(moments) < inertia_repair.MIN_MOMENT * (1 - inertia_repair.ROUNDING_SHARE),
+            )
+            body.mass = max(mass, DEFAULT_BODY_MASS)
+            _state(body, np.maximum(moments, inertia_repair.MIN_MOMENT), axes)
+            body.explicitinertial = True
+            if light:
+                carries = any(b.parent is not None and b.parent.name == name for b in spec.bodies)
+                self.massless.setdefault(carries, []).append(name)
+            elif thin:
+                self.slight.append(name)
+            return light or thin
+        return False
+
+    @property
+    def notes(self) -> list[str]:
+        """Notes, one for each kind of repair."""
+        notes = self.left.notes
+        if self.balanced:
+            notes.append(
+                "no body has principal moments A + B < C; the nearest are taken (kg m^2): "
+                f"{format_item_list(self.balanced)}"
+            )
+        given = (
+            f"given {DEFAULT_BODY_MASS:g} kg and moments of {inertia_repair.MIN_MOMENT:g} kg m^2"
+        )
+        for carries, names in self.massless.items():
+            hangs = "" if carries else ", and nothing hangs on them, so their joints mean little"
+            notes.append(f"move without a mass{hangs}; {given}: {format_name_list(names)}")
+        if self.slight:
+            least = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
+            notes.append(
+                f"move without moments of inertia; given {least}: {format_name_list(self.slight)}"
+            )
+        return notes
+
+
+def _moments(body: Any) -> tuple[Array, Array | None]:
+    """Return the specified principal moments in kg m^2, and their axes or None.
+
+    None stands for the axes of the body's inertial frame.
+    """
+    full = np.asarray(body.fullinertia, dtype=float)
+    if np.isfinite(full).all() and full.any():
+        return inertia_repair.compute_principal_moments(list(full))
+    return np.nan_to_num(np.asarray(body.inertia, dtype=float)), None
+
+
+def _state(body: Any, moments: Array, axes: Array | None) -> None:
+    if axes is None:
+        body.inertia = moments
+    else:
+        body.fullinertia = inertia_repair.compose_inertia_tensor(moments, axes)

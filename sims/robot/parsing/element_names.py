@@ -1,0 +1,85 @@
+"""Unique, valid names of model elements.
+
+Effect places refer to elements by name. So every element needs a name, without the characters that
+separate the parts of a place or of an option.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree.ElementTree import Element
+
+from sims.robot.note_text import format_name_list
+
+RESERVED_CHARACTERS = "@=,*"
+"""Characters with a meaning in places and options, which names must not contain.
+
+Examples: ``friction.coulomb@elbow=0.3`` and ``--free damping@*,mass@forearm``.
+"""
+FREE_TEXT_ATTRIBUTES = ("file", "class", "childclass", "filename")
+"""XML attributes whose values are not names of elements."""
+
+
+def rename_invalid_names(root: Element) -> list[str]:
+    """Rename elements whose names contain `RESERVED_CHARACTERS` characters, and all references to them.
+
+    Args:
+        root: root element of the model file; it is changed in place.
+
+    Returns:
+        Notes, at most one.
+    """
+    named = {element.get("name") or "" for element in root.iter()}
+    changed: dict[str, str] = {}
+    for name in sorted(named):
+        other = name.strip()
+        for character in RESERVED_CHARACTERS:
+            other = other.replace(character, "_")
+        if other == name:
+            continue
+        while other in named or other in changed.values() or not other:
+            other += "_"
+        changed[name] = other
+    for element in root.iter():
+        for key, value in element.items():
+            if value in changed and key not in FREE_TEXT_ATTRIBUTES:
+                element.set(key, changed[value])
+    pairs = [f"{name} -> {other}" for name, other in changed.items()]
+    return (
+        [f"renamed, since places are written with {RESERVED_CHARACTERS}: {format_name_list(pairs)}"]
+        if pairs
+        else []
+    )
+
+
+def name_unnamed_elements(spec: Any) -> list[str]:
+    """Name unnamed joints, actuators, bodies and sensors of a spec by their numbers in the file.
+
+    Args:
+        spec: the mujoco.MjSpec; it is changed in place.
+
+    Returns:
+        Notes, one for each kind of element with new names.
+    """
+    notes = []
+    kinds = {
+        "joint": spec.joints,
+        "actuator": spec.actuators,
+        "body": spec.bodies,
+        "sensor": spec.sensors,
+    }
+    for kind, parts in kinds.items():
+        taken = {part.name for part in parts}
+        new = []
+        for number, part in enumerate(parts):
+            if part.name:
+                continue
+            name = f"{kind}{number}"
+            while name in taken:
+                name += "_"
+            part.name = name
+            taken.add(name)
+            new.append(name)
+        if new:
+            notes.append(f"without a name in the file, called here: {format_name_list(new)}")
+    return notes

@@ -1,0 +1,190 @@
+"""Prepare an MJCF for loading: omit elements with missing files where masses are specified."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
+from typing import Any
+from xml.etree.ElementTree import Element
+
+from sims.core.value_limits import truncate_text
+from sims.robot.parsing.mesh_lookup import is_file
+from sims.robot.parsing.missing_meshes import OmittedShapes
+from sims.robot.parsing.xml_files import MAX_ASSET_BYTES, ModelFileReader, find_children, parse_tree
+
+PLACEHOLDER_MESH_VERTICES = "0 0 0 1 0 0 0 1 0 0 0 1"
+"""Vertices of a placeholder for a missing mesh; the mesh is removed after loading."""
+TEXTURE_FILE_ATTRIBUTES = (
+    "file",
+    "fileright",
+    "fileleft",
+    "fileup",
+    "filedown",
+    "filefront",
+    "fileback",
+)
+"""Attributes of a texture that name files."""
+COUNT_ATTRIBUTES = ("count", "cellcount")
+"""Attributes with counts that multiply the number of elements."""
+MAX_COUNT = 1e5
+"""Maximum total number of elements that counts may generate."""
+MAX_SIZE_ATTRIBUTES = {
+    "width": 2e4,
+    "height": 2e4,
+    "nrow": 1e4,
+    "ncol": 1e4,
+    "nkey": 1e5,
+    "nuserdata": 1e6,
+}
+"""Attributes that request memory, and their maximum values."""
+
+
+@dataclass
+class MissingFiles:
+    """Missing files that a model refers to.
+
+    Attributes:
+        meshes: missing mesh files by name of the asset.
+        fields: missing height field files by name of the asset.
+        pictures: missing files of textures and skins.
+    """
+
+    meshes: dict[str, str] = field(default_factory=dict)
+    fields: dict[str, str] = field(default_factory=dict)
+    pictures: list[str] = field(default_factory=list)
+
+    def remove_from_spec(self, spec: Any, left: OmittedShapes) -> None:
+        """Remove elements with missing files from a spec.
+
+        Args:
+            spec: the mujoco.MjSpec; it is changed in place.
+            left: record of omitted shapes.
+
+        Raises:
+            InputError: the mass of a moving body depends on a missing mesh.
+        """
+        why = "is absent"
+        for geom in list(spec.geoms):
+            file = self.meshes.get(geom.meshname) or self.fields.get(geom.hfieldname)
+            if file:
+                left.leave_out(spec, geom, file, why)
+        for assets, names in ((spec.meshes, self.meshes), (spec.hfields, self.fields)):
+            for asset in [asset for asset in assets if asset.name in names]:
+                spec.delete(asset)
+        if self.pictures:
+            left.seen.setdefault(why, []).extend(self.pictures)
+
+
+def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles:
+    """Read the files that an MJCF refers to, and insert placeholders for missing ones.
+
+    Args:
+        files: reader of the model file.
+        root: root element of the MJCF; it is changed in place.
+
+    Returns:
+        The missing files.
+
+    Raises:
+        InputError: a count, a size or a file is too large, or an attached model is missing.
+    """
+    _measured(files, root, 1.0)
+    absent = MissingFiles()
+    settings = {key: value for e in find_children(root, "compiler") for key, value in e.items()}
+    everywhere = settings.get("assetdir", "")
+    meshes = settings.get("meshdir", everywhere)
+    pictures = settings.get("texturedir", everywhere)
+    strip = settings.get("strippath") == "true"
+    for element in root.iter("flexcomp"):
+        file = element.get("file")
+        if file and _read(files, meshes, file, strip):
+            element.set("file", str((files.path.parent / meshes / file).resolve()))
+    for asset in find_children(root, "asset"):
+        for element in list(asset):
+            if element.tag == "model":
+                _model(files, element)
+                continue
+            folder = pictures if element.tag == "texture" else meshes
+            missing = [name for name in _named(element) if not _read(files, folder, name, strip)]
+            if missing:
+                _insert_placeholder(absent, asset, element, missing[0])
+    return absent
+
+
+def _measured(files: ModelFileReader, element: Element, times: float) -> None:
+    """Reject counts and sizes that would exhaust the memory."""
+    for key, value in element.items():
+        numbers = (
+            [_size(word) for word in value.split()]
+            if key in (*COUNT_ATTRIBUTES, *MAX_SIZE_ATTRIBUTES)
+            else []
+        )
+        most = MAX_SIZE_ATTRIBUTES.get(key, MAX_COUNT)
+        if key in COUNT_ATTRIBUTES:
+            times *= math.prod(max(number, 1.0) for number in numbers)
+        if max([times, *numbers]) > most or (key.startswith("nuser_") and _size(value) > MAX_COUNT):
+            raise files.make_error(
+                element, f'{key}="{truncate_text(value)}" is too much: at most {most:g} in all'
+            )
+    for child in element:
+        _measured(files, child, times)
+
+
+def _size(word: str) -> float:
+    try:
+        return abs(float(word))
+    except ValueError:  # MuJoCo itself reports what it expects.
+        return 0.0
+
+
+def _model(files: ModelFileReader, element: Element) -> None:
+    """Read an attached model, which MuJoCo opens itself."""
+    name = element.get("file") or ""
+    path = files.path.parent / name.replace("\\", "/")
+    if not is_file(path):
+        raise files.make_error(element, f"the attached model {truncate_text(name)} is absent")
+    if path.resolve() in files.included:
+        raise files.make_error(element, f"{truncate_text(name)} holds itself")
+    _measured(files, parse_tree(files, path), 1.0)
+    # MuJoCo opens the attached model before the spec knows its folder, so the path must be
+    # absolute.
+    element.set("file", str(path.resolve()))
+
+
+def _named(element: Element) -> Iterator[str]:
+    keys = TEXTURE_FILE_ATTRIBUTES if element.tag == "texture" else ("file",)
+    return (element.attrib[key] for key in keys if element.get(key))
+
+
+def _read(files: ModelFileReader, folder: str, name: str, strip: bool) -> bool:
+    plain = name.replace("\\", "/")
+    path = files.path.parent / folder / (PurePosixPath(plain).name if strip else plain)
+    if not is_file(path):
+        return False
+    files.read_content(path, MAX_ASSET_BYTES)
+    return True
+
+
+def _insert_placeholder(absent: MissingFiles, asset: Element, element: Element, file: str) -> None:
+    """Replace an asset with a missing file by a placeholder that loads, if possible."""
+    name = element.get("name") or PurePosixPath(file.replace("\\", "/")).stem
+    if element.tag == "mesh":
+        absent.meshes[name] = file
+        kept = {"name": name, "vertex": PLACEHOLDER_MESH_VERTICES}
+    elif element.tag == "hfield":
+        absent.fields[name] = file
+        kept = {"name": name, "nrow": "2", "ncol": "2", "size": "1 1 1 1"}
+    elif element.tag == "texture":
+        absent.pictures.append(file)
+        kept = {"name": name, "type": element.get("type", "cube"), "builtin": "flat"}
+        kept |= {"width": "1", "height": "1"}
+    elif element.tag == "skin":
+        absent.pictures.append(file)
+        asset.remove(element)
+        return
+    else:
+        return  # MuJoCo itself reports what is missing.
+    element.attrib.clear()
+    element.attrib.update(kept)

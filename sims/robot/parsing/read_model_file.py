@@ -1,0 +1,180 @@
+"""Read an MJCF or URDF model file into a `RobotModel`, with safe repairs that are listed in notes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from sims.core.freed_memory import release_free_memory
+from sims.core.simulator import InputError
+from sims.core.value_limits import MAX_NUMBER, truncate_text
+from sims.robot.mujoco_messages import capture_mujoco_warnings, format_mujoco_error
+from sims.robot.note_text import format_name_list
+from sims.robot.parsing import (
+    added_actuators,
+    contact_exclusion,
+    element_names,
+    mjcf_loading,
+    urdf_loading,
+)
+from sims.robot.parsing.compile_repairs import CompileRepairs
+from sims.robot.parsing.missing_meshes import OmittedShapes
+from sims.robot.parsing.xml_files import ModelFileReader, format_tree, parse_tree, resolve_includes
+from sims.robot.robot_model import Format, RobotModel
+
+FORMAT_BY_ROOT: Mapping[str, Format] = {"mujoco": "mjcf", "robot": "urdf"}
+"""Formats of model files, by the name of the root element."""
+NO_ACTUATORS_NOTE = (
+    "no actuators: nothing drives it unless a recording's [actuators.NAME] adds some"
+)
+CHECKED_MODEL_FIELDS = (
+    "body_mass", "body_inertia", "body_pos", "body_ipos", "jnt_pos", "jnt_axis",
+    "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
+)  # fmt: skip
+"""Fields of the compiled model that are checked for values beyond the allowed range."""
+
+
+def read_robot(
+    path: str | Path,
+    *,
+    actuators: Mapping[str, Any] | None = None,
+    engine: Mapping[str, Any] | None = None,
+) -> RobotModel:
+    """Read the robot of a model file, without printing or writing anything.
+
+    Args:
+        path: path of an MJCF or a URDF; the content determines the format.
+        actuators: actuators to add, by name: tables as in a recording's ``[actuators.NAME]``.
+        engine: ``timestep`` (s) and ``integrator`` that replace those of the file.
+
+    Returns:
+        The robot, with a note for everything that was repaired or omitted.
+
+    Raises:
+        InputError: the file cannot be read, or MuJoCo rejects it; one line with file and cause.
+    """
+    path = Path(path)
+    files = ModelFileReader(path)
+    try:
+        root = parse_tree(files, path)
+        kind = FORMAT_BY_ROOT.get(root.tag)
+        if kind is None:
+            raise InputError(
+                f"{path}: expected <mujoco> or <robot>, found <{truncate_text(root.tag)}>"
+            )
+        resolve_includes(files, root)
+        with capture_mujoco_warnings() as warnings:
+            return _robot(files, root, kind, actuators or {}, engine or {}, warnings)
+    except RecursionError:
+        raise InputError(f"{path}: elements too deep within each other") from None
+
+
+def _robot(
+    files: ModelFileReader,
+    root: Element,
+    kind: Format,
+    actuators: Mapping[str, Any],
+    engine: Mapping[str, Any],
+    warnings: list[str],
+) -> RobotModel:
+    source, notes = str(files.path), element_names.rename_invalid_names(root)
+    mends = CompileRepairs(files, OmittedShapes(source))
+    if kind == "urdf":
+        notes += urdf_loading.repair_urdf(files, root)
+        spec = _parsed(files, root)
+        urdf_loading.stiffen_mimics(spec)
+    else:
+        absent = mjcf_loading.load_referenced_files(files, root)
+        spec = _parsed(files, root)
+        absent.remove_from_spec(spec, mends.left)
+    rated = added_actuators.add_actuators(spec, actuators, source)
+    added_actuators.apply_engine_settings(spec, engine, source)
+    notes += element_names.name_unnamed_elements(spec)
+    above = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
+    spec, model = mends.compile(spec)
+    _check(files, model)
+    further = contact_exclusion.exclude_spurious_contacts(spec, model) if kind == "urdf" else []
+    if further:
+        spec, model = mends.compile(spec)
+    aliases = _fused(above, {model.body(i).name for i in range(model.nbody)})
+    said = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
+    if model.nu == 0:
+        said.insert(0, NO_ACTUATORS_NOTE)
+    settings = json.dumps([actuators, engine], sort_keys=True, default=str)
+    files.add_to_digest(settings.encode())
+    robot = RobotModel(
+        path=files.path,
+        format=kind,
+        spec=spec,
+        notes=(*notes, *mends.notes, *further, *_said_of(aliases), *said),
+        aliases=aliases,
+        digest=files.digest.hexdigest(),
+        rate_controlled_actuators=rated,
+        actuator_tables=actuators,
+        engine_table=engine,
+        speeds=urdf_loading.read_velocity_limits(root) if kind == "urdf" else {},
+    )
+    # The model is stored here, so that it is not compiled again.
+    robot.__dict__["compiled"] = model
+    if model.nmesh:
+        release_free_memory()
+    return robot
+
+
+def _check(files: ModelFileReader, model: Any) -> None:
+    if model.njnt == 0:
+        raise InputError(f"{files.path}: it has no joint that moves")
+    step = float(model.opt.timestep)
+    if not added_actuators.SHORTEST <= step <= added_actuators.LONGEST:
+        span = f"{added_actuators.SHORTEST:g} to {added_actuators.LONGEST:g} s"
+        raise InputError(f"{files.path}: option timestep: expected {span}, found {step:g}")
+    for field in CHECKED_MODEL_FIELDS:
+        values = np.asarray(getattr(model, field), dtype=float)
+        faults = np.argwhere(~(np.abs(values) <= MAX_NUMBER))
+        if len(faults):
+            (row, *_), (kind, what) = faults[0], field.split("_", 1)
+            joint = model.dof_jntid[row] if kind == "dof" else row
+            name = (model.body(row) if kind == "body" else model.joint(joint)).name
+            raise InputError(
+                f"{files.path}: {what} of {truncate_text(name)}: expected numbers within ±{MAX_NUMBER:g}, "
+                f"found {values[tuple(faults[0])]:g}"
+            )
+
+
+def _parsed(files: ModelFileReader, root: Element) -> Any:
+    """Parse the repaired file into a mujoco.MjSpec."""
+    import mujoco
+
+    text, files.given = format_tree(root)
+    try:
+        spec = mujoco.MjSpec.from_string(text)
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        raise files.make_mujoco_error(format_mujoco_error(error)) from None
+    spec.modelfiledir = str(files.path.parent.resolve())
+    return spec
+
+
+def _fused(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
+    """Map the bodies that MuJoCo fused into others to the bodies that contain them."""
+    aliases = {}
+    for name in parents:
+        into = name
+        while into not in compiled:
+            into = parents[into]
+        if into != name:
+            aliases[name] = into
+    return aliases
+
+
+def _said_of(aliases: Mapping[str, str]) -> list[str]:
+    groups: dict[str, list[str]] = {}
+    for alias, name in aliases.items():
+        groups.setdefault(name, []).append(alias)
+    said = [f"{format_name_list(names)} of {into}" for into, names in groups.items()]
+    whole = format_name_list(said, between="; ")
+    return [f"links on fixed joints are part of what carries them: {whole}"] if said else []

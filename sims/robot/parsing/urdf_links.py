@@ -1,0 +1,163 @@
+"""Repair inertias and shapes of URDF links for MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from sims.core.value_limits import truncate_text
+from sims.robot.note_text import format_item_list, format_name_list
+from sims.robot.parsing import inertia_repair
+from sims.robot.parsing.mesh_lookup import MeshLookup
+from sims.robot.parsing.xml_files import ModelFileReader, find_children
+
+TENSOR_ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+FRAME_MASS_THRESHOLD = 1e-6
+"""Mass, in kg, below which a link counts as a mere frame, whose inertia needs no note."""
+MESH_FOLDER_SETTINGS = ("meshdir", "assetdir", "texturedir", "strippath", "discardvisual")
+"""Settings of MuJoCo's compiler about mesh files, which are removed after the meshes were found."""
+
+
+def parse_number(text: str | None) -> float:
+    """Parse a number; 0 for a missing text, NaN for an invalid one."""
+    try:
+        return float(text) if text else 0.0
+    except ValueError:
+        return math.nan
+
+
+def get_link_mass(link: Element) -> float:
+    """Return the mass that a link specifies, in kg; 0 if it specifies none."""
+    stated = find_children(link, "inertial", "mass")
+    return parse_number(stated[0].get("value")) if stated else 0.0
+
+
+def repair_inertials(
+    files: ModelFileReader, links: Mapping[str, Element], held: set[str]
+) -> list[str]:
+    """Repair masses and moments of inertia.
+
+    Args:
+        files: reader of the model file.
+        links: link elements by name; changed in place.
+        held: links that are fused to the world, which need no notes.
+
+    Returns:
+        Notes about the repairs.
+
+    Raises:
+        InputError: a mass is negative, or an entry is not a number.
+    """
+    points, raised, inferred = [], [], []
+    for name, link in links.items():
+        stated = find_children(link, "inertial")
+        if not stated:
+            inferred += [name] if find_children(link, "collision") and name not in held else []
+            continue
+        weight = get_link_mass(link)
+        if not 0 <= weight < math.inf:
+            raise files.make_error(
+                stated[0], f"link {truncate_text(name)}: its mass is {weight:g} kg"
+            )
+        if not find_children(stated[0], "mass"):
+            SubElement(stated[0], "mass", value="0")
+        tensor = (find_children(stated[0], "inertia") or [SubElement(stated[0], "inertia")])[0]
+        entries = [parse_number(tensor.get(key)) for key in TENSOR_ENTRIES]
+        if not np.isfinite(entries).all():
+            raise files.make_error(
+                tensor, f"link {truncate_text(name)}: its inertia is not made of numbers"
+            )
+        change = _raise_moments(tensor, entries)
+        if name in held or weight < FRAME_MASS_THRESHOLD or not change:
+            continue
+        points += [name] if max(map(abs, entries)) < inertia_repair.NEGLIGIBLE_MOMENT else []
+        raised += [f"{name} {change}"] if name not in points else []
+    return _said(points, raised, inferred)
+
+
+def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
+    """Raise principal moments that are not positive; return a text about the change."""
+    moments, axes = inertia_repair.compute_principal_moments(entries)
+    if moments[0] >= inertia_repair.NEGLIGIBLE_MOMENT:
+        return ""
+    after = inertia_repair.find_nearest_valid_moments(moments)
+    for key, entry in zip(
+        TENSOR_ENTRIES, inertia_repair.compose_inertia_tensor(after, axes), strict=True
+    ):
+        tensor.set(key, repr(entry))
+    return inertia_repair.format_moments(moments, after)
+
+
+def _said(points: list[str], raised: list[str], inferred: list[str]) -> list[str]:
+    notes = []
+    if points:
+        least = f"{inertia_repair.MIN_MOMENT:g} kg m^2"
+        notes.append(
+            f"a mass and no moments of inertia, so a point ({least}): {format_name_list(points)}"
+        )
+    if raised:
+        notes.append(
+            "principal moments that are not positive; the nearest that a body can have are taken "
+            f"(kg m^2): {format_item_list(raised)}"
+        )
+    if inferred:
+        notes.append(
+            "no mass stated; it follows from the collision shapes at 1000 kg/m^3, as MuJoCo does: "
+            f"{format_name_list(inferred)}"
+        )
+    return notes
+
+
+def remove_unusable_shapes(
+    files: ModelFileReader, links: Mapping[str, Element], compiler: Element, held: set[str]
+) -> list[str]:
+    """Remove visual shapes, and collision shapes whose mesh is missing or of an unsupported format.
+
+    Args:
+        files: reader of the model file.
+        links: link elements by name; changed in place.
+        compiler: settings of MuJoCo's compiler; changed in place.
+        held: links that are fused to the world, whose mass does not matter.
+
+    Returns:
+        Notes about the omitted shapes.
+
+    Raises:
+        InputError: the mass of a moving link would depend on a missing mesh.
+    """
+    meshes = MeshLookup(files, compiler.get("meshdir") or compiler.get("assetdir") or "")
+    inferring = compiler.get("inertiafromgeom") == "true"
+    for key in MESH_FOLDER_SETTINGS:
+        compiler.attrib.pop(key, None)
+    for name, link in links.items():
+        stated = (bool(find_children(link, "inertial")) and not inferring) or name in held
+        for shape in find_children(link, "visual"):
+            link.remove(shape)
+        for shape in find_children(link, "collision"):
+            if not _kept(files, name, shape, meshes, stated):
+                link.remove(shape)
+    return meshes.notes
+
+
+def _kept(
+    files: ModelFileReader, name: str, shape: Element, meshes: MeshLookup, stated: bool
+) -> bool:
+    """Return whether a collision shape can be read, and set the path of its mesh."""
+    for mesh in find_children(shape, "geometry", "mesh"):
+        file = mesh.get("filename") or ""
+        found, why = meshes.find(file)
+        if found is not None:
+            mesh.set("filename", found)
+            return True
+        if not stated:
+            raise files.make_error(
+                mesh,
+                f"mesh {truncate_text(file)} {why}, and the mass of link {truncate_text(name)} would follow from it; "
+                "put it there, or state the link's <inertial>",
+            )
+        meshes.leave_out(file, why)
+        return False
+    return True

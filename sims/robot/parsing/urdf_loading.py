@@ -1,0 +1,304 @@
+"""Prepare a URDF for MuJoCo: remove elements that MuJoCo does not read, and repair mistakes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement
+
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.core.value_limits import truncate_text
+from sims.robot.model_field_effects import FRICTION_SOLIMP
+from sims.robot.mujoco_messages import format_mujoco_error
+from sims.robot.note_text import format_name_list
+from sims.robot.parsing.urdf_links import (
+    get_link_mass,
+    parse_number,
+    remove_unusable_shapes,
+    repair_inertials,
+)
+from sims.robot.parsing.xml_files import ModelFileReader, find_children, format_tree
+
+READ_ELEMENTS = ("link", "joint", "mujoco")
+"""Child elements of a robot that are read."""
+VISUAL_ELEMENTS = ("material", "visual")
+"""Elements that are only visual."""
+ONE_DOF_JOINT_TYPES = ("revolute", "continuous", "prismatic")
+MOVING_JOINT_TYPES = (*ONE_DOF_JOINT_TYPES, "floating", "planar", "spherical")
+JOINT_TYPES = ("fixed", *MOVING_JOINT_TYPES)
+WORLD = "world"
+"""Name of the link that is the fixed world by a convention of many files."""
+RIGID = (1e-4, 1.0)
+"""Parameter `solref` of a rigid mimic relation.
+
+MuJoCo raises its time constant, in s, to two time steps.
+"""
+
+
+def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
+    """Repair a URDF in place.
+
+    Args:
+        files: reader of the model file.
+        root: root element of the URDF.
+
+    Returns:
+        Notes, one line for each kind of repair or omission.
+
+    Raises:
+        InputError: the links do not form a tree, or nothing in it moves.
+    """
+    _no_macros(files, root)
+    links, joints = _links(files, root), find_children(root, "joint")
+    notes = [*_with_world(files, root, links, joints), *_unread(root), *_named(files, joints)]
+    above = _joined(files, links, joints)
+    if not any(joint.get("type") in MOVING_JOINT_TYPES for joint in joints):
+        raise InputError(f"{files.path}: none of its {len(joints)} joints moves")
+    held = {name for name in links if _held(above, name)}
+    heavy = [name for name in links if name not in above and get_link_mass(links[name]) > 0]
+    if heavy:
+        notes.append(
+            f"held to the world, as MuJoCo does with a URDF's root: {format_name_list(heavy)}"
+        )
+    notes += _once([*links.values(), *joints])
+    notes += repair_inertials(files, links, held)
+    _checked(files, root)
+    notes += remove_unusable_shapes(files, links, _compiler(root), held)
+    notes += _limits(joints)
+    notes += _mimics(joints)
+    return notes
+
+
+def _no_macros(files: ModelFileReader, root: Element) -> None:
+    for element in root.iter():
+        macros = [value for value in element.attrib.values() if "${" in value or "$(" in value]
+        if element.tag.startswith("xacro:") or macros:
+            what = truncate_text(macros[0]) if macros else f"<{truncate_text(element.tag)}>"
+            raise files.make_error(element, f"{what} is a macro; run xacro, and give the result")
+
+
+def _unread(root: Element) -> list[str]:
+    """Remove elements that MuJoCo does not read."""
+    tags = sorted(
+        {child.tag for child in root if child.tag not in (*READ_ELEMENTS, *VISUAL_ELEMENTS)}
+    )
+    root[:] = [child for child in root if child.tag in READ_ELEMENTS]
+    unread = format_name_list([f"<{tag}>" for tag in tags])
+    return [f"not read, since MuJoCo knows no such thing: {unread}"] if tags else []
+
+
+def _links(files: ModelFileReader, root: Element) -> dict[str, Element]:
+    links: dict[str, Element] = {}
+    for link in find_children(root, "link"):
+        name = link.get("name")
+        if not name:
+            raise files.make_error(link, "a link without a name")
+        if name in links:
+            raise files.make_error(link, f"two links are called '{truncate_text(name)}'")
+        links[name] = link
+    return links
+
+
+def _with_world(
+    files: ModelFileReader, root: Element, links: dict[str, Element], joints: Sequence[Element]
+) -> list[str]:
+    """Add the link `world` if joints refer to it and the file does not define it.
+
+    Simulators with a link of this name read such a file in this way.
+    """
+    if WORLD in links or not any(_end(files, joint, "parent") == WORLD for joint in joints):
+        return []
+    links[WORLD] = SubElement(root, "link", {"name": WORLD})
+    return [f"the link {WORLD}, which the file does not state, is the fixed world"]
+
+
+def _named(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
+    """Give each joint a unique name."""
+    seen: set[str] = set()
+    notes = []
+    for joint in joints:
+        name = joint.get("name") or ""
+        own = name or f"joint_{_end(files, joint, 'child')}"
+        while own in seen:
+            own += "_"
+        seen.add(own)
+        if own == name:
+            continue
+        joint.set("name", own)
+        was = f"another joint {truncate_text(name)}" if name else "a joint without a name"
+        notes.append(f"called {truncate_text(own)} here: {was}")
+    return notes
+
+
+def _end(files: ModelFileReader, joint: Element, tag: str) -> str:
+    """Return the name of a joint's parent or child link."""
+    ends = find_children(joint, tag)
+    name = ends[0].get("link") if ends else None
+    if not name:
+        label = truncate_text(joint.get("name") or "without a name")
+        raise files.make_error(joint, f"joint {label} states no {tag} link")
+    return name
+
+
+def _joined(
+    files: ModelFileReader, links: Mapping[str, Element], joints: Sequence[Element]
+) -> dict[str, tuple[str, Element]]:
+    """Return the parent link and the joint of each link; raise an error if links form no tree."""
+    above: dict[str, tuple[str, Element]] = {}
+    for joint in joints:
+        label, kind = truncate_text(joint.get("name") or ""), joint.get("type") or ""
+        if kind not in JOINT_TYPES:
+            raise files.make_error(
+                joint, f"joint {label}: {make_unknown_name_error('type', kind, JOINT_TYPES)}"
+            )
+        parent, child = _end(files, joint, "parent"), _end(files, joint, "child")
+        for name in (parent, child):
+            if name not in links:
+                raise files.make_error(
+                    joint, f"joint {label}: there is no link '{truncate_text(name)}'"
+                )
+        if child in above:
+            raise files.make_error(
+                joint, f"link {truncate_text(child)} hangs on two joints; a loop needs an MJCF"
+            )
+        above[child] = (parent, joint)
+    for name in links:
+        upwards, steps = name, 0
+        while upwards in above:
+            upwards, steps = above[upwards][0], steps + 1
+            if steps > len(links):
+                raise files.make_error(links[name], f"link {truncate_text(name)} hangs on itself")
+    return above
+
+
+def _held(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
+    """Return whether a link is fused to the world."""
+    while name in above:
+        name, joint = above[name]
+        if joint.get("type") != "fixed":
+            return False
+    return True
+
+
+def _compiler(root: Element) -> Element:
+    """Return the settings element of MuJoCo's compiler, which is created if missing."""
+    blocks = find_children(root, "mujoco")
+    block = blocks[0] if blocks else SubElement(root, "mujoco")
+    found = find_children(block, "compiler")
+    return found[0] if found else SubElement(block, "compiler")
+
+
+def _checked(files: ModelFileReader, root: Element) -> None:
+    """Raise an error for unknown MuJoCo settings, which MuJoCo ignores in a URDF."""
+    import mujoco
+
+    for child in find_children(root, "mujoco"):
+        for setting in child:
+            alone = Element("mujoco")
+            alone.append(Element(setting.tag, setting.attrib))
+            try:
+                mujoco.MjSpec.from_string(format_tree(alone)[0])
+            except ValueError as error:
+                said = re.sub(r", line \d+", "", format_mujoco_error(error))
+                raise files.make_error(setting, said) from None
+
+
+def _once(parts: Sequence[Element]) -> list[str]:
+    """Remove repeated elements in a link or a joint, except for the first of each kind."""
+    twice = []
+    for part in parts:
+        seen: set[str] = set()
+        for child in list(part):
+            if child.tag in seen and child.tag not in ("visual", "collision"):
+                part.remove(child)
+                twice.append(f"<{child.tag}> of {part.tag} {part.get('name')}")
+            seen.add(child.tag)
+    return [f"stated twice, the first is read: {format_name_list(twice)}"] if twice else []
+
+
+def read_velocity_limits(root: Element) -> dict[str, float]:
+    """Return the velocity limits of joints, rad/s or m/s, where the file specifies them."""
+    found = {}
+    for joint in find_children(root, "joint"):
+        for limit in find_children(joint, "limit"):
+            fastest = parse_number(limit.get("velocity"))
+            if joint.get("type") in ONE_DOF_JOINT_TYPES and 0 < fastest < math.inf:
+                found[joint.get("name") or ""] = fastest
+    return found
+
+
+def _limits(joints: Sequence[Element]) -> list[str]:
+    unstated, empty, clamped = [], [], []
+    for joint in joints:
+        name, kind = joint.get("name") or "", joint.get("type")
+        for limit in find_children(joint, "limit"):
+            if kind not in ONE_DOF_JOINT_TYPES:
+                joint.remove(limit)
+                continue
+            effort = parse_number(limit.get("effort"))
+            if "effort" in limit.attrib and not (0 < effort < math.inf):
+                unstated.append(name)
+                del limit.attrib["effort"]
+            elif effort > 0:
+                clamped.append(f"{name} {effort:g}")
+            if kind == "continuous" or parse_number(limit.get("lower")) >= parse_number(
+                limit.get("upper")
+            ):
+                empty += [name] if kind != "continuous" else []
+                limit.attrib.pop("lower", None)
+                limit.attrib.pop("upper", None)
+    notes = []
+    if clamped:
+        notes.append(
+            f"effort limits clamp what actuators exert (N m or N): {format_name_list(clamped)}"
+        )
+    if unstated:
+        notes.append(
+            f"an effort limit that is not positive is read as none: {format_name_list(unstated)}"
+        )
+    if empty:
+        notes.append(
+            f"a lower limit not below the upper is read as none: {format_name_list(empty)}"
+        )
+    return notes
+
+
+def stiffen_mimics(spec: Any) -> None:
+    """Make mimic joints follow as stiffly as MuJoCo allows.
+
+    URDF specifies a rigid relation, and MuJoCo's default equality follows it with a delay of 20 ms.
+
+    Args:
+        spec: mujoco.MjSpec of a URDF, whose only equalities are those of mimic joints.
+    """
+    for equality in spec.equalities:
+        equality.solref = RIGID
+        equality.solimp = FRICTION_SOLIMP
+
+
+def _mimics(joints: Sequence[Element]) -> list[str]:
+    kinds = {joint.get("name"): joint.get("type") for joint in joints}
+    tied, loose = [], []
+    for joint in joints:
+        for mimic in find_children(joint, "mimic"):
+            name, other = joint.get("name") or "", mimic.get("joint") or ""
+            if (
+                joint.get("type") in ONE_DOF_JOINT_TYPES
+                and kinds.get(other) in ONE_DOF_JOINT_TYPES
+                and name != other
+            ):
+                factor, shift = mimic.get("multiplier") or "1", mimic.get("offset") or "0"
+                tied.append(f"{name} = {factor} {other} + {shift}")
+            else:
+                joint.remove(mimic)
+                loose.append(f"{name} ({other})")
+    notes = []
+    if tied:
+        notes.append(f"mimic joints follow as stiffly as MuJoCo allows: {format_name_list(tied)}")
+    if loose:
+        notes.append(
+            f"mimics of joints that do not move, or are not there: {format_name_list(loose)}"
+        )
+    return notes

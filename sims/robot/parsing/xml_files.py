@@ -1,0 +1,224 @@
+"""Read model files as XML trees with a safe parser, resolve includes, and format trees as text.
+
+The parser opens no other files. Each line of the formatted text can be traced back to a line of the
+user's files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, tostring
+from xml.parsers import expat
+
+from sims.core.atomic_files import require_file
+from sims.core.simulator import InputError
+
+MAX_MODEL_BYTES = 50 * 2**20
+"""Maximum size of a model file including all included files, in bytes."""
+MAX_ASSET_BYTES = 500 * 2**20
+"""Maximum size of a mesh or an image file, in bytes."""
+MAX_ELEMENT_DEPTH = 400
+"""Maximum nesting depth of XML elements."""
+
+
+@dataclass
+class ModelFileReader:
+    """Reader of the files of one model.
+
+    Attributes:
+        path: the model file; included files are relative to its folder.
+        places: file and line of each element.
+        included: the model file and all included files.
+        size: total size of these files in bytes.
+        digest: SHA-256 digest of everything that was read.
+        given: elements in the text given to MuJoCo, one for each line of the text.
+    """
+
+    path: Path
+    places: dict[Element, str] = field(default_factory=dict)
+    included: list[Path] = field(default_factory=list)
+    size: int = 0
+    digest: Any = field(default_factory=hashlib.sha256)
+    given: list[Element] = field(default_factory=list)
+
+    def make_error(self, element: Element | None, message: str) -> InputError:
+        """Make the error for an element of the file, with file and line."""
+        place = self.places.get(element) if element is not None else None
+        return InputError(f"{place or self.path}: {message}")
+
+    def make_mujoco_error(self, said: str) -> InputError:
+        """Make the error for a message of MuJoCo about the text that it was given.
+
+        The line in that text is replaced by the line in the user's file.
+        """
+        line = re.search(r", line (\d+)", said)
+        number = int(line[1]) if line else 0
+        element = self.given[number - 1] if 0 < number <= len(self.given) else None
+        return self.make_error(element, re.sub(r", line \d+", "", said))
+
+    def read_content(self, path: Path, most: int) -> bytes:
+        """Read a file, and add its bytes to the digest.
+
+        Args:
+            path: path of the file.
+            most: maximum size in bytes.
+
+        Raises:
+            InputError: the file cannot be read, or is too large.
+        """
+        require_file(path)
+        try:
+            size = path.stat().st_size
+            if size > most:
+                raise InputError(f"{path}: {size} bytes; a file of a model has at most {most}")
+            data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        self.add_to_digest(data)
+        return data
+
+    def add_to_digest(self, data: bytes) -> None:
+        """Add bytes to the digest."""
+        self.digest.update(f"{len(data)}:".encode())
+        self.digest.update(data)
+
+
+def parse_tree(files: ModelFileReader, path: Path) -> Element:
+    """Parse a file and return its root element.
+
+    Args:
+        files: reader of the model.
+        path: path of the file.
+
+    Raises:
+        InputError: the file cannot be read, is too large or is not XML, or it declares something
+            that an XML parser would fetch or repeat (a document type, an entity).
+    """
+    data = files.read_content(path, MAX_MODEL_BYTES)
+    files.included.append(path.resolve())
+    files.size += len(data)
+    if files.size > MAX_MODEL_BYTES:
+        raise InputError(
+            f"{files.path}: with what it includes it has more than {MAX_MODEL_BYTES} bytes"
+        )
+    # Like MuJoCo's parser, accept blank lines before the declaration and zero bytes after the end.
+    text = data.rstrip(b"\0").lstrip(b" \t\r\n")
+    above = data[: data.find(text[:1])].count(b"\n") if text else 0
+    parser = expat.ParserCreate()
+    grown = _LineTrackingTreeBuilder(files, path, parser, above)
+    try:
+        parser.Parse(text, True)
+    except InputError:
+        raise
+    except expat.ExpatError as error:
+        what = expat.ErrorString(error.code)
+        line = error.lineno + above
+        wanted = "a robot's model file is MJCF or URDF"
+        raise InputError(f"{path}:{line}: not well-formed XML: {what}; {wanted}") from None
+    except (ValueError, LookupError) as error:  # The declared encoding does not exist.
+        raise InputError(f"{path}: not XML: {error}") from None
+    return grown.root
+
+
+class _LineTrackingTreeBuilder:
+    """XML tree under construction by a parser."""
+
+    def __init__(self, files: ModelFileReader, path: Path, parser: Any, above: int) -> None:
+        self.files, self.path, self.parser, self.above = files, path, parser, above
+        self.open: list[Element] = []
+        self.top: Element | None = None
+        parser.StartElementHandler = self.begin
+        parser.EndElementHandler = self.end
+        parser.StartDoctypeDeclHandler = self.refuse
+        parser.EntityDeclHandler = self.refuse
+
+    @property
+    def root(self) -> Element:
+        assert self.top is not None, "a well-formed file has a root"
+        return self.top
+
+    @property
+    def here(self) -> str:
+        """File and line at the parser's position."""
+        return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
+
+    def begin(self, name: str, attributes: dict[str, str]) -> None:
+        element = Element(name, attributes)
+        self.files.places[element] = self.here
+        if self.open:
+            self.open[-1].append(element)
+        else:
+            self.top = element
+        self.open.append(element)
+        if len(self.open) > MAX_ELEMENT_DEPTH:
+            raise self.files.make_error(element, f"elements more than {MAX_ELEMENT_DEPTH} deep")
+
+    def end(self, _: str) -> None:
+        self.open.pop()
+
+    def refuse(self, *_: Any) -> None:
+        raise InputError(f"{self.here}: document types and entities are not read; remove them")
+
+
+def resolve_includes(files: ModelFileReader, root: Element) -> None:
+    """Replace ``resolve_includes`` elements by the content of their files, as MuJoCo does.
+
+    Names are relative to the model file's folder, and no file is included twice.
+
+    Args:
+        files: reader of the model.
+        root: root element; it is changed in place.
+    """
+    for parent in list(root.iter()):
+        if any(child.tag == "include" for child in parent):
+            parent[:] = _with_included(files, parent)
+
+
+def _with_included(files: ModelFileReader, parent: Element) -> list[Element]:
+    children: list[Element] = []
+    for child in parent:
+        if child.tag != "include":
+            children.append(child)
+            continue
+        name = child.get("file")
+        if not name:
+            raise files.make_error(child, "an include states no file")
+        path = files.path.parent / name.replace("\\", "/")
+        if not path.is_file():
+            raise files.make_error(child, f"the included file {name} is absent ({path})")
+        if path.resolve() in files.included:
+            raise files.make_error(
+                child, f"{name} is included already: MuJoCo takes each file once"
+            )
+        inner = parse_tree(files, path)
+        resolve_includes(files, inner)
+        children += list(inner)
+    return children
+
+
+def format_tree(root: Element) -> tuple[str, list[Element]]:
+    """Format a tree as text with one element begun in each line.
+
+    Returns:
+        The text, and the element that begins in each line.
+    """
+    elements = list(root.iter())
+    for element in elements:
+        element.text = "\n" if len(element) else None
+        element.tail = None
+    for element in elements:
+        for child in element[:-1]:
+            child.tail = "\n"
+    return tostring(root, encoding="unicode"), elements
+
+
+def find_children(element: Element, *path: str) -> list[Element]:
+    """Find all elements at a path of tags below an element; each tag may occur repeatedly."""
+    found = [element]
+    for tag in path:
+        found = [child for parent in found for child in parent if child.tag == tag]
+    return found

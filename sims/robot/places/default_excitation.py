@@ -1,0 +1,194 @@
+"""Default channels and excitation of a robot, for recordings without specified ones.
+
+The commands move every joint about its reference pose, within the limits of controls and joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.core.system import DefaultRecording
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.places.typical_forces import compute_joint_scales
+from sims.robot.robot_model import Actuator, Joint, RobotModel
+
+SWING_AMPLITUDES = {"hinge": 0.4, "slide": 0.1}
+"""Amplitude of a joint's motion, in rad or m, by joint kind, if its range allows it."""
+MAX_RANGE_SHARE = 0.25
+"""Maximum amplitude of a joint's motion, as a share of its range."""
+MAX_MARGIN_SHARE = 0.8
+"""Maximum amplitude, as a share of the distance from the pose to the nearer joint limit."""
+MIN_GRAVITY_FORCE_SHARE = 0.5
+"""Minimum force amplitude, as a share of the typical force of the joint."""
+SLOW, FAST = 0.3, 2.0
+"""Lowest and highest frequency of a command, in Hz."""
+CENTRE_FREQUENCY = 2.0 * np.pi * np.sqrt(SLOW * FAST)
+"""Geometric mean of the lowest and highest frequency, in rad/s."""
+TRIAL_SECONDS = 4.0
+"""Duration of the trial simulation of commands, in seconds."""
+MAX_AMPLITUDE_HALVINGS = 6
+"""Number of command amplitudes that are tried; each is half the previous one."""
+
+
+class ExcitationCommand(NamedTuple):
+    """Excitation command of one input.
+
+    Attributes:
+        name: name of the input.
+        centre: mean value.
+        size: amplitude.
+        address: index of the control, or of the generalised force.
+    """
+
+    name: str
+    centre: float
+    size: float
+    address: int
+
+    def to_signal_text(self, share: float) -> str:
+        """Format as a signal text, with the amplitude multiplied by a share."""
+        swing = f"multisine:{share * self.size:.4g}:{SLOW:g}:{FAST:g}"
+        return f"{self.centre:.6g} + {swing}" if self.centre else swing
+
+
+class LazyDefaultRecording:
+    """Default recording of a robot's system, created on first access (a descriptor)."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = f"_made_{name}"
+
+    def __get__(self, _instance: object, owner: Any) -> DefaultRecording:
+        # The value is stored in the class itself, since an inherited value belongs to another
+        # robot.
+        if self._name not in vars(owner):
+            setattr(owner, self._name, make_default_recording(owner.robot))
+        made: DefaultRecording = vars(owner)[self._name]
+        return made
+
+
+def make_default_recording(robot: RobotModel) -> DefaultRecording:
+    """Make the default recording: all joint positions, with commands that move each joint.
+
+    The commands oscillate about the reference pose of the file. A servo receives positions or
+    velocities. A motor receives the force that holds the pose, plus a force that would move a free
+    joint. A robot without actuators is moved by forces at its joints.
+    """
+    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
+    commands = _commands(robot, joints)
+    shares = [0.5**k for k in range(MAX_AMPLITUDE_HALVINGS)]
+    with capture_mujoco_warnings():
+        # If joints leave their ranges at any amplitude, their commands are not the cause.
+        share = next((s for s in shares if _stays(robot, joints, commands, s)), 1.0)
+    observe = tuple(f"q.{joint.name}" for joint in joints)
+    return DefaultRecording(
+        observe=observe, inputs={c.name: c.to_signal_text(share) for c in commands}
+    )
+
+
+def _commands(robot: RobotModel, joints: Sequence[Joint]) -> list[ExcitationCommand]:
+    holding, forces = _at_pose(robot, joints)
+    driven = {joint.name: joint for joint in joints}
+    commands = []
+    for actuator in robot.actuators:
+        if actuator.joint in driven:
+            joint = driven[actuator.joint]
+            held, force = holding[joint.name], forces[joint.name]
+            commands.append(_command(robot, actuator, joint, held, force))
+    if commands:
+        return commands
+    return [
+        ExcitationCommand(f"force.{j.name}", holding[j.name], forces[j.name], j.velocity)
+        for j in joints
+    ]
+
+
+def _at_pose(
+    robot: RobotModel, joints: Sequence[Joint]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the holding force of each joint in the reference pose, and a force amplitude."""
+    import mujoco
+
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    bias = data.qfrc_bias - data.qfrc_passive
+    sizes = compute_joint_scales(robot)
+    holding, forces = {}, {}
+    for number, joint in enumerate(joints):
+        holding[joint.name] = float(bias[joint.velocity])
+        swing = _swing(joint, float(model.qpos0[joint.position]))
+        # The inertia force of a free joint at the centre frequency; gravity restrains other joints.
+        free = sizes.inertia[number] * CENTRE_FREQUENCY**2 * swing
+        forces[joint.name] = float(max(free, MIN_GRAVITY_FORCE_SHARE * sizes.force[number]))
+    return holding, forces
+
+
+def _swing(joint: Joint, start: float) -> float:
+    """Return the amplitude of a joint's motion, in rad or m.
+
+    Args:
+        joint: joint to move.
+        start: position about which it moves, in rad or m.
+    """
+    swing = SWING_AMPLITUDES[joint.kind]
+    if joint.range is None:
+        return swing
+    low, high = joint.range
+    room = MAX_MARGIN_SHARE * min(start - low, high - start)
+    return min(swing, MAX_RANGE_SHARE * (high - low), room if room > 0 else swing)
+
+
+def _command(
+    robot: RobotModel, actuator: Actuator, joint: Joint, holding: float, force: float
+) -> ExcitationCommand:
+    """Make the command of an actuator."""
+    model = robot.compiled
+    start = float(model.qpos0[joint.position])
+    swing = _swing(joint, start)
+    if actuator.kind in ("position", "pid"):
+        centre, size = start, swing
+    elif actuator.kind == "velocity":
+        centre, size = 0.0, CENTRE_FREQUENCY * swing
+    else:
+        gain = float(model.actuator_gear[actuator.id, 0] * model.actuator_gainprm[actuator.id, 0])
+        gain = gain or 1.0
+        centre, size = holding / gain, force / abs(gain)
+    if actuator.range is not None:
+        low, high = actuator.range
+        centre = min(max(centre, low), high)
+        room = min(centre - low, high - centre)
+        # A set point at the end of the control range is moved to its middle.
+        if room < MAX_RANGE_SHARE * size:
+            centre = 0.5 * (low + high)
+            room = 0.5 * (high - low)
+        size = min(size, room)
+    return ExcitationCommand(f"u.{actuator.name}", centre, size, actuator.control)
+
+
+def _stays(
+    robot: RobotModel, joints: Sequence[Joint], commands: Sequence[ExcitationCommand], share: float
+) -> bool:
+    """Return whether no joint leaves its range under commands of reduced amplitude in phase."""
+    import mujoco
+
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    limited = [joint for joint in joints if joint.range is not None]
+    places = [joint.position for joint in limited]
+    low, high = np.array([joint.range for joint in limited]).reshape(-1, 2).T
+    # The reference pose of a file may violate the file's limits, so limits include it.
+    low, high = np.minimum(low, model.qpos0[places]), np.maximum(high, model.qpos0[places])
+    told: Any = data.ctrl if any(c.name.startswith("u.") for c in commands) else data.qfrc_applied
+    addresses = [c.address for c in commands]
+    centres = np.array([c.centre for c in commands])
+    sizes = share * np.array([c.size for c in commands])
+    for k in range(int(TRIAL_SECONDS / model.opt.timestep)):
+        told[addresses] = centres + sizes * np.sin(CENTRE_FREQUENCY * k * model.opt.timestep)
+        mujoco.mj_step(model, data)
+        at = data.qpos[places]
+        if not np.isfinite(data.qpos).all() or (at < low).any() or (at > high).any():
+            return False
+    return True

@@ -1,0 +1,383 @@
+"""Effect classes for each place of a robot, and effect families over all places.
+
+Each registered effect becomes a class for every joint, actuator, body or channel where it can act,
+named ``effect@place``, and one class for all of them together, the family ``effect@*``.
+
+An effect does not depend on robots. At a joint it receives that joint alone, as a system of one
+coordinate; at an actuator or a channel it receives that signal. A family is the sum of its members.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import (
+    ALL_PLACES,
+    ActiveEffects,
+    Coefficient,
+    Effect,
+    Force,
+    Friction,
+    HiddenState,
+    HiddenStateEffect,
+    Input,
+    ModelValueEffect,
+    Sensor,
+    StateSnapshot,
+    SystemKind,
+)
+from sims.robot.places.place_list import EffectPlace
+from sims.robot.state_snapshots import RobotSnapshot
+
+SHARED_COEFFICIENT_EFFECTS = frozenset(
+    {"input.delay", "input.hold", "input.lag", "sensor.delay", "sensor.lag"}
+)
+"""Families with one coefficient for all places, such as delays."""
+EFFECTS_WITHOUT_FAMILY = frozenset(
+    {
+        "force.periodic",
+        "force.ripple",
+        "input.power",
+        "joint.backlash",
+        "joint.coupling",
+        "joint.flexibility",
+        "friction.direction",
+        "friction.hysteresis",
+        "friction.load_direction",
+        "friction.load_quadratic",
+        "friction.position",
+        "friction.stribeck",
+        "friction.warming",
+        "sensor.eccentricity",
+        "sensor.slip",
+        "state.limit",
+    }
+)
+"""Effects without a family, since their shape parameters differ between places."""
+SHARED_ACTUATOR_EFFECTS = frozenset({"supply.sag"})
+"""Effects at actuators that the actuators may share, such as a battery; one number of the world."""
+POSITION_SENSOR_EFFECTS = frozenset({"sensor.slip"})
+"""Effects of position encoders, which act on no other channel."""
+REFERENCE_FORCES = {"hinge": 0.5, "slide": 5.0}
+"""Reference force for the plausible ranges of the effect library: N m on a hinge, N on a slide."""
+HIDDEN_STATE_SHAPE_COUNT = 6
+"""Number of values tried for a shape parameter of a hidden-state effect.
+
+It is small since each value requires an integration over time.
+"""
+MIN_LOAD_FREQUENCY = 15.0
+"""Minimum natural frequency of the load on a flexible joint, in rad/s."""
+_KINDS: Mapping[str, SystemKind] = {"hinge": "rotary", "slide": "linear"}
+
+
+def make_world_effect(effect: type[Effect]) -> type[Effect]:
+    """Make an effect of the world, with the units that it has on any kind of system."""
+    coefficients = [_everywhere(c) for c in effect.coefficients]
+    return _made(effect, effect.name, "", coefficients, {})
+
+
+def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
+    """Make the class of an effect at one place."""
+    coefficients = [_of_spot(effect, c, spot) for c in effect.coefficients]
+    changed: dict[str, Any] = {"coordinate": spot.coordinate, "signal": spot.signal}
+    changed["says"] = f"{effect.says} (at {spot.words})"
+    if issubclass(effect, Force):
+        changed["force"] = _force_of(effect)
+    elif issubclass(effect, Friction):
+        changed["limit"] = _limit_of(effect)
+    elif issubclass(effect, HiddenStateEffect):
+        changed["act"] = _act_of(effect)
+        declared = effect.between or effect.coefficients
+        coefficients = [_tried(_of_spot(effect, c, spot)) for c in declared if not _has(spot, c)]
+        own = [f"{other}@{spot.name}" for other in effect.contains]
+        # A rigid transmission with the drive's inertia is the armature effect.
+        drive = f"inertia.armature@{spot.name}"
+        for number, c in enumerate(coefficients):
+            if c.of == "rotor":
+                own.append(drive)
+                changed["taking"] = _taking(drive, spot.inertia, number, c.plausible[0])
+        changed["contains"] = tuple(own)
+    return _made(effect, f"{effect.name}@{spot.name}", spot.name, coefficients, changed)
+
+
+def _force_of(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Array]:
+    def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
+        """Compute the force (L, D) along the joint of the effect."""
+        joint = cast(int, self.coordinate)
+        alone = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
+        result = np.zeros_like(moment.x)
+        result[:, joint] = effect.force(self, c, alone)[:, 0]
+        return result
+
+    return force
+
+
+def make_shared_effects(
+    effect: type[Effect], drives: Sequence[EffectPlace]
+) -> Iterator[type[Effect]]:
+    """Yield the class of an effect that all drives share, if they are of one kind.
+
+    Args:
+        effect: registered effect.
+        drives: places of the actuators.
+    """
+    joints = {one.coordinate: one for one in drives}
+    kinds = {one.kind for one in drives}
+    if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
+        return
+    whole = drives[0]._replace(size=sum(one.size for one in joints.values()))
+    coefficients = [_of_spot(effect, c, whole) for c in effect.coefficients]
+    changed: dict[str, Any] = {
+        "at": "world",
+        "says": f"{effect.says} (of one supply that all drives share)",
+        "force": _force_of_all(effect, [cast(int, joint) for joint in joints]),
+    }
+    yield _made(effect, effect.name, "", coefficients, changed)
+
+
+def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
+    def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
+        """Compute the forces (L, D) along the joints, each from the total load of the supply."""
+        robot = cast(RobotSnapshot, moment)
+        drawn = sum(np.abs(robot.carried[0][:, joint : joint + 1]) for joint in joints)
+        result = np.zeros_like(moment.x)
+        for joint in joints:
+            alone = replace(robot.get_joint_snapshot(joint), shared=drawn)
+            result[:, joint] = effect.force(self, c, alone)[:, 0]
+        return result
+
+    return force
+
+
+def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapshot], Array]:
+    def limit(self: Friction, c: Array, moment: StateSnapshot) -> Array:
+        """Compute the friction limit (L, 1) of the effect's joint."""
+        alone = cast(RobotSnapshot, moment).get_joint_snapshot(cast(int, self.coordinate))
+        return effect.limit(self, c, alone)
+
+    return limit
+
+
+def _has(spot: EffectPlace, c: Coefficient) -> bool:
+    """Return whether the model file specifies the quantity of a coefficient."""
+    stated = spot.stated.get("inertia.armature", 0.0)
+    return c.of == "rotor" and stated > c.plausible[0][0] * spot.inertia
+
+
+def _taking(
+    drive: str, inertia: float, number: int, bounds: tuple[float, float]
+) -> Callable[[Effect, Array, str, Array], Array]:
+    def taking(_: Effect, c: Array, simpler: str, given: Array) -> Array:
+        """Convert the inertia of an armature effect to the rotor's share of the joint inertia."""
+        if simpler != drive:
+            return c
+        made: Array = c.copy()
+        made[number] = np.clip(given[0] / inertia, *bounds)
+        return made
+
+    return taking
+
+
+def _tried(c: Coefficient) -> Coefficient:
+    """Add start values of a search to a shape parameter of a hidden-state effect."""
+    low, high = c.plausible[0]
+    if c.tried or low <= 0:
+        return c
+    return replace(c, tried=tuple(np.geomspace(low, high, HIDDEN_STATE_SHAPE_COUNT).tolist()))
+
+
+def _act_of(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Array, Array]]:
+    def act(
+        self: HiddenStateEffect, c: Array, moment: StateSnapshot, state: HiddenState
+    ) -> tuple[Array, Array]:
+        """Compute the force (L, D) along the effect's joint, and the rate of its hidden state."""
+        joint = cast(int, self.coordinate)
+        alone = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
+        result = np.zeros_like(moment.x)
+        force, rate = effect.compute_force_and_rate(self, c, alone, state)
+        result[:, joint] = force[:, 0]
+        return result, rate
+
+    return act
+
+
+def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) -> type[Effect]:
+    """Make the family of an effect: all its places, with one coefficient each or a shared one.
+
+    Args:
+        effect: registered effect.
+        members: classes of the effect at each place.
+    """
+    shared = effect.name in SHARED_COEFFICIENT_EFFECTS
+    first = members[0].coefficients
+    coefficients: list[Coefficient] = list(first) if shared else []
+    if not shared:
+        for member in members:
+            for c in member.coefficients:
+                coefficients.append(replace(c, name=f"{c.name}@{member.place}"))
+    count = len(first)
+    instances = tuple(member() for member in members)
+
+    def parts(_: Effect, c: Array) -> ActiveEffects:
+        """Return the members with their coefficients."""
+        if shared:
+            return tuple((one, c) for one in instances)
+        return tuple((one, c[i * count : (i + 1) * count]) for i, one in enumerate(instances))
+
+    contains = {member.name for member in members}
+    for member in members:
+        contains.update(member.contains)
+    contains.update(f"{name}@{ALL_PLACES}" for name in effect.contains)
+    changed = {
+        "parts": parts,
+        "members": instances,
+        "places": tuple(member.place for member in members),
+        "contains": tuple(sorted(contains)),
+        "says": f"{effect.says} (at every place of its kind)",
+    }
+    return _made(effect, f"{effect.name}@{ALL_PLACES}", ALL_PLACES, coefficients, changed)
+
+
+def _made(
+    effect: type[Effect],
+    name: str,
+    place: str,
+    coefficients: Sequence[Coefficient],
+    changed: Mapping[str, Any],
+) -> type[Effect]:
+    contains = tuple(f"{other}@{place}" for other in effect.contains) if place else ()
+    body = {
+        "name": name,
+        "of": effect.name,
+        "place": place,
+        "coefficients": tuple(coefficients),
+        "contains": contains,
+        "needs": "",
+        "__module__": __name__,
+        "__doc__": effect.__doc__,
+        **changed,
+    }
+    return type(f"{effect.__name__}At", (effect,), body)
+
+
+def _everywhere(c: Coefficient) -> Coefficient:
+    """Give a coefficient one unit and range for all kinds of systems: the first that it has."""
+    i = next(k for k, unit in enumerate(c.units) if unit is not None)
+    return replace(c, units=(c.units[i],) * 3, plausible=(c.plausible[i],) * 3)
+
+
+def _of_spot(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coefficient:
+    """Give a coefficient the unit and the plausible range that apply at a place."""
+    i = 2 if spot.kind == "hinge" else 1
+    unit, (low, high) = c.units[i], c.plausible[i]
+    least = c.least
+    if c.of.startswith(("input", "error")):
+        unit = c.of.replace("error", "input").replace("input", spot.unit)
+    elif c.of.startswith("reading"):
+        unit = c.of.replace("reading", spot.unit)
+    # Plausible ranges of the library refer to small joints, so forces are scaled with the joint.
+    if unit is None:
+        unit = "1"
+    share = spot.size / REFERENCE_FORCES[spot.kind]
+    if unit.startswith("N"):
+        low, high = share * low, share * high
+    elif unit.startswith(("1/N", "1/(N")):
+        low, high = low / share, high / share
+    if effect.name == "inertia.armature":
+        high = 3.0 * spot.inertia
+    if c.of == "give":
+        high = 1.0 / (spot.inertia * MIN_LOAD_FREQUENCY**2)
+    most = c.most
+    stated = spot.stated.get(effect.name) if effect.at == "joint" else None
+    if stated is not None:
+        # The total must not be negative, so the difference can at most remove the value of the
+        # file.
+        high = max(high, 2.0 * abs(stated))
+        low = least = min(0.0 - stated, 0.0)
+    if effect.name == "mass.offset":
+        least, most = spot.offsets[c.name]
+        if least < most:
+            low, high = max(low, least), min(high, most)
+    return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most)
+
+
+def make_effect_classes(
+    effect: type[Effect],
+    found: Mapping[str, Sequence[EffectPlace]],
+    native: Collection[str],
+    compiles: Callable[[type[Effect]], bool] = lambda _: True,
+) -> Iterator[type[Effect]]:
+    """Yield the classes of an effect at all places of a robot, followed by its family.
+
+    Args:
+        effect: registered effect.
+        found: places of the robot by kind.
+        native: effects that the engine writes into the model.
+        compiles: returns whether the model with an effect at one place compiles.
+    """
+    if effect.at == "world":
+        if effect.name in native or (issubclass(effect, Sensor) and not effect.filters):
+            yield make_world_effect(effect)
+        return
+    if effect.name not in native and not _for_one(effect):
+        return
+    members = [
+        make_placed_effect(effect, s) for s in found[effect.at] if _acts_at(effect, s, found)
+    ]
+    members = [member for member in members if compiles(member)]
+    yield from members
+    # Position channels of encoders are alike, while other channels have units of their own.
+    alike = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]
+    if len(alike) > 1 and effect.name not in EFFECTS_WITHOUT_FAMILY:
+        yield make_effect_family(effect, alike)
+    if len(alike) > 1 and effect.name in SHARED_ACTUATOR_EFFECTS:
+        yield from make_shared_effects(effect, found["actuator"])
+
+
+def _for_one(effect: type[Effect]) -> bool:
+    """Return whether an effect can act at one of several places without the engine's support."""
+    if issubclass(effect, Input | Sensor):
+        return True
+    # A force that needs more than its own joint is undefined at one of several joints.
+    alone = effect.needs in ("", "guide", "input", "servo")
+    if issubclass(effect, HiddenStateEffect):
+        # An effect with a share of the joint's inertia must declare what it connects.
+        return (
+            bool(effect.between) or effect.get_inertia_share is HiddenStateEffect.get_inertia_share
+        )
+    return alone and issubclass(effect, Force | Friction)
+
+
+def _acts_at(
+    effect: type[Effect], spot: EffectPlace, found: Mapping[str, Sequence[EffectPlace]]
+) -> bool:
+    """Return whether a place has the quantity that an effect changes."""
+    if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[spot.kind]) is None:
+        return False
+    if effect.at == "joint" and effect.needs == "input":
+        return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
+    if issubclass(effect, HiddenStateEffect) and effect.between:
+        # The effect connects the drive of a joint to its load, so both must exist.
+        return spot.last and any(one.coordinate == spot.coordinate for one in found["actuator"])
+    if effect.needs == "servo" and not spot.servo:
+        return False
+    if effect.name == "joint.coupling" and not spot.coupled:
+        return False
+    # A power effect is undefined for a set point.
+    if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):
+        return False
+    if effect.name in POSITION_SENSOR_EFFECTS and not spot.name.startswith("q."):
+        return False
+    # Angular coefficients apply to encoders, and not to other channels.
+    if effect.at == "channel" and not effect.coefficients[0].of:
+        unit = effect.coefficients[0].unit(_KINDS[spot.kind])
+        if unit is None or (unit == "rad" and spot.unit != "rad"):
+            return False
+    if issubclass(effect, ModelValueEffect) and effect.at == "actuator":
+        return spot.stated.get(effect.name, 1.0) != 0.0
+    return True

@@ -1,0 +1,163 @@
+"""List the places of a robot where effects may act, and what its model file specifies there.
+
+Places are joints, actuators, bodies and channels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.robot.coupled_drives import list_coupling_places as coupled_places
+from sims.robot.places.centre_of_mass_limits import observable_axes, reach
+from sims.robot.robot_model import RobotModel
+
+MUJOCO_EFFECT_WORDS = {
+    "armature": "inertia.armature",
+    "damping": "drag.linear",
+    "frictionloss": "friction.coulomb",
+    "gear": "input.gain",
+    "gravity": "gravity.scale",
+    "inertia": "inertia.scale",
+    "ipos": "mass.offset",
+    "kp": "actuator.stiffness",
+    "kv": "actuator.damping",
+    "mass": "mass.scale",
+    "stiffness": "spring.linear",
+}
+"""MuJoCo's words for numbers of a model file, and the effects that change them."""
+
+
+class EffectPlace(NamedTuple):
+    """A place at which an effect may act.
+
+    Attributes:
+        name: name of the joint, actuator, body or channel.
+        kind: kind of the coordinate whose units apply: hinge or slide.
+        coordinate: index of the coordinate; None if there is none.
+        signal: name of the input or channel; empty for a joint or body.
+        unit: unit of the signal.
+        size: typical force along the coordinate, in N or N m.
+        inertia: inertia about the coordinate, in kg or kg m^2.
+        stated: values that the model file specifies, by name of the effect that changes them.
+        words: name of the place in a sentence.
+        servo: whether it is an actuator that follows a position set point.
+        last: whether it is the last joint of its body.
+        coupled: whether it is a joint whose drive may be coupled to the preceding joint.
+        offsets: for a body, lowest and highest offset in metres that leaves its centre of mass
+            within the link, by axis of its frame (``x``, ``y``, ``z``); both are zero along an axis
+            where an offset cannot be observed.
+    """
+
+    name: str
+    kind: str
+    coordinate: int | None
+    signal: str
+    unit: str
+    size: float
+    inertia: float
+    stated: Mapping[str, float]
+    words: str
+    servo: bool = False
+    last: bool = False
+    coupled: bool = False
+    offsets: Mapping[str, tuple[float, float]] = MappingProxyType({})
+
+
+def list_places(
+    robot: RobotModel, channels: Sequence[tuple[str, str]]
+) -> dict[str, list[EffectPlace]]:
+    """List the places of a robot by kind: joint, actuator, body, channel.
+
+    Args:
+        robot: robot whose places are listed.
+        channels: names and units of the channels that it can observe.
+    """
+    from sims.robot.places.typical_forces import coefficient_scales
+
+    sizes = coefficient_scales(robot)
+    found: dict[str, list[EffectPlace]] = {"joint": [], "actuator": [], "body": [], "channel": []}
+    numbers: dict[str, int] = {}
+    may_be_coupled = coupled_places(robot)
+    bodies = robot.compiled.jnt_bodyid
+    lasts = {int(body): i for i, body in enumerate(bodies)}
+    for number, joint in enumerate(j for j in robot.joints if j.has_one_coordinate):
+        numbers[joint.name] = number
+        found["joint"].append(
+            EffectPlace(
+                joint.name,
+                joint.kind,
+                number,
+                "",
+                joint.unit,
+                sizes.force[number],
+                sizes.inertia[number],
+                _stated(robot, joint.velocity, joint.id),
+                f"joint {joint.name}",
+                last=lasts[int(bodies[joint.id])] == joint.id,
+                coupled=joint.name in may_be_coupled,
+            )
+        )
+    for actuator in robot.actuators:
+        on = next((s for s in found["joint"] if s.name == actuator.joint), None)
+        if on is None:
+            continue
+        unit = _control_unit(actuator.kind, on)
+        found["actuator"].append(
+            on._replace(
+                name=actuator.name,
+                signal=f"u.{actuator.name}",
+                unit=unit,
+                stated=_gains(robot, actuator.id),
+                words=f"actuator {actuator.name}",
+                servo=actuator.kind == "position",
+            )
+        )
+    for body in robot.bodies:
+        nothing: Mapping[str, float] = {}
+        words = f"body {body.name}"
+        box = reach(robot, body.name)
+        axes = observable_axes(robot, body.name)
+        ends = np.where(np.isin(range(3), axes)[:, None], box, 0.0).tolist()
+        offsets = {axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)}
+        spot = EffectPlace(
+            body.name, "hinge", None, "", "kg", 1.0, 1.0, nothing, words, offsets=offsets
+        )
+        found["body"].append(spot)
+    for name, unit in channels:
+        _, _, of = name.partition(".")
+        coordinate = numbers.get(of) if name.startswith(("q.", "qd.", "tau.")) else None
+        on = found["joint"][coordinate] if coordinate is not None else None
+        kind, size = (on.kind, on.size) if on else ("hinge", 1.0)
+        words = f"channel {name}"
+        found["channel"].append(
+            EffectPlace(name, kind, coordinate, name, unit, size, 1.0, {}, words)
+        )
+    return found
+
+
+def _control_unit(kind: str, on: EffectPlace) -> str:
+    """Return the unit of an actuator's control."""
+    length = "rad" if on.kind == "hinge" else "m"
+    force = "N*m" if on.kind == "hinge" else "N"
+    return {"position": length, "velocity": f"{length}/s", "motor": force}.get(kind, "1")
+
+
+def _gains(robot: RobotModel, actuator: int) -> dict[str, float]:
+    """Return the servo gains of an actuator in the model file; zero if it is not a servo."""
+    bias = robot.compiled.actuator_biasprm[actuator]
+    return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
+
+
+def _stated(robot: RobotModel, dof: int, joint: int) -> dict[str, float]:
+    model = robot.compiled
+    return {
+        "drag.linear": float(model.dof_damping[dof]),
+        "friction.coulomb": float(model.dof_frictionloss[dof]),
+        "inertia.armature": float(model.dof_armature[dof]),
+        "spring.linear": float(model.jnt_stiffness[joint]),
+        "drag.quadratic": float(np.ravel(model.dof_dampingpoly[dof])[0]),
+    }

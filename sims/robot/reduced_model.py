@@ -1,0 +1,271 @@
+"""The model that is simulated: a robot's model without elements that do not influence its motion.
+
+The batch elements of a simulation copy the whole model, for every candidate that adds joints to it.
+Meshes, textures and geoms that cannot collide take most of the memory and of the compile time. They
+do not influence the motion once the masses that follow from them are known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sims.core.freed_memory import release_free_memory
+from sims.robot.coupled_drives import name_unnamed_elements
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.parsing import contact_exclusion
+from sims.robot.parsing.collision_hulls import (
+    MIN_FACES,
+    TESTED,
+    CollisionShapes,
+    Hull,
+    add_hull,
+    add_reserve,
+    has_room,
+    read_hull,
+)
+from sims.robot.robot_model import RobotModel, cache_per_robot
+
+RAYS = frozenset(
+    f"mjSENS_{name}"
+    for name in ("RANGEFINDER", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "TACTILE", "PLUGIN")
+)
+"""Sensor types that measure shapes which need not collide."""
+SHAPES = (
+    "geom_", "mesh_", "mat_", "tex_", "skin_", "hfield_", "bvh_", "oct_", "vis", "stat",
+    "dof_length", "body_margin",
+)  # fmt: skip
+"""Prefixes of model fields that do not influence the motion.
+
+They are shapes (colliding ones are compared by `GEOM_FIELDS`), lengths that decide which bodies
+sleep, and margins that bound the search for contacts.
+"""
+GEOM_FIELDS = (
+    "geom_type", "geom_bodyid", "geom_condim", "geom_priority", "geom_sameframe", "geom_solmix",
+    "geom_solref", "geom_solimp", "geom_size", "geom_aabb", "geom_rbound", "geom_pos", "geom_quat",
+    "geom_friction", "geom_margin", "geom_gap", "geom_fluid",
+)  # fmt: skip
+"""Fields on which contacts of a geom depend, in addition to its mesh and its contact partners."""
+
+POSES = 20
+"""Number of poses in which contacts of whole meshes and of their hulls are compared."""
+FREE_RANGE = (-1.0, 1.0)
+"""Positions of joints without a range in these poses, in rad or m."""
+
+
+@cache_per_robot
+def strip_assets(robot: RobotModel) -> RobotModel:
+    """Remove the elements of a robot's model that do not influence its motion.
+
+    Masses and inertias are those of the whole compiled model. Geoms that can collide stay, with the
+    convex hulls of their meshes.
+
+    Args:
+        robot: robot as read from its model file.
+
+    Returns:
+        The robot with a smaller spec, whose motion is bitwise equal; the robot itself if that is
+        impossible.
+    """
+    import mujoco
+
+    model = robot.compiled
+    if _needs_shapes(model):
+        return robot
+    try:
+        stripped = _stripped(robot)
+    # Any compiler error concerns the smaller model only, since the whole model has compiled.
+    except (ValueError, RuntimeError):
+        stripped = robot
+    # MuJoCo caches all meshes that it has read, for specs that may use them again.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
+    release_free_memory()
+    return stripped
+
+
+def _stripped(robot: RobotModel) -> RobotModel:
+    """Remove the elements of a robot's model that do not influence its motion, see `strip_assets`.
+
+    Raises:
+        ValueError: MuJoCo rejects the smaller model.
+    """
+    model = robot.compiled
+    spec = robot.spec.copy()
+    with capture_mujoco_warnings():
+        spec.compile()  # Compilation assigns numbers to the elements.
+    _state_inertials(spec, model)
+    hulls, numbers = _reduce_geoms(spec, model)
+    name_unnamed_elements(spec, robot)
+    spec.discard_visual()
+    spec.compiler.discardvisual = False
+    used = {geom.hfieldname for geom in spec.geoms}
+    unused = [field for field in spec.hfields if field.name not in used]
+    for asset in [*spec.skins, *unused]:
+        spec.delete(asset)
+    stripped = replace(robot, spec=spec)
+    if hulls:
+        add_reserve(spec, stripped.compile(spec), model, hulls)
+        geoms = {geom.name: numbers[geom.name] for geom in spec.geoms if geom.meshname in hulls}
+        stripped = replace(stripped, shapes=CollisionShapes.read(model, hulls, geoms))
+    alike = _moves_alike(model, stripped.compiled, numbers)
+    if alike and hulls:
+        alike = has_room(stripped.compiled, model)
+        alike = alike and _touches_alike(robot, stripped.compiled, numbers)
+    return stripped if alike else robot
+
+
+@cache_per_robot
+def strip_shapes(robot: RobotModel) -> RobotModel:
+    """Remove all geoms that no other element refers to.
+
+    The resulting model compiles in a millisecond, or fails to compile like the whole model.
+
+    Args:
+        robot: robot as read from its model file.
+
+    Returns:
+        The robot without contacts; the robot itself if MuJoCo cannot compile it without shapes.
+    """
+    spec = strip_assets(robot).spec.copy()
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+    try:
+        spec.discard_visual()
+        bare = replace(robot, spec=spec)
+        return bare if bare.compiled.nq == robot.compiled.nq else robot
+    except ValueError:
+        return robot
+
+
+def _needs_shapes(model: Any) -> bool:
+    """Return whether non-contact quantities depend on geoms, or contacts on more than hulls."""
+    import mujoco
+
+    kinds = {mujoco.mjtSensor(int(kind)).name for kind in model.sensor_type}
+    sdf = int(mujoco.mjtGeom.mjGEOM_SDF) in model.geom_type
+    sleeps = model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    fluid = model.geom_fluid.any()
+    return bool(kinds & RAYS or model.nflex or model.nplugin or sdf or fluid or sleeps)
+
+
+def _state_inertials(spec: Any, model: Any) -> None:
+    """Write the masses and inertias of the compiled model into a spec."""
+    import mujoco
+
+    for compiler in (spec.compiler, *(body.compiler for body in spec.bodies)):
+        compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        compiler.balanceinertia = False
+        compiler.boundmass = compiler.boundinertia = 0.0
+        compiler.settotalmass = -1.0
+    for body in spec.bodies:
+        i = body.id
+        body.explicitinertial = bool(i and model.body_mass[i] > 0)
+        if not body.explicitinertial:
+            continue
+        body.mass, body.inertia = float(model.body_mass[i]), model.body_inertia[i]
+        body.ipos, body.iquat = model.body_ipos[i], model.body_iquat[i]
+        body.fullinertia = np.full(6, np.nan)
+        body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+
+
+def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int]]:
+    """Make geoms that cannot collide visual, and reduce the meshes of the others to convex hulls.
+
+    Returns:
+        The hulls by the names of their meshes, and the numbers of all geoms by their names.
+    """
+    import mujoco
+
+    touching = contact_exclusion.touching(model)
+    known = mujoco.__version__.startswith(TESTED)
+    hulls: dict[str, Hull] = {}
+    numbers: dict[str, int] = {}
+    # The numbers are collected first, since a spec loses them when it is edited.
+    for geom, i in [(geom, geom.id) for geom in spec.geoms]:
+        geom.name = geom.name or f"simgap.geom{i}"
+        numbers[geom.name] = i
+        if not touching[i]:
+            geom.contype = geom.conaffinity = 0
+        mesh = int(model.geom_dataid[i]) if geom.meshname else -1
+        if mesh < 0 and not geom.meshname:
+            continue
+        # The compiler may have fitted a primitive to the mesh, or moved its frame.
+        kind = mujoco.mjtGeom(int(model.geom_type[i]))
+        if kind != mujoco.mjtGeom.mjGEOM_MESH:
+            geom.type, geom.size, geom.meshname = kind, model.geom_size[i], ""
+        elif known and touching[i] and model.mesh_facenum[mesh] > MIN_FACES:
+            hull = hulls.get(geom.meshname) or read_hull(model, mesh)
+            if hull is None:
+                continue
+            hulls[geom.meshname] = hull
+        else:
+            continue
+        geom.set_frame(geom.parent.add_frame())
+        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        geom.pos, geom.quat = model.geom_pos[i], model.geom_quat[i]
+    for mesh in [mesh for mesh in spec.meshes if mesh.name in hulls]:
+        name = mesh.name
+        spec.delete(mesh)
+        add_hull(spec, name, hulls[name])
+    return hulls, numbers
+
+
+def _moves_alike(model: Any, other: Any, numbers: Mapping[str, int]) -> bool:
+    """Return whether two models of one robot have equal fields, except for non-colliding shapes.
+
+    Args:
+        model: whole model.
+        other: model with some of its geoms.
+        numbers: numbers of the whole model's geoms, by geom name.
+    """
+    of = [numbers[other.geom(i).name] for i in range(other.ngeom)]
+    fields = {
+        name: getattr(model, name) for name in dir(model) if not name.startswith(("_", *SHAPES))
+    }
+    for name, values in fields.items():
+        is_number = isinstance(values, np.ndarray) and values.dtype.kind == "f"
+        if is_number and not np.array_equal(values, getattr(other, name), equal_nan=True):
+            return False
+    if model.stat.meaninertia != other.stat.meaninertia:
+        return False
+    return all(
+        np.array_equal(getattr(model, field)[of], getattr(other, field)) for field in GEOM_FIELDS
+    )
+
+
+def _touches_alike(robot: RobotModel, other: Any, numbers: Mapping[str, int]) -> bool:
+    """Return whether contacts are equal in random poses within the ranges of the joints.
+
+    The test is needed since other versions of MuJoCo may read more of a mesh than hulls contain.
+
+    Args:
+        robot: robot with the whole model.
+        other: model with hulls.
+        numbers: numbers of the whole model's geoms, by geom name.
+    """
+    import mujoco
+
+    model = robot.compiled
+    rng = np.random.default_rng(0)
+    data, smaller = mujoco.MjData(model), mujoco.MjData(other)
+    of = np.array([numbers[other.geom(i).name] for i in range(other.ngeom)])
+    for _ in range(POSES):
+        data.qpos[:] = model.qpos0
+        for joint in robot.joints:
+            if joint.has_one_coordinate:
+                data.qpos[joint.position] = rng.uniform(*(joint.range or FREE_RANGE))
+        smaller.qpos[:] = data.qpos
+        for one, its in ((model, data), (other, smaller)):
+            mujoco.mj_fwdPosition(one, its)
+        whole, reduced = data.contact, smaller.contact
+        if data.ncon != smaller.ncon or not (
+            np.array_equal(whole.geom, of[reduced.geom])
+            and np.array_equal(whole.dist, reduced.dist)
+            and np.array_equal(whole.pos, reduced.pos)
+            and np.array_equal(whole.frame, reduced.frame)
+        ):
+            return False
+    return True

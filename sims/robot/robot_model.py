@@ -1,0 +1,408 @@
+"""A robot read from a model file: joints, actuators, bodies and sensors of the compiled model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, wraps
+from pathlib import Path
+from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
+
+import numpy as np
+
+from sims.core.simulator import InputError, make_unknown_name_error
+from sims.robot.friction_form import FrictionForm
+from sims.robot.mujoco_messages import capture_mujoco_warnings
+from sims.robot.parsing.collision_hulls import CollisionShapes
+
+Format = Literal["mjcf", "urdf"]
+JointKind = Literal["hinge", "slide", "ball", "free"]
+ActuatorKind = Literal["motor", "position", "velocity", "pid", "other"]
+KINDS: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")
+"""Joint kinds, in the order of MuJoCo's mjtJoint."""
+
+
+COUPLING_TENDON_SUFFIX = "_coupling"
+"""Suffix of the name of a coupled drive's tendon, after the name of the drive's own joint."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint.
+
+    Attributes:
+        name: name in the model; such as ``joint3`` if it has none.
+        kind: kind, in MuJoCo's words.
+        id: number in the compiled model.
+        position: address of its first position in qpos.
+        velocity: address of its first velocity in qvel.
+        range: lowest and highest position, rad or m; None if not limited.
+        effort: largest force of its actuators, N or N m; None if not limited.
+    """
+
+    name: str
+    kind: JointKind
+    id: int
+    position: int
+    velocity: int
+    range: tuple[float, float] | None
+    effort: float | None
+
+    @property
+    def has_one_coordinate(self) -> bool:
+        """Whether the joint has one coordinate."""
+        return self.kind in ("hinge", "slide")
+
+    @property
+    def unit(self) -> str:
+        """Unit of the position."""
+        return "rad" if self.kind == "hinge" else "m"
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the force along the joint."""
+        return "N*m" if self.kind == "hinge" else "N"
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """An actuator.
+
+    Attributes:
+        name: name in the model; such as ``actuator3`` if it has none.
+        id: number in the compiled model.
+        joint: joint that it drives; None if it drives something else.
+        kind: ``motor`` (its control is a force, times the gear), ``position``, ``velocity``,
+            ``pid``, or ``other``.
+        range: range of its (first) control; None if not limited.
+        force: lowest and highest force; None if not limited.
+        control: address of its first control.
+        controls: number of its controls: a pid may have, in this order, a position, a velocity, a
+            force.
+    """
+
+    name: str
+    id: int
+    joint: str | None
+    kind: ActuatorKind
+    range: tuple[float, float] | None
+    force: tuple[float, float] | None
+    control: int = -1
+    controls: int = 1
+
+
+@dataclass(frozen=True)
+class Body:
+    """A moving body, with its number, its mass in kg, and the links that are fused to it."""
+
+    name: str
+    id: int
+    mass: float
+    aliases: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SensorRow:
+    """One row of a sensor's data.
+
+    Attributes:
+        name: name; such as ``force.x`` for a sensor with three rows.
+        address: address in ``sensordata``.
+        unit: unit of the value.
+    """
+
+    name: str
+    address: int
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class RobotModel:
+    """A robot read from a model file.
+
+    Attributes:
+        path: path of the model file.
+        format: mjcf or urdf.
+        spec: repaired mujoco.MjSpec; compile a copy of it and do not change it.
+        notes: notes about repairs and omissions, one line each.
+        aliases: body that MuJoCo compiles, by name of a link that is fused into it.
+        digest: digest of everything that was read, in hexadecimal digits.
+        rate_controlled_actuators: actuators whose second control is the rate of their first; the
+            simulation sets it.
+        actuator_tables: actuators that a recording added, by name, as specified there.
+        engine_table: time step and integrator that a recording specified instead of the file's.
+        speeds: velocity limits of joints in a URDF, rad/s or m/s; an MJCF specifies none.
+        series: added joints in series with others (`dynamics.series_joints`): inertia about them by
+            name, kg or kg m^2; only these joints are not in the model file.
+        coupled: joints whose drives also drive the preceding joint (`sims.robot.coupled_drives`).
+        friction_form: form of the dry friction that effects add; friction of the file without added
+            friction keeps the file's solver parameters.
+        shapes: data written into compiled models whose meshes are convex hulls.
+        function_cache: results of functions with the decorator `cache_per_robot`.
+    """
+
+    path: Path
+    format: Format
+    spec: Any
+    notes: tuple[str, ...] = ()
+    aliases: Mapping[str, str] | None = None
+    digest: str = ""
+    rate_controlled_actuators: tuple[str, ...] = ()
+    actuator_tables: Mapping[str, Any] = field(default_factory=dict)
+    engine_table: Mapping[str, Any] = field(default_factory=dict)
+    speeds: Mapping[str, float] = field(default_factory=dict)
+    series: Mapping[str, float] = field(default_factory=dict)
+    coupled: tuple[str, ...] = ()
+    friction_form: FrictionForm = "stiff"
+    shapes: CollisionShapes | None = None
+    function_cache: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def compiled(self) -> Any:
+        """The compiled mujoco.MjModel; it must not be changed."""
+        # A copy is compiled, since a compiled spec holds all meshes a second time.
+        return self.compile(self.spec.copy())
+
+    def compile(self, spec: Any) -> Any:
+        """Compile a mujoco.MjSpec of this robot."""
+        with capture_mujoco_warnings():
+            model = spec.compile()
+        if self.shapes is not None:
+            self.shapes.write(model)
+        return model
+
+    def with_friction_form(self, form: FrictionForm) -> RobotModel:
+        """Return the robot with another form of the dry friction that effects add."""
+        other = replace(self, friction_form=form)
+        # The compiled model does not depend on the form, so it is reused.
+        other.__dict__["compiled"] = self.compiled
+        return other
+
+    @property
+    def name(self) -> str:
+        """Name of the robot: the file name without its suffix."""
+        return self.path.stem
+
+    @cached_property
+    def joints(self) -> tuple[Joint, ...]:
+        """All joints, in the order of their velocities."""
+        model = self.compiled
+        joints = []
+        for i in range(model.njnt):
+            kind = KINDS[int(model.jnt_type[i])]
+            low, high = (float(v) for v in model.jnt_range[i])
+            effort = _limit(model.jnt_actfrcrange[i], bool(model.jnt_actfrclimited[i]))
+            joints.append(
+                Joint(
+                    name=model.joint(i).name or f"joint{i}",
+                    kind=kind,
+                    id=i,
+                    position=int(model.jnt_qposadr[i]),
+                    velocity=int(model.jnt_dofadr[i]),
+                    range=(low, high) if model.jnt_limited[i] else None,
+                    effort=effort[1] if effort else None,
+                )
+            )
+        return tuple(joints)
+
+    @cached_property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """All actuators."""
+        model = self.compiled
+        # Before MuJoCo 4 each actuator had one control.
+        return tuple(self._actuator(i) for i in range(getattr(model, "nactuator", model.nu)))
+
+    def _actuator(self, i: int) -> Actuator:
+        import mujoco
+
+        model = self.compiled
+        joint = None
+        drives = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+        if int(model.actuator_trntype[i]) in drives:
+            joint = self.joints[int(model.actuator_trnid[i, 0])].name
+        if self.coupled and int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
+            tendon = model.tendon(int(model.actuator_trnid[i, 0])).name
+            own = tendon.removesuffix(COUPLING_TENDON_SUFFIX)
+            joint = own if own in self.coupled else None
+        control, controls = i, 1
+        if hasattr(model, "actuator_ctrladr"):
+            control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
+        limited = controls > 0 and bool(model.actuator_ctrllimited[control])
+        return Actuator(
+            name=model.actuator(i).name or f"actuator{i}",
+            id=i,
+            joint=joint,
+            kind=_kind(model, i),
+            range=_limit(model.actuator_ctrlrange[control], True) if limited else None,
+            force=_limit(model.actuator_forcerange[i], bool(model.actuator_forcelimited[i])),
+            control=control,
+            controls=controls,
+        )
+
+    @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """Bodies that joints move, directly or through other bodies."""
+        model = self.compiled
+        fused: dict[str, list[str]] = {}
+        for alias, name in (self.aliases or {}).items():
+            fused.setdefault(name, []).append(alias)
+        moving = []
+        for i in range(1, model.nbody):
+            # Bodies welded to the world do not move; those welded to other bodies move with them.
+            if int(model.body_weldid[i]) == 0:
+                continue
+            name = model.body(i).name or f"body{i}"
+            aliases = tuple(fused.get(name, ()))
+            moving.append(Body(name, i, float(model.body_mass[i]), aliases))
+        return tuple(moving)
+
+    @cached_property
+    def sensors(self) -> tuple[SensorRow, ...]:
+        """Rows of all sensors."""
+        model = self.compiled
+        rows = []
+        for i in range(model.nsensor):
+            name = model.sensor(i).name or f"sensor{i}"
+            begin, count = int(model.sensor_adr[i]), int(model.sensor_dim[i])
+            ends = [""] if count == 1 else [f".{axis}" for axis in _axes(count)]
+            unit = self._unit(i)
+            rows += [SensorRow(name + end, begin + k, unit) for k, end in enumerate(ends)]
+        return tuple(rows)
+
+    def _unit(self, sensor: int) -> str:
+        """Return the unit of a sensor; 1 if unknown."""
+        import mujoco
+
+        model, of = self.compiled, mujoco.mjtSensor
+        kind, on = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
+        if kind == int(of.mjSENS_JOINTPOS):
+            return self.joints[on].unit
+        if kind == int(of.mjSENS_JOINTVEL):
+            return f"{self.joints[on].unit}/s"
+        if kind in (int(of.mjSENS_JOINTACTFRC), int(of.mjSENS_JOINTLIMITFRC)):
+            return self.joints[on].force_unit
+        return _UNITS.get(kind, "1")
+
+    def integrates(self, actuator: Actuator) -> bool:
+        """Return whether an actuator integrates its control, such as ``intvelocity``."""
+        import mujoco
+
+        integrator = int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+        return int(self.compiled.actuator_dyntype[actuator.id]) == integrator
+
+    def joint(self, name: str) -> Joint:
+        """Return the joint with a name.
+
+        Raises:
+            InputError: there is no such joint; the message lists the existing ones.
+        """
+        found: Joint = self._named("joint", name, {joint.name: joint for joint in self.joints})
+        return found
+
+    def actuator(self, name: str) -> Actuator:
+        """Return the actuator with a name; errors as in `joint`."""
+        found: Actuator = self._named("actuator", name, {a.name: a for a in self.actuators})
+        return found
+
+    def body(self, name: str) -> Body:
+        """Return the body with a name, or the body into which a link with the name is fused.
+
+        Raises:
+            InputError: there is no such body; the message lists the existing ones.
+        """
+        bodies = {body.name: body for body in self.bodies}
+        fused = (self.aliases or {}).get(name, name)
+        found: Body = self._named("body", fused if fused in bodies else name, bodies)
+        return found
+
+    def _named(self, kind: str, name: str, known: Mapping[str, Any]) -> Any:
+        if name not in known:
+            error = make_unknown_name_error(
+                f"{kind} of {self.path.name}", name, list(known) or ["none"]
+            )
+            raise InputError(str(error))
+        return known[name]
+
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def cache_per_robot(
+    function: Callable[Concatenate[RobotModel, _P], _T],
+) -> Callable[Concatenate[RobotModel, _P], _T]:
+    """Cache the results of a function of a robot in the robot itself, by arguments.
+
+    A cache of the module would hold every model that a process has read.
+    """
+
+    @wraps(function)
+    def asked(robot: RobotModel, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        key = (function, *args, *kwargs.items())
+        if key not in robot.function_cache:
+            robot.function_cache[key] = function(robot, *args, **kwargs)
+        found: _T = robot.function_cache[key]
+        return found
+
+    return asked
+
+
+def _limit(values: Any, limited: bool) -> tuple[float, float] | None:
+    return (float(values[0]), float(values[1])) if limited else None
+
+
+def _kind(model: Any, i: int) -> ActuatorKind:
+    """Return the kind of an actuator from its gain and bias (MuJoCo's shortcuts)."""
+    import mujoco
+
+    gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
+    fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    dynamics = int(model.actuator_dyntype[i])
+    # A filter changes when a control acts, but not its meaning.
+    direct = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
+    pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # Available since MuJoCo 4.
+    if pid is not None and int(model.actuator_gaintype[i]) == int(pid):
+        return "pid"
+    if not fixed or not direct:
+        return "other"
+    if not affine or not np.any(bias[:3]):
+        return "motor"
+    if bias[0] == 0 and bias[1] == -gain[0] and gain[0] != 0:
+        return "position"
+    if bias[0] == 0 and bias[1] == 0 and bias[2] == -gain[0]:
+        return "velocity"
+    return "other"
+
+
+def filters() -> tuple[int, int]:
+    """Return MuJoCo's numbers of first-order filters before an actuator (mjtDyn)."""
+    import mujoco
+
+    return int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+
+
+def _axes(count: int) -> list[str]:
+    named = {3: "xyz", 4: "wxyz"}
+    return list(named[count]) if count in named else [str(k) for k in range(count)]
+
+
+_UNITS: Mapping[int, str] = {
+    0: "N",  # touch
+    1: "m/s^2",  # accelerometer
+    2: "m/s",  # velocimeter
+    3: "rad/s",  # gyro
+    4: "N",  # force
+    5: "N*m",  # torque
+    26: "m",  # frame position
+    31: "m/s",  # frame linear velocity
+    32: "rad/s",
+    33: "m/s^2",
+    34: "rad/s^2",
+    35: "m",  # centre of mass of a subtree
+    36: "m/s",
+}
+"""Units of sensors, by number of MuJoCo's mjtSensor.
+
+Units of joint and actuator sensors depend on their joint.
+"""

@@ -1,0 +1,167 @@
+"""Reference to a robot in the file of an extended simulator.
+
+It contains the model file, the additions of the recording, and the free parameters.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sims.core.simulator import InputError
+from sims.core.toml_validation import (
+    Source,
+    check_finite,
+    check_name_list,
+    check_table,
+    check_text,
+    make_error,
+)
+from sims.robot.friction_form import FRICTION_FORMS, FrictionForm
+
+if TYPE_CHECKING:
+    from sims.robot.robot_simulator import RobotSimulator
+
+ROBOT_KEYS = ("model", "digest", "free", "actuators", "engine", "numerics", "friction_form")
+"""Keys of extended.toml that describe the robot."""
+
+
+@dataclass(frozen=True)
+class RobotReference:
+    """Reference to a robot, as stored in extended.toml.
+
+    Attributes:
+        path: path of the model file.
+        digest: digest of the model file and everything that was read with it; None accepts any
+            content.
+        free: numbers of the model file that are free parameters, such as ``damping@*``.
+        actuators: actuators that a recording added, by name.
+        engine: time step and integrator of the recording that replace those of the model file.
+        numerics: ``timestep`` and ``integrator`` that differ from those; found by explain.
+        friction_form: form of the dry friction that effects add (`sims.robot.friction_form`).
+    """
+
+    path: Path
+    digest: str | None = None
+    free: tuple[str, ...] = ()
+    actuators: Mapping[str, Any] = field(default_factory=dict)
+    engine: Mapping[str, Any] = field(default_factory=dict)
+    numerics: Mapping[str, Any] = field(default_factory=dict)
+    friction_form: FrictionForm = "stiff"
+
+    def to_document(self, folder: Path | None) -> dict[str, Any]:
+        """Return the reference as a TOML document of a file in a folder.
+
+        Args:
+            folder: folder of the TOML file; None stores the model file's name without a folder.
+        """
+        where = self.path.name if folder is None else _from(folder, self.path)
+        document = {
+            key: value for key, value in asdict(self).items() if value and key in ROBOT_KEYS
+        }
+        # A file without the key means stiff friction, as files of earlier versions do.
+        if self.friction_form == "stiff":
+            del document["friction_form"]
+        free = {"free": list(self.free)} if self.free else {}
+        return {"model": where, **document, **free}
+
+    def make_simulator(self) -> type[RobotSimulator]:
+        """Make the simulator of the robot.
+
+        Raises:
+            InputError: the model file is missing, cannot be read or has changed.
+        """
+        # These modules are imported lazily, since most simulators do not need robots.
+        from sims.robot.integrator_settings import IntegratorSettings, read_integrator_settings
+        from sims.robot.parsing.read_model_file import read_robot
+        from sims.robot.robot_simulator import make_robot_simulator
+
+        robot = read_robot(self.path, actuators=self.actuators, engine=self.engine)
+        if self.digest is not None and robot.digest != self.digest:
+            remedy = "put that one back, or explain the recording anew"
+            raise InputError(f"model file {self.path} is not the one that was fitted; {remedy}")
+        numerics = IntegratorSettings(
+            **{**read_integrator_settings(robot)._asdict(), **self.numerics}
+        )
+        return make_robot_simulator(
+            robot.with_friction_form(self.friction_form), self.free, numerics
+        )
+
+
+def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
+    """Make the reference to the robot of a simulator."""
+    from sims.robot.integrator_settings import read_integrator_settings
+
+    robot = kind.robot
+    differs = kind.numerics != read_integrator_settings(robot)
+    return RobotReference(
+        Path(robot.path).resolve(),
+        robot.digest,
+        kind.free,
+        robot.actuator_tables,
+        robot.engine_table,
+        kind.numerics._asdict() if differs else {},
+        robot.friction_form,
+    )
+
+
+def _from(folder: Path, path: Path) -> str:
+    """Return a path relative to a folder if both are in one tree, else the absolute path."""
+    folder, path = folder.resolve(), path.resolve()
+    common = Path(os.path.commonpath([folder, path])) if folder.drive == path.drive else None
+    # A relative path through the root of a file system would be valid on this machine only.
+    if common is None or common == Path(common.anchor):
+        return str(path)
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
+def read_robot_reference(source: Path, document: Mapping[str, Any]) -> RobotReference:
+    """Read a robot reference from the document of a file.
+
+    Args:
+        source: the file; the path of the model file is relative to its folder.
+        document: content of the file.
+
+    Raises:
+        InputError: the document is malformed.
+    """
+    if "system" in document:
+        raise InputError(f"{source}: expected system or model, found both; leave one out")
+    digest = document.get("digest")
+    return RobotReference(
+        source.parent / check_text(source, "model", document["model"]),
+        None if digest is None else check_text(source, "digest", digest),
+        check_name_list(source, "free", document.get("free", []), "a list of names"),
+        check_table(source, "actuators", document.get("actuators", {})),
+        check_table(source, "engine", document.get("engine", {})),
+        _numerics(source, document.get("numerics", {})),
+        _friction_form(source, document.get("friction_form", "stiff")),
+    )
+
+
+def _friction_form(source: Source, value: Any) -> FrictionForm:
+    """Check the value of ``friction_form``."""
+    for form in FRICTION_FORMS:
+        if value == form:
+            return form
+    raise make_error(source, "friction_form", " or ".join(FRICTION_FORMS), value)
+
+
+def _numerics(source: Source, value: Any) -> dict[str, Any]:
+    """Check the table ``[numerics]``: a time step in seconds, and one of MuJoCo's integrators."""
+    from sims.robot.integrator_settings import INTEGRATOR_IDS
+
+    given = check_table(source, "numerics", value)
+    for key, entry in given.items():
+        where = f"numerics.{key}"
+        if key == "timestep":
+            given[key] = check_finite(source, where, entry)
+            if given[key] <= 0:
+                raise make_error(source, where, "more than 0 s", entry)
+        elif key != "integrator" or entry not in INTEGRATOR_IDS:
+            wanted = f"timestep, or integrator = {' | '.join(INTEGRATOR_IDS)}"
+            raise make_error(source, where, wanted, entry)
+    return given

@@ -1,0 +1,339 @@
+"""The system of a robot: its coordinates, inputs and channels, and the effects at its places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sims import effects as library
+from sims.core.registry import PartUnavailableError
+from sims.core.simulator import Array, Channel, InputError, Parameter, make_unknown_name_error
+from sims.core.system import ALL_PLACES, Effect, StateSnapshot, System, SystemKind
+from sims.robot import coupled_drives
+from sims.robot.dynamics.activation_filters import activation_filters
+from sims.robot.dynamics.series_joints import SeriesJoints, compile_error, is_series_effect
+from sims.robot.floating_joints import FloatingJoints
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.places import effect_places
+from sims.robot.places.default_excitation import LazyDefaultRecording
+from sims.robot.places.place_list import MUJOCO_EFFECT_WORDS, EffectPlace, list_places
+from sims.robot.robot_model import RobotModel
+from sims.robot.state_snapshots import SingleJointSystem, SingleSlideSystem
+
+INTEGRATES = (
+    "the actuator integrates its control (dyntype integrator), and no recording says where its "
+    "integral begins; expected a position servo, whose input is the integral"
+)
+"""Reason why a recording cannot contain the control of an integrator actuator."""
+
+
+class RobotSystem(System):
+    """The system of a robot's simulator, created from its model file.
+
+    Attributes:
+        robot: the robot.
+        places: its places by kind.
+        alone: (D,) each joint as a separate system.
+        drives: inputs of the actuators of each coordinate.
+        servos: input that is the set point of the position servo, by coordinate.
+        gears: gear of that servo, by coordinate: its set point per unit of the coordinate.
+        activations: names under which a recording may specify initial activations of filters.
+        refused_inputs: reason why a recording cannot contain an input, by input.
+        traced: compiled effects by inputs (`sims.robot.dynamics.compiled_forces`).
+    """
+
+    name = "robot"
+    says = "a robot of a model file"
+    kind: ClassVar[SystemKind] = "rotary"
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    channels: ClassVar[tuple[Channel, ...]] = ()
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    rates: ClassVar[tuple[str, ...]] = ()
+    states: ClassVar[Mapping[str, float]] = MappingProxyType({})
+    sensed: ClassVar[tuple[str, ...]] = ()
+    has_model = True
+    usual_recording = LazyDefaultRecording()
+    robot: ClassVar[RobotModel]
+    places: ClassVar[Mapping[str, Sequence[EffectPlace]]]
+    alone: ClassVar[tuple[System, ...]]
+    drives: ClassVar[Mapping[int, tuple[str, ...]]]
+    servos: ClassVar[Mapping[int, str]]
+    gears: ClassVar[Mapping[int, float]]
+    activations: ClassVar[tuple[str, ...]]
+    refused_inputs: ClassVar[Mapping[str, str]]
+    freed_parameters: ClassVar[frozenset[str]] = frozenset()
+    freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
+    traced: ClassVar[dict[tuple[str, ...], Any]]
+    _placed: ClassVar[dict[str, tuple[type[Effect], ...]]]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        # These caches must not be shared with other robots, or with the same robot with free
+        # parameters.
+        cls.traced, cls._placed, cls.left_out = {}, {}, {}
+
+    @classmethod
+    def get_gear_ratio(cls, coordinate: int) -> float:
+        """Return the gear of a coordinate's position servo, see `System`."""
+        return cls.gears.get(coordinate, 1.0)
+
+    @classmethod
+    def expand_to_places(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+        """Return the effect at each of its places, without effects that are free parameters."""
+        if effect.name not in cls._placed:
+            found = effect_places.make_effect_classes(
+                effect, cls.places, MODEL_FIELD_EFFECTS, cls._compiles
+            )
+            cls._placed[effect.name] = tuple(found)
+        return [one for one in cls._placed[effect.name] if not cls.is_free(one)]
+
+    @classmethod
+    def _compiles(cls, effect: type[Effect]) -> bool:
+        """Return whether the model with an effect at one place compiles.
+
+        If not, MuJoCo's reason is stored in `left_out`.
+        """
+        if effect.of == coupled_drives.COUPLING_EFFECT:
+            added: SeriesJoints = (coupled_drives.COUPLING_PLACEHOLDER,)
+        elif is_series_effect(effect):
+            added = ((effect.place, effect.of),)
+        else:
+            return True
+        error = compile_error(cls.robot, added)
+        if error:
+            cls.left_out[effect.name] = f"MuJoCo does not compile the model with it: {error}"
+        return not error
+
+    @classmethod
+    def is_free(cls, effect: type[Effect]) -> bool:
+        """Return whether a coefficient of an effect is a parameter; then it cannot be a cause."""
+        members = getattr(effect, "members", ())
+        return effect.name in cls.freed_parameters or any(
+            m.name in cls.freed_parameters for m in members
+        )
+
+    @classmethod
+    def find_effect(cls, name: str) -> type[Effect] | None:
+        """Find the effect with a name such as ``friction.coulomb@elbow``.
+
+        Raises:
+            InputError: there is no such effect, or it has no such place; the message lists the
+                existing ones.
+        """
+        base, _, place = name.partition("@")
+        try:
+            registered = library.get_effect(base)
+        except PartUnavailableError:
+            raise
+        cls.expand_to_places(registered)
+        if name in cls.left_out:
+            raise InputError(f"effect {name} of robot {cls.name}: {cls.left_out[name]}")
+        known = {one.name: one for one in cls._placed[base]}
+        if name in known:
+            return known[name]
+        if not known:
+            raise InputError(f"robot {cls.name} cannot have effect {base}")
+        if not place:
+            raise InputError(
+                f"effect {base} of robot {cls.name} needs a place; there are: "
+                + ", ".join(sorted(known))
+            )
+        if registered.at == "body" and place in (cls.robot.aliases or {}):
+            return cls.find_effect(f"{base}@{cls.robot.body(place).name}")
+        there = [one.place for one in known.values() if one.place]
+        if place == ALL_PLACES and len(there) == 1:
+            # If there is one place only, the family is this place.
+            return known[f"{base}@{there[0]}"]
+        raise make_unknown_name_error(
+            f"place of effect {base} in robot {cls.name}", place, there or ["none"]
+        )
+
+    @classmethod
+    def find_freeable_effects(cls, word: str) -> list[type[Effect]]:
+        """Return the effects whose coefficients an entry of ``--free`` refers to.
+
+        Args:
+            word: name in MuJoCo's words such as ``damping@elbow``, or effect such as
+                ``drag.linear@elbow``; ``@*`` is every place.
+        """
+        base, _, place = word.partition("@")
+        name = MUJOCO_EFFECT_WORDS.get(base, base)
+        if name not in library.list_names():
+            there = [
+                *cls.list_mujoco_words(),
+                *(other for other in library.list_names() if cls._has(other)),
+            ]
+            raise make_unknown_name_error(f"number of robot {cls.name}", base, there)
+        found = cls.find_effect(f"{name}@{place}" if place else name)
+        assert found is not None
+        # Shared effects, such as delays, have one number for all places.
+        members = (
+            ()
+            if name in effect_places.SHARED_COEFFICIENT_EFFECTS
+            else getattr(found, "members", ())
+        )
+        return [type(member) for member in members] or [found]
+
+    @classmethod
+    def list_mujoco_words(cls) -> list[str]:
+        """List MuJoCo's words for numbers that the model file specifies."""
+        return [word for word, name in MUJOCO_EFFECT_WORDS.items() if cls._has(name)]
+
+    @classmethod
+    def _has(cls, name: str) -> bool:
+        """Return whether the robot can have a registered effect at any place."""
+        try:
+            return bool(cls.expand_to_places(library.get_effect(name)))
+        except PartUnavailableError:
+            return False
+
+    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """Raise an error: only the engine computes the pose-dependent inertia matrix."""
+        raise NotImplementedError
+
+    def weight(self, moment: StateSnapshot) -> Array:
+        """Raise an error: only the engine computes gravity forces."""
+        raise NotImplementedError
+
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """Raise an error: the engine reads the channels itself."""
+        raise NotImplementedError
+
+
+def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[RobotSystem]:
+    """Make the system of a robot.
+
+    Args:
+        robot: robot as read from its model file.
+        free: numbers to tune, such as ``damping@*`` or ``mass.scale@forearm``.
+
+    Raises:
+        InputError: the robot has no joint with one coordinate, or a name in `free` does not exist.
+    """
+    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
+    if not joints:
+        raise InputError(f"{robot.path}: expected a hinge or slide joint, found none that moves")
+    channels = _channels(robot)
+    inputs = [Channel(f"u.{a.name}", _unit(robot, a.name)) for a in robot.actuators]
+    inputs += [Channel(f"force.{j.name}", j.force_unit) for j in joints]
+    model = robot.compiled
+    states = {f"q.{j.name}": float(model.qpos0[j.position]) for j in joints}
+    states |= {f"qd.{j.name}": 0.0 for j in joints}
+    floating = FloatingJoints.from_robot(robot)
+    states |= floating.states(model)
+    drives: dict[int, tuple[str, ...]] = {}
+    servos: dict[int, str] = {}
+    gears: dict[int, float] = {}
+    for number, joint in enumerate(joints):
+        own = [a for a in robot.actuators if a.joint == joint.name]
+        drives[number] = tuple(f"u.{a.name}" for a in own)
+        follows = [a for a in own if a.kind == "position"]
+        # With several servos at one joint, its motion would not show which one has an error.
+        if len(follows) == 1:
+            servos[number] = f"u.{follows[0].name}"
+            gears[number] = float(model.actuator_gear[follows[0].id, 0])
+    declared: dict[str, Any] = {
+        "name": robot.name,
+        "says": f"the robot of {robot.path.name}",
+        "parameters": (),
+        "constants": (),
+        "inputs": tuple(inputs),
+        "channels": channels,
+        "coordinates": tuple(f"q.{j.name}" for j in joints),
+        "rates": tuple(f"qd.{j.name}" for j in joints),
+        "states": MappingProxyType(states),
+        "sensed": tuple(c.name for c in channels),
+        "robot": robot,
+        "afloat": MappingProxyType(floating.units()),
+        "places": list_places(robot, [(c.name, c.unit) for c in channels]),
+        "alone": tuple(
+            SingleJointSystem() if j.kind == "hinge" else SingleSlideSystem() for j in joints
+        ),
+        "drives": drives,
+        "servos": servos,
+        "gears": gears,
+        "activations": tuple(one.state for one in activation_filters(robot)),
+        "refused_inputs": MappingProxyType(
+            {f"u.{a.name}": INTEGRATES for a in robot.actuators if robot.integrates(a)}
+        ),
+    }
+    system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)
+    if not free:
+        return system
+    effects = list_freed_effects(system, free)
+    declared["freed_parameters"] = frozenset(effect.name for effect in effects)
+    declared["parameters"] = tuple(p for effect in effects for p in _parameters(effect))
+    declared["freed_effects"] = tuple(effects)
+    return type("RobotSystemOfFile", (RobotSystem,), declared)
+
+
+def list_freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[type[Effect]]:
+    """Return the effects that the names of ``--free`` refer to, without duplicates.
+
+    Args:
+        system: system of the robot.
+        free: names such as ``damping@*``.
+
+    Returns:
+        Effects at one place each, or shared by all places.
+    """
+    by_name = {one.name: one for word in free for one in system.find_freeable_effects(word)}
+    return list(by_name.values())
+
+
+FREED_RANGE_FACTOR = 4.0
+"""Bounds of a free parameter, as a multiple of its plausible range."""
+FREED_GAIN_RANGE_FACTOR = 9.0
+"""Upper bound of a free servo gain's relative change, as a multiple of the specified gain."""
+
+
+def _parameters(effect: type[Effect]) -> list[Parameter]:
+    """Make parameters from an effect's coefficients; nominal values keep the file's values."""
+    result = []
+    for c in effect.coefficients:
+        low, high = c.plausible[0]
+        # A free gain is a guess, so the true value may be several times as large.
+        guess = effect.at == "actuator" and c.least is not None
+        bounds = (
+            FREED_RANGE_FACTOR * low,
+            FREED_GAIN_RANGE_FACTOR if guess else FREED_RANGE_FACTOR * high,
+        )
+        # A coefficient that cannot be observed has an empty range; it gets wider bounds, and the
+        # data will not identify it.
+        if c.least is not None and c.least != c.most:
+            most = np.inf if c.most is None else c.most
+            bounds = max(bounds[0], c.least), min(bounds[1], most)
+        name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
+        unit = c.units[0] or "1"
+        result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
+    return result
+
+
+def _unit(robot: RobotModel, actuator: str) -> str:
+    """Return the unit of an actuator's control."""
+    a = robot.actuator(actuator)
+    if a.joint is None:
+        return "1"
+    joint = robot.joint(a.joint)
+    units = {"position": joint.unit, "velocity": f"{joint.unit}/s", "motor": joint.force_unit}
+    return units.get(a.kind, "1")
+
+
+def _channels(robot: RobotModel) -> tuple[Channel, ...]:
+    """Return position, velocity and drive force channels of each joint, and the model's sensors."""
+    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
+    channels = [Channel(f"q.{j.name}", j.unit, says=f"position of joint {j.name}") for j in joints]
+    channels += [
+        Channel(f"qd.{j.name}", f"{j.unit}/s", says=f"velocity of joint {j.name}") for j in joints
+    ]
+    channels += [
+        Channel(f"tau.{j.name}", j.force_unit, says=f"what actuators exert on joint {j.name}")
+        for j in joints
+    ]
+    channels += [Channel(f"s.{s.name}", s.unit, says=f"sensor {s.name}") for s in robot.sensors]
+    return tuple(channels)

@@ -1,0 +1,147 @@
+"""Snapshots of the state of a robot, or of one of its joints, as effects receive them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import StateSnapshot, System, SystemKind
+
+
+class SingleJointSystem(System):
+    """One joint of a robot, as a system of one coordinate."""
+
+    name = "joint"
+    says = "one joint of a robot"
+    kind: ClassVar[SystemKind] = "rotary"
+    parameters = ()
+    channels = ()
+    coordinates = ("q",)
+    rates = ("qd",)
+    states: ClassVar[dict[str, float]] = {}
+    sensed = ()
+
+    def inertia(self, theta: Array, constants: Any) -> Array:
+        """Raise an error: the inertia is not known for one joint alone."""
+        raise NotImplementedError
+
+    def weight(self, moment: StateSnapshot) -> Array:
+        """Raise an error: the gravity force is not known for one joint alone."""
+        raise NotImplementedError
+
+    def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
+        """Raise an error: a joint alone has no channels."""
+        raise NotImplementedError
+
+
+class SingleSlideSystem(SingleJointSystem):
+    """One slide joint of a robot, as a system of one coordinate."""
+
+    kind: ClassVar[SystemKind] = "linear"
+
+
+@dataclass
+class JointSnapshot(StateSnapshot):
+    """State of one joint at one time.
+
+    Attributes:
+        carried: (2, L, 1) forces on both sides of its transmission: the drive, and the load.
+        goal: (L, 1) set point of its position servo; NaN without a servo.
+        stiffness: (L, 1) force of the servo per unit of its error.
+        gear: set point of the servo per unit of the joint's position.
+        shared: (L, 1) absolute forces of all drives of the robot; None if the drive has its own
+            supply.
+    """
+
+    carried: Array = field(default_factory=lambda: np.zeros((2, 0, 1)))
+    goal: Array = field(default_factory=lambda: np.zeros((0, 1)))
+    stiffness: Array = field(default_factory=lambda: np.zeros((0, 1)))
+    gear: float = 1.0
+    shared: Array | None = None
+
+    @property
+    def supply_load(self) -> Array:
+        """Load of the power supply, see `StateSnapshot`."""
+        return super().supply_load if self.shared is None else self.shared
+
+    @property
+    def transmission_load(self) -> Array:
+        """Absolute load of the transmission, (L, 1)."""
+        load: Array = np.abs(self.carried[0] + self.carried[1])
+        return load
+
+    @property
+    def transmission_sides(self) -> tuple[Array, Array]:
+        """Forces on both sides of the transmission, see `StateSnapshot`."""
+        return self.carried[0], self.carried[1]
+
+    @property
+    def servo_error(self) -> Array:
+        """Error of the position servo, see `StateSnapshot`."""
+        return self.goal - self.gear * self.x
+
+    def compute_set_point_force(self, shift: Array) -> Array:
+        """Return the additional drive force for a shifted set point, see `StateSnapshot`.
+
+        It does not include force limits of the actuator.
+        """
+        return self.stiffness * shift
+
+
+@dataclass
+class RobotSnapshot(StateSnapshot):
+    """State of a robot at one time, for all batch elements.
+
+    Attributes:
+        carried: (2, L, D) forces on both sides of each joint's transmission: the drive; and the
+            load by gravity and the motion of the other bodies.
+        alone: (D,) each joint as a separate system.
+        drives: inputs of the actuators of each coordinate.
+        servos: input that is the set point of the position servo, by coordinate.
+        stiffness: (L, D) forces of position servos per unit of their errors; zero without a servo.
+    """
+
+    carried: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    alone: tuple[System, ...] = ()
+    drives: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    servos: dict[int, str] = field(default_factory=dict)
+    stiffness: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def select_element(self, lane: int) -> RobotSnapshot:
+        """Select one batch element."""
+        own = slice(lane, lane + 1)
+        return replace(
+            self,
+            theta=self.theta[own],
+            t=self.t[own],
+            x=self.x[own],
+            v=self.v[own],
+            inputs={name: u[own] for name, u in self.inputs.items()},
+            carried=self.carried[:, own],
+            stiffness=self.stiffness[own],
+        )
+
+    def get_joint_snapshot(self, joint: int) -> JointSnapshot:
+        """Return the snapshot of one joint."""
+        one = slice(joint, joint + 1)
+        inputs = {
+            name: self.inputs[name] for name in self.drives.get(joint, ()) if name in self.inputs
+        }
+        servo = self.servos.get(joint)
+        followed = servo is not None and servo in self.inputs and self.stiffness.size
+        return JointSnapshot(
+            self.alone[joint],
+            self.theta,
+            self.constants,
+            self.t,
+            self.x[:, one],
+            self.v[:, one],
+            inputs,
+            self.carried[:, :, one],
+            self.inputs[servo] if followed and servo else np.full_like(self.t, np.nan),
+            self.stiffness[:, one] if followed else np.zeros_like(self.t),
+            self.system.get_gear_ratio(joint),
+        )

@@ -1,0 +1,430 @@
+"""Simulator composed of a system, an engine and effects, which any tuner can tune."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims import effects as library
+from sims.core.simulation_counter import SIMULATION_COUNTER
+from sims.core.simulator import Array, InputError, Parameter, Scenario, Simulator
+from sims.core.system import (
+    ActiveEffects,
+    Contact,
+    Effect,
+    Engine,
+    Force,
+    Friction,
+    HiddenStateEffect,
+    Input,
+    IntegrationBatch,
+    Level,
+    Sensor,
+    Signal,
+    System,
+    Trajectories,
+)
+from sims.core.toml_validation import format_value
+from sims.core.value_limits import is_plausible_number
+from sims.engines import HIDDEN_STATE_ENGINES, make_engine
+from sims.engines.hidden_states import integrate_with_hidden_states
+from sims.engines.time_grid import (
+    TimeGrid,
+    build_time_grid,
+    compute_applied_inputs,
+    group_by_identity,
+    group_scenarios,
+    is_active,
+)
+
+MAX_COEFFICIENT_FACTOR = 1e6
+"""Factor of its largest plausible value above which a coefficient is refused as a mistake."""
+
+
+class SystemSimulator(Simulator):
+    """Base class of the simulators of declared systems; a subclass sets `system`.
+
+    Args:
+        constants: Values of `make_constant_nodes` that differ from their defaults.
+        observe: Channels to return, in order (default: all).
+        engine: Name of the engine: pybullet, mujoco or batch.
+        effects: Effects whose coefficients are parameters after the system's own, in the order in
+            which a signal passes them: registered names, or classes, which need not be registered.
+        fixed: Effects with known coefficients: a number, or a list if an effect has several.
+        settings: Settings of the engine, e.g. ``time_step``.
+
+    Raises:
+        InputError: A name is unknown, the system cannot have an effect, or the engine does not
+            support it.
+    """
+
+    system: ClassVar[type[System]]
+    default_engine: ClassVar[str] = "batch"
+    own_engine: ClassVar[bool] = False
+    """Whether the simulator steps itself, so that no engine can be chosen."""
+
+    def __init__(
+        self,
+        constants: Mapping[str, float] | None = None,
+        observe: Sequence[str] | None = None,
+        *,
+        engine: str | None = None,
+        effects: Sequence[str | type[Effect]] = (),
+        fixed: Mapping[str, float | Sequence[float]] | None = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__(constants, observe)
+        self._declared = self.system()
+        self.engine = self._engine(engine, settings)
+        _check_given(effects, fixed)
+        self.effects = [self._effect(effect) for effect in effects]
+        self.fixed = [
+            (self._effect(name), _row(name, value)) for name, value in (fixed or {}).items()
+        ]
+        named = [effect.name for effect in self.effects]
+        doubled = [name for name in named if name in (fixed or {}) or named.count(name) > 1]
+        if doubled:
+            raise InputError(f"effect {doubled[0]} is named twice")
+        for effect, values in self.fixed:
+            names = [c.name for c in effect.on(self.system)]
+            if not 1 <= len(values) <= len(names):
+                raise InputError(
+                    f"effect {effect.name}: expected up to {len(names)} values"
+                    f" ({', '.join(names)}), found {format_value(values)}"
+                )
+            _check_sizes(effect, self.system, values)
+        observed = [c.name for c in self.channels]
+        extra: list[Parameter] = []
+        for effect in self.effects:
+            extra += make_effect_parameters(effect, self.system, observed)
+        self.parameters = (*self.system.parameters, *extra)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        # The declaration is copied from the system.
+        system = cls.system
+        cls.name = system.name
+        cls.says = system.says
+        cls.parameters = system.parameters
+        cls.channels = system.channels
+        cls.constants = system.constants
+        cls.inputs = system.inputs
+        cls.states = system.states
+
+    def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+        return make_engine(name or self.default_engine, self.system, settings)
+
+    def _effect(self, named: str | type[Effect]) -> Effect:
+        effect = library.find_effect(named, self.system) if isinstance(named, str) else named
+        # Effects at a place are made by the system itself and need no check.
+        if effect.of:
+            return effect()
+        if reason := effect.misses(self.system):
+            raise InputError(
+                f"system {self.system.name} cannot have effect {effect.name}: {reason}"
+            )
+        if issubclass(effect, HiddenStateEffect) and self.engine.name not in HIDDEN_STATE_ENGINES:
+            raise InputError(
+                f"engine {self.engine.name} cannot carry effect {effect.name}, which has a state of"
+                f" its own; choose engine {' or '.join(HIDDEN_STATE_ENGINES)}"
+            )
+        return effect()
+
+    def simulate(self, theta: Array, scenario: Scenario) -> Array:
+        """Simulate each parameter vector in one scenario; see `Simulator.simulate`.
+
+        Args:
+            theta: Parameter vectors (n, dim), physical units.
+            scenario: Conditions of the run.
+
+        Returns:
+            Observations (n, T, C), SI units.
+        """
+        return self.simulate_batch(theta, [scenario] * len(theta))
+
+    def simulate_batch(
+        self,
+        theta: Array,
+        scenarios: Sequence[Scenario],
+        initial: Mapping[str, Array] | None = None,
+    ) -> Array:
+        """Simulate each parameter vector in its own scenario, all in one call of the engine.
+
+        This is fastest if batch elements share scenario objects.
+
+        Args:
+            theta: Parameter vectors (L, dim): physical parameters, then coefficients of effects.
+            scenarios: Scenario of each batch element.
+            initial: Initial states (L,) by name, which replace those of the scenarios.
+
+        Returns:
+            Observations (L, T, C), with T of the longest scenario; NaN after the end of a shorter
+            one.
+
+        Raises:
+            InputError: A shape is wrong, or a scenario names a constant, input or state that the
+                system does not have.
+        """
+        theta = np.asarray(theta, dtype=np.float64)
+        if theta.ndim != 2 or theta.shape != (len(scenarios), len(self.parameters)):
+            expected = (len(scenarios), len(self.parameters))
+            raise InputError(f"theta must have shape {expected}, found {theta.shape}")
+        if not len(theta):
+            return np.empty((0, 0, len(self.channels)))
+        SIMULATION_COUNTER.count(len(theta))
+        return self._simulated(theta, scenarios, initial or {})
+
+    def _simulated(
+        self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
+    ) -> Array:
+        """Simulate at least one batch element with checked arguments."""
+        acting = self._acting(theta)
+        runs = group_scenarios(scenarios)
+        commands = [self.run_inputs(s) for s in runs.unique_scenarios]
+        with np.errstate(all="ignore"):  # batch elements that overflow become NaN
+            plan = build_time_grid(
+                runs, commands, _of(acting, (Input, Sensor)), self.engine.largest_step
+            )
+            inputs = (
+                compute_applied_inputs(plan, runs, commands, _of(acting, Input))
+                if self.inputs
+                else {}
+            )
+            sensors = tuple((effect, c) for effect, c in _of(acting, Sensor) if c.any())
+            # A sensor filter needs every step; other sensor effects need the samples only.
+            filtered = any(_filters(effect) for effect, _ in sensors)
+            every = 1 if filtered else plan.steps_per_sample
+            own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
+            constants, x, v = self._known(scenarios, initial)
+            forces = _of(acting, (Force, Friction, Contact, HiddenStateEffect, Level))
+            lanes = IntegrationBatch(
+                self._declared, own, constants, x, v, plan.steps, inputs, forces, every
+            )
+            clock = np.array([s.times[0] for s in runs.unique_scenarios])[runs.scenario_index, None]
+            motion = integrate_with_hidden_states(self.engine, lanes)
+            observations = self._read(motion, lanes, plan, sensors, clock)
+        # Readings of a shorter run while it waits at its end are not samples.
+        sizes = np.array([s.times.size for s in runs.unique_scenarios])
+        if sizes.min() < sizes.max():
+            observations[np.arange(sizes.max()) >= sizes[runs.scenario_index, None]] = np.nan
+        return observations
+
+    def close(self) -> None:
+        """Release the resources of the engine."""
+        self.engine.close()
+
+    def _acting(self, theta: Array) -> ActiveEffects:
+        """Return the effects with their coefficients (K, L, 1): tuned ones, then fixed ones.
+
+        Coefficients that the system does not have, or that were not given, are zero.
+        """
+        acting = []
+        place = len(self.system.parameters)
+        for effect in self.effects:
+            count = len(effect.on(self.system))
+            rows = theta[:, place : place + count].T
+            acting.append((effect, _coefficients(effect, rows)))
+            place += count
+        for effect, values in self.fixed:
+            column = np.array(values)[:, None]
+            rows = np.repeat(column, len(theta), axis=1)
+            acting.append((effect, _coefficients(effect, rows)))
+        return tuple(acting)
+
+    def _known(
+        self, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
+    ) -> tuple[dict[str, Array], Array, Array]:
+        """Return constants (L, 1) by name, and initial positions and velocities (L, D)."""
+        # Check each scenario object once, not each of hundreds of batch elements.
+        distinct, of = group_by_identity(scenarios)
+        known = [self.run_constants(s) for s in distinct]
+        began = [self.run_initial(s) for s in distinct]
+        constants = {name: values[of, None] for name, values in _columns(known).items()}
+        states = {name: values[of] for name, values in _columns(began).items()}
+        states = self._checked("initial state", states, initial)
+        x = _stacked(states, self.system.coordinates, of.size)
+        v = _stacked(states, self.system.rates, of.size)
+        return constants, x, v
+
+    def _read(
+        self,
+        motion: Trajectories,
+        lanes: IntegrationBatch,
+        plan: TimeGrid,
+        sensors: ActiveEffects,
+        clock: Array,
+    ) -> Array:
+        """Return the sensor readings of a simulation.
+
+        Args:
+            motion: Result of the engine.
+            lanes: Work of the engine.
+            plan: Time grid.
+            sensors: Active sensor effects.
+            clock: (L, 1) first time stamp of each run, s.
+
+        Returns:
+            Observations (L, T, C).
+        """
+        channels = self._declared.observe(motion.x, motion.v, motion.a, lanes.constants)
+        names = [c.name for c in self.channels]
+        valued = self.system.reading(names)
+        times = _kept(plan, lanes.steps_per_sample)
+        steps = np.diff(times, axis=1, prepend=0.0)
+        # Convert the rows: with a sensor filter, more states than the samples are stored.
+        rows = plan.rows * (plan.steps_per_sample // lanes.steps_per_sample)
+        observations = np.empty((*rows.shape, len(names)))
+        for place, name in enumerate(names):
+            values = channels[name]
+            # A gain or bias affects one channel only.
+            reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
+            if reading:
+                values = apply_sensor_effects(reading, values, steps, times, clock)
+            observations[:, :, place] = _chosen(values, rows)
+        observations += 0.0  # turn negative zeros into positive ones
+        return observations
+
+
+def _filters(effect: Effect) -> bool:
+    """Return whether an effect is a sensor effect that needs every step."""
+    return isinstance(effect, Sensor) and effect.filters
+
+
+def apply_sensor_effects(
+    sensors: ActiveEffects, values: Array, steps: Array, times: Array, clock: Array | float = 0.0
+) -> Array:
+    """Apply sensor effects one after another to a channel.
+
+    Each effect gets the output of the previous one, also for the value at the start.
+
+    Args:
+        sensors: Sensor effects with their coefficients.
+        values: (L, R) values of the channel.
+        steps: (L, R) lengths of the steps before the values, s.
+        times: (L, R) times of the values since the start, s.
+        clock: (L, 1) first time stamp of each run, s.
+
+    Returns:
+        Readings (L, R).
+    """
+    values = values.copy()
+    start = values[:, :1].copy()
+    clock = np.broadcast_to(clock, start.shape)
+    for effect, c in sensors:
+        assert isinstance(effect, Sensor)
+        # An effect may be active in few of the batch elements; evaluate only these.
+        lanes = np.flatnonzero(is_active(c))
+        own, begin = c[:, lanes], start[lanes]
+        nothing = np.zeros_like(begin)
+        first = clock[lanes]
+        signal = Signal(values[lanes], steps[lanes], begin, times[lanes], first)
+        values[lanes] = effect.read(own, signal)
+        start[lanes] = effect.read(own, Signal(begin, nothing, begin, nothing, first))
+    return values
+
+
+def _kept(plan: TimeGrid, every: int) -> Array:
+    """Return the times (L, R) since the start of the states that the engine stores, s."""
+    start = np.zeros((len(plan.ends), 1))
+    return np.concatenate([start, plan.ends[:, every - 1 :: every]], axis=1)
+
+
+def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
+    """Return values[l, rows[l, t]], without a copy if the first values are selected in order."""
+    in_order = (rows[:1] == np.arange(rows.shape[1])).all()
+    if in_order and (rows.strides[0] == 0 or (rows == rows[:1]).all()):
+        return values[:, : rows.shape[1]]
+    chosen: Array = np.take_along_axis(values, rows, axis=1)
+    return chosen
+
+
+def make_effect_parameters(
+    effect: Effect | type[Effect], system: type[System], observed: Sequence[str] = ()
+) -> tuple[Parameter, ...]:
+    """Return the coefficients of an effect as parameters with their plausible ranges as bounds.
+
+    Args:
+        effect: Effect.
+        system: System on which it acts.
+        observed: Names of the observed channels, which may determine units; all if empty.
+    """
+    result = []
+    there = effect.on(system)
+    for c in there:
+        name = effect.name if len(there) == 1 else f"{effect.name}.{c.name}"
+        low, high = c.range(system.kind)
+        unit = c.unit_on(system, observed) or ""
+        off = min(max(0.0, low), high)  # zero, or the nearest value of the range
+        result.append(Parameter(name, unit, off, (low, high), says=effect.says))
+    return tuple(result)
+
+
+def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
+    """Convert rows of numbers by name to one array (N,) per name."""
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:
+    """Return the states with these names as columns (L, D)."""
+    if not names:
+        return np.empty((count, 0))
+    columns = [np.broadcast_to(states[name], (count,)) for name in names]
+    result: Array = np.stack(columns, axis=1)
+    return result
+
+
+def _check_given(effects: object, fixed: object) -> None:
+    """Check the types of effects and fixed coefficients, which may come from an experiment's file.
+
+    Raises:
+        InputError: A type is wrong.
+    """
+    if not isinstance(effects, list | tuple) or not all(map(_names_effect, effects)):
+        raise InputError(f"effects: expected a list of names, found {format_value(effects)}")
+    if fixed is not None and not isinstance(fixed, Mapping):
+        wanted = "a table of coefficients by effect"
+        raise InputError(f"fixed: expected {wanted}, found {format_value(fixed)}")
+
+
+def _names_effect(value: object) -> bool:
+    return isinstance(value, str) or (isinstance(value, type) and issubclass(value, Effect))
+
+
+def _row(name: str, value: Any) -> tuple[float, ...]:
+    """Return the coefficients of a fixed effect as a tuple."""
+    several = isinstance(value, list | tuple)
+    values = tuple(value) if several else (value,)
+    if not all(map(is_plausible_number, values)):
+        raise InputError(
+            f"effect {name}: expected finite coefficients, found {format_value(value)}"
+        )
+    return tuple(float(v) for v in values)
+
+
+def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) -> None:
+    """Check that coefficients have plausible sizes.
+
+    Raises:
+        InputError: A coefficient is too large.
+    """
+    for coefficient, value in zip(effect.on(system), values, strict=False):
+        largest = max(map(abs, coefficient.range(system.kind)))
+        if abs(value) > MAX_COEFFICIENT_FACTOR * largest:
+            wanted = f"within ±{MAX_COEFFICIENT_FACTOR * largest:g} {coefficient.unit_on(system) or ''}".rstrip()
+            raise InputError(
+                f"effect {effect.name}: expected {coefficient.name} {wanted}, found {value:g}"
+            )
+
+
+def _coefficients(effect: Effect, rows: Array) -> Array:
+    """Extend coefficients `rows` (k, L) to (K, L, 1) with zeros."""
+    result = np.zeros((len(effect.coefficients), rows.shape[1], 1))
+    result[: len(rows), :, 0] = rows
+    return result
+
+
+def _of(acting: ActiveEffects, kind: Any) -> ActiveEffects:
+    return tuple((effect, c) for effect, c in acting if isinstance(effect, kind))

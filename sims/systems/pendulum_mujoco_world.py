@@ -1,0 +1,52 @@
+"""World of the pendulum in MuJoCo.
+
+A body on a short arm gives the torque of gravity, and the armature of the joint the inertia. As in
+Bullet (`systems.pendulum_bullet_world`) the inertia may be anything above mass length^2 / 1000.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sims.systems.pendulum_bullet_world import gravity  # same torque as in Bullet
+
+__all__ = ["OPEN_LOOP", "gravity", "load", "model"]
+
+OPEN_LOOP = True
+"""Whether the torque depends on the input alone."""
+LENGTH_REDUCTION_FACTOR = 1000.0
+"""Factor by which the body is heavier and its arm is shorter than in the system."""
+_TINY = 1e-14
+"""Inertia of the body in kg m^2: MuJoCo requires a positive value."""
+
+
+def model(constants: Mapping[str, float]) -> str:
+    """Return the world as MJCF."""
+    mass = constants["mass"] * LENGTH_REDUCTION_FACTOR
+    arm = constants["length"] / LENGTH_REDUCTION_FACTOR
+    return f"""
+    <mujoco>
+      <option gravity="0 0 {-constants["gravity"]!r}"/>
+      <worldbody>
+        <body>
+          <joint type="hinge" axis="0 1 0"/>
+          <inertial mass="{mass!r}" pos="0 0 {-arm!r}" diaginertia="{_TINY} {_TINY} {_TINY}"/>
+        </body>
+      </worldbody>
+    </mujoco>"""
+
+
+def load(model: Any, inertia: float, constants: Mapping[str, float]) -> bool:
+    """Set the joint's armature for this inertia; return False if it would not be positive.
+
+    Args:
+        model: compiled model (``MjModel``).
+        inertia: generalised inertia in kg or kg*m^2.
+        constants: constants of the system by name.
+    """
+    armature = (
+        inertia - constants["mass"] * constants["length"] ** 2 / LENGTH_REDUCTION_FACTOR - _TINY
+    )
+    model.dof_armature[0] = armature
+    return armature > 0.0

@@ -1,0 +1,209 @@
+"""Servo: a position-controlled motor that carries a pendulum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from sims.core.simulator import Array, Channel, Constant, Parameter
+from sims.core.system import (
+    DefaultRecording,
+    DerivedQuantity,
+    Effect,
+    RenderedModelFile,
+    StateSnapshot,
+    System,
+    SystemKind,
+)
+from sims.core.value_limits import (
+    GAIN_RANGE,
+    GRAVITY_RANGE,
+    LENGTH_RANGE,
+    MASS_RANGE,
+    VOLTAGE_RANGE,
+)
+from sims.system_simulator import SystemSimulator
+from sims.systems.servo_mjcf import render_model_file
+
+_KT = slice(0, 1)
+"""Column of the torque constant among the parameters."""
+_RESISTANCE = slice(1, 2)
+"""Column of the winding's resistance among the parameters."""
+_ARMATURE = slice(2, 3)
+"""Column of the inertia of motor and gears among the parameters."""
+
+
+class ServoSystem(System):
+    """Pendulum on a motor with a proportional position controller.
+
+        (armature + mass length^2) q'' = torque - mass gravity length sin q    (1)
+        duty = clip(kp error_gain (goal - q), -1, 1)                           (2)
+        torque = kt (duty voltage - kt q') / resistance                        (3)
+
+    while enabled, else without torque. States are the angle q [rad], 0 hanging, and its rate qd
+    [rad/s].
+    """
+
+    name = "servo"
+    says = "a position-controlled servo motor that carries a pendulum"
+    kind: ClassVar[SystemKind] = "rotary"
+    parameters = (
+        Parameter(
+            "torque_constant",
+            "N*m/A",
+            0.5,
+            (0.05, 3.0),
+            (0.2, 1.0),
+            says="torque of the motor per ampere",
+        ),
+        Parameter(
+            "resistance",
+            "ohm",
+            4.0,
+            (0.5, 20.0),
+            (2.0, 8.0),
+            says="resistance of the motor's winding",
+        ),
+        Parameter(
+            "armature",
+            "kg*m^2",
+            2e-3,
+            (1e-4, 0.05),
+            (5e-4, 8e-3),
+            says="inertia of motor and gears",
+        ),
+    )
+    constants = (
+        Constant("mass", "kg", 0.49, "load", positive=True, limits=MASS_RANGE),
+        Constant(
+            "length", "m", 0.1, "from the joint to the load", positive=True, limits=LENGTH_RANGE
+        ),
+        Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY_RANGE),
+        Constant("voltage", "V", 7.4, "supply", positive=True, limits=VOLTAGE_RANGE),
+        Constant(
+            "error_gain",
+            "1/rad",
+            0.00287738,
+            "duty per radian of error and unit of kp",
+            limits=GAIN_RANGE,
+        ),
+        Constant("kp", "1", 200.0, "firmware gain", limits=GAIN_RANGE),
+    )
+    inputs = (
+        Channel("goal", "rad", says="commanded angle"),
+        Channel("torque_enable", "1", says="1 while the motor is driven, 0 while it is free"),
+    )
+    channels = (Channel("q", "rad", says="angle, 0 when hanging"),)
+    coordinates = ("q",)
+    rates = ("qd",)
+    states: ClassVar[Mapping[str, float]] = MappingProxyType({"q": 0.0, "qd": 0.0})
+    sensed = ("q",)
+    servo = "goal"
+    derived = (
+        DerivedQuantity(
+            "torque constant over resistance",
+            "N*m/V",
+            "stall torque for each volt",
+            lambda k: k["torque_constant"] / k["resistance"],
+        ),
+        DerivedQuantity(
+            "back-EMF damping",
+            "N*m*s/rad",
+            "what the driven motor's own voltage takes off its torque",
+            lambda k: k["torque_constant"] ** 2 / k["resistance"],
+        ),
+        DerivedQuantity(
+            "stall torque",
+            "N*m",
+            "at the whole supply, at rest",
+            lambda k: k["torque_constant"] * k["voltage"] / k["resistance"],
+            strongest=True,
+        ),
+        DerivedQuantity(
+            "free speed",
+            "rad/s",
+            "at the whole supply, without friction",
+            lambda k: k["voltage"] / k["torque_constant"],
+        ),
+    )
+    usual_recording = DefaultRecording(
+        initial={"q": (-0.5, 0.5)},
+        inputs={"goal": "steps:1:1", "torque_enable": "1"},
+    )
+
+    @classmethod
+    def find_unsupported_reason(cls, effect: type[Effect]) -> str:
+        """Return why the servo cannot have an effect; see `System`."""
+        return "its input is a set point, not a force" if effect.name == "input.power" else ""
+
+    @classmethod
+    def render_model_file(cls, numbers: Mapping[str, float]) -> RenderedModelFile:
+        """Return the servo as a model file; see `System`.
+
+        The duty is limited before the back electromotive force is subtracted. Therefore the latter
+        is a damping of the joint, outside the limit of the servo's force.
+        """
+        return render_model_file(numbers)
+
+    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+        """Return the inertia (L, 1) about the joint in kg m^2.
+
+        Args:
+            theta: (L, p) parameters.
+            constants: (L, 1) constants by name.
+        """
+        return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2  # (1)
+
+    def weight(self, moment: StateSnapshot) -> Array:
+        """Return the torque of gravity (L, 1)."""
+        k = moment.constants
+        torque: Array = -k["mass"] * k["gravity"] * k["length"] * np.sin(moment.x)
+        return torque
+
+    def drive(self, moment: StateSnapshot) -> Array:
+        """Return the motor's torque (L, 1), including its back electromotive force."""
+        k = moment.constants
+        kt = moment.theta[:, _KT]
+        error = moment.inputs["goal"] - moment.x
+        wanted = k["kp"] * k["error_gain"] * error
+        duty = np.minimum(np.maximum(wanted, -1.0), 1.0)  # (2)
+        voltage = duty * k["voltage"] - kt * moment.v
+        torque = kt * voltage / moment.theta[:, _RESISTANCE]  # (3)
+        return np.where(moment.inputs["torque_enable"] > 0.5, torque, 0.0)
+
+    def push(self, moment: StateSnapshot, axis: Literal["x", "y"]) -> Array:
+        """Return the torque (L, 1) of 1 m/s^2 of horizontal acceleration.
+
+        The pendulum swings in the plane of x and the vertical.
+
+        Args:
+            moment: state snapshot.
+            axis: horizontal axis of the acceleration.
+        """
+        if axis == "y":
+            return np.zeros_like(moment.x)
+        torque: Array = moment.constants["mass"] * moment.constants["length"] * np.cos(moment.x)
+        return torque
+
+    def observe(
+        self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
+    ) -> dict[str, Array]:
+        """Return the angle of the encoder.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: constants by name.
+        """
+        return {"q": x[:, :, 0]}
+
+
+class Servo(SystemSimulator):
+    """Servo; see `ServoSystem`."""
+
+    system = ServoSystem
+    default_engine = "pybullet"

@@ -1,0 +1,240 @@
+"""A two-link arm in a vertical plane, on PyBullet.
+
+With both angles measured from the vertical of the link before (0 hanging straight),
+
+    M(q) q'' + c(q, q') + g(q) = u - damping q' - friction sign(q')        (1)
+
+the equations are those of M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling and Control
+(2006), section 7.4, with gravity along the arm at rest. Bullet's articulated-body algorithm solves
+them.
+
+Bullet steps by semi-implicit Euler, which is of first order. Here each step of length h is two of
+Bullet's, from v to v1 and from v1 to v2, whose mean is taken as in Heun's method, which makes it of
+second order (E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993,
+section II.1):
+
+    q' = q + h (v + v1) / 2                                                (2)
+    v' = (v + v2) / 2                                                      (3)
+
+Dry friction is Bullet's
+joint motor with the friction as its limit and standstill as its goal: a constraint of both joints
+at once, which holds what pulls less. It cannot change sides within a step, so a step in which a
+joint that rubs comes to rest or turns round is taken again in small parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from sims.core.simulator import Channel, Constant, Parameter
+from sims.core.value_limits import GRAVITY_RANGE, INERTIA_RANGE, LENGTH_RANGE
+from sims.engines.adapters.bullet_world import NO_LIMIT
+from sims.own_simulator import BulletWorld, OwnSimulator
+
+_IDENTITY_QUATERNION = (0.0, 0.0, 0.0, 1.0)
+"""Not turned, as a quaternion x, y, z, w."""
+_AXIS = (0.0, 1.0, 0.0)
+"""Of both joints: the arm swings in the plane of x and z."""
+_FRICTION_SUBSTEPS = 16
+"""Parts of a step in which dry friction changes sides."""
+_SOLVER_ROUNDS = 200
+"""Rounds of Bullet's constraint solver, in which both joints' frictions are settled together."""
+_UNPICKLABLE_ATTRIBUTES = ("_world", "_place", "_push", "_state", "_go")
+"""Attributes that belong to a world in this process and cannot be copied."""
+_REST_SPEED = 1e-6
+"""rad/s: a joint that is slower is at rest."""
+
+
+def _of_link(
+    name: str,
+    unit: str,
+    nominal: float,
+    bounds: tuple[float, float],
+    training: tuple[float, float],
+    says: str,
+) -> tuple[Parameter, Parameter]:
+    """The same number of both links, told apart by its name."""
+
+    def of(link: int) -> Parameter:
+        return Parameter(f"{name}{link}", unit, nominal, bounds, training, says=f"{says} {link}")
+
+    return of(1), of(2)
+
+
+class TwoLinkArm(OwnSimulator):
+    """A two-link arm that swings in a vertical plane, driven at both joints."""
+
+    name = "arm"
+    requires = ("pybullet",)
+    says = "a two-link arm in a vertical plane, driven at both joints"
+    kind = "rotary"
+    time_step = 1 / 250
+    parameters = (
+        *_of_link("mass", "kg", 1.0, (0.2, 3.0), (0.5, 1.5), says="mass of link"),
+        *_of_link(
+            "centre",
+            "m",
+            0.2,
+            (0.05, 0.35),
+            (0.12, 0.28),
+            says="from the joint to the centre of mass of link",
+        ),
+        *_of_link(
+            "damping", "N*m*s/rad", 0.1, (0.0, 0.5), (0.0, 0.2), says="viscous damping of joint"
+        ),
+        *_of_link("friction", "N*m", 0.1, (0.0, 0.5), (0.0, 0.2), says="dry friction of joint"),
+    )
+    constants = (
+        Constant("length", "m", 0.4, "of link 1, from joint to joint", True, LENGTH_RANGE),
+        Constant(
+            "inertia1", "kg*m^2", 0.012, "of link 1 about its centre of mass", True, INERTIA_RANGE
+        ),
+        Constant(
+            "inertia2", "kg*m^2", 0.012, "of link 2 about its centre of mass", True, INERTIA_RANGE
+        ),
+        Constant("gravity", "m/s^2", 9.81, "downward", limits=GRAVITY_RANGE),
+    )
+    inputs = (
+        Channel("u1", "N*m", says="torque at joint 1"),
+        Channel("u2", "N*m", says="torque at joint 2"),
+    )
+    channels = (
+        Channel("q1", "rad", says="angle of joint 1, 0 when link 1 hangs"),
+        Channel("q2", "rad", says="angle of joint 2, 0 when the arm is straight"),
+        Channel("qd1", "rad/s", 10.0, "rate of joint 1"),
+        Channel("qd2", "rad/s", 10.0, "rate of joint 2"),
+    )
+    coordinates = ("q1", "q2")
+    rates = ("qd1", "qd2")
+    states = MappingProxyType({"q1": 0.5, "q2": 0.5, "qd1": 0.0, "qd2": 0.0})
+
+    _world: BulletWorld
+
+    def reset(
+        self,
+        theta: Mapping[str, float],
+        constants: Mapping[str, float],
+        initial: Mapping[str, float],
+    ) -> None:
+        """A new arm in an empty world: Bullet has no way to move a centre of mass, and building
+        takes 0.3 ms.
+        """
+        if "_world" not in self.__dict__:
+            self._world = BulletWorld()
+        p = self._world
+        p.resetSimulation()
+        p.setGravity(0.0, 0.0, -constants["gravity"])
+        # All rounds, whatever the residual: what friction holds must stand still.
+        p.setPhysicsEngineParameter(numSolverIterations=_SOLVER_ROUNDS, solverResidualThreshold=0.0)
+        self._arm = self._built(theta, constants)
+        for joint in (0, 1):
+            inertia = constants[f"inertia{joint + 1}"]
+            damping = theta[f"damping{joint + 1}"]
+            p.changeDynamics(
+                self._arm, joint, localInertiaDiagonal=(inertia,) * 3, jointDamping=damping
+            )
+        self._friction = [theta["friction1"], theta["friction2"]]
+        self._step = 0.0
+        # Looked up once: a run has thousands of each.
+        self._place = p.resetJointState
+        self._push = p.setJointMotorControl2
+        self._state = p.getJointState
+        self._go = p.stepSimulation
+        self._torque = p.TORQUE_CONTROL
+        self._q = [initial["q1"], initial["q2"]]
+        self._v = [initial["qd1"], initial["qd2"]]
+
+    def _built(self, theta: Mapping[str, float], constants: Mapping[str, float]) -> int:
+        """The two links in the empty world; the body's id."""
+        p = self._world
+        arm: int = p.createMultiBody(
+            linkMasses=[theta["mass1"], theta["mass2"]],
+            linkCollisionShapeIndices=[-1, -1],
+            linkVisualShapeIndices=[-1, -1],
+            linkPositions=[(0.0, 0.0, 0.0), (0.0, 0.0, -constants["length"])],
+            linkOrientations=[_IDENTITY_QUATERNION, _IDENTITY_QUATERNION],
+            linkInertialFramePositions=[
+                (0.0, 0.0, -theta["centre1"]),
+                (0.0, 0.0, -theta["centre2"]),
+            ],
+            linkInertialFrameOrientations=[_IDENTITY_QUATERNION, _IDENTITY_QUATERNION],
+            linkParentIndices=[0, 1],
+            linkJointTypes=[p.JOINT_REVOLUTE, p.JOINT_REVOLUTE],
+            linkJointAxis=[_AXIS, _AXIS],
+        )
+        # By default Bullet adds air resistance, sleep when nothing moves, and a speed limit.
+        p.changeDynamics(arm, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=NO_LIMIT)
+        p.changeDynamics(arm, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
+        return arm
+
+    def step(self, inputs: Mapping[str, float], seconds: float) -> None:
+        """One step of Heun's method, or several short ones where dry friction changes sides."""
+        torques = (inputs["u1"], inputs["u2"])
+        before = (self._q, self._v)
+        # Friction's side is fixed within a step of Bullet's; where it changes, steps must be short.
+        if self._heun(torques, seconds):
+            self._q, self._v = before
+            for _ in range(_FRICTION_SUBSTEPS):
+                self._heun(torques, seconds / _FRICTION_SUBSTEPS)
+
+    def _heun(self, torques: tuple[float, float], seconds: float) -> bool:
+        """The mean of two of Bullet's steps; returns whether a joint that rubs came to rest or
+        turned round.
+        """
+        self._pace(seconds)
+        q = self._q
+        v = self._v
+        for joint in (0, 1):
+            self._place(self._arm, joint, q[joint], v[joint])
+        v1 = self._advance(torques)
+        v2 = self._advance(torques)
+        self._q = [q[i] + seconds * (v[i] + v1[i]) / 2 for i in (0, 1)]  # (2)
+        self._v = [(v[i] + v2[i]) / 2 for i in (0, 1)]  # (3)
+        return any(_turns(v[i], v1[i], v2[i]) for i in (0, 1) if self._friction[i] > 0)
+
+    def observe(self) -> Mapping[str, float]:
+        """Angles and rates."""
+        q1, q2 = self._q
+        qd1, qd2 = self._v
+        return {"q1": q1, "q2": q2, "qd1": qd1, "qd2": qd2}
+
+    def close(self) -> None:
+        """Leave Bullet; the next run starts it again."""
+        self.__dict__.pop("_world", None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy gets a world of its own.
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name not in _UNPICKLABLE_ATTRIBUTES
+        }
+
+    def _pace(self, seconds: float) -> None:
+        # Bullet turns a motor's force into an impulse when the motor is set, so a motor holds for
+        # one length of step.
+        if seconds != self._step:
+            p = self._world
+            p.setTimeStep(seconds)
+            for joint, friction in enumerate(self._friction):
+                p.setJointMotorControl2(
+                    self._arm, joint, p.VELOCITY_CONTROL, targetVelocity=0.0, force=friction
+                )
+            self._step = seconds
+
+    def _advance(self, torques: tuple[float, float]) -> tuple[float, float]:
+        """One step of Bullet's; the joints' rates after it."""
+        for joint in (0, 1):
+            if torques[joint]:  # Bullet forgets them after each step
+                self._push(self._arm, joint, self._torque, force=torques[joint])
+        self._go()
+        return self._state(self._arm, 0)[1], self._state(self._arm, 1)[1]
+
+
+def _turns(before: float, middle: float, after: float) -> bool:
+    """Whether a joint that moved has come to rest or turned round, from its rates in rad/s."""
+    if abs(before) <= _REST_SPEED:
+        return False
+    return min(middle * before, after * before) < _REST_SPEED * abs(before)

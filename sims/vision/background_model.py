@@ -1,0 +1,195 @@
+"""Background image of a fixed camera without the ball, and the cuts of a film."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array, InputError
+from sims.vision.ball_renderer import RgbImage
+
+MAX_BACKGROUND_FRAMES = 25
+"""Maximum number of frames whose median is the background."""
+_PIXELS = 5_000
+"""Approximate number of pixels per picture used in the first pass."""
+_CUT = 0.5
+"""Fraction of pixels that change where the film is cut or the camera moves."""
+_STEP = 12
+"""Change in grey levels above which a pixel counts as changed; smaller ones are noise or shadow."""
+_GRAIN = 4
+"""Grey levels of compression noise in addition to the camera noise, which the median estimates."""
+_NEAR = 1.3
+"""Distance around a ball's centre at which it hides the background with its soft edge, in radii."""
+_EDGE = 3
+"""Additional margin around a ball that compression affects, pixels."""
+_NORMAL = 1.4826
+"""Standard deviation of normal noise divided by its median magnitude."""
+_WORST = 1.5
+"""Assumed ratio of the largest of three noise magnitudes to a single one."""
+
+
+@dataclass(frozen=True)
+class FrameSurvey:
+    """Result of a first pass over the frames.
+
+    Attributes:
+        times: (n,) times of the frames, s.
+        moved: (n,) mean change from the previous frame, grey levels.
+        cuts: Numbers of the frames that begin a new shot.
+        size: Width and height of the picture, px.
+    """
+
+    times: Array
+    moved: Array
+    cuts: tuple[int, ...]
+    size: tuple[int, int]
+
+    def list_shots(self) -> list[tuple[int, int]]:
+        """Return the first frame and the end (exclusive) of each shot between cuts."""
+        edges = [0, *self.cuts, len(self.times)]
+        # Consecutive cuts have no shot between them.
+        return [(a, b) for a, b in pairwise(edges) if b > a]
+
+
+def survey_frames(frames: Iterable[tuple[float, RgbImage]]) -> FrameSurvey:
+    """Measure the change between consecutive frames at low resolution.
+
+    Args:
+        frames: Time in seconds and picture (height, width, 3) of each frame.
+
+    Raises:
+        InputError: The size of the picture changes.
+    """
+    times = []
+    moved = []
+    cuts = []
+    size = 0, 0
+    before = None
+    for number, (time, picture) in enumerate(frames):
+        if number and picture.shape[1::-1] != size:
+            expected = f"{size[0]} x {size[1]} px as before"
+            raise InputError(f"frame {number}: expected {expected}, found another size")
+        height, width = picture.shape[:2]
+        size = width, height
+        share = height * width / _PIXELS
+        skip = max(1, int(share**0.5))
+        coarse = picture[::skip, ::skip].astype(np.int16)
+        earlier = coarse if before is None else before
+        change = np.abs(coarse - earlier).max(axis=2)
+        if np.mean(change > _STEP) > _CUT:
+            cuts.append(number)
+            # The whole picture has changed, and no ball has moved.
+            change[:] = 0
+        times.append(time)
+        # Ignore small changes: noise would make a static picture look busy.
+        usual = np.median(change)
+        beyond = change - 2 * usual - _GRAIN
+        moved.append(float(np.maximum(beyond, 0).mean()))
+        before = coarse
+    return FrameSurvey(np.array(times), np.array(moved), tuple(cuts), size)
+
+
+def select_frames(moved: Array, most: int = MAX_BACKGROUND_FRAMES) -> list[int]:
+    """Select frames at even intervals of accumulated motion.
+
+    Frames at even intervals of time would mostly show a ball that comes to rest, which would then
+    be part of the median.
+
+    Args:
+        moved: (n,) mean change from the previous frame, grey levels.
+        most: Maximum number of frames.
+
+    Returns:
+        Sorted numbers of the frames.
+    """
+    count = len(moved)
+    # A small value for each frame, so that a film without motion has marks, too.
+    least = 1e-3 * moved.sum() / max(1, count)
+    way = np.cumsum(moved + least + 1e-12)
+    marks = np.linspace(way[0], way[-1], min(most, count))
+    places = np.searchsorted(way, marks - 1e-12).clip(0, count - 1)
+    return sorted(set(places.tolist()))
+
+
+def compute_median_background(pictures: list[RgbImage]) -> RgbImage:
+    """Return the pixelwise median of pictures."""
+    stack = np.stack(pictures)
+    half = len(stack) // 2
+    # A partition finds the middle without sorting, and keeps integer grey levels.
+    stack.partition(half, axis=0)
+    result: RgbImage = stack[half].copy()
+    return result
+
+
+def compute_masked_background(
+    pictures: list[RgbImage],
+    balls: list[list[tuple[float, float, float]]],
+    before: RgbImage,
+    shaded: NDArray[np.bool_] | None = None,
+) -> RgbImage:
+    """Return the median of pictures without the objects that hide the background.
+
+    Args:
+        pictures: Pictures (height, width, 3), n of them.
+        balls: Circles (u, v, radius) of the objects in each picture, pixels.
+        before: Previous estimate of the background, used where no picture shows it.
+        shaded: Mask (n, height, width) of shadows that also hide it; None for none.
+    """
+    height, width = before.shape[:2]
+    rows, columns = np.mgrid[:height, :width]
+    nowhere = np.zeros((len(pictures), height, width), bool)
+    hidden = nowhere if shaded is None else shaded.copy()
+    for mask, there in zip(hidden, balls, strict=True):
+        for u, v, radius in there:
+            far = np.hypot(columns - u, rows - v)
+            mask |= far < _NEAR * radius + _EDGE
+    # Elsewhere the median is kept: pixels that are never hidden, or hidden in all pictures.
+    ever = hidden.any(axis=0) & ~hidden.all(axis=0)
+    colours = np.stack(pictures)[:, ever].astype(np.float32)
+    values = np.where(hidden[:, ever, None], np.nan, colours)
+    result = before.copy()
+    if ever.any():
+        middle = _median_of_seen(values)
+        # Add half a grey level, because the conversion to integers truncates.
+        result[ever] = (middle + 0.5).astype(np.uint8)
+    return result
+
+
+def _median_of_seen(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the median over the first axis, ignoring NaN; numpy's takes four times as long."""
+    # NaN are sorted last, so the number of other values determines the middle.
+    ranked = np.sort(values, axis=0)
+    count = np.isfinite(values).sum(axis=0, keepdims=True)
+    low = np.take_along_axis(ranked, (count - 1) // 2, axis=0)
+    high = np.take_along_axis(ranked, count // 2, axis=0)
+    result: NDArray[np.float32] = (low[0] + high[0]) / 2
+    return result
+
+
+def estimate_camera_noise(pictures: list[RgbImage], background: RgbImage) -> float:
+    """Estimate the camera noise from pictures in which little differs from the background.
+
+    Args:
+        pictures: Pictures (height, width, 3).
+        background: Background (height, width, 3).
+
+    Returns:
+        Standard deviation in grey levels of the worst colour.
+    """
+    # A few pictures suffice, because each has many pixels.
+    every = max(1, len(pictures) // 8)
+    worst = [_difference(picture, background) for picture in pictures[::every]]
+    return float(_NORMAL * np.median(np.stack(worst)) / _WORST)
+
+
+def _difference(picture: RgbImage, background: RgbImage) -> NDArray[np.int16]:
+    """Return the largest difference over the colours (height, width)."""
+    # Unsigned integers would wrap around.
+    signed = picture.astype(np.int16)
+    apart = np.abs(signed - background)
+    result: NDArray[np.int16] = apart.max(axis=2)
+    return result

@@ -1,0 +1,481 @@
+"""Detect round objects that differ from the background, with subpixel accuracy.
+
+Pixels that differ are grouped to connected regions. A circle is fitted to the edge of each region.
+The edge is located along rays from the centre where the difference has fallen to half of its value
+inside: there the ball covers half of a pixel, whatever its colour. Rays that meet other things (a
+shadow, the picture's edge, a patch of similar colour) are outliers of the circle and are ignored; a
+region in which too few rays agree is not a ball.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+from sims.vision import circle_fit
+from sims.vision.ball_renderer import RgbImage
+from sims.vision.video_packages import import_package
+
+_RAYS = 36
+"""Number of rays, evenly spaced over the full circle, along which an edge is located."""
+_LEAST_AREA = 6
+"""Minimum area of a region in pixels; smaller ones are noise."""
+_LEAST_LEVEL = 12.0
+"""Minimum threshold of the difference in grey levels, because compression adds noise."""
+_MIN_RAY_AGREEMENT = 0.6
+"""Minimum fraction of the rays that must agree on a circle."""
+_GOOD_RAY_AGREEMENT = 0.85
+"""Fraction of agreeing rays below which a fit from arcs is also tried, as shadows bias circles."""
+_MOST_SPOTS = 4
+"""Maximum number of regions per picture that are measured, the largest first."""
+_TINY = 2.5
+"""Radius in pixels below which a region is too small for rays."""
+_ROUNDS = 3
+"""Maximum number of iterations of edge location and circle fit."""
+_STILL = 0.02
+"""Change of a circle in pixels below which the iteration ends."""
+_FINE = 0.25
+"""Spacing of samples along a ray, pixels."""
+_TUKEY_WIDTH_KNOWN_RADIUS = 0.5
+"""Width of the robust weights in pixels when the radius is known."""
+_RIM = 5
+"""Width in pixels of the line around a region in which nothing is treated as shadow."""
+_AROUND = 1.6
+"""Distance from the centre at which a region's surroundings are sampled, in radii."""
+_SHADOW_FACTOR_RANGE = (0.25, 0.97)
+"""Range of brightness factors of shadow; darker is an object, lighter is noise."""
+_UNEVEN = 6.0
+"""Maximum deviation of the colours from a common factor for shadow, grey levels."""
+_OUTSIDE = -1000.0
+"""Value for pixels outside the picture, far below every difference."""
+_SINGULAR = 1e-6
+"""Determinant below which an edge does not determine a centre."""
+_TURNS = 12
+"""Maximum number of Gauss-Newton steps."""
+
+GreyLevels: TypeAlias = NDArray[np.float32]
+"""Grey levels, or positions in pixels."""
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+class BallDetection(NamedTuple):
+    """Detected ball.
+
+    Attributes:
+        u: Horizontal position of the centre, pixels.
+        v: Vertical position of the centre, pixels.
+        radius: Radius of the outline, pixels.
+        ray_agreement: Fraction of the rays that agree on the circle.
+        scatter: RMS distance of the agreeing edge points from the circle, pixels.
+        edges: Edge points (n, 2) to which the circle was fitted; none for a ball of a few pixels.
+        colour: Mean colour at the centre, grey levels.
+        contrast: Difference of that colour from the background, grey levels.
+        is_ghost: Whether it is a ball or shadow in the background image that the picture lacks.
+    """
+
+    u: float
+    v: float
+    radius: float
+    ray_agreement: float
+    scatter: float
+    edges: Array = np.empty((0, 2))
+    colour: tuple[float, ...] = (0.0, 0.0, 0.0)
+    contrast: float = 0.0
+    is_ghost: bool = False
+
+    def refit_with_radius(self, radius: float) -> BallDetection:
+        """Return the detection with its centre refitted for a radius known from other pictures.
+
+        If shade hides a part of the edge, a fit with free radius shifts both centre and radius.
+        """
+        if len(self.edges) < 0.4 * _RAYS:
+            return self
+        u, v = self.u, self.v
+        for _ in range(_TURNS):
+            away_u = self.edges[:, 0] - u
+            away_v = self.edges[:, 1] - v
+            far = np.maximum(np.hypot(away_u, away_v), 1e-9)
+            rest = far - radius
+            # Geman-McClure weights: points off the circle hardly count.
+            weights = 1 / (1 + (rest / _TUKEY_WIDTH_KNOWN_RADIUS) ** 2) ** 2
+            # Equation (2) of sims.vision.circle_fit without dR
+            rows = np.stack([away_u / far, away_v / far, rest])
+            normal = (rows * weights) @ rows.T
+            (a, b, p), (_, c, q), _ = normal.tolist()
+            area = a * c - b * b
+            if area < _SINGULAR:
+                return self
+            # Cramer's rule
+            du = (c * p - b * q) / area
+            dv = (a * q - b * p) / area
+            u += du
+            v += dv
+            if abs(du) + abs(dv) < 1e-3:
+                break
+        # The fit has moved to the edge of another object.
+        if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
+            return self
+        return self._replace(u=u, v=v)
+
+
+class BallDetector:
+    """Detector of round objects in pictures of one scene.
+
+    Args:
+        background: Scene without the ball.
+        sigma: Standard deviation of the noise, grey levels.
+        shadows: Whether regions that are only darker than the background are treated as shadow;
+            wrong for a ball of the ground's own hue.
+    """
+
+    def __init__(self, background: RgbImage, sigma: float, shadows: bool) -> None:
+        self.background = background
+        self.sigma = sigma
+        self.shadows = shadows
+        # With six sigma, none of ten thousand pixels exceeds the threshold by noise alone.
+        self.level = max(_LEAST_LEVEL, 6 * sigma)
+        self._plain = background.astype(np.float32)
+        cv2 = import_package("cv2")
+        self._grey = cv2.cvtColor(background, cv2.COLOR_RGB2GRAY)
+        squares = (self._plain * self._plain).sum(axis=2)
+        self._square = np.maximum(squares, 1.0)
+
+    def detect(self, picture: RgbImage, ghosts: bool = False) -> list[BallDetection]:
+        """Detect round objects in a picture, the largest first.
+
+        Args:
+            picture: Picture (height, width, 3).
+            ghosts: Whether to include objects that only the background image has.
+        """
+        cv2 = import_package("cv2")
+        difference = self._difference(picture)
+        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+        brightness = cv2.absdiff(grey, self._grey)
+        mask = (difference > self.level).astype(np.uint8)
+        if not mask.any():
+            return []
+        if self.shadows:
+            shade = self._even(picture, mask) > 0
+            mask[shade] = 0
+            # Remove single pixels that remain from shadow and noise.
+            pair = np.ones((2, 2), np.uint8)
+            mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, pair)
+        else:
+            shade = np.zeros(mask.shape, bool)
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        lengths = [(len(c), i) for i, c in enumerate(contours) if len(c) > 3]
+        large = sorted(lengths, reverse=True)[:_MOST_SPOTS]
+        seen = []
+        for _, i in large:
+            spot = self._spot(contours[i], (brightness, difference), shade)
+            if spot is not None:
+                seen.append(self._coloured(spot, picture))
+        return seen if ghosts else [spot for spot in seen if not spot.is_ghost]
+
+    def _coloured(self, spot: BallDetection, picture: RgbImage) -> BallDetection:
+        """Add to a detection its colour, its contrast, and whether it is a background artefact."""
+        here = _inside(picture, spot)
+        behind = _inside(self.background, spot)
+        out = _around(picture, spot)
+        out_behind = _around(self.background, spot)
+        contrast = float(np.abs(here - behind).max())
+        ghost = self._is_ghost((here, out), (behind, out_behind))
+        return spot._replace(colour=tuple(here.tolist()), contrast=contrast, is_ghost=ghost)
+
+    def find_missing_shadow(self, picture: RgbImage) -> Mask:
+        """Return the mask where the picture lacks a shadow of the background image."""
+        cv2 = import_package("cv2")
+        mask = (self._difference(picture) > self.level).astype(np.uint8)
+        lighter = (self._even(picture, mask) > 1).astype(np.uint8)
+        count, parts, sizes, _ = cv2.connectedComponentsWithStats(lighter)
+        gone = np.zeros(mask.shape, bool)
+        # Component 0 is the area between the others.
+        for part in range(1, count):
+            if sizes[part, cv2.CC_STAT_AREA] < _LEAST_AREA:
+                continue
+            inside = (parts == part).astype(np.uint8)
+            # Leave out one pixel between inside and ring, which is half one and half the other.
+            near = cv2.dilate(inside, np.ones((3, 3), np.uint8))
+            wide = cv2.dilate(near, np.ones((5, 5), np.uint8))
+            ring = (wide > 0) & (near == 0) & (mask == 0)
+            if not ring.any():
+                continue
+            within = inside > 0
+            shown = _medians(picture, within, ring)
+            hidden = _medians(self.background, within, ring)
+            # A pale ball is lighter, too, but it stands out in the picture.
+            if self._is_ghost(shown, hidden):
+                gone |= within
+        return gone
+
+    def _is_ghost(self, here: tuple[Array, Array], behind: tuple[Array, Array]) -> bool:
+        """Return whether an object is in the background image and not in the picture.
+
+        Args:
+            here: Colours inside and around the object in the picture.
+            behind: Colours there in the background image.
+        """
+        stands_out = float(np.abs(here[0] - here[1]).max())
+        stood_out = float(np.abs(behind[0] - behind[1]).max())
+        return stood_out > stands_out + self.level / 2
+
+    def _difference(self, picture: RgbImage) -> NDArray[np.uint8]:
+        """Return the largest difference from the background over the colours (height, width)."""
+        cv2 = import_package("cv2")
+        apart = cv2.absdiff(picture, self.background)
+        red_green = cv2.max(apart[..., 0], apart[..., 1])
+        result: NDArray[np.uint8] = cv2.max(red_green, apart[..., 2])
+        return result
+
+    def _even(self, picture: RgbImage, mask: NDArray[np.uint8]) -> GreyLevels:
+        """Return the factor between picture and background where it is the same in all colours.
+
+        The factor is below 1 in shadow, above 1 where the picture lacks a shadow, and 0 elsewhere.
+        """
+        result = np.zeros(mask.shape, np.float32)
+        rows, columns = np.nonzero(mask)
+        there = picture[rows, columns].astype(np.float32)
+        plain = self._plain[rows, columns]
+        # Least squares over the three colours.
+        product = (there * plain).sum(axis=1)
+        factor = product / self._square[rows, columns]
+        apart = np.abs(there - factor[:, None] * plain).max(axis=1)
+        rest = apart / np.maximum(factor, 1)
+        # A missing shadow is judged by the inverse factor.
+        even = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
+        darkest, lightest = _SHADOW_FACTOR_RANGE
+        shade = (even > darkest) & (even < lightest)
+        shade &= rest < max(_UNEVEN, 3 * self.sigma)
+        result[rows, columns] = np.where(shade, factor, 0)
+        return result
+
+    def _spot(
+        self,
+        contour: Any,
+        differences: tuple[NDArray[np.uint8], ...],
+        shade: Mask,
+    ) -> BallDetection | None:
+        """Measure the object inside a contour; None if it is not round.
+
+        Args:
+            contour: Contour of the region.
+            differences: Differences of brightness and of the worst colour (height, width).
+            shade: Mask of the shadow (height, width).
+        """
+        cv2 = import_package("cv2")
+        left, top, width, height = cv2.boundingRect(contour)
+        # An object that nearly fills the picture is not a ball in front of a background.
+        if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
+            return None
+        filled = np.zeros((height + 2, width + 2), np.uint8)
+        offset = 1 - left, 1 - top
+        cv2.drawContours(filled, [contour], -1, 1, -1, offset=offset)
+        if int(filled.sum()) < _LEAST_AREA:
+            return None
+        # The largest inscribed disc is the ball, even if a shadow is connected to it.
+        inside = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
+        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
+        radius = max(float(inside[row, column]), 1.0)
+        u = left + float(column) - 1
+        v = top + float(row) - 1
+        # Use a window around it in which shadow counts as background unless the region encloses it.
+        reach = int(2 * max(radius, 0.5 * max(width, height))) + 4
+        u0 = max(0, int(u) - reach)
+        v0 = max(0, int(v) - reach)
+        place = np.s_[v0 : int(v) + reach + 1, u0 : int(u) + reach + 1]
+        windows = np.stack([each[place] for each in differences]).astype(np.float32)
+        # The edge itself, half ball and half background, must not be treated as shadow.
+        hidden = shade[place].astype(np.uint8)
+        offset = -u0, -v0
+        cv2.drawContours(hidden, [contour], -1, 0, -1, offset=offset)
+        cv2.drawContours(hidden, [contour], -1, 0, _RIM, offset=offset)
+        windows[:, hidden > 0] = 0
+        if radius < _TINY:
+            return self._tiny(windows[1], u - u0, v - v0, radius, u0, v0)
+        return self._circle(windows, (u - u0, v - v0, radius), u0, v0)
+
+    def _circle(
+        self,
+        windows: GreyLevels,
+        start: circle_fit.Circle,
+        u0: int,
+        v0: int,
+    ) -> BallDetection | None:
+        """Fit a circle in windows that begin at (u0, v0); None if too few rays agree."""
+        u, v, radius = start
+        on_it = np.empty(0, bool)
+        rest = np.empty(0)
+        edges = None
+        for _ in range(_ROUNDS):
+            edges = self._edges(windows, u, v, radius)
+            if edges is None:
+                return None
+            fitted = circle_fit.fit_circle(edges, (u, v, None))
+            enough = (
+                fitted is not None
+                and circle_fit.find_inliers(fitted).sum() >= _GOOD_RAY_AGREEMENT * _RAYS
+            )
+            if not enough:
+                from_an_arc = circle_fit.fit_circle(edges, circle_fit.fit_arc(edges))
+                fitted = circle_fit.select_better_fit(fitted, from_an_arc)
+            if fitted is None:
+                return None
+            before = u, v, radius
+            found, rest = fitted
+            moved = max(abs(new - old) for new, old in zip(found, before, strict=True))
+            u, v, radius = found
+            on_it = circle_fit.find_inliers(fitted)
+            if moved < _STILL:
+                break
+        agree = float(on_it.sum()) / _RAYS
+        height, width = windows.shape[1:]
+        # A centre outside the window belongs to an arc of a large object.
+        within = -0.5 <= u <= width - 0.5
+        within &= -0.5 <= v <= height - 0.5
+        if edges is None or agree < _MIN_RAY_AGREEMENT or not within:
+            return None
+        scatter = float(np.sqrt(np.mean(rest[on_it] ** 2)))
+        whole = edges + np.array([u0, v0])
+        return BallDetection(u + u0, v + v0, radius, agree, scatter, whole)
+
+    def _edges(self, windows: GreyLevels, u: float, v: float, radius: float) -> Array | None:
+        """Locate the points (n, 2) where the difference falls to half along rays from (u, v).
+
+        The reference value is taken just inside the edge, because the brightness of a lit ball
+        varies. Brightness is used where it differs enough: video files store colours at half the
+        resolution.
+
+        Args:
+            windows: Differences of brightness and of the worst colour (2, height, width).
+            u: Horizontal position of the centre in the window, pixels.
+            v: Vertical position of the centre in the window, pixels.
+            radius: Approximate radius, pixels.
+
+        Returns:
+            Edge points in the window; None if there are too few.
+        """
+        begin = max(0.0, 0.7 * radius - 2)
+        steps = np.arange(begin, 1.5 * radius + 2, _FINE, dtype=np.float32)
+        cos, sin = _directions()
+        along_u = (u + cos * steps).astype(np.float32)
+        along_v = (v + sin * steps).astype(np.float32)
+        profiles = [_along(window, along_u, along_v) for window in windows]
+        # Last pixels inside the edge, except those affected by blur.
+        inner = steps > min(0.5 * radius, radius - 3.5)
+        inner &= steps < max(0.7 * radius, radius - 1.3)
+        half_way = int(inner.sum()) // 2
+        levels = []
+        for profile in profiles:
+            ranked = np.partition(profile[:, inner], half_way, axis=1)
+            levels.append(ranked[:, half_way])
+        brightness, worst = levels
+        bright = brightness > 1.5 * self.level
+        bright &= brightness > 0.7 * worst
+        values = np.where(bright[:, None], *profiles)
+        half = 0.5 * np.where(bright, brightness, worst)
+        crossed = half[:, None]
+        below = values[:, 1:] < crossed
+        below &= values[:, :-1] >= crossed
+        # A dark patch further inside is not an edge.
+        below[:, : int(np.flatnonzero(inner)[0])] = False
+        # Take the first of several crossings.
+        k = below.argmax(axis=1)
+        lines = np.arange(_RAYS)
+        a = values[lines, k]
+        b = values[lines, k + 1]
+        has = below.any(axis=1) & (half > 0.4 * self.level)
+        # A fall to the value for outside is the end of the picture, not of the ball.
+        has &= b > 0.5 * _OUTSIDE
+        if has.sum() < 0.5 * _RAYS:
+            return None
+        # Interpolate linearly between the two samples.
+        drop = np.maximum(a - b, 1e-6)
+        share = (a - half)[has] / drop[has]
+        out = steps[k[has]] + _FINE * share
+        edge_u = u + cos[has, 0] * out
+        edge_v = v + sin[has, 0] * out
+        return np.stack([edge_u, edge_v], axis=1).astype(np.float64)
+
+    def _tiny(
+        self,
+        window: GreyLevels,
+        u: float,
+        v: float,
+        radius: float,
+        u0: int,
+        v0: int,
+    ) -> BallDetection | None:
+        """Measure a ball of a few pixels: centroid of the difference, and radius from its sum."""
+        height, width = window.shape
+        rows, columns = np.mgrid[:height, :width]
+        near = np.hypot(columns - u, rows - v) <= radius + 2.5
+        weights = np.where(near & (window > 0.4 * self.level), window, 0.0)
+        total = float(weights.sum())
+        peak = float(np.percentile(window[near], 90))
+        if total <= 0 or peak < self.level:
+            return None
+        # A partly covered pixel differs in proportion: sums measure areas.
+        area = total / max(peak, 1.0)
+        if area < _LEAST_AREA / 2:
+            return None
+        u = u0 + float((weights * columns).sum() / total)
+        v = v0 + float((weights * rows).sum() / total)
+        equal = float(np.sqrt(area / np.pi))
+        # Without rays there is no agreement; assume that of the worst accepted circle.
+        return BallDetection(u, v, equal, _MIN_RAY_AGREEMENT, 0.2)
+
+
+def _medians(picture: RgbImage, inside: Mask, around: Mask) -> tuple[Array, Array]:
+    """Return the median colours (3,) of two parts of a picture."""
+    within: Array = np.median(picture[inside], axis=0)
+    outside: Array = np.median(picture[around], axis=0)
+    return within, outside
+
+
+def _inside(picture: RgbImage, spot: BallDetection) -> Array:
+    """Return the mean colour (3,) at a detection's centre."""
+    side = 2 * max(1, int(0.4 * spot.radius)) + 1
+    patch = import_package("cv2").getRectSubPix(picture, (side, side), (spot.u, spot.v))
+    colour: Array = patch.reshape(-1, 3).mean(axis=0)
+    return colour
+
+
+def _around(picture: RgbImage, spot: BallDetection) -> Array:
+    """Return the median colour (3,) around a detection."""
+    cos, sin = _directions()
+    height, width = picture.shape[:2]
+    away = _AROUND * spot.radius
+    half = _RAYS // 2
+    rows = (spot.v + away * sin[:, 0] + 0.5).astype(np.intp)
+    columns = (spot.u + away * cos[:, 0] + 0.5).astype(np.intp)
+    # Beyond the border, the outermost pixels are repeated.
+    rows = rows.clip(0, height - 1)
+    columns = columns.clip(0, width - 1)
+    ranked = np.partition(picture[rows, columns], half, axis=0)
+    colour: Array = ranked[half].astype(np.float64)
+    return colour
+
+
+def _along(window: GreyLevels, u: GreyLevels, v: GreyLevels) -> GreyLevels:
+    """Interpolate a window at subpixel positions; `_OUTSIDE` outside it."""
+    cv2 = import_package("cv2")
+    result: GreyLevels = cv2.remap(
+        window,
+        u,
+        v,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=_OUTSIDE,
+    )
+    return result
+
+
+@lru_cache(maxsize=1)
+def _directions() -> tuple[Array, Array]:
+    """Return the cosines and sines (rays, 1) of the ray directions."""
+    angles = np.linspace(0, 2 * np.pi, _RAYS, endpoint=False)[:, None]
+    return np.cos(angles), np.sin(angles)

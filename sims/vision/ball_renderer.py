@@ -1,0 +1,273 @@
+"""Render films of a ball with PyBullet's CPU renderer (TinyRenderer), without a window.
+
+The static scene is rendered once. In each frame only a window around the ball is rendered, at two
+or three times the resolution and then averaged, so that edges are smooth as through a lens and a
+frame costs a fraction of a whole picture. Ground pattern, shadow and camera noise are added with
+NumPy: the renderer has no procedural textures, and its shadow map darkens flat ground by itself.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Iterable, Iterator
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sims.core.simulator import Array
+from sims.engines.adapters import bullet_world
+from sims.vision.pinhole_camera import PinholeCamera
+from sims.vision.scene_appearance import SceneAppearance
+from sims.vision.sphere_mesh import make_sphere_mesh
+
+RgbImage: TypeAlias = NDArray[np.uint8]
+"""Picture (height, width, 3): red, green, blue."""
+ColourArray: TypeAlias = NDArray[np.float32]
+"""Picture in floating-point grey levels; or each pixel's coverage (height, width, 1)."""
+PixelWindow: TypeAlias = tuple[int, int, int, int]
+"""Part of a picture in pixels: left, top, right (exclusive), bottom (exclusive)."""
+
+_NEAR = 0.2
+"""Distance from the camera below which nothing is drawn, m."""
+_FAR = 200.0
+"""Distance from the camera beyond which nothing is drawn, m."""
+_GROUND = 60.0
+"""Half the side length of the ground, m."""
+_THICKNESS = 0.05
+"""Half the thickness of the ground, whose upper side is at height 0, m."""
+_MARGIN = 2
+"""Number of pixels around the ball's outline that are rendered with it."""
+_SMALL = 20
+"""Radius in pixels below which a ball is rendered three times finer; larger ones twice."""
+_SHARPEST = 0.02
+"""Half the width of a shadow's edge where the ball is on the ground, in ball radii."""
+_SUN = 0.01
+"""Growth of the shadow's edge per distance from ball to ground, as from the sun's disc, rad."""
+
+
+class BallScene:
+    """Scene with ground, ball and camera, ready to be rendered.
+
+    Args:
+        camera: Camera.
+        look: Colours, light and noise.
+        radius: Radius of the ball, m.
+        rng: Random number generator for the camera noise.
+    """
+
+    def __init__(
+        self, camera: PinholeCamera, look: SceneAppearance, radius: float, rng: np.random.Generator
+    ) -> None:
+        self.camera = camera
+        self.look = look
+        self.radius = radius
+        self._rng = rng
+        p = bullet_world.import_pybullet()
+        self._client: int = p.connect(p.DIRECT)
+        self.close = weakref.finalize(self, p.disconnect, self._client)
+        extents = [_GROUND, _GROUND, _THICKNESS]
+        ground = self._body(p.GEOM_BOX, look.ground, halfExtents=extents)
+        self._place(ground, (0, 0, -_THICKNESS))
+        width, height = camera.size
+        everything = 0, 0, width, height
+        self._rays = self._directions()
+        picture, covered = self._render(everything, 1, ground)
+        # Frames are rendered without the ground, because it does not change.
+        p.removeBody(ground, physicsClientId=self._client)
+        self._still = self._background(picture, covered)
+        points, faces = make_sphere_mesh()
+        self._ball = self._body(
+            p.GEOM_MESH,
+            look.ball,
+            vertices=(radius * points).tolist(),
+            indices=faces,
+            # Normals of the sphere instead of its faces, for smooth shading.
+            normals=points.tolist(),
+        )
+
+    def render_frames(self, positions: Iterable[Array]) -> Iterator[RgbImage]:
+        """Render one frame for each position (3,) of the ball's centre, m."""
+        return (self.render_frame(np.asarray(position, dtype=np.float64)) for position in positions)
+
+    def render_frame(self, position: Array) -> RgbImage:
+        """Render a frame with the ball's centre at `position` (3,), m."""
+        picture = self._still.copy()
+        # The shadow comes first, because the ball may hide a part of it.
+        self._cast_shadow(picture, position)
+        self._draw_ball(picture, position)
+        if self.look.noise > 0:
+            grain = self._rng.standard_normal(picture.shape, dtype=np.float32)
+            picture += self.look.noise * grain
+        # Add half a grey level, because the conversion to integers truncates.
+        return (picture + 0.5).clip(0, 255).astype(np.uint8)
+
+    def _place(self, body: int, position: ArrayLike) -> None:
+        bullet_world.import_pybullet().resetBasePositionAndOrientation(
+            body, position, (0, 0, 0, 1), physicsClientId=self._client
+        )
+
+    def _body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
+        p = bullet_world.import_pybullet()
+        visual = p.createVisualShape(
+            shape,
+            rgbaColor=[*colour, 1.0],
+            physicsClientId=self._client,
+            **size,
+        )
+        # No mass and no collision shape, because nothing is simulated here.
+        body: int = p.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
+        return body
+
+    def _directions(self) -> Array:
+        """Return the viewing direction of each pixel as world vectors (height, width, 3)."""
+        v, u = np.mgrid[: self.camera.size[1], : self.camera.size[0]]
+        right, down, forward = self.camera.axes
+        # Equation (2) of sims.vision.pinhole_camera at depth 1, inverted
+        middle_u, middle_v = self.camera.principal_point
+        a = (u - middle_u) / self.camera.focal
+        b = (v - middle_v) / self.camera.focal
+        result: Array = a[..., None] * right + b[..., None] * down + forward
+        return result
+
+    def _background(self, picture: ColourArray, covered: ColourArray) -> ColourArray:
+        """Return the scene without the ball, and store the visible ground points for shadows.
+
+        Args:
+            picture: Rendered ground.
+            covered: Fraction of each pixel that the ground covers.
+        """
+        # A ray meets the ground at height 0.
+        with np.errstate(divide="ignore"):
+            far = -self.camera.position[2] / self._rays[..., 2]
+        # Without the second condition, rays above the horizon would meet the ground behind the
+        # camera.
+        meets = (covered[..., 0] > 0.5) & (far > 0)
+        along = np.where(meets, far, 0.0)
+        points = self.camera.position + along[..., None] * self._rays
+        self._points = points.astype(np.float32)
+        self._open = meets
+        bright = self.look.compute_ground_brightness(points[..., 0], points[..., 1])
+        ground = picture * bright[..., None]
+        sky = 255 * np.array(self.look.sky)
+        return np.where(meets[..., None], ground, sky).astype(np.float32)
+
+    def _cast_shadow(self, picture: ColourArray, position: Array) -> None:
+        """Darken the ground in the ball's shadow; the sun's disc softens its edge."""
+        light = self.look.light
+        stretch = 1 / light[2]
+        travel = position[2] / light[2]
+        # Intersection of the ground with the line through the ball's centre along the light.
+        foot = position - travel * light
+        signs = np.array(
+            [
+                (-1, -1, 0.0),
+                (-1, 1, 0.0),
+                (1, -1, 0.0),
+                (1, 1, 0.0),
+            ]
+        )
+        # Slanting light stretches the disc to an ellipse.
+        corners = foot + self.radius * stretch * 1.1 * signs
+        window = _window(self.camera.project(corners), self.camera.size)
+        if window is None:
+            return
+        left, top, right, bottom = window
+        place = np.s_[top:bottom, left:right]
+        away = self._points[place] - foot.astype(np.float32)
+        # Distance from that line by Pythagoras; rounding may make the square negative.
+        along = away @ light.astype(np.float32)
+        far = (away * away).sum(axis=-1)
+        squares = far - along * along
+        distance = np.sqrt(np.maximum(squares, 0))
+        soft = _SHARPEST * self.radius + _SUN * travel
+        depth = (self.radius + soft - distance) / (2 * soft)
+        hidden = np.clip(depth, 0, 1) * self._open[place]
+        left_over = 1 - self.look.shadow * hidden
+        picture[place] *= left_over[..., None].astype(np.float32)
+
+    def _draw_ball(self, picture: ColourArray, position: Array) -> None:
+        """Blend the ball into the picture, weighted by its coverage of each pixel."""
+        centre, (longer, _) = self.camera.project_sphere(position, self.radius)
+        reach = longer + _MARGIN
+        if not np.isfinite(reach):
+            return
+        around = np.array([centre - reach, centre + reach])
+        window = _window(around, self.camera.size)
+        if window is None:
+            return
+        self._place(self._ball, position)
+        fine = 3 if longer < _SMALL else 2
+        ball, covered = self._render(window, fine, self._ball)
+        left, top, right, bottom = window
+        place = np.s_[top:bottom, left:right]
+        picture[place] = covered * ball + (1 - covered) * picture[place]
+
+    def _render(self, window: PixelWindow, fine: int, body: int) -> tuple[ColourArray, ColourArray]:
+        """Render a body in a window of the picture.
+
+        Args:
+            window: Window (left, top, right, bottom).
+            fine: Factor of oversampling.
+            body: Id of the body.
+
+        Returns:
+            Mean colours of the body (height, width, 3), and its coverage (height, width, 1).
+        """
+        p = bullet_world.import_pybullet()
+        camera = self.camera
+        left, top, right, bottom = window
+        width = right - left
+        height = bottom - top
+        # size of a pixel on the near plane in metres
+        at = _NEAR / camera.focal
+        # The renderer counts pixels from their corner: shift by half a fine pixel, measured on
+        # spheres.
+        shift = 0.5 / fine
+        u, v = camera.principal_point - (shift, -shift)
+        # The edges of the window are half a pixel outside the centres of its outermost pixels.
+        left_edge = left - 0.5 - u
+        right_edge = right - 0.5 - u
+        lower_edge = bottom - 0.5 - v
+        upper_edge = top - 0.5 - v
+        projection = p.computeProjectionMatrix(
+            at * left_edge,
+            at * right_edge,
+            -at * lower_edge,
+            -at * upper_edge,
+            _NEAR,
+            _FAR,
+        )
+        view = p.computeViewMatrix(camera.position, camera.target, (0, 0, 1))
+        _, _, colours, _, bodies = p.getCameraImage(
+            width * fine,
+            height * fine,
+            view,
+            projection,
+            lightDirection=self.look.light.tolist(),
+            shadow=0,
+            renderer=p.ER_TINY_RENDERER,
+            physicsClientId=self._client,
+        )
+        # Average the fine pixels of each pixel; only colours of the body itself count.
+        grouped = height, fine, width, fine
+        there = np.reshape(bodies, (*grouped, 1)) == body
+        share = there.mean(axis=(1, 3), dtype=np.float32)
+        colour = np.reshape(colours, (*grouped, 4))[..., :3]
+        sums = np.where(there, colour, 0).sum(axis=(1, 3), dtype=np.float32)
+        count = np.maximum(share * fine**2, 1)
+        return sums / count, share
+
+
+def _window(pixels: Array, size: tuple[int, int]) -> PixelWindow | None:
+    """Return the window of the picture that contains `pixels` (n, 2); None if they are outside."""
+    if not np.isfinite(pixels).all():
+        return None
+    left, top = (max(0, math.floor(x)) for x in pixels.min(axis=0))
+    last_u, last_v = pixels.max(axis=0)
+    right = min(size[0], math.ceil(last_u) + 1)
+    bottom = min(size[1], math.ceil(last_v) + 1)
+    if left < right and top < bottom:
+        return left, top, right, bottom
+    return None

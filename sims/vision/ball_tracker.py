@@ -1,0 +1,370 @@
+"""Track the ball through the frames of a film."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array, InputError
+from sims.vision import background_model
+from sims.vision.ball_detection import BallDetection, BallDetector
+from sims.vision.ball_renderer import RgbImage
+from sims.vision.circle_fit import Circle
+from sims.vision.trajectory_linking import TrackedPath, link_detections, merge_continuations
+
+_LEAST_FRAMES = 5
+"""Minimum number of frames that must show the ball."""
+_WINDOW = 9
+"""Length in samples of the windows for noise estimation; shorter paths are not smoothed."""
+_FEW = 8
+"""Approximate number of frames on which both treatments of shadows are compared."""
+_HELD = 200_000_000
+"""Maximum number of bytes of frames that are cached in memory."""
+_FEWEST = 3
+"""Minimum number of frames without an object that prove that it is in the background estimate."""
+_MISFIT = 0.2
+"""Maximum relative deviation of a radius from the linear trend along its path."""
+_SHADOWS = 0.8
+"""Minimum ratio of the ray agreement with and without shadow removal at which it is used."""
+_ROUNDS = 10
+"""Number of iterations of reweighted least squares."""
+_SURE = 0.02
+"""Lower limit of the uncertainty of a radius, in pixels."""
+
+
+@dataclass(frozen=True)
+class BallTrack:
+    """Tracked ball.
+
+    Attributes:
+        times: (n,) times of the frames of one shot, s.
+        u: (n,) horizontal position relative to the upper left pixel's centre, pixels; NaN in frames
+            without a ball.
+        v: (n,) position downwards, pixels.
+        radius: (n,) radius of the ball's outline, pixels.
+        noise: Standard deviation of u and v in pixels, estimated from the path.
+        size: Width and height of the picture, pixels.
+        notes: Remarks for the user, in sentences.
+        background: Scene without the ball.
+        pictures: Some of the frames, by number.
+    """
+
+    times: Array
+    u: Array
+    v: Array
+    radius: Array
+    noise: float
+    size: tuple[int, int]
+    notes: tuple[str, ...]
+    background: RgbImage = field(repr=False)
+    pictures: dict[int, RgbImage] = field(repr=False)
+
+    @property
+    def visible_frames(self) -> NDArray[np.intp]:
+        """Numbers of the frames that show the ball."""
+        return np.flatnonzero(np.isfinite(self.u))
+
+
+def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
+    """Track the ball that moves in front of a fixed camera.
+
+    Args:
+        frames: Time in seconds and picture (height, width, 3) of each frame; iterated three times.
+
+    Raises:
+        InputError: No ball is found.
+    """
+    frames = _FrameCache(frames)
+    survey = background_model.survey_frames(frames)
+    notes: list[str] = []
+    first, end = _find_longest_shot(survey, notes)
+    numbers = [first + k for k in background_model.select_frames(survey.moved[first:end])]
+    wanted = set(numbers)
+    pictures = [picture for number, (_, picture) in enumerate(frames) if number in wanted]
+    finder = _finder(pictures)
+    spots = []
+    for number, (_, picture) in enumerate(frames):
+        if first <= number < end:
+            spots.append(finder.detect(picture))
+    paths = link_detections(spots)
+    if not paths:
+        raise InputError(_format_no_ball_message(end - first, sum(map(bool, spots))))
+    path, others = merge_continuations(paths)
+    # An object that hardly moves may be a ball, but its fall cannot be measured.
+    if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
+        raise InputError(_format_no_ball_message(end - first, len(path.frames)))
+    _others(path, others, notes)
+    shown = {n - first: p for n, p in zip(numbers, pictures, strict=True)}
+    return _measured(survey.times[first:end], path, survey.size, notes, finder, shown)
+
+
+class _FrameCache:
+    """Frames that are cached if they are few and small, and otherwise read again each time."""
+
+    def __init__(self, source: Iterable[tuple[float, RgbImage]]) -> None:
+        self._source = source
+        self._kept: list[tuple[float, RgbImage]] | None = None
+
+    def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
+        if self._kept is not None:
+            yield from self._kept
+            return
+        frames = []
+        held = 0
+        for time, picture in self._source:
+            held += picture.nbytes
+            if held <= _HELD:
+                frames.append((time, picture))
+            else:
+                # Too many frames: release those cached so far at once.
+                frames.clear()
+            yield time, picture
+        if held <= _HELD:
+            self._kept = frames
+
+
+def _format_no_ball_message(frames: int, some: int) -> str:
+    """Format the message that no ball was found.
+
+    Args:
+        frames: Number of frames.
+        some: Number of frames with a round object.
+    """
+    seen = f"something round in {some} of {frames} frames, but nothing" if some else "nothing"
+    return (
+        f"no ball found: {seen} that moves and stays round; "
+        "film with a fixed camera and a ball unlike its background"
+    )
+
+
+def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -> tuple[int, int]:
+    """Return the first frame and the end (exclusive) of the longest part without a cut."""
+    shots = survey.list_shots()
+    first, end = max(shots, key=lambda shot: shot[1] - shot[0])
+    if len(shots) > 1:
+        cuts = ", ".join(f"{survey.times[cut]:.2f} s" for cut in survey.cuts[:5])
+        span = f"{survey.times[first]:.2f} to {survey.times[end - 1]:.2f} s"
+        notes.append(
+            f"the film is cut or the camera moves (at {cuts}); "
+            f"only the longest part is tracked, {span}"
+        )
+    if end - first < _LEAST_FRAMES:
+        raise InputError(
+            f"expected at least {_LEAST_FRAMES} frames without a cut, found {end - first}"
+        )
+    return first, end
+
+
+def _finder(pictures: list[RgbImage]) -> BallDetector:
+    """Make a detector with the better treatment of shadows and a background without the ball."""
+    plain = background_model.compute_median_background(pictures)
+    every = max(1, len(pictures) // _FEW)
+    # Two passes: objects hidden by the first background are detected with the second.
+    for _ in range(2):
+        sigma = background_model.estimate_camera_noise(pictures, plain)
+        careful = BallDetector(plain, sigma, shadows=True)
+        careless = BallDetector(plain, sigma, shadows=False)
+        by_careful = [careful.detect(p, ghosts=True) for p in pictures[::every]]
+        by_careless = [careless.detect(p, ghosts=True) for p in pictures[::every]]
+        # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
+        if _roundness(by_careful) >= _SHADOWS * _roundness(by_careless):
+            best, known = careful, by_careful
+        else:
+            best, known = careless, by_careless
+        found = []
+        for i, picture in enumerate(pictures):
+            if i % every == 0:
+                found.append(known[i // every])
+            else:
+                found.append(best.detect(picture, ghosts=True))
+        hiding = _hiding(found)
+        shaded = None
+        if best.shadows:
+            shaded = _shaded([best.find_missing_shadow(picture) for picture in pictures])
+        plain = background_model.compute_masked_background(pictures, hiding, plain, shaded)
+    return BallDetector(plain, sigma, best.shadows)
+
+
+def _roundness(pictures: list[list[BallDetection]]) -> float:
+    """Return the sum over frames of the best circle's fraction of agreeing rays."""
+    return sum(
+        max((spot.ray_agreement for spot in spots if not spot.is_ghost), default=0.0)
+        for spots in pictures
+    )
+
+
+def _hiding(found: list[list[BallDetection]]) -> list[list[Circle]]:
+    """Return the circles that hide the background in each picture.
+
+    A ball that rests for most of the film, or its shadow, is part of the median. Pictures without
+    it at that position show the true background; in the others it hides the background.
+    """
+    balls: list[list[Circle]] = []
+    ghosts: list[list[Circle]] = []
+    for spots in found:
+        balls.append([(s.u, s.v, s.radius) for s in spots if not s.is_ghost])
+        ghosts.append([(s.u, s.v, s.radius) for s in spots if s.is_ghost])
+    for one in [ghost for there in ghosts for ghost in there]:
+        lacking = [any(_same(one, other) for other in there) for there in ghosts]
+        # One or two frames may miss it by mistake.
+        if sum(lacking) < _FEWEST:
+            continue
+        for there, lacks in zip(balls, lacking, strict=True):
+            if not lacks:
+                there.append(one)
+    return balls
+
+
+def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Return where a shadow hides the background in each picture (n, height, width).
+
+    Args:
+        lit: Masks (height, width) where the shadow in the background is missing, one per picture.
+    """
+    stack = np.stack(lit)
+    result: NDArray[np.bool_] = ~stack & (stack.sum(axis=0) >= _FEWEST)
+    return result
+
+
+def _same(a: Circle, b: Circle) -> bool:
+    """Return whether two circles are the same object at rest."""
+    apart = abs(a[0] - b[0]) + abs(a[1] - b[1])
+    return apart < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
+
+
+def _others(path: TrackedPath, others: Sequence[TrackedPath], notes: list[str]) -> None:
+    """Add a note if a second object moves at the same time as the ball."""
+    frames = set(path.frames)
+    for other in others:
+        shared = len(frames & set(other.frames))
+        # A brief, small or resting object is not a second ball.
+        beside = shared >= max(8, 0.25 * len(path.frames))
+        moves = other.travel > 2 * other.radius
+        if beside and moves and 0.4 < other.radius / path.radius < 2.5:
+            notes.append(
+                f"a second ball, or its shadow, moves in {shared} of the same frames; "
+                "the clearer one is tracked"
+            )
+            return
+
+
+def _measured(
+    times: Array,
+    path: TrackedPath,
+    size: tuple[int, int],
+    notes: list[str],
+    finder: BallDetector,
+    pictures: dict[int, RgbImage],
+) -> BallTrack:
+    """Make the track of a path, with noise estimate and notes.
+
+    Args:
+        times: (n,) times of the frames, s.
+        path: Path of the ball.
+        size: Width and height of the picture, pixels.
+        notes: Remarks so far.
+        finder: Detector, which has the background.
+        pictures: Some of the frames, by number.
+    """
+    columns = np.full((3, len(times)), np.nan)
+    steady, misfits = _refine_with_smooth_radius(path.spots)
+    for frame, spot, misfit in zip(path.frames, steady, misfits, strict=True):
+        # An empty cell is better than the position of another object.
+        if not misfit:
+            columns[:, frame] = spot.u, spot.v, spot.radius
+    u, v, radius = columns
+    gone = int(np.isnan(u).sum())
+    if gone:
+        notes.append(
+            f"{gone} of {len(times)} frames show no ball that could be measured; "
+            "their cells are empty"
+        )
+    noise = np.nan
+    if len(times) > _WINDOW:
+        noise = max(estimate_roughness(u), estimate_roughness(v))
+    # If the path is too short or at rest, use the distance of the edges from their circles.
+    if not (np.isfinite(noise) and noise > 0):
+        noise = float(np.median([spot.scatter for spot in path.spots]))
+    return BallTrack(
+        times,
+        u,
+        v,
+        radius,
+        noise,
+        size,
+        tuple(notes),
+        finder.background,
+        pictures,
+    )
+
+
+def _refine_with_smooth_radius(
+    spots: list[BallDetection],
+) -> tuple[list[BallDetection], list[bool]]:
+    """Refit the centres with radii that change linearly along the path, as perspective implies.
+
+    Args:
+        spots: Detections of the ball.
+
+    Returns:
+        The refitted detections, and whether the radius of each deviates too much from the linear
+        trend, which means that another object was measured.
+    """
+    if len(spots) < _WINDOW:
+        return spots, [False] * len(spots)
+    places = np.array([(spot.u, spot.v) for spot in spots])
+    offsets = places - places.mean(axis=0)
+    spread = np.maximum(np.ptp(places, axis=0), 1.0)
+    # position along the path's main direction, about -1 to 1
+    axes = np.linalg.svd(offsets, full_matrices=False)[2]
+    along = offsets @ axes[0] / spread.max()
+    basis = np.stack([np.ones_like(along), along], axis=1)
+    radius = np.array([s.radius for s in spots])
+    weights = np.ones_like(radius)
+    line = np.zeros(2)
+    for _ in range(_ROUNDS):
+        weighed = basis * weights[:, None]
+        line = np.linalg.lstsq(weighed, radius * weights, rcond=None)[0]
+        rest = np.abs(radius - basis @ line)
+        # Weights with heavy tails: measurements of other objects must not affect the trend.
+        width = max(float(np.median(rest)), _SURE)
+        weights = 1 / (1 + (rest / width) ** 2)
+    fitted = np.maximum(basis @ line, 0.5)
+    allowed = np.maximum(_MISFIT * fitted, 1.0)
+    wrong = np.abs(radius - fitted) > allowed
+    steady = [s.refit_with_radius(float(r)) for s, r in zip(spots, fitted, strict=True)]
+    return steady, wrong.tolist()
+
+
+def estimate_roughness(values: Array) -> float:
+    """Estimate the noise of a signal from the residuals of local cubic fits.
+
+    A cubic is fitted to each window of nine samples in which the signal moves. Windows with gaps
+    are skipped, and the median makes the result insensitive to bounces.
+
+    Args:
+        values: (T,) signal, NaN where missing.
+
+    Returns:
+        Standard deviation of the noise; NaN if the signal never moves.
+    """
+    if len(values) < _WINDOW:
+        return float("nan")
+    windows = sliding_window_view(values, _WINDOW)
+    windows = windows[np.isfinite(windows).all(axis=1)]
+    # At rest the same pixels give the same error again and again, which is no scatter.
+    there = values[np.isfinite(values)]
+    travel = max(float(np.ptp(there)), 1e-12)
+    windows = windows[np.ptp(windows, axis=1) > 1e-3 * travel * _WINDOW]
+    if not len(windows):
+        return float("nan")
+    # A cubic has four coefficients, which reduces the degrees of freedom by four.
+    cubic = np.vander(np.linspace(-1, 1, _WINDOW), 4)
+    basis = np.linalg.qr(cubic)[0]
+    rest = windows - windows @ basis @ basis.T
+    squares = (rest**2).sum(axis=1)
+    return float(np.sqrt(np.median(squares) / (_WINDOW - 4)))

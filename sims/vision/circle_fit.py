@@ -1,0 +1,189 @@
+"""Robust circle fit to points of an edge, some of which belong to other objects.
+
+With d a point's distance from the centre (u, v), R the radius and n = (x - u, y - v) / d:
+
+    (1)  rest = d - R
+    (2)  Gauss-Newton: rest = n . (du, dv) + dR, by weighted least squares
+    (3)  Tukey's weights: (1 - (rest / width)^2)^2, zero beyond the width
+
+and for the initial circle Kasa's linear fit, with doubled centre (2 u, 2 v):
+
+    (4)  x^2 + y^2 = 2 u x + 2 v y + (R^2 - u^2 - v^2)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+
+Circle = tuple[float, float, float]
+"""Centre and radius (u, v, radius), pixels."""
+CircleFit = tuple[Circle, Array]
+"""Circle, and each point's distance to it, > 0 outside."""
+
+_MAX_ITERATIONS = 8
+"""Maximum number of Gauss-Newton steps."""
+_EXACT = 1e-3
+"""Length of a step, in pixels, below which the iteration ends."""
+_ARC_STRIDE = 3
+"""Number of points between the beginnings of consecutive arcs."""
+_TUKEY = 4.7
+"""Width of Tukey's weights in standard deviations, for 95 % efficiency with normal errors."""
+_NORMAL = 1.4826
+"""Standard deviation of a normal distribution divided by its median absolute deviation."""
+_FINEST = 0.15
+"""Lower limit of the estimated edge noise in pixels, so that good points are not rejected."""
+_SINGULAR = 1e-6
+"""Determinant below which the points do not determine a circle."""
+_LEAST_RADIUS = 0.5
+"""Minimum radius, pixels."""
+_MOST_RADIUS = 1e4
+"""Maximum radius in pixels; with a larger one, the points are on a straight line."""
+
+
+def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -> CircleFit | None:
+    """Fit a circle to most of the points by Gauss-Newton with Tukey's weights.
+
+    The normal equations of (2) are solved explicitly, because the call of numpy's solver would take
+    most of the time.
+
+    Args:
+        points: Points (n, 2), pixels.
+        start: Initial centre and radius; without radius, the median distance from the centre is
+            used. None if there is no initial circle.
+
+    Returns:
+        The circle and the distances of all points; None if no circle is found.
+    """
+    if start is None:
+        return None
+    u, v, radius = start
+    x = points[:, 0]
+    y = points[:, 1]
+    # Rows: the two components of n, ones for dR, and the residual of (2).
+    count = len(points)
+    rows: Array = np.ones((4, count))
+    for _ in range(_MAX_ITERATIONS):
+        away_u = x - u
+        away_v = y - v
+        far = np.hypot(away_u, away_v)
+        if radius is None:
+            radius = _middle(far)
+        rest = far - radius  # (1)
+        width = _TUKEY * max(_NORMAL * _middle(np.abs(rest)), _FINEST)
+        weights = np.maximum(1 - (rest / width) ** 2, 0.0) ** 2  # (3)
+        np.maximum(far, 1e-9, out=far)
+        rows[0] = away_u / far
+        rows[1] = away_v / far
+        rows[3] = rest
+        step = _step((rows * weights) @ rows.T)
+        if step is None:
+            return None
+        du, dv, dr = step
+        u += du
+        v += dv
+        radius += dr
+        if abs(du) + abs(dv) + abs(dr) < _EXACT:
+            break
+    if radius is None or not _LEAST_RADIUS < radius < _MOST_RADIUS:
+        return None
+    return (u, v, radius), np.hypot(x - u, y - v) - radius
+
+
+def _step(normal: Array) -> tuple[float, float, float] | None:
+    """Return (du, dv, dR) of (2) from its weighted products (4, 4); None if they are singular."""
+    (xx, xy, mx, p), (_, yy, my, q), (_, _, total, r), _ = normal.tolist()
+    if total <= 0:
+        return None
+    # Eliminate dR by the Schur complement; two equations in du and dv remain.
+    a = xx - mx * mx / total
+    b = xy - mx * my / total
+    c = yy - my * my / total
+    area = a * c - b * b
+    if total * area < _SINGULAR:
+        return None
+    p = p - mx * r / total
+    q = q - my * r / total
+    du = (c * p - b * q) / area
+    dv = (a * q - b * p) / area
+    dr = (r - mx * du - my * dv) / total
+    return du, dv, dr
+
+
+def find_inliers(fitted: CircleFit) -> NDArray[np.bool_]:
+    """Return which of the points are on the circle, as a mask (n,)."""
+    (_, _, radius), rest = fitted
+    tolerance = max(0.7, 0.1 * radius)
+    result: NDArray[np.bool_] = np.abs(rest) < tolerance
+    return result
+
+
+def select_better_fit(one: CircleFit | None, other: CircleFit | None) -> CircleFit | None:
+    """Return the circle that has more of the points on it.
+
+    Args:
+        one: First circle, or None.
+        other: Second circle, or None.
+
+    Returns:
+        The better circle; None if both are None.
+    """
+    if one is None or other is None:
+        return one or other
+    return other if find_inliers(other).sum() > find_inliers(one).sum() else one
+
+
+def fit_arc(points: Array) -> Circle | None:
+    """Fit circles to arcs of consecutive points, and return the one with most points on it.
+
+    A shadow or another ball disturbs one side of an edge. Circles are fitted to arcs of half of the
+    points that begin all around, by linear least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25,
+    8, 1976, doi:10.1109/TIM.1976.6312298).
+
+    Args:
+        points: Points (n, 2), in their order along the edge, pixels.
+
+    Returns:
+        The circle; None if an arc does not determine one.
+    """
+    count = len(points)
+    begins = np.arange(0, count, _ARC_STRIDE)
+    along = np.arange(count // 2 + 1)
+    numbers = (begins[:, None] + along) % count
+    # Relative to the mean, because the squares in (4) lose digits far from the origin.
+    middle = points.mean(axis=0)
+    arcs = points[numbers] - middle
+    table = np.concatenate([arcs, np.ones((*numbers.shape, 1))], axis=2)
+    turned = table.transpose(0, 2, 1)
+    normal = turned @ table
+    if (np.abs(np.linalg.det(normal)) < _SINGULAR).any():
+        return None
+    squares = (arcs**2).sum(axis=2)[..., None]
+    solution = np.linalg.solve(normal, turned @ squares)  # (4)
+    doubled_u, doubled_v, rest = solution[..., 0].T
+    u = doubled_u / 2
+    v = doubled_v / 2
+    radius = np.sqrt(np.maximum(rest + u**2 + v**2, 0.0))
+    x, y = (points - middle).T
+    far = np.hypot(x - u[:, None], y - v[:, None])
+    away = far - radius[:, None]
+    # Half the tolerance of `find_inliers`: points graze the circle of a wrong arc.
+    tolerance = np.maximum(0.35, 0.05 * radius)
+    agree = np.abs(away) < tolerance[:, None]
+    best = int(agree.sum(axis=1).argmax())
+    return (
+        float(u[best] + middle[0]),
+        float(v[best] + middle[1]),
+        float(radius[best]),
+    )
+
+
+def _middle(values: Array) -> float:
+    """Return the median; numpy's own takes ten times as long for a few numbers."""
+    k = len(values) // 2
+    sorted_there = np.partition(values, (k - 1, k))
+    if len(values) % 2:
+        return float(sorted_there[k])
+    return float(0.5 * (sorted_there[k - 1] + sorted_there[k]))

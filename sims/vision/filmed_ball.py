@@ -1,0 +1,170 @@
+"""The ball before a camera: heights, and where a tracker sees the ball in the picture."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
+from sims.core.value_limits import ANGLE_RANGE, IMAGE_SIZE_RANGE, LENGTH_RANGE
+from sims.systems.ball import Ball, BallSystem
+from sims.vision import video_packages
+from sims.vision.pinhole_camera import PinholeCamera
+
+FILM_MODES = ("projected", "tracked")
+"""How a film is made: computed through the camera, or rendered and tracked."""
+
+
+class FilmedBall(Simulator):
+    """A ball that falls and bounces on level ground, and its place in the picture of a fixed
+    camera.
+
+    The camera has a field of view of 40 degrees and looks at (0, 0, 2) m where nothing else is
+    said, as the published visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released
+    code). `v` is the pixel row of the middle of the ball's outline, from the top; it may lie
+    outside the picture.
+
+    Args:
+        constants: values for `make_constant_nodes` other than their defaults.
+        observe: channels to return, in order (default: both).
+        film: "projected" computes `v` through the camera. "tracked" renders a film of each run, its
+            light, colours and compression drawn from the run's own numbers, and lets the tracker
+            find the ball: `v` is missing where it is not seen, and `z`, which no film shows,
+            throughout.
+        settings: those of simulator ball.
+
+    Raises:
+        InputError: an unknown name or setting, or a film to be tracked without the packages for it.
+    """
+
+    name = "ball-filmed"
+    says = "a bouncing ball before a fixed camera"
+    parameters: tuple[Parameter, ...] = BallSystem.parameters
+    channels = (
+        Channel("z", "m", says="height of the centre above the ground"),
+        Channel("v", "px", says="pixel row of the middle of the ball's outline, down from the top"),
+    )
+    constants = (
+        *BallSystem.constants,
+        Constant(
+            "camera_azimuth",
+            "rad",
+            0.0,
+            "where the camera stands around the vertical",
+            limits=ANGLE_RANGE,
+        ),
+        Constant(
+            "camera_distance", "m", 7.5, "of the camera from the vertical", True, LENGTH_RANGE
+        ),
+        Constant("camera_height", "m", 6.5, "of the camera above the ground", limits=(-1e6, 1e6)),
+        Constant(
+            "camera_aim",
+            "m",
+            2.0,
+            "height of the point on the vertical at which the camera looks",
+            limits=(-1e6, 1e6),
+        ),
+        Constant("pixels", "px", 100.0, "width and height of the picture", True, IMAGE_SIZE_RANGE),
+    )
+    states = BallSystem.states
+
+    def __init__(
+        self,
+        constants: Mapping[str, float] | None = None,
+        observe: Sequence[str] | None = None,
+        *,
+        film: str = "projected",
+        **settings: Any,
+    ) -> None:
+        super().__init__(constants, observe)
+        if film not in FILM_MODES:
+            raise InputError(
+                f"simulator {self.name}: expected film to be one of {', '.join(FILM_MODES)}, found"
+                f" {film!r}"
+            )
+        if film == "tracked":
+            video_packages.check_installed()  # now, with one message, and not in the middle of a training
+        self._tracked = film == "tracked"
+        self._ball = Ball(self._of_ball(self.constant_values), ["x", "y", "z"], **settings)
+        # with the coefficients of effects that are not fixed
+        self.parameters = self._ball.parameters
+
+    def simulate(self, theta: Array, scenario: Scenario) -> Array:
+        """Simulate each row of `theta` (n, 1); returns (n, T, C). See `Simulator.simulate`."""
+        constants = self.run_constants(scenario)
+        self.run_inputs(scenario)  # which refuses any: the ball does not know of these names
+        fall = Scenario(scenario.times, scenario.initial, {}, self._of_ball(constants))
+        places = self._ball.simulate(theta, fall)
+        camera = _camera(constants)
+        radius = constants["radius"]
+        if self._tracked:
+            tracks = [_tracked(camera, radius, way, scenario.times) for way in places]
+            rows = np.array(tracks).reshape(places.shape[:2])  # also where there are no lanes
+            heights = np.full_like(rows, np.nan)
+        else:
+            middles, _ = camera.project_sphere(places, radius)
+            heights = places[..., 2]
+            rows = middles[..., 1]
+        seen = np.stack([heights, rows], axis=2)
+        result: Array = seen[:, :, self.columns]
+        return result
+
+    def close(self) -> None:
+        """Give back what the engine holds."""
+        self._ball.close()
+
+    @staticmethod
+    def _of_ball(constants: Mapping[str, float]) -> dict[str, float]:
+        return {c.name: constants[c.name] for c in BallSystem.constants}
+
+
+def _camera(constants: Mapping[str, float]) -> PinholeCamera:
+    size = round(constants["pixels"])
+    place = (constants["camera_azimuth"], constants["camera_distance"], constants["camera_height"])
+    return PinholeCamera(*place, target=(0.0, 0.0, constants["camera_aim"]), size=(size, size))
+
+
+def _tracked(camera: PinholeCamera, radius: float, places: Array, times: Array) -> Array:
+    """Pixel rows (T,) that the tracker finds in a film of the ball at `places` (T, 3); NaN where it
+    finds none.
+    """
+    from sims.vision.ball_renderer import BallScene
+    from sims.vision.ball_tracker import track_ball
+    from sims.vision.scene_appearance import SceneAppearance
+    from sims.vision.video_files import VideoFile, write_video
+
+    rows: Array = np.full(times.size, np.nan)
+    if not np.isfinite(places).all():
+        return rows
+    # Light, colours and compression are drawn from what the film shows: the same parameters and
+    # scenario give the same film, whatever was filmed before.
+    numbers = [
+        camera.azimuth,
+        camera.distance,
+        camera.height,
+        *camera.size,
+        radius,
+        *places.ravel(),
+    ]
+    digest = hashlib.sha256(np.array(numbers).tobytes()).digest()
+    rng = np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
+    look = SceneAppearance.draw(rng)
+    stage = BallScene(camera, look, radius, rng)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "film.mp4"
+            write_video(path, stage.render_frames(places), times, look.crf)
+            measured = track_ball(VideoFile(path))
+    except InputError:  # no ball to be seen: nothing was measured
+        return rows
+    finally:
+        stage.close()
+    # Frames without a ball are left out of a track: each place is found by its time.
+    frames = np.interp(measured.times, times - times[0], np.arange(times.size))
+    rows[np.rint(frames).astype(int)] = measured.v
+    return rows

@@ -1,0 +1,252 @@
+"""Pinhole camera: where a point of the world, or a ball, appears in the picture.
+
+Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as in OpenCV.
+World coordinates are in metres, z up. Pixels are square and the lens has no distortion.
+
+With (X, Y, Z) a point in the camera's frame (right, down, depth), f the focal length in pixels and
+(u0, v0) the pixel of the optical axis (the principal point):
+
+    (1)  (X, Y, Z) = axes (point - position)
+    (2)  u = u0 + f X / Z,  v = v0 + f Y / Z
+    (3)  f = (height / 2) / tan(field of view / 2)
+
+(R. Hartley, A. Zisserman, Multiple View Geometry, 2004, chapter 6). A sphere of radius r at
+distance d, seen at the angle t from the optical axis, fills a cone of half angle p with
+
+    (4)  sin p = r / d
+
+The section of this cone with the picture plane Z = 1 is an ellipse whose long axis is on the line
+to the principal point, from tan(t - p) to tan(t + p):
+
+    (5)  centre a = (tan(t - p) + tan(t + p)) / 2,  half length (tan(t + p) - tan(t - p)) / 2
+
+Its half width b follows from a point (a, b, 1) of the cone, whose axis is (sin t, 0, cos t):
+
+    (6)  (a sin t + cos t)^2 = cos(p)^2 (a^2 + b^2 + 1)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sims.core.simulator import Array, InputError, make_read_only
+
+_REFINEMENTS = 4
+"""Number of iterations in which the offset between outline and projected centre is subtracted."""
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Camera at the horizontal distance `distance` from its target, directed at the target.
+
+    Attributes:
+        azimuth: Direction from the target to the camera about the vertical, from x towards y, rad.
+        distance: Distance from the vertical through the target, m.
+        height: Height above the ground, m.
+        target: Point in the middle of the picture (x, y, z), m.
+        field_of_view: Angle from the lower to the upper edge of the picture, degrees.
+        size: Width and height of the picture, pixels.
+    """
+
+    azimuth: float
+    distance: float
+    height: float
+    target: tuple[float, float, float] = (0.0, 0.0, 2.0)
+    field_of_view: float = 40.0
+    size: tuple[int, int] = (100, 100)
+
+    def __post_init__(self) -> None:
+        numbers = [
+            self.azimuth,
+            self.distance,
+            self.height,
+            self.field_of_view,
+            *self.target,
+        ]
+        if not np.isfinite(numbers).all():
+            raise InputError(f"camera: expected finite numbers, found {numbers}")
+        # From straight above, the upright direction of the picture would be undefined.
+        if self.distance <= 0:
+            raise InputError(f"camera: distance: expected more than 0 m, found {self.distance:g}")
+        angle = self.field_of_view
+        if not 0 < angle < 180:
+            raise InputError(f"camera: field_of_view: expected 0 to 180 degrees, found {angle:g}")
+        if len(self.size) != 2 or min(self.size) < 2:
+            raise InputError(f"camera: size: expected two numbers of pixels, found {self.size}")
+
+    @classmethod
+    def draw_published(cls, rng: np.random.Generator, pixels: int = 100) -> PinholeCamera:
+        """Draw a camera as for the published visual tuner.
+
+        Azimuth U[0, 2 pi], distance U[5, 10] m, height U[5, 8] m, aimed at (0, 0, 2), field of view
+        40 degrees, 100 x 100 px (Allevato et al., TuneNet, arXiv 1907.11200, released code).
+
+        Args:
+            rng: Random number generator.
+            pixels: Width and height of the picture.
+        """
+        low = 0.0, 5.0, 5.0
+        high = 2 * math.pi, 10.0, 8.0
+        azimuth, distance, height = rng.uniform(low, high).tolist()
+        return cls(azimuth, distance, height, size=(pixels, pixels))
+
+    def with_size(self, width: int, height: int) -> PinholeCamera:
+        """Return this camera with another picture size and the same vertical field of view.
+
+        Args:
+            width: Width of the picture, pixels.
+            height: Height of the picture, pixels.
+        """
+        return replace(self, size=(width, height))
+
+    @cached_property
+    def position(self) -> Array:
+        """Position of the camera (3,), m."""
+        x, y, _ = self.target
+        x += self.distance * math.cos(self.azimuth)
+        y += self.distance * math.sin(self.azimuth)
+        return make_read_only([x, y, self.height])
+
+    @cached_property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        half_angle = math.radians(self.field_of_view) / 2
+        return 0.5 * self.size[1] / math.tan(half_angle)  # (3)
+
+    @cached_property
+    def principal_point(self) -> Array:
+        """Principal point: the pixel (2,) of the optical axis."""
+        # Pixel coordinates refer to pixel centres, so the middle of 100 pixels is 49.5.
+        width, height = self.size
+        return make_read_only([(width - 1) / 2, (height - 1) / 2])
+
+    @cached_property
+    def axes(self) -> Array:
+        """Axes of the camera as unit vectors of the world (3, 3), in rows: right, down, forward."""
+        # The vertical of the world is upright in the picture.
+        forward = np.asarray(self.target) - self.position
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        return make_read_only([right, down, forward])
+
+    def to_camera_frame(self, points: ArrayLike) -> Array:
+        """Transform world points (..., 3) to the camera's frame (..., 3), m: right, down, depth."""
+        away = np.asarray(points, dtype=np.float64) - self.position
+        result: Array = away @ self.axes.T  # (1)
+        return result
+
+    def compute_depth(self, points: ArrayLike) -> Array:
+        """Return the depths (...) of world points (..., 3) along the optical axis, m.
+
+        Depths are negative behind the camera.
+        """
+        result: Array = self.to_camera_frame(points)[..., 2]
+        return result
+
+    def project(self, points: ArrayLike) -> Array:
+        """Project world points (..., 3) to pixels (..., 2).
+
+        Pixels may be outside the picture; they are NaN for points behind the camera.
+        """
+        seen = self.to_camera_frame(points)
+        depth = seen[..., 2:]
+        # Points behind the camera would appear mirrored about the principal point.
+        depth = np.where(depth > 0, depth, np.nan)
+        result: Array = self.principal_point + self.focal * seen[..., :2] / depth  # (2)
+        return result
+
+    def project_sphere(self, points: ArrayLike, radius: float) -> tuple[Array, Array]:
+        """Return the ellipse that is the outline of a sphere in the picture.
+
+        The longer axis points to the middle of the picture, and the centre is slightly further from
+        it than the projection of the sphere's own centre.
+
+        Args:
+            points: Centres of the sphere (..., 3), m.
+            radius: Radius of the sphere, m.
+
+        Returns:
+            Centre (..., 2) and semi-axes (..., 2) of the ellipse in pixels, the longer axis first;
+            NaN where the sphere is not wholly in front of the camera.
+        """
+        seen = self.to_camera_frame(points)
+        sideways = seen[..., :2]
+        depth = seen[..., 2]
+        far = np.linalg.norm(seen, axis=-1)
+        aside = np.hypot(sideways[..., 0], sideways[..., 1])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            half = np.arcsin(radius / far)  # (4)
+            tilt = np.arctan2(aside, depth)
+            # The section is no ellipse if the cone reaches the plane of the camera.
+            tilt = np.where(tilt + half < math.pi / 2, tilt, np.nan)
+            near_end = np.tan(tilt - half)
+            far_end = np.tan(tilt + half)
+            away = (near_end + far_end) / 2  # (5)
+            lean = away * np.sin(tilt) + np.cos(tilt)
+            ratio = lean / np.cos(half)
+            across = ratio**2 - away**2 - 1  # (6), b^2
+            # In the middle of the picture the direction is arbitrary.
+            divisor = np.where(aside > 0, aside, 1.0)
+            direction = sideways / divisor[..., None]
+        centre = self.principal_point + self.focal * away[..., None] * direction
+        longer = (far_end - near_end) / 2  # (5)
+        shorter = np.sqrt(across)
+        return centre, self.focal * np.stack([longer, shorter], axis=-1)
+
+    def compute_apparent_radius(self, points: ArrayLike, radius: float) -> Array:
+        """Return the radius (...) in pixels of the circle with the area of the sphere's outline.
+
+        Args:
+            points: Centres of the sphere (..., 3), m.
+            radius: Radius of the sphere, m.
+        """
+        axes = self.project_sphere(points, radius)[1]
+        result: Array = np.sqrt(axes[..., 0] * axes[..., 1])
+        return result
+
+    def estimate_heights(self, centres: ArrayLike, x: float, y: float, radius: float) -> Array:
+        """Estimate the heights of a ball on a vertical line from the centres of its outlines.
+
+        A point on that vertical is linear in z, base + z up. Multiplied by Z, both equations (2)
+        are
+        linear in z; with k = (u - u0, v - v0) / f they read
+
+            (7)  (base_XY - k base_Z) + z (up_XY - k up_Z) = 0
+
+        and are solved for z by least squares. The small offset between outline and projected centre
+        is
+        subtracted iteratively.
+
+        Args:
+            centres: Centres of the outlines (..., 2), pixels.
+            x: Horizontal position of the vertical line, m.
+            y: Horizontal position of the vertical line, m.
+            radius: Radius of the ball, m.
+
+        Returns:
+            Heights (...) of the ball's centre, m.
+        """
+        pixels = np.asarray(centres, dtype=np.float64)
+        base = self.to_camera_frame((x, y, 0.0))
+        up = self.axes[:, 2]
+        shift: Array = np.zeros_like(pixels)
+        z: Array = np.full(pixels.shape[:-1], np.nan)
+        for _ in range(_REFINEMENTS):
+            ratio = (pixels - shift - self.principal_point) / self.focal
+            constant = base[:2] - ratio * base[2]
+            slope = up[:2] - ratio * up[2]
+            along = (constant * slope).sum(axis=-1)
+            square = (slope * slope).sum(axis=-1)
+            z = -along / square  # (7)
+            everywhere = np.ones_like(z)
+            points = np.stack([x * everywhere, y * everywhere, z], axis=-1)
+            centre, _ = self.project_sphere(points, radius)
+            shift = centre - self.project(points)
+        return z

@@ -1,0 +1,251 @@
+"""Link the detections in many frames to paths, one path for each moving object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.vision.ball_detection import BallDetection
+
+_MAX_MISSED_FRAMES = 15
+"""Maximum number of consecutive frames in which an object may be missed."""
+_RADIUS_RATIO_RANGE = (0.65, 1.55)
+"""Range of the ratio of two radii of one object, which approaches the camera or is blurred."""
+_LEAST = 3
+"""Minimum number of frames of a path; shorter ones are noise."""
+_CHANCE = 0.5
+"""Fraction of the rays that agree on a circle by chance."""
+_MEMORY = 20
+"""Number of frames over which the colour of a path is averaged."""
+_COLOUR_TOLERANCE = 25.0
+"""Tolerance of the colour of an object, in grey levels."""
+_CONTRAST_TOLERANCE_SHARE = 0.45
+"""Tolerance of the colour of an object, as a fraction of its contrast with the background."""
+_MAX_CONTINUATION_DISTANCE = 3
+"""Maximum distance of a continuation from the line of a path, in median radii."""
+_CHROMA_BLUR_PIXELS = 1.5
+"""Width in pixels over which video files mix the colours of ball and background.
+
+Video files store colours at half the resolution.
+"""
+
+
+@dataclass
+class TrackedPath:
+    """Path of one object: frame numbers, detections and mean colour."""
+
+    frames: list[int] = field(default_factory=list)
+    spots: list[BallDetection] = field(default_factory=list)
+    mean_colour: Array = field(default_factory=lambda: np.zeros(3))
+
+    def append(self, frame: int, spot: BallDetection) -> None:
+        """Append a detection, and update the mean colour.
+
+        Args:
+            frame: Number of the frame.
+            spot: Detection in that frame.
+        """
+        # A plain mean at first, later an exponential one, because the light changes along the path.
+        count = len(self.spots) + 1
+        weight = 1.0 / min(count, _MEMORY)
+        colour = np.array(spot.colour)
+        self.mean_colour = (1.0 - weight) * self.mean_colour + weight * colour
+        self.frames.append(frame)
+        self.spots.append(spot)
+
+    def predict(self, frame: int) -> tuple[float, float, float]:
+        """Predict the position in a frame by linear extrapolation.
+
+        Args:
+            frame: Number of the frame.
+
+        Returns:
+            Position (u, v), and the maximum distance of a detection from it, which allows for a
+            bounce; pixels.
+        """
+        last = self.spots[-1]
+        u, v = last.u, last.v
+        # A single detection has no direction.
+        if len(self.spots) < 2:
+            return u, v, 4 * last.radius + 10
+        before = self.spots[-2]
+        gap = self.frames[-1] - self.frames[-2]
+        du = (u - before.u) / gap
+        dv = (v - before.v) / gap
+        wait = frame - self.frames[-1]
+        # Twice the distance covered: an object that reverses is that far from its prediction.
+        speed = float(np.hypot(du, dv))
+        reach = 2 * speed * wait + last.radius + 2
+        return u + du * wait, v + dv * wait, reach
+
+    def compute_distance(self, frame: int, spot: BallDetection) -> float:
+        """Return the distance of a detection from this path as a fraction of the allowed one.
+
+        Position, radius and colour count; the result is infinite for another object. Colour
+        separates a ball from its shadow where they meet and the shadow continues as the ball moved
+        before.
+
+        Args:
+            frame: Number of the frame.
+            spot: Detection in that frame.
+        """
+        u, v, reach = self.predict(frame)
+        off = float(np.hypot(spot.u - u, spot.v - v)) / reach
+        if off > 1:
+            return np.inf
+        low, high = _RADIUS_RATIO_RANGE
+        if not low < spot.radius / self.spots[-1].radius < high:
+            return np.inf
+        unlike = self.compute_colour_distance(spot.colour, spot.contrast)
+        return off + unlike if unlike <= 1 else np.inf
+
+    def compute_colour_distance(self, colour: Sequence[float], contrast: float) -> float:
+        """Return the difference of a colour from that of the path as a fraction of the tolerance.
+
+        The tolerance allows for light and compression.
+
+        Args:
+            colour: Red, green, blue, grey levels.
+            contrast: Contrast with the background of the object of that colour, grey levels.
+        """
+        # The smaller the ball, the more of it is mixed with the background.
+        tinge = _COLOUR_TOLERANCE * (1.0 + _CHROMA_BLUR_PIXELS / self.spots[-1].radius)
+        allowed = max(
+            tinge,
+            _CONTRAST_TOLERANCE_SHARE * contrast,
+            _CONTRAST_TOLERANCE_SHARE * self.contrast,
+        )
+        apart = np.abs(self.mean_colour - colour)
+        return float(apart.max()) / allowed
+
+    @property
+    def contrast(self) -> float:
+        """Contrast of the last detection with the background, grey levels."""
+        return self.spots[-1].contrast
+
+    @property
+    def radius(self) -> float:
+        """Median radius of the detections, pixels."""
+        return float(np.median([s.radius for s in self.spots]))
+
+    @property
+    def places(self) -> Array:
+        """Centres of the detections (n, 2), pixels."""
+        return np.array([(s.u, s.v) for s in self.spots])
+
+    @property
+    def travel(self) -> float:
+        """Extent of the path, as the diagonal of its bounding box in pixels."""
+        spans = np.ptp(self.places, axis=0)
+        return float(np.linalg.norm(spans))
+
+    @property
+    def evidence(self) -> float:
+        """Evidence for the path: length of edge on circles beyond chance level, in pixels.
+
+        A count of frames alone would prefer a permanent remnant of shadow to a ball.
+        """
+        return sum((spot.ray_agreement - _CHANCE) * spot.radius for spot in self.spots)
+
+
+def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[TrackedPath]:
+    """Link detections to paths, the best path first; short paths are left out.
+
+    Args:
+        pictures: Detections in each frame.
+    """
+    done: list[TrackedPath] = []
+    live: list[TrackedPath] = []
+    for frame, spots in enumerate(pictures):
+        done += [path for path in live if frame - path.frames[-1] > _MAX_MISSED_FRAMES]
+        live = [path for path in live if frame - path.frames[-1] <= _MAX_MISSED_FRAMES]
+        taken = _continued(live, frame, spots)
+        # Each remaining detection begins a new path.
+        for k, spot in enumerate(spots):
+            if k not in taken:
+                path = TrackedPath()
+                path.append(frame, spot)
+                live.append(path)
+    paths = [path for path in done + live if len(path.frames) >= _LEAST]
+    # Objects that do not move come last, regardless of their evidence.
+    return sorted(paths, key=lambda path: -path.evidence * (path.travel > path.radius))
+
+
+def _continued(live: Sequence[TrackedPath], frame: int, spots: Sequence[BallDetection]) -> set[int]:
+    """Append each detection to the path that it fits best.
+
+    Args:
+        live: Paths that may continue.
+        frame: Number of the frame.
+        spots: Detections in that frame.
+
+    Returns:
+        Numbers of the detections that were appended.
+    """
+    pairs = []
+    for i, path in enumerate(live):
+        for k, spot in enumerate(spots):
+            distance = path.compute_distance(frame, spot)
+            if np.isfinite(distance):
+                pairs.append((distance, i, k))
+    paths: set[int] = set()
+    taken: set[int] = set()
+    # Nearest pairs first: a path gets one detection, and a detection one path.
+    for _, i, k in sorted(pairs):
+        if i in paths or k in taken:
+            continue
+        paths.add(i)
+        taken.add(k)
+        live[i].append(frame, spots[k])
+    return taken
+
+
+def merge_continuations(paths: Sequence[TrackedPath]) -> tuple[TrackedPath, list[TrackedPath]]:
+    """Merge the first path with those that continue it after it was lost from view.
+
+    Args:
+        paths: Paths, the best first.
+
+    Returns:
+        The merged path, and the other paths.
+    """
+    main = paths[0]
+    others = []
+    frames = list(main.frames)
+    spots = list(main.spots)
+    low, high = _RADIUS_RATIO_RANGE
+    for path in paths[1:]:
+        # A ball is in one place: a detection in the same frame is another object.
+        apart = not set(path.frames) & set(frames)
+        alike = low < path.radius / main.radius < high
+        alike &= main.compute_colour_distance(path.mean_colour.tolist(), path.contrast) <= 1
+        aside = _median_distance_from_line(main.places, path.places)
+        if apart and alike and aside < _MAX_CONTINUATION_DISTANCE * main.radius:
+            frames += path.frames
+            spots += path.spots
+        else:
+            others.append(path)
+    order = np.argsort(frames).tolist()
+    whole = TrackedPath(
+        [frames[i] for i in order],
+        [spots[i] for i in order],
+        main.mean_colour,
+    )
+    return whole, others
+
+
+def _median_distance_from_line(line: Array, points: Array) -> float:
+    """Return the median distance of points from the line fitted to other points.
+
+    Args:
+        line: Points (n, 2) that determine the line.
+        points: Points (m, 2).
+    """
+    middle = line.mean(axis=0)
+    # The last axis is perpendicular to the line: along it, the points differ least.
+    _, _, axes = np.linalg.svd(line - middle, full_matrices=False)
+    across = (points - middle) @ axes[-1]
+    return float(np.median(np.abs(across)))

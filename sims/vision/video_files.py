@@ -1,0 +1,227 @@
+"""Read and write video files with their true time stamps.
+
+PyAV contains its own codecs and reports each frame's time as stated in the file, also for uneven
+frame rates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.core.atomic_files import atomic_replacement, require_file
+from sims.core.simulator import Array, InputError
+from sims.recording.recording_writer import check_absent, write_files
+from sims.vision.ball_renderer import RgbImage
+from sims.vision.video_packages import import_package
+
+_FRAMES = (1e-3, 1e7)
+"""Range of plausible frame rates, frames per second."""
+_TICKS = 90_000
+"""Time stamps per second in the files written here, a multiple of the usual frame rates."""
+_DEFAULT_RATE = 30.0
+"""Frame rate in frames per second of a file that states neither times nor a rate."""
+_HEAD = 64
+"""Number of bytes from which the kind of an unreadable file is determined."""
+
+
+def write_video(
+    path: Path,
+    frames: Iterable[RgbImage],
+    times: Array,
+    crf: int = 18,
+    beside: Mapping[Path, str] | None = None,
+) -> None:
+    """Write frames as H.264 in an .mp4 file, completely or not at all.
+
+    Args:
+        path: New file, whose name ends in .mp4.
+        frames: Pictures (height, width, 3) of one size with even height and width.
+        times: (n,) time of each frame in seconds, increasing; rounded to 1/90000 s.
+        crf: Constant rate factor, 0 (lossless) to 51.
+        beside: Texts of other new files that belong to it; they are written before the film becomes
+            visible.
+
+    Raises:
+        InputError: The file exists or cannot be written, or the size of the frames cannot be
+            encoded.
+    """
+    if path.suffix != ".mp4":
+        raise InputError(f"{path}: expected a name that ends in .mp4")
+    check_absent([path])
+    try:
+        # FFmpeg derives the format from the name.
+        with atomic_replacement(path, keep_ending=True) as partial:
+            _encode(partial, frames, times, crf)
+            # Encoding takes long; the file may have been created meanwhile.
+            check_absent([path])
+            write_files(beside or {})
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def _encode(path: Path, frames: Iterable[RgbImage], times: Array, crf: int) -> None:
+    av = import_package("av")
+    ticks = np.rint((times - times[0]) * _TICKS).astype(int)
+    rate = Fraction(30)
+    if len(times) > 1:
+        seconds = Fraction(max(1, int(ticks[-1])), _TICKS)
+        rate = Fraction(len(times) - 1, 1) / seconds
+    # Write the index first, so that a truncated file can be read up to the end.
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
+        stream = file.add_stream("libx264", rate=rate.limit_denominator(1000))
+        stream.pix_fmt = "yuv420p"
+        stream.thread_count = 1
+        # Reproducible output on every processor: with x264's fast code paths alone, the file
+        # differs occasionally.
+        exact = {"x264-params": "cpu-independent=1"}
+        stream.options = {
+            "crf": str(crf),
+            "preset": "veryfast",
+            # No B-frames, so that frames are stored in the order of their times.
+            "bf": "0",
+            **exact,
+        }
+        stream.codec_context.time_base = Fraction(1, _TICKS)
+        converter = av.video.reformatter.VideoReformatter()
+        for tick, picture in zip(ticks.tolist(), frames, strict=True):
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = picture.shape[:2]
+                if stream.height % 2 or stream.width % 2:
+                    raise InputError(
+                        f"{path}: expected an even number of pixels, found {picture.shape[:2]}"
+                    )
+            # One converter with one thread: by default PyAV starts as many threads as there are
+            # cores for each frame.
+            coloured = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame = converter.reformat(coloured, format="yuv420p", threads=1)
+            frame.pts = tick
+            frame.time_base = Fraction(1, _TICKS)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode(None))
+
+
+class VideoFile:
+    """Video file that can be read frame by frame, repeatedly.
+
+    Args:
+        path: Any file that FFmpeg reads.
+        fps: Frame rate in frames per second, instead of the file's own time stamps.
+
+    Attributes:
+        notes: Faults of the file that did not prevent reading, in sentences; complete after one
+            pass.
+
+    Raises:
+        InputError: The file does not exist, or contains no video.
+    """
+
+    def __init__(self, path: Path, fps: float | None = None) -> None:
+        require_file(path)
+        if fps is not None and not _FRAMES[0] <= fps <= _FRAMES[1]:
+            wanted = f"more than 0, from {_FRAMES[0]:g} to {_FRAMES[1]:g}"
+            raise InputError(f"frames a second, {fps:g}: expected {wanted}")
+        self.path, self.fps = path, fps
+        self.notes: list[str] = []
+        with self._open():
+            pass
+
+    def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
+        """Iterate over time in seconds and picture of each readable frame; times increase."""
+        self.notes = []
+        last = -np.inf
+        count = 0
+        dropped = 0
+        broken = False
+        with self._open() as file:
+            stated = file.streams.video[0].frames
+            for seconds, picture in self._decoded(file):
+                if picture is None:
+                    broken = True
+                    break
+                time = count / self.fps if self.fps else seconds
+                count += 1
+                # The times of a recording must increase, those of a file need not.
+                if time <= last:
+                    dropped += 1
+                    continue
+                last = time
+                yield time, picture
+        self._judge(count, stated, broken, dropped)
+
+    def _open(self) -> Any:
+        av = import_package("av")
+        try:
+            file = av.open(str(self.path))
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
+        # FFmpeg errors without a Python class, such as an unexpected end of the file.
+        except (ValueError, av.FFmpegError):
+            raise InputError(f"{self.path}: {_describe_unreadable_file(self.path)}") from None
+        if not file.streams.video:
+            if not len(file.streams):
+                raise InputError(f"{self.path}: {_describe_unreadable_file(self.path)}")
+            file.close()
+            raise InputError(f"{self.path}: expected a video, found a file without moving pictures")
+        return file
+
+    def _decoded(self, file: Any) -> Iterator[tuple[float, RgbImage | None]]:
+        """Iterate over time and picture of each frame; the picture is None after an error."""
+        av = import_package("av")
+        stream = file.streams.video[0]
+        stream.thread_count = 1
+        rate = float(stream.average_rate or _DEFAULT_RATE)
+        converter = av.video.reformatter.VideoReformatter()
+        number = 0
+        try:
+            for frame in file.decode(stream):
+                seconds = frame.time if frame.time is not None else number / rate
+                picture = converter.reformat(frame, format="rgb24", threads=1)
+                yield seconds, _apply_rotation(picture, frame.rotation)
+                number += 1
+        except av.FFmpegError:
+            yield np.nan, None
+
+    def _judge(self, count: int, stated: int, broken: bool, dropped: int) -> None:
+        """Add notes about faults of a pass; refuse a file without readable frames.
+
+        Args:
+            count: Number of frames read.
+            stated: Number of frames that the file states; 0 if unknown.
+            broken: Whether decoding failed.
+            dropped: Number of frames whose times do not increase.
+        """
+        if not count:
+            raise InputError(
+                f"{self.path}: no frame of it can be read; "
+                "the file is damaged or breaks off too early"
+            )
+        if broken or count < stated:
+            of = f" of {stated}" if stated > count else ""
+            self.notes.append(f"the file is truncated or damaged: {count}{of} frames could be read")
+        if dropped:
+            self.notes.append(f"{dropped} frames whose time stamps do not increase were left out")
+
+
+def _apply_rotation(frame: Any, degrees: float) -> RgbImage:
+    """Rotate the picture as a viewer does: telephones store how they were held."""
+    picture: RgbImage = frame.to_ndarray()
+    turns = round(degrees / 90) % 4
+    return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
+
+
+def _describe_unreadable_file(path: Path) -> str:
+    """Describe why a file is not a readable video, from its first bytes."""
+    with path.open("rb") as file:
+        start = file.read(_HEAD)
+    if not start:
+        return "expected a video, found an empty file"
+    # These bytes begin an MP4 file, whose index may be at its end.
+    if start[4:8] == b"ftyp":
+        return "breaks off before its index, so no frame can be found; copy the whole file again"
+    text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start)
+    return f"expected a video, found {'a text file' if text else 'something else'}"

@@ -1,0 +1,283 @@
+"""`simgap explain` and `simgap score` as they are typed."""
+
+import json
+import signal
+
+import pytest
+
+from bench.cli.main import main
+from bench.cli.search_progress import ProgressDisplay
+from bench.core.plugin_registries import simulators
+from sims.extended_simulator import load_extended, read_extended
+from tests.bench.diagnosis import verdict_schema
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A swing with drag, made by another engine than the one that explains it, and what explain
+    wrote about it.
+    """
+    there = tmp_path_factory.mktemp("commands")
+    command = [
+        "simulate",
+        "pendulum",
+        "--engine",
+        "mujoco",
+        "--effect",
+        "drag.linear=1e-3",
+        "--theta",
+        "inertia=4e-3",
+    ]
+    command += ["--noise", "q=0.003", "qd=0.02", "--runs", "3", "--seconds", "1.5", "--rate", "60"]
+    assert main([*command, "--out", str(there / "swing.csv")]) == 0
+    assert main([*command, "--seed", "9", "--out", str(there / "other.csv")]) == 0
+    assert main(["explain", str(there / "swing.csv"), "--out", str(there / "out")]) == 0
+    return there
+
+
+def faulty(capsys, *command):
+    """The one line on stderr of a command that must fail, progress left out."""
+    capsys.readouterr()
+    assert main([str(part) for part in command]) == 2
+    told = capsys.readouterr()
+    lines = [line for line in told.err.splitlines() if not line.endswith(" ...")]
+    assert len(lines) == 1
+    assert lines[0].startswith("simgap: ")
+    assert "Traceback" not in told.err
+    return lines[0]
+
+
+def test_explain_writes_verdict_simulator_figures_and_report(folder):
+    names = {path.name for path in (folder / "out").iterdir()}
+    assert {"verdict.json", "extended.toml", "report.html"} <= names
+    assert any(name.endswith(".png") for name in names)
+    report = (folder / "out" / "report.html").read_text()
+    assert "linear drag" in report
+    assert "http://" not in report.replace("http://www.w3.org", "")
+
+
+def test_the_verdict_is_right_and_has_the_form_of_the_design(folder):
+    found = verdict_schema.check((folder / "out" / "verdict.json").read_text())
+    assert (found["verdict"], found["system"], found["engine"]) == ("named", "pendulum", "batch")
+    (cause,) = found["causes"]
+    assert (cause["effect"], cause["alternatives"]) == ("drag.linear", [])
+    assert cause["p_value"] < 1e-6
+    drag = cause["coefficients"]["coefficient"]
+    assert drag["unit"] == "N*m*s/rad"
+    assert drag["value"] == pytest.approx(1e-3, rel=0.02)
+    assert drag["low"] < 1e-3 < drag["high"]
+    inertia = found["parameters"]["inertia"]
+    assert inertia["value"] == pytest.approx(4e-3, rel=2e-3)
+    held_out = found["heldout"]
+    assert held_out["noise_floor"] == pytest.approx(0.003)
+    assert held_out["rmse_extended"] == pytest.approx(0.003, rel=0.2)
+    assert held_out["rmse_base"] > 0.02
+    assert held_out["low"] <= held_out["gap_closed"] <= held_out["high"]
+    assert held_out["gap_closed"] > 0.95
+    assert found["candidates"][0]["effect"] == "drag.linear"
+    assert found["seconds"] < 60
+
+
+def test_the_extended_simulator_loads_with_the_numbers_of_the_verdict(folder):
+    verdict = json.loads((folder / "out" / "verdict.json").read_text())
+    kind = load_extended(folder / "out" / "extended.toml", simulators.get)
+    assert kind.name == "pendulum_extended"
+    inertia, drag = kind.parameters
+    assert inertia.nominal == verdict["parameters"]["inertia"]["value"]
+    assert drag.nominal == verdict["causes"][0]["coefficients"]["coefficient"]["value"]
+    assert read_extended(folder / "out" / "extended.toml").constants["mass"] == 0.15
+
+
+def test_the_account_says_what_was_found(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    capsys.readouterr()
+    assert main(["explain", "swing.csv", "--seed", "0"]) == 0
+    told = capsys.readouterr()
+    assert "The simulation lacks linear drag" in told.out
+    (made,) = (folder / "results").iterdir()
+    assert f"report  results/{made.name}/report.html" in told.out
+    again, first = (
+        json.loads((part / "verdict.json").read_text()) for part in (made, folder / "out")
+    )
+    assert again.pop("seconds") > 0
+    first.pop("seconds")
+    assert again == first, "the same seed says the same"
+    assert (made / "extended.toml").read_bytes() == (folder / "out" / "extended.toml").read_bytes()
+
+
+def test_score_prints_json_with_the_keys_of_the_design(folder, capsys):
+    for name in ("swing.csv", "other.csv"):
+        capsys.readouterr()
+        assert (
+            main(["score", str(folder / "out" / "extended.toml"), str(folder / name), "--json"])
+            == 0
+        )
+        found = json.loads(capsys.readouterr().out)
+        assert list(found) == ["rmse", "normalised_rmse", "runs", "samples"]
+        assert set(found["rmse"]) == {"q", "qd"}
+        assert found["rmse"]["q"] == pytest.approx(0.003, rel=0.12)
+        assert found["normalised_rmse"] == pytest.approx(1.0, abs=0.08)
+        assert (found["runs"], found["samples"]) == (3, 270)
+
+
+def test_score_says_it_to_a_person(folder, capsys):
+    assert (
+        main(
+            [
+                "score",
+                str(folder / "out" / "extended.toml"),
+                str(folder / "other.csv"),
+                "--held-out",
+            ]
+        )
+        == 0
+    )
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].startswith("q: RMSE 0.00")
+    assert out[0].endswith(" rad")
+    assert out[-1].endswith("times the noise; 1 runs, 90 samples") or out[-1].endswith(
+        "1 run, 90 samples"
+    )
+
+
+def test_nothing_is_written_over(folder, capsys, tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    line = faulty(capsys, "explain", folder / "swing.csv", "--out", tmp_path / "full")
+    assert "full: exists and is not empty" in line
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
+    line = faulty(capsys, "explain", folder / "swing.csv", "--out", tmp_path / "full" / "mine.txt")
+    assert "mine.txt: exists and is not empty" in line
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--system", "ball"], "unknown channel"),
+        (["--system", "bal"], "unknown simulator 'bal'; there are: "),
+        (["--engine", "ode"], "unknown engine 'ode'; there are: batch, mujoco, pybullet"),
+        (
+            ["--free", "weight"],
+            "unknown constant of system pendulum 'weight'; there are: gravity, length, mass",
+        ),
+        (["--tuner", "magic"], "unknown tuner 'magic'; there are: "),
+        (["--tuner", "tunenet"], "tuner tunenet must be trained first"),
+        (["--plugin", "none.py"], "no such file"),
+        (["--plugin", "none.toml"], "no such file"),
+    ],
+)
+def test_bad_options_are_one_line(folder, capsys, tmp_path, options, message):
+    assert message in faulty(
+        capsys, "explain", folder / "swing.csv", "--out", tmp_path / "o", *options
+    )
+    assert not (tmp_path / "o").exists()
+
+
+def test_bad_files_are_one_line(folder, capsys, tmp_path):
+    model = folder / "out" / "extended.toml"
+    assert "none.csv" in faulty(capsys, "explain", tmp_path / "none.csv").replace(
+        "none.toml", "none.csv"
+    )
+    assert "none.toml: no such file" in faulty(
+        capsys, "score", tmp_path / "none.toml", folder / "swing.csv"
+    )
+    assert "format" in faulty(capsys, "score", folder / "swing.toml", folder / "swing.csv")
+    assert "none" in faulty(capsys, "score", model, tmp_path / "none.csv")
+
+
+@pytest.mark.slow
+def test_a_tuner_may_find_where_the_fit_begins(folder, capsys, tmp_path):
+    assert (
+        main(
+            [
+                "explain",
+                str(folder / "swing.csv"),
+                "--tuner",
+                "least_squares",
+                "--out",
+                str(tmp_path / "o"),
+            ]
+        )
+        == 0
+    )
+    found = verdict_schema.check((tmp_path / "o" / "verdict.json").read_text())
+    assert [cause["effect"] for cause in found["causes"]] == ["drag.linear"]
+
+
+def test_help_says_what_the_commands_take(capsys):
+    for command, words in (
+        ("explain", ("--free", "--tuner", "--engine", "--out")),
+        ("score", ("--json", "--held-out")),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main([command, "--help"])
+        assert ended.value.code == 0
+        out = capsys.readouterr().out
+        assert all(word in out for word in words)
+
+
+def test_a_budget_that_is_over_leaves_an_answer_that_says_so(folder, capsys, tmp_path):
+    out = tmp_path / "out"
+    command = ["explain", str(folder / "swing.csv"), "--budget", "1e-3", "--out", str(out)]
+    assert main(command) == 0
+    found = verdict_schema.check((out / "verdict.json").read_text())
+    assert (found["verdict"], found["cut"]["by"]) == ("unknown", "budget")
+    assert "The search was ended by its budget of time" in " ".join(capsys.readouterr().out.split())
+    assert load_extended(out / "extended.toml", simulators.get).name == "pendulum_extended"
+
+
+@pytest.mark.parametrize("budget", ["0", "-3", "nan", "soon"])
+def test_a_bad_budget_is_one_line(folder, budget, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["explain", str(folder / "swing.csv"), f"--budget={budget}"])
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"expected a number of seconds above 0, found '{budget}'" in line
+
+
+def interrupted(monkeypatch, times):
+    """Have Ctrl-C pressed so often as soon as something is shown."""
+    left = [times]
+
+    def completed(*_):
+        while left[0]:
+            left[0] -= 1
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(ProgressDisplay, "completed", completed)
+
+
+def test_ctrl_c_ends_with_what_there_is_and_is_an_interrupt(folder, capsys, tmp_path, monkeypatch):
+    interrupted(monkeypatch, 1)
+    out = tmp_path / "out"
+    assert main(["explain", str(folder / "swing.csv"), "--out", str(out)]) == 130
+    found = verdict_schema.check((out / "verdict.json").read_text())
+    assert found["cut"]["by"] == "interrupt"
+    told = capsys.readouterr()
+    assert "The search was ended by an interrupt" in told.out
+    assert "simgap: ending with what there is; Ctrl-C again ends at once" in told.err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_twice_ends_at_once_and_writes_nothing(folder, capsys, tmp_path, monkeypatch):
+    interrupted(monkeypatch, 2)
+    out = tmp_path / "out"
+    assert main(["explain", str(folder / "swing.csv"), "--out", str(out)]) == 130
+    assert not out.exists()
+    assert "interrupted before there was a result" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.slow
+def test_a_thorough_search_changes_nothing_where_nothing_is_left_over(folder, tmp_path):
+    command = ["explain", str(folder / "swing.csv"), "--thorough", "--out", str(tmp_path / "o")]
+    assert main(command) == 0
+    plain, thorough = (
+        json.loads((where / "verdict.json").read_text())
+        for where in (folder / "out", tmp_path / "o")
+    )
+    for document in (plain, thorough):
+        del document["seconds"]
+    assert thorough == plain
+    made = json.loads((tmp_path / "o" / "environment.json").read_text())
+    assert made["settings"]["thorough"] is True

@@ -1,0 +1,158 @@
+"""`simgap check NAME` on sound and on broken subjects."""
+
+import json
+
+import pytest
+from jsonschema import validate
+
+from bench.cli.main import main
+from bench.schemas import load_schema
+from tests.conftest import PLUGINS
+
+CHAOS = ["--plugin", str(PLUGINS / "chaos.py")]
+SPRING = ["--plugin", str(PLUGINS / "spring.py")]
+SOUND = """import numpy as np
+
+from methods.tuner import Tuner
+
+
+class Shrinking(Tuner):
+    def tune(self, task, rng):
+        best, best_loss, width = task.start, np.inf, 0.3
+        while True:
+            seen = yield np.clip(best + width * rng.normal(size=(1, task.dim)), 0, 1)
+            if seen.losses[0] < best_loss:
+                best, best_loss = seen.proposals[0], seen.losses[0]
+            else:
+                width *= 0.9
+"""
+
+
+def checked(capsys, *arguments):
+    code = main(["check", *arguments])
+    return code, capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
+    plugin = tmp_path / "shrinking.py"
+    plugin.write_text(SOUND)
+    code, said = checked(capsys, "shrinking", "--plugin", str(plugin))
+    assert code == 0, said
+    assert said.count("ok    ") == 14
+    assert (
+        "-       stochastic is declared\n        not applicable: it says that it uses chance"
+        in said
+    )
+    assert (
+        "-       what was learned can be stored\n        not applicable: it does not learn" in said
+    )
+    assert said.endswith(
+        "tuner shrinking (simgap_plugin_shrinking.Shrinking): all 14 checks passed, "
+        "2 not applicable\n"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("chaos_raise", "found crashed: Traceback"),
+        (
+            "chaos_exit",
+            "expected to survive; found DeathError: the worker process exited with code 7",
+        ),
+        ("chaos_hang", "expected an end within 2 s; found none"),
+        ("chaos_nan", "found diverged: the tuner gave proposals that are not finite"),
+    ],
+)
+def test_chaos_tuner_fails_with_what_was_expected_and_where_to_look(
+    name, expected, capsys, monkeypatch
+):
+    monkeypatch.setattr("bench.conformance.run_checks.LIMIT", 2.0)
+    monkeypatch.setattr("bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS", 0.0)
+    code, said = checked(capsys, name, *CHAOS)
+    assert code == 1
+    assert expected in said
+    assert "FAILED  runs in one and in ten dimensions" in said
+    assert "; see " in said
+    assert f"(simgap_plugin_chaos.{''.join(w.title() for w in name.split('_'))}): " in said
+
+
+@pytest.mark.slow
+def test_simulators_and_effects_are_checked_by_name(capsys):
+    code, said = checked(capsys, "drag.linear")
+    assert (code, said.splitlines()[-1]) == (
+        0,
+        "effect drag.linear (sims.effects.drag.LinearDrag): all 10 checks passed",
+    )
+    code, said = checked(capsys, "slider")
+    assert (code, said.splitlines()[-1]) == (
+        0,
+        "simulator slider (sims.systems.slider.Slider): all 10 checks passed, 4 not applicable",
+    )  # fmt: skip
+    code, said = checked(capsys, "spring", *SPRING)
+    assert code == 0, said
+
+
+LEAKY = """from simgap import Channel, OwnSimulator, Parameter
+
+
+class Leaky(OwnSimulator):
+    \"\"\"A motor whose winding is still warm when the next run begins.\"\"\"
+
+    name = "leaky"
+    parameters = (Parameter("friction", "1/s", 0.5, (0.1, 1.0)),)
+    inputs, channels = (Channel("volts", "V"),), (Channel("speed", "rad/s"),)
+    states = {"speed": 1.0}
+    warmth = 0.0
+
+    def reset(self, theta, constants, initial):
+        self.friction, self.speed = theta["friction"], initial["speed"]
+
+    def step(self, inputs, seconds):
+        self.warmth += inputs["volts"] ** 2 * seconds
+        self.speed += (inputs["volts"] / (1 + self.warmth) - self.friction * self.speed) * seconds
+
+    def observe(self):
+        return {"speed": self.speed}
+"""
+
+
+@pytest.mark.usefixtures("fresh_registries")
+def test_state_left_over_between_runs_is_one_failure_for_people_and_programs(tmp_path, capsys):
+    plugin = tmp_path / "leaky.py"
+    plugin.write_text(LEAKY)
+    code, said = checked(capsys, "leaky", "--plugin", str(plugin))
+    assert code == 1
+    assert said.count("FAILED") == 1
+    assert "FAILED  same proposal gives the same bits\n        expected the same numbers" in said
+    assert "see Leaky.reset: it must set everything that a run has changed" in said
+    needs = "not tested: needs 'same proposal gives the same bits'"
+    assert f"-       initial states show\n        {needs}" in said
+    assert said.splitlines()[-1].endswith(": 1 of 7 checks failed, 7 not tested")
+    code, said = checked(capsys, "leaky", "--plugin", str(plugin), "--json")
+    document = json.loads(said)
+    assert (code, document["passed"]) == (1, False)
+    outcomes = [check["outcome"] for check in document["checks"]]
+    assert [outcomes.count(what) for what in ("passed", "failed", "not tested")] == [6, 1, 7]
+    validate(document, load_schema("check"))
+
+
+@pytest.mark.usefixtures("fresh_registries")
+def test_an_exception_of_the_subject_names_its_line(tmp_path, capsys):
+    plugin = tmp_path / "leaky.py"
+    plugin.write_text(LEAKY.replace('theta["friction"]', 'theta["fiction"]'))
+    code, said = checked(capsys, "leaky", "--plugin", str(plugin))
+    assert (code, said.count("FAILED")) == (1, 1)
+    assert "simulator leaky: KeyError: 'fiction' (leaky.py, line 14, in reset)" in said
+
+
+def test_unknown_name_is_one_line(capsys):
+    assert main(["check", "cma_ess"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(
+        "simgap: unknown tuner, simulator, effect or diagnoser 'cma_ess'; "
+        "there are: actuator.damping, actuator.limit, actuator.stiffness, arm, backlash, ball"
+    )
+    assert error.count("\n") == 1

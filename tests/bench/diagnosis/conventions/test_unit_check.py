@@ -1,0 +1,237 @@
+"""Wrong units and reversed signs are recognised before a search, and nothing else is taken for
+them.
+"""
+
+import json
+import re
+from math import pi
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.core.plugin_registries import simulators
+from bench.diagnosis.conventions.unit_check import UNITS, Subject, recognised, wrong_units
+from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.explain import explain
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.diagnosis.verdict import Cause, Verdict
+from bench.logs.joined_recordings import load_joined
+from bench.logs.synthetic_recording import simulate_recording
+from sims.extended_simulator import FittedValue
+from sims.recording.unit_conversion import compute_unit_scale
+from tests.conftest import PLUGINS
+from tests.simulation_arguments import Wish
+
+ARM = PLUGINS.parents[1] / "examples" / "robot" / "log.csv"
+DEGREE = pi / 180.0
+WISHES = {
+    "pendulum": {
+        "noise": ["q=0.002", "qd=0.02"],
+        "inputs": ["u=multisine:0.05:0.2:2"],
+        "initial": ["q=-0.8:0.8"],
+    },
+    "slider": {
+        "noise": ["0.002"],
+        "inputs": ["u=multisine:2:0.2:2"],
+        "initial": ["x=-0.1:0.1"],
+    },
+    "ball": {"noise": ["0.003"], "initial": ["z=0.5:1.5"]},
+}
+
+
+def swing(folder, stated=None, factors=None):
+    """A recording of a pendulum in a folder, with units other than SI stated, or numbers that were
+    multiplied.
+    """
+    simulated = simulate_recording(Wish("pendulum", **WISHES["pendulum"]))
+    path = folder / "swing.csv"
+    simulated.write(path)
+    text = path.with_suffix(".toml").read_text()
+    for name, unit in (stated or {}).items():
+        text = re.sub(rf'(\[\w+\.{name}\]\n(noise = .*\n)?unit = )"[^"]*"', rf'\1"{unit}"', text)
+    path.with_suffix(".toml").write_text(text)
+    if factors:
+        head, *lines = path.read_text().splitlines()
+        columns = head.split(",")
+        rows = [line.split(",") for line in lines]
+        for row in rows:
+            for name, factor in factors.items():
+                row[columns.index(name)] = repr(float(row[columns.index(name)]) * factor)
+        path.write_text("\n".join([head, *map(",".join, rows)]) + "\n")
+    return path
+
+
+def fault_of(path=None, recording=None, kind=None):
+    """What the check finds in a recording."""
+    if recording is None:
+        recording, kind = load_joined([path], None, None, ())
+    kind = kind or simulators.get(recording.system)
+    subject = Subject(kind, recording, "batch" if not kind.own_engine else None)
+    world = subject.world(recording)
+    sigma = compute_noise_floor(world, recording).sigma
+    noise = NoiseModel(sigma, np.zeros(len(sigma)))
+    return wrong_units(subject, world, noise, fit_base_model(world, noise))
+
+
+@pytest.mark.parametrize(
+    ("stated", "factors", "signals", "line"),
+    [
+        ({"q": "deg"}, {}, ("q",), '[channels.q] unit = "rad"'),
+        ({}, {"q": 1 / DEGREE}, ("q",), '[channels.q] unit = "deg"'),
+        ({}, {"qd": 30 / pi}, ("qd",), '[channels.qd] unit = "rpm"'),
+        ({}, {"q": DEGREE}, ("q",), "[channels.q] scale = 57.2957795"),
+        ({}, {"q": -1}, ("q",), "[channels.q] scale = -1"),
+        ({}, {"u": -1}, ("u",), "[inputs.u] scale = -1"),
+        ({"u": "mN*m"}, {}, ("u",), '[inputs.u] unit = "N*m"'),
+        ({}, {"u": 1 / 9.80665}, ("u",), '[inputs.u] unit = "kgf*m"'),
+        ({}, {"q": 1 / DEGREE, "qd": 1 / DEGREE}, ("q", "qd"), '[channels.q] unit = "deg"'),
+    ],
+)
+def test_what_is_stated_wrongly_is_named_with_the_line_that_corrects_it(
+    stated, factors, signals, line, tmp_path
+):
+    found = fault_of(swing(tmp_path, stated, factors))
+    assert found is not None
+    assert found.signals == signals
+    assert found.lines[0] == line
+    # The stated noise is that of a column in the right unit, and may be too small by the factor.
+    assert found.error_after < 0.02 * found.error_before
+    if not factors:
+        assert found.error_after < 1.1
+
+
+def test_a_sign_that_does_not_matter_is_not_questioned():
+    wish = {"noise": ["q=0.002"], "observe": ["q"], "initial": ["q=-1:1"]}
+    recording = simulate_recording(Wish("pendulum", **wish)).recording
+    subject = Subject(simulators.get("pendulum"), recording, "batch")
+    found = fault_of(recording=subject.rescaled({"q": 1 / DEGREE}))
+    assert found.lines == ('[channels.q] unit = "deg"',)
+    assert found.alternatives == ()
+
+
+def test_the_first_line_is_the_correction_and_applying_it_explains_the_recording(tmp_path, capsys):
+    path = swing(tmp_path, {"q": "deg"})
+    assert main(["explain", str(path), "--out", str(tmp_path / "wrong"), "--jobs", "1"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        "The recorded numbers of channel q look like radians, stated as degrees (factor 57.3): "
+        'set unit = "rad" in [channels.q] of swing.toml.' in said
+    )
+    assert "sensor gain" not in said
+    document = json.loads((tmp_path / "wrong" / "verdict.json").read_text())
+    assert (document["verdict"], document["causes"]) == ("unknown", [])
+    (fault,) = document["recording_faults"]
+    assert fault["factor"] == pytest.approx(180 / pi)
+    assert fault["unit"] == "rad"
+    assert Verdict.from_document(document).to_document() == document
+    page = (tmp_path / "wrong" / "report.html").read_text()
+    assert "<code>[channels.q] unit = &quot;rad&quot;</code>" in page
+
+    about = path.with_suffix(".toml")
+    about.write_text(about.read_text().replace('"deg"', '"rad"'))
+    answer = explain(path).answer
+    assert answer.verdict == "adequate"
+    assert "recording_faults" not in answer.to_document()
+
+
+def test_a_scale_is_applied_to_the_column_and_its_noise(tmp_path):
+    path = swing(tmp_path, {}, {"q": -1})
+    about = path.with_suffix(".toml")
+    about.write_text(about.read_text().replace("[channels.q]\n", "[channels.q]\nscale = -1\n"))
+    assert fault_of(path) is None
+    recording, _ = load_joined([path], None, None, ())
+    assert recording.noise["q"] == 0.002
+    about.write_text(about.read_text().replace("scale = -1", "scale = 0"))
+    out = str(tmp_path / "out")
+    assert main(["inspect", str(path), "--out", out]) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("factors", "line"),
+    [
+        ({"q.elbow": 1 / DEGREE}, '[channels."q.elbow"] unit = "deg"'),
+        (
+            {"q.elbow": 1 / DEGREE, "q.shoulder": 1 / DEGREE},
+            '[channels."q.shoulder"] unit = "deg"',
+        ),
+        ({"u.m_elbow": -1}, '[inputs."u.m_elbow"] scale = -1'),
+    ],
+)
+def test_a_robot_that_lacks_a_friction_too_is_told_its_wrong_unit(factors, line):
+    recording, kind = load_joined([ARM], None, None, ())
+    subject = Subject(kind, recording, None)
+    found = fault_of(recording=subject.rescaled(factors), kind=kind)
+    assert found is not None
+    assert found.signals == tuple(sorted(factors, reverse=True))
+    assert found.lines[0] == line
+    assert fault_of(recording=recording, kind=kind) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", WISHES)
+def test_neither_clean_recordings_nor_gains_nor_causes_are_called_wrong_units(system):
+    """Forty clean recordings, and true errors of 5 % and more."""
+    effects = {
+        "pendulum": ["sensor.gain=0.05", "input.gain=-0.3", "friction.coulomb=0.01"],
+        "slider": ["sensor.gain=-0.05", "input.gain=0.4", "friction.coulomb=1", "force.bias=2"],
+        "ball": ["sensor.gain=0.05", "drag.linear=0.3", "wind=2,1", "gravity.scale=0.1"],
+    }  # fmt: skip
+    clean = [{"seed": seed} for seed in range(14)]
+    wrong = [{"seed": seed, "effects": [e]} for e in effects[system] for seed in (1, 2)]
+    for wish in (*clean, *wrong):
+        recording = simulate_recording(Wish(system, **WISHES[system], **wish)).recording
+        assert fault_of(recording=recording) is None, wish
+
+
+def test_a_true_gain_near_a_conversion_is_not_a_unit():
+    recording = simulate_recording(Wish("pendulum", **WISHES["pendulum"])).recording
+    subject = Subject(simulators.get("pendulum"), recording, "batch")
+    # Turns for radians would be 2 pi: 4.5 % from it, the misfit falls by 95 %.
+    assert fault_of(recording=subject.rescaled({"q": 1 / 6.0})) is None
+
+
+@pytest.mark.parametrize(
+    ("effect", "value", "line"),
+    [
+        ("sensor.gain", DEGREE - 1, "[channels.q] scale = 57.2957795"),
+        ("sensor.gain", 1 / DEGREE - 1.001, '[channels.q] unit = "deg"'),
+        ("sensor.gain", -2.0, "[channels.q] scale = -1"),
+        ("input.gain", -1.99, "[inputs.u] scale = -1"),
+        ("input.gain", 1e-3 - 1, '[inputs.u] unit = "mN*m"'),
+        ("sensor.gain", -0.96, None),
+        # The lower bound of the range: the fit asks for less.
+        ("sensor.gain", -0.8, None),
+    ],
+)
+def test_a_fitted_gain_that_is_a_conversion_is_recognised(effect, value, line):
+    found = recognised_of(effect, value)
+    assert found is not None
+    assert found.lines == ((line,) if line else ())
+    if line is None:
+        assert "nearly independent of the simulation" in found.says
+
+
+@pytest.mark.parametrize(("effect", "value"), [("sensor.gain", 0.05), ("input.gain", -0.5)])
+def test_a_plausible_gain_is_a_gain(effect, value):
+    assert recognised_of(effect, value) is None
+
+
+def recognised_of(effect, value):
+    recording = simulate_recording(Wish("pendulum", **WISHES["pendulum"])).recording
+    subject = Subject(simulators.get("pendulum"), recording, "batch")
+    world = RunEvaluator(subject.kind, recording, recording.training(), candidates=[effect])
+    number = FittedValue(value, "1", value - 1e-3, value + 1e-3)
+    nowhere = SimpleNamespace(free=np.array([], dtype=int), theta=np.array([]))
+    cause = Cause(effect, (), "says so", {"coefficient": number}, 0.0)
+    return recognised(subject, world, cause, nowhere)
+
+
+def test_the_gains_of_units_are_those_of_the_unit_library():
+    for si, units in UNITS.items():
+        for unit, gain in units.items():
+            assert compute_unit_scale(unit, si).gain == pytest.approx(gain, rel=1e-9), unit

@@ -1,0 +1,45 @@
+"""One recording with known numbers, explained once, and its sheet."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bench.api.datasheet import datasheet
+from bench.api.explain import explain
+from bench.cli.main import main
+from bench.diagnosis.datasheet.datasheet import DataSheet
+from bench.diagnosis.explanation import Explanation
+from sims import extended_simulator
+from tests.bench.diagnosis.datasheet.drive_recordings import written
+
+NAME = "servo <i>one</i>"
+
+
+@pytest.fixture(scope="session")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("drive"))
+
+
+@pytest.fixture(scope="session")
+def explained(log: Path) -> Explanation:
+    return explain(log, jobs=1)
+
+
+@pytest.fixture(scope="session")
+def sheet(log: Path, explained: Explanation) -> DataSheet:
+    return datasheet(log, explained=explained, name=NAME)
+
+
+@pytest.fixture(scope="session")
+def files(log: Path, explained: Explanation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command writes, from what explain has written."""
+    folder = tmp_path_factory.mktemp("made")
+    # The two of its files that are read again; to draw its figures takes seconds.
+    (folder / "verdict.json").write_text(json.dumps(explained.answer.to_document()))
+    extended_simulator.write_extended(explained.extended, folder / "extended.toml")
+    given = ["--from", str(folder), "--name", NAME, "--out", str(folder / "sheet")]
+    assert main(["datasheet", str(log), *given]) == 0
+    return folder / "sheet"

@@ -1,0 +1,84 @@
+"""The sheet of a robot's joint: what the file states is added, and other joints stay out of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bench.core.plugin_registries import make_robot_simulator
+from bench.diagnosis.datasheet.datasheet import build_datasheet
+from bench.diagnosis.datasheet.sheet_content import SheetContent
+from bench.diagnosis.datasheet.sheet_rows import SheetRow
+from bench.diagnosis.datasheet.subject import make_subject
+from bench.diagnosis.datasheet.wording import format_name, format_short_name
+from bench.logs.joined_recordings import load_joined
+from sims.core.simulator import InputError
+from sims.extended_simulator import FittedValue
+from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.diagnosis.test_extended_robot_files import EXAMPLE, extended_of
+
+FOUND = {
+    "friction.coulomb@*": {
+        "coefficient@shoulder": FittedValue(0.001, "N*m", -0.002, 0.004),
+        "coefficient@elbow": FittedValue(0.03, "N*m", 0.029, 0.031),
+    },
+    "drag.linear@elbow": {"coefficient": FittedValue(0.02, "N*m*s/rad", 0.015, 0.025)},
+    "gravity.scale": {"coefficient": FittedValue(0.01, "1", 0.0, 0.02)},
+}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("arm")
+    lines = (EXAMPLE / "log.csv").read_text().splitlines()
+    (folder / "log.csv").write_text("\n".join(lines[:401]) + "\n")
+    text = (EXAMPLE / "log.toml").read_text().split("[runs.5]")[0]
+    (folder / "log.toml").write_text(text)
+    (folder / "arm2.xml").write_text((EXAMPLE / "arm2.xml").read_text())
+    return folder / "log.csv"
+
+
+def made(log: Path, joint: str) -> SheetContent:
+    recording, kind = load_joined([log])
+    return build_datasheet(recording, extended_of(kind, effects=FOUND), story().verdict, joint)
+
+
+def row(facts: SheetContent, name: str) -> SheetRow:
+    return next(row for row in facts.rows if row.name == name)
+
+
+def test_what_was_found_is_added_to_what_the_file_states(log: Path) -> None:
+    facts = made(log, "elbow")
+    drag = row(facts, "drag.linear@elbow")
+    assert drag.stated == pytest.approx(0.1)
+    assert drag.number is not None
+    assert (drag.number.value, drag.number.low) == pytest.approx((0.12, 0.115))
+    assert format_name(drag) == "linear drag"
+    armature = row(facts, "inertia.armature@elbow")
+    assert format_name(armature) == "armature"
+    assert format_short_name(row(facts, "sensor.bias@q.elbow")) == "sensor.bias q"
+    assert format_short_name(row(facts, "force.ripple@elbow sine")) == "force.ripple sine"
+    assert armature.state == "not shown"
+    assert armature.stated == pytest.approx(0.005)
+    assert row(facts, "friction.coulomb@elbow").state == "found"
+    assert facts.diagram.breakaway == pytest.approx(0.03)
+    places = {row.name.partition("@")[2].partition(" ")[0] for row in facts.rows}
+    assert {"elbow", "q.elbow"} <= places
+    assert not any("shoulder" in place for place in places)
+    assert list(facts.elsewhere()) == ["gravity.scale"]
+
+
+def test_what_may_be_nothing_at_a_joint_of_a_family_is_not_shown_there(log: Path) -> None:
+    friction = row(made(log, "shoulder"), "friction.coulomb@shoulder")
+    assert friction.state == "not shown"
+    assert friction.detection_limit is not None
+    assert friction.detection_limit.size == pytest.approx(0.004)
+
+
+def test_a_joint_has_to_be_named_where_there_are_several() -> None:
+    kind = make_robot_simulator(EXAMPLE / "arm2.xml")
+    with pytest.raises(InputError, match="expected --joint, one of shoulder, elbow"):
+        make_subject(kind, None)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="wrist"):
+        make_subject(kind, "wrist")  # type: ignore[arg-type]

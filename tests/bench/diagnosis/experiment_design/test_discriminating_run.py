@@ -1,0 +1,97 @@
+import re
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.experiment_design.discriminating_run import (
+    MIN_DISCRIMINATION_SIGMAS,
+    propose_discriminating_run,
+)
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.search.effect_search import EffectSearch
+from sims.core.simulator import Scenario
+from sims.systems.pendulum import Pendulum
+from tests.bench.diagnosis.explained_samples import marked, recording, white, world
+
+
+def rivals(made, sigma, effects, **options):
+    """A search with one fitted model for each effect."""
+    there = world(made, candidates=list(effects), **options)
+    noise = white(there, sigma)
+    base = fit_base_model(there, noise)
+    search = EffectSearch(
+        there, noise, base.insensitive_parameters, np.random.default_rng(0), marked(there, True)
+    )
+    models = []
+    for name in effects:
+        start = FitStart((name,), base.fit.theta, base.fit.states)
+        models.append(search.add_fit(TrajectoryFitter(there, noise).fit_models([start], 20)[0]))
+    return search, *models
+
+
+def small_swing(**changes):
+    changes = {"noise": ["q=0.003", "qd=0.02"], **changes}
+    return recording(runs=1, seconds=1, rate=60, initial=["q=0.3"], **changes)
+
+
+@pytest.mark.parametrize("free", [(), ("length",)])
+def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
+    effects = ("drag.linear", "drag.quadratic")
+    made = small_swing(effects=["drag.quadratic=2e-4"])
+    search, model, rival = rivals(made, [0.003, 0.02], effects, free=free)
+    found = propose_discriminating_run(search, model, rival)
+    assert found.discrimination_sigmas > MIN_DISCRIMINATION_SIGMAS
+    assert found.change
+    said = re.fullmatch(
+        r"(.*): there drag.linear and drag.quadratic differ by (.*) times the noise", found.says
+    )
+    assert float(said[2]) == pytest.approx(found.discrimination_sigmas, rel=0.01)
+    if free:
+        return
+    track = search.world.tracks[0]
+    initial = dict(zip(("q", "qd"), track.initial_state_guess.tolist(), strict=True)) | {
+        k: v for k, v in found.change.items() if k in ("q", "qd")
+    }
+    times = track.scenario.times
+    if "seconds" in found.change:
+        times = np.arange(2 * times.size - 1) / 60
+        assert found.change["seconds"] == pytest.approx(times[-1])
+    seen = [
+        Pendulum(
+            fixed={name: m.fit.theta[search.world.slots[name]].tolist()}, time_step=1e-3
+        ).simulate(m.fit.theta[None, :1], Scenario(times, initial))[0]
+        for name, m in zip(effects, (model, rival), strict=True)
+    ]
+    apart = np.sqrt(np.square((seen[0] - seen[1]) / [0.003, 0.02]).mean())
+    assert apart == pytest.approx(found.discrimination_sigmas, rel=0.05)
+
+
+def test_equal_models_are_not_told_apart_by_any_run():
+    made = small_swing()
+    search, model, _ = rivals(made, [0.003, 0.02], ("drag.linear", "drag.quadratic"))
+    found = propose_discriminating_run(search, model, model)
+    assert found.discrimination_sigmas == 0
+    assert found.change == {}
+    assert found.says.startswith("No run of this kind would tell")
+    assert found.says.endswith("measure one of the causes directly")
+
+
+def test_what_is_not_recorded_is_proposed_where_no_run_would_do():
+    search, model, _ = rivals(
+        small_swing(observe=["q"], noise=["0.003"]), 0.003, ("drag.linear", "drag.quadratic")
+    )
+    assert propose_discriminating_run(search, model, model).says.endswith("record qd besides")
+
+
+def test_an_input_is_made_smaller_or_larger():
+    made = recording("slider", runs=1, seconds=1, rate=50, inputs=["u=square:1:1"], noise=["0.003"],
+                     effects=["input.gain=0.2"])  # fmt: skip
+    search, model, rival = rivals(made, 0.003, ("input.deadband", "friction.coulomb"))
+    before = search.world.simulations
+    found = propose_discriminating_run(search, model, rival)
+    assert np.isfinite(found.discrimination_sigmas)
+    assert search.world.simulations - before == 2 * (1 + 6 + 2), (
+        "twice as long, each state three ways, the input two"
+    )

@@ -1,0 +1,216 @@
+"""What is proposed to be recorded next keeps to the limits that the model file states."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.core.plugin_registries import make_robot_simulator
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.experiment_design.candidate_runs import RigModel, RunPlan
+from bench.diagnosis.experiment_design.discriminating_run import _largest_share, _runs
+from bench.diagnosis.experiment_design.model_file_limits import UNLIMITED, stated_limits
+from bench.diagnosis.experiment_design.safety_limits import RigLimits
+from sims.core.simulator import Scenario
+from sims.recording.recording import Recording, Run
+
+TIMES = np.arange(0.0, 2.0, 0.02)
+MOTOR = {"m": {"joint": "hip", "kind": "motor"}}
+URDF = """<robot name="arm"><link name="base"/>
+<link name="leg"><inertial><origin xyz="0 0 -0.3"/><mass value="1"/>
+<inertia ixx="0.03" iyy="0.03" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hip" type="revolute"><parent link="base"/><child link="leg"/><axis xyz="0 1 0"/>
+<limit lower="-0.9" upper="0.9" effort="1" velocity="2.5"/><dynamics damping="0.2"/></joint></robot>
+"""
+MJCF = """<mujoco model="arm"><option gravity="0 0 -9.81"/><worldbody><body name="leg">
+<joint name="hip" axis="0 1 0" range="-0.5 0.4" damping="0.2" armature="0.02"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03" mass="1"/></body></worldbody>
+<actuator><position name="s" joint="hip" kp="20" kv="1" ctrlrange="-0.35 0.6"
+forcerange="-6 6"/></actuator><compiler angle="radian"/></mujoco>
+"""
+MANY = """<mujoco><compiler angle="radian"/><worldbody><body name="a">
+<joint name="j1" axis="0 1 0" range="-1 2" actuatorfrcrange="-2 3"/><geom size="0.1" mass="1"/>
+<body name="b" pos="0 0 1"><joint name="j2" type="slide" axis="0 0 1"/><geom size="0.1"/></body>
+</body></worldbody><actuator>
+<motor name="m" joint="j1" gear="-2" forcerange="-10 1"/>
+<general name="g" joint="j1" gainprm="0.5" ctrlrange="-1 1"/>
+<position name="p" joint="j1" kp="3" gear="0.5"/>
+<motor name="free" joint="j2"/>
+</actuator></mujoco>"""
+
+
+def kind_of(folder, text, name="arm.urdf", **options):
+    """The simulator of a model file that is written."""
+    path = folder / name
+    path.write_text(text)
+    return make_robot_simulator(path, **options)
+
+
+def simulated(kind, command, effect=None, coefficient=0.0, begin=0.0):
+    """Positions of the hip under a command of the only actuator."""
+    (name,) = (one.name for one in kind.inputs if one.name.startswith("u."))
+    inputs = {channel.name: np.zeros(TIMES.size) for channel in kind.inputs} | {name: command}
+    simulator = kind(observe=["q.hip"], effects=[effect] if effect else [])
+    theta = np.array([[coefficient]]) if effect else np.empty((1, 0))
+    return simulator.simulate(theta, Scenario(TIMES, {"q.hip": begin}, inputs))[0][:, 0], inputs
+
+
+def world_of(kind, command, begin=0.0):
+    """The world of one run under a command, and a model that is true there."""
+    seen, inputs = simulated(kind, command, begin=begin)
+    run = Run("1", TIMES, {"q.hip": seen}, inputs, {}, {}, held_out=False)
+    recording = RunEvaluator(
+        kind, Recording("x.csv", kind.name, "", {}, {}, (run,)), (run,), None, candidates=()
+    )
+    fit = SimpleNamespace(theta=recording.get_nominal_theta(), states=recording.guess)
+    return recording, SimpleNamespace(fit=fit, names=())
+
+
+def log(folder, kind, effect, coefficient, size, noise):
+    """Write a recording of three runs in which an effect acts that the model lacks."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for number in range(3):
+        command = size * np.sin(2.0 * TIMES + number)
+        seen, inputs = simulated(kind, command, effect, coefficient, 0.05 * number)
+        (name,) = (one for one in inputs if one.startswith("u."))
+        seen = seen + noise * rng.standard_normal(seen.size)
+        rows += [
+            f"{number},{t:.3f},{u:.6f},{q:.6f}"
+            for t, u, q in zip(TIMES, inputs[name], seen, strict=True)
+        ]
+    path = folder / "log.csv"
+    path.write_text("\n".join([f"run,t,{name},q.hip", *rows]) + "\n")
+    actuators = kind.robot.actuator_tables
+    tables = [
+        f'[actuators.{n}]\njoint = "{t["joint"]}"\nkind = "motor"' for n, t in actuators.items()
+    ]
+    unit = {one.name: one.unit for one in kind.inputs}[name]
+    path.with_suffix(".toml").write_text(
+        "\n".join([
+            f'model = "{kind.robot.path.name}"', f'[inputs."{name}"]\nunit = "{unit}"',
+            f'[channels."q.hip"]\nunit = "rad"\nnoise = {noise}',
+            *tables, "[runs.2]\nheld_out = true\n",
+        ])
+    )  # fmt: skip
+    return path
+
+
+def check_proposals(path, out, limits, capsys):
+    """Explain and design; what both propose is within the limits of commands and states."""
+    assert main(["explain", str(path), "--out", str(out), "--jobs", "1"]) == 0
+    proposed = json.loads((out / "verdict.json").read_text())["next_experiment"]
+    change = {} if proposed is None else proposed.get("change") or {}
+    for name, value in change.items():
+        if name in limits.states:
+            low, high = limits.states[name]
+            assert low <= value <= high, proposed
+    capsys.readouterr()
+    table = out / "next.csv"
+    assert main(["design", str(path), "--out", str(table), "--jobs", "1", "--json"]) == 0
+    design = json.loads(capsys.readouterr().out)["design"]
+    for name, value in design["initial"].items():
+        low, high = limits.states.get(name, UNLIMITED)
+        assert low <= value <= high, design["says"]
+    head = table.read_text().splitlines()[0].split(",")
+    columns = dict(zip(head, np.loadtxt(table, delimiter=",", skiprows=1).T, strict=True))
+    for name, (low, high) in limits.commands.items():
+        if name in columns:
+            assert low - 1e-9 <= columns[name].min(), design["says"]
+            assert columns[name].max() <= high + 1e-9, design["says"]
+    return change, columns
+
+
+@pytest.mark.slow
+def test_torques_and_starts_keep_to_the_limits_of_a_urdf(tmp_path, capsys):
+    kind = kind_of(tmp_path, URDF, actuators=MOTOR)
+    path = log(tmp_path, kind, "drag.quadratic@hip", 0.06, 0.7, 0.02)
+    limits = SimpleNamespace(
+        commands={"u.m": (-1.0, 1.0)}, states={"q.hip": (-0.9, 0.9), "qd.hip": (-2.5, 2.5)}
+    )
+    check_proposals(path, tmp_path / "out", limits, capsys)
+
+
+@pytest.mark.slow
+def test_set_points_keep_to_the_limits_of_an_mjcf(tmp_path, capsys):
+    kind = kind_of(tmp_path, MJCF, "arm.xml")
+    path = log(tmp_path, kind, "input.lag@s", 0.02, 0.3, 0.006)
+    limits = SimpleNamespace(commands={"u.s": (-0.35, 0.4)}, states={"q.hip": (-0.5, 0.4)})
+    check_proposals(path, tmp_path / "out", limits, capsys)
+
+
+def test_all_limits_of_a_urdf_are_read(tmp_path):
+    kind = kind_of(tmp_path, URDF, actuators={"m": {**MOTOR["m"], "gear": 4.0}})
+    world, _ = world_of(kind, 0.1 * np.sin(TIMES))
+    limits = stated_limits(world)
+    assert limits.commands == {"u.m": (-0.25, 0.25), "force.hip": (-1.0, 1.0)}
+    assert limits.states == {"q.hip": (-0.9, 0.9), "qd.hip": (-2.5, 2.5)}
+    assert limits.forces == {"tau.hip": (-1.0, 1.0)}
+
+
+def test_a_velocity_servo_keeps_to_the_velocity_of_a_urdf(tmp_path):
+    servo = {"m": {"joint": "hip", "kind": "velocity", "kv": 2.0, "gear": 2.0}}
+    world, _ = world_of(kind_of(tmp_path, URDF, actuators=servo), 0.1 * np.sin(TIMES))
+    assert stated_limits(world).commands["u.m"] == (-5.0, 5.0)
+
+
+def test_limits_of_an_mjcf_are_those_of_joint_and_actuator_together(tmp_path):
+    kind = kind_of(tmp_path, MANY, "many.xml")
+    found = stated_limits(SimpleNamespace(kind=kind))
+    # Two motors share the force range of the joint; the first also has one of its own.
+    assert found.commands["u.m"] == pytest.approx((-0.75, 0.5))
+    assert found.commands["u.g"] == pytest.approx((-1.0, 1.0))
+    assert found.commands["u.p"] == pytest.approx((-0.5, 1.0))
+    assert found.commands["force.j1"] == (-2.0, 3.0)
+    assert not {"u.free", "force.j2"} & set(found.commands)
+    assert found.states == {"q.j1": (-1.0, 2.0)}
+
+
+def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
+    kind = kind_of(tmp_path, URDF, actuators=MOTOR)
+    # The recording itself went beyond: its commands are limited too.
+    world, _ = world_of(kind, 1.3 * np.sin(2.0 * TIMES))
+    limits = stated_limits(world)
+    runs = list(_runs(world))
+    assert len(runs) > 4
+    for run in runs:
+        assert np.abs(run.scenario.inputs["u.m"]).max() <= 1.0
+        states = dict(zip(world.states, run.states, strict=True))
+        assert abs(states["q.hip"]) <= 0.9
+        assert states["qd.hip"] == 0.0
+        assert "commands limited" in run.says
+        assert set(run.change) <= {"seconds", "q.hip", "u.m"}
+    assert limits.commands["u.m"] == (-1.0, 1.0)
+
+
+def test_a_signal_is_enlarged_up_to_its_limit():
+    signal = np.array([-0.5, 0.4])
+    assert _largest_share(signal, (-1.0, 1.0)) == 2.0
+    assert _largest_share(signal, (-2.0, 0.5)) == 1.25
+    assert _largest_share(signal, UNLIMITED) == np.inf
+    assert _largest_share(np.zeros(2), (-1.0, 1.0)) == np.inf
+
+
+def test_what_the_runs_so_far_did_wrongly_is_not_proposed_again(tmp_path):
+    kind = kind_of(tmp_path, URDF.replace('velocity="2.5"', 'velocity="0.5"'), actuators=MOTOR)
+    world, model = world_of(kind, 0.9 * np.sin(3.0 * TIMES))
+    rig, limits = RigModel(world, 2.0), RigLimits(world, model)
+    assert np.abs(limits.past[0]["qd.hip"]).max() > 0.5
+    assert limits.bounds["qd.hip"] == (-0.5, 0.5)
+    strong, weak = (rig.make_run(RunPlan(("u.m",), "slow sine", size)) for size in (1.0, 0.05))
+    assert limits(model, [strong, weak]) == [False, True]
+
+
+def test_plans_say_that_a_command_is_limited_and_begin_in_range(tmp_path):
+    kind = kind_of(tmp_path, URDF, actuators=MOTOR)
+    world, _ = world_of(kind, 0.7 * np.sin(2.0 * TIMES), begin=0.6)
+    rig = RigModel(world, 2.0)
+    run = rig.make_run(RunPlan(("u.m",), "slow sine", 2.0))
+    assert np.abs(run.scenario.inputs["u.m"]).max() == 1.0
+    assert "u.m limited to -1 to 1" in run.says
+    begins = [value for name, value in rig._beginnings() if name == "q.hip"]
+    assert max(begins) == 0.9
+    assert min(begins) == pytest.approx(-0.6, abs=0.01)
+    assert len(begins) == len(set(begins))

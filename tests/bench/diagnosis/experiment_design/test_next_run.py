@@ -1,0 +1,161 @@
+"""The next recording: what is designed splits what was open, recorded by scipy."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import simgap
+from bench.cli.main import main
+from bench.core.plugin_registries import make_robot_simulator
+from bench.diagnosis.experiment_design.information_gain import RunValue
+from bench.diagnosis.experiment_design.next_run import _connected_groups, _would_longer_run_help
+from bench.logs.quality.pose_check import find_contacts
+from sims.core.simulator import InputError
+
+MASS, LENGTH, INERTIA, NOISE = 0.2, 0.15, 0.006, 4e-3
+TIMES = np.arange(0.0, 4.0, 0.02)
+
+
+def write(folder, name, runs, lag=0.0, push=0.0, seed=0):
+    """A pendulum whose torque lags, and which something pushes.
+
+    Args:
+        runs: of each run stamps, torques held from stamp to stamp, angle and speed it begins with.
+        lag: s, of a drive of first order.
+        push: N m, all the time.
+    """
+    rng, rows = np.random.default_rng(seed), ["run,t,u,q"]
+    for number, (times, torques, q0, v0) in enumerate(runs):
+
+        def rate(_t, x, held):
+            drive = x[2] if lag else held
+            pull = drive + push - MASS * 9.80665 * LENGTH * np.sin(x[0])
+            return [x[1], pull / INERTIA, (held - x[2]) / lag if lag else 0.0]
+
+        state, q = np.array([q0, v0, torques[0]]), []
+        for i, begin in enumerate(times):
+            q.append(state[0])
+            if i + 1 < times.size:
+                end = times[i + 1]
+                done = solve_ivp(
+                    rate, (begin, end), state, args=(torques[i],), rtol=1e-8, atol=1e-10
+                )
+                state = done.y[:, -1]
+        seen = np.array(q) + NOISE * rng.standard_normal(len(q))
+        columns = zip(times, torques, seen, strict=True)
+        rows += [f"{number},{t:.4f},{u:.8f},{x:.6f}" for t, u, x in columns]
+    path = folder / f"{name}.csv"
+    path.write_text("\n".join(rows))
+    path.with_suffix(".toml").write_text(
+        f'system = "pendulum"\n[channels.q]\nunit = "rad"\nnoise = {NOISE}\n[inputs.u]\n'
+        f'unit = "N*m"\n[constants]\nmass = {MASS}\nlength = {LENGTH}\ngravity = 9.80665\n'
+    )
+    return path
+
+
+def slow(count=3):
+    """Torques so slow that of a delay and a lag only how late they are is seen."""
+    return [(TIMES, 0.06 * np.sin(2 * TIMES + k), 0.05 * k, 0.0) for k in range(count)]
+
+
+def drawn(design):
+    """The runs that it says, twice."""
+    (torques,) = design.inputs.values()
+    one = design.times, torques, design.initial["q"], design.initial["qd"]
+    return [one, one, one]
+
+
+def names_of(explanation):
+    (cause,) = explanation.causes
+    return {cause.effect, *cause.alternatives}
+
+
+@pytest.mark.slow
+def test_the_proposed_run_splits_the_set(tmp_path):
+    before = write(tmp_path, "before", slow(), lag=0.04)
+    # Three fitted runs would tell a delay from a lag.
+    with before.with_suffix(".toml").open("a") as description:
+        description.write("[runs.2]\nheld_out = true\n")
+    proposed = simgap.design(before)
+    ambiguous = names_of(proposed.explanation)
+    assert {"input.lag", "input.delay"} <= ambiguous
+    design = proposed.design
+    assert design.by == "T"
+    assert {design.effect, *design.discrimination_by_effect} == ambiguous
+    assert design.distinguished_effects
+    assert design.times[-1] <= 4.0
+    after = write(tmp_path, "after", drawn(design), lag=0.04, seed=1)
+    names = names_of(simgap.explain([before, after]))
+    assert "input.lag" in names
+    # What it says it would split is split.
+    kept = "input.lag" in (design.effect, *design.distinguished_effects)
+    assert kept
+    assert len(names) < len(ambiguous)
+    assert "input.delay" not in names
+
+
+def test_what_no_run_can_split_is_said(tmp_path, capsys):
+    path = write(tmp_path, "push", slow(), push=0.02)
+    out = tmp_path / "next.csv"
+    assert main(["design", str(path), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "force.bias" in said
+    assert "input.bias" in said
+    assert "no run of this kind tells it from" in said
+
+
+def test_what_is_known_is_narrowed(tmp_path, capsys):
+    """Nothing is open: the run that says most of the numbers is proposed, and keeps its word."""
+    path = write(tmp_path, "clean", slow())
+    out = tmp_path / "next.csv"
+    assert main(["design", str(path), "--out", str(out), "--seconds", "3"]) == 0
+    said = capsys.readouterr().out
+    assert "nothing is open: it narrows" in said
+    factor = float(said.split("together ")[1].split(" times")[0])
+    columns = np.genfromtxt(out, delimiter=",", names=True)
+    assert columns.dtype.names == ("t", "u")
+    assert columns["t"][-1] == pytest.approx(2.98, abs=0.021)
+    design = simgap.design(path, seconds=3.0).design
+    after = write(tmp_path, "after", drawn(design)[:1] * 3, seed=2)
+    # Of three runs one is held out, so that the two together are worth a little more than one.
+    one = simgap.explain(path).answer.parameters["inertia"]
+    both = simgap.explain([path, after]).answer.parameters["inertia"]
+    narrowed = (one.high - one.low) / (both.high - both.low)
+    assert factor * 0.6 < narrowed < factor * 2.5
+
+
+def test_what_is_asked_wrongly_is_one_line(tmp_path, capsys):
+    path = write(tmp_path, "clean", slow())
+    out = tmp_path / "next.csv"
+    out.write_text("mine")
+    assert main(["design", str(path), "--out", str(out)]) == 2
+    assert "next.csv" in capsys.readouterr().err
+    assert out.read_text() == "mine"
+    with pytest.raises(InputError, match="seconds: expected 0 to 600, found -1"):
+        simgap.design(path, seconds=-1)
+    with pytest.raises(InputError, match="longest: expected 4 to 600, found 2"):
+        simgap.design(path, longest=2)
+
+
+def test_what_hangs_together_and_what_a_longer_run_would_tell():
+    least = np.array([[0, 90, 7, 80.0], [90, 0, 95, 3.0], [7, 95, 0, 60.0], [80, 3, 60, 0]])
+    assert list(_connected_groups(["a", "b", "c", "d"], least)) == [("a", "c"), ("b", "d")]
+    run = RunValue(None, least + np.triu(least), 0.0, is_exact=True)
+    # Of 7 and 3 squared noises a run twice as long may make 25 if it is lucky, twice of the first.
+    assert _would_longer_run_help(run, 2.0)
+    assert not _would_longer_run_help(run, 1.0)
+    run = RunValue(None, np.where(least < 10, 1.0, least), 0.0, is_exact=True)
+    assert not _would_longer_run_help(run, 5.0)
+
+
+def test_parts_that_touch_are_seen(tmp_path):
+    path = tmp_path / "two.xml"
+    path.write_text(
+        '<mujoco><worldbody><geom name="wall" type="box" pos="0.6 0 0" size="0.1 1 1"/>'
+        '<body><joint name="hip" axis="0 1 0"/><geom name="leg" type="capsule" size="0.05" '
+        'fromto="0 0 0 0 0 -1"/></body></worldbody></mujoco>'
+    )
+    kind = make_robot_simulator(path)
+    angles = np.linspace(0, 1.5, 50)
+    assert find_contacts(kind, {"q.hip": 0.2 * angles}) == frozenset()
+    assert find_contacts(kind, {"q.hip": -angles}) == {(0, 1)}

@@ -1,0 +1,134 @@
+"""What a rig may be made to do: plans in its own terms, and its limits, by simulation."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.core.plugin_registries import make_robot_simulator
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.experiment_design.candidate_runs import RigModel, RunPlan
+from bench.diagnosis.experiment_design.safety_limits import SPEED_AND_FORCE_FACTOR, RigLimits
+from sims.core.simulator import Scenario
+from sims.recording.recording import Recording, Run
+from sims.systems.servo import Servo
+
+TIMES = np.arange(100) / 50.0
+URDF = """<robot name="arm"><link name="base"/>
+<link name="leg"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="foot"><inertial><origin xyz="0 0 -0.2"/><mass value="0.2"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hip" type="revolute"><parent link="base"/><child link="leg"/><axis xyz="0 1 0"/>
+<limit lower="-1.5" upper="1.5" effort="30" velocity="SPEED"/><dynamics damping="0.5"/></joint>
+<joint name="knee" type="continuous"><parent link="leg"/><child link="foot"/><axis xyz="0 1 0"/>
+<origin xyz="0 0 -1"/><limit effort="0" velocity="0"/><dynamics damping="0.3"/></joint></robot>
+"""
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    """A function of the hip's fastest speed: the world of a run in which it swings gently, of which
+    positions alone are recorded.
+    """
+    folder = tmp_path_factory.mktemp("arm")
+
+    def made(speed):
+        path = folder / f"arm{speed:g}.urdf"
+        path.write_text(URDF.replace("SPEED", f"{speed:g}"))
+        actuators = {"m": {"joint": "hip", "kind": "motor"}}
+        kind = make_robot_simulator(path, actuators=actuators)
+        inputs = {c.name: np.zeros(TIMES.size) for c in kind.inputs}
+        inputs["u.m"] = 1.5 * np.sin(3 * TIMES)
+        simulator = kind(observe=["q.hip", "q.knee"])
+        seen = simulator.simulate(np.empty((1, 0)), Scenario(TIMES, {}, inputs))[0]
+        channels = dict(zip(("q.hip", "q.knee"), seen.T, strict=True))
+        run = Run("1", TIMES, channels, inputs, {}, {}, held_out=False)
+        recording = Recording(Path("x.csv"), kind.name, "", {}, {}, (run,))
+        world = RunEvaluator(kind, recording, (run,), None, candidates=())
+        fit = SimpleNamespace(theta=world.get_nominal_theta(), states=world.guess)
+        return world, SimpleNamespace(fit=fit, names=())
+
+    return made
+
+
+def pushes(rig, size):
+    return rig.run(RunPlan(("u.m",), "slow sine", size))
+
+
+def test_a_speed_that_the_file_states_is_kept_though_nobody_recorded_it(arm):
+    world, model = arm(9.0)
+    assert world.kind.robot.speeds == {"hip": 9.0}
+    rig, limits = RigModel(world, 2.0), RigLimits(world, model)
+    assert limits.bounds["qd.hip"] == (-9.0, 9.0)
+    gentle, strong = pushes(rig, 1.0), pushes(rig, 1.5)
+    assert limits(model, [gentle, strong]) == [True, True]
+    fastest = np.abs(limits._seen(model, [strong.scenario], strong.states[None])[0]["qd.hip"]).max()
+    slower, same = arm(0.9 * fastest)
+    assert RigLimits(slower, same)(same, [strong]) == [False]
+
+
+def test_what_nothing_states_is_as_fast_and_as_strong_as_it_was(arm):
+    world, model = arm(0.0)
+    limits, rig = RigLimits(world, model), RigModel(world, 2.0)
+    past = limits.past[0]
+    assert limits.bounds["qd.hip"][1] == pytest.approx(
+        SPEED_AND_FORCE_FACTOR * np.abs(past["qd.hip"]).max()
+    )
+    assert limits.bounds["tau.hip"] == (-30.0, 30.0)
+    assert limits.bounds["q.hip"] == (-1.5, 1.5)
+    assert limits(model, [pushes(rig, 1.0), pushes(rig, 40.0)]) == [True, False]
+
+
+def test_commands_keep_to_what_joints_take(arm):
+    world, _ = arm(9.0)
+    rig = RigModel(world, 2.0)
+    assert rig.limits.commands["force.hip"] == (-30.0, 30.0)
+    assert np.abs(rig._limited("force.hip", np.array([-50.0, 7.0]))).max() == 30.0
+
+
+@pytest.fixture(scope="module")
+def servo():
+    """The rig of a servo with two loads."""
+    runs = tuple(
+        Run(
+            str(mass), TIMES, {"q": 0.3 * np.sin(TIMES)},
+            {"goal": 0.4 * np.sin(TIMES), "torque_enable": np.ones(TIMES.size)},
+            {"mass": mass}, {}, held_out=False,
+        )
+        for mass in (0.1, 0.3)
+    )  # fmt: skip
+    recording = Recording(Path("x.csv"), "servo", "", {}, {}, runs)
+    return RigModel(RunEvaluator(Servo, recording, runs, "batch", candidates=()), 4.0)
+
+
+def test_loads_that_were_there_can_be_had_again(servo):
+    plan = RunPlan(("goal",), "slow sine")
+    loads = {dict(one.constants)["mass"] for one in servo.variants(plan) if one.constants}
+    assert loads == {0.1, 0.3}
+    other = servo.make_run(RunPlan(("goal",), "slow sine", constants=(("mass", 0.3),)))
+    assert other.scenario.constants["mass"] == 0.3
+    assert other.says.endswith("with mass = 0.3")
+    # What was the same all the time is no knob: torque is on, and stays on.
+    assert {name for one in servo.basic() for name in one.driven_inputs} == {"goal"}
+    assert (other.scenario.inputs["torque_enable"] == 1.0).all()
+
+
+def test_commands_have_their_form_their_level_and_their_rate(servo):
+    def goal(plan):
+        run = servo.make_run(plan)
+        return run.scenario.times, run.scenario.inputs["goal"] - servo.rest["goal"]
+
+    most = servo.largest["goal"]
+    _, ramp = goal(RunPlan(("goal",), "ramps up and down", 2.0))
+    assert np.abs(ramp).max() == pytest.approx(2.0 * most, rel=0.02)
+    assert np.abs(np.diff(ramp)).max() == pytest.approx(8.0 * most / 199, rel=0.01)
+    _, holds = goal(RunPlan(("goal",), "holds"))
+    assert np.unique(holds / most).round(9).tolist() == [-1.0, -0.5, 0.0, 0.25, 0.5, 1.0]
+    times, push = goal(RunPlan(("goal",), "a push, then let go", level=0.5))
+    assert push[times > 1.0] == pytest.approx(0.5 * most)
+    assert push[0] == pytest.approx(1.5 * most)
+    coarse, _ = goal(RunPlan(("goal",), "holds", hold_factor=4))
+    assert np.diff(coarse) == pytest.approx(0.08)
+    assert len(coarse) == 50

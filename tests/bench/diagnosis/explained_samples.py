@@ -1,0 +1,139 @@
+"""Small recordings, worlds and made-up fits for the tests of explain."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.core.plugin_registries import simulators
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.diagnosis.fitting.fit_state import TrajectoryFit
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.logs.synthetic_recording import simulate_recording
+from sims.core.simulator import Scenario
+from sims.recording.recording import Recording, Run
+from tests.simulation_arguments import Wish
+
+
+def recording(system="pendulum", **wish):
+    """A simulated recording, nothing written."""
+    return simulate_recording(Wish(system, **wish)).recording
+
+
+def recorded(simulator, theta, starts, times, noise=0.0, seed=0, stated=True):
+    """Runs of any simulator as a recording: an initial state each, or (initial state, inputs)."""
+    rng, runs = np.random.default_rng(seed), []
+    names = [c.name for c in simulator.channels]
+    sigma = np.broadcast_to(np.asarray(noise, dtype=float), (len(names),))
+    for number, start in enumerate(starts, start=1):
+        initial, inputs = start if isinstance(start, tuple) else (start, {})
+        scenario = Scenario(times, initial, inputs)
+        seen = simulator.simulate(np.array([theta], dtype=float), scenario)[0]
+        seen = seen + sigma * rng.standard_normal(seen.shape)
+        columns = dict(zip(names, seen.T.copy(), strict=True))
+        runs.append(Run(str(number), times, columns, dict(scenario.inputs), {}, {}, False))
+    kept = {n: float(s) for n, s in zip(names, sigma, strict=True) if s and stated}
+    return Recording(
+        Path("made.csv"), simulator.name, "made", simulator.constant_values, kept, tuple(runs)
+    )
+
+
+def changed(run, **changes):
+    """The run with samples of channels replaced: name=function of the old ones."""
+    channels = {n: changes.get(n, lambda v: v)(v.copy()) for n, v in run.channels.items()}
+    return replace(run, channels=channels)
+
+
+def with_runs(recorded, runs):
+    """The recording with other runs, named in order."""
+    return replace(
+        recorded, runs=tuple(replace(run, name=str(i)) for i, run in enumerate(runs, start=1))
+    )
+
+
+def world(recorded, **options):
+    """All runs of a recording as the fit meets them."""
+    return RunEvaluator(simulators.get(recorded.system), recorded, recorded.runs, **options)
+
+
+def white(world, sigma):
+    """White noise of every channel, or of each its own."""
+    return NoiseModel(
+        np.broadcast_to(np.asarray(sigma, dtype=float), (len(world.channels),)).copy(), np.zeros(1)
+    ).with_correlation(0.0)
+
+
+def marked(world, stated):
+    """(C,) whether the noise of each channel is stated: of all, or of each its own."""
+    return np.broadcast_to(np.asarray(stated, dtype=bool), (len(world.channels),)).copy()
+
+
+def searched(recorded, sigma, seed=0, stated=True, **options):
+    """A search with the fitted base model entered, and that model."""
+    there = world(recorded, **options)
+    noise = white(there, sigma)
+    base = fit_base_model(there, noise)
+    search = EffectSearch(
+        there,
+        noise,
+        base.insensitive_parameters,
+        np.random.default_rng(seed),
+        marked(there, stated),
+    )
+    return search, search.add_fit(base.fit)
+
+
+def linear_fit(jacobian, q, free=None):
+    """A fit whose Jacobian (R, T, C, q + s) is given, for what needs nothing else of it."""
+    runs, samples, channels, size = jacobian.shape
+    places = np.arange(q) if free is None else np.asarray(free)
+    return TrajectoryFit(
+        (),
+        np.zeros(q),
+        np.zeros((runs, size - q)),
+        places,
+        np.zeros((runs, samples, channels)),
+        jacobian,
+        0.0,
+    )
+
+
+def correlated(rng, phi, sigma, shape):
+    """(R, T, C) stationary first-order autoregressions, sigma and phi a number or (C,)."""
+    made = rng.standard_normal(shape)
+    for t in range(1, shape[1]):
+        made[:, t] = phi * made[:, t - 1] + np.sqrt(1 - np.square(phi)) * made[:, t]
+    return made * sigma
+
+
+def covariance_of(seen, phi):
+    """(n, n) correlations of the seen samples of one channel (R, T): each unbroken stretch is an
+    autoregression.
+    """
+    stretch = np.cumsum(~(seen & np.pad(seen, ((0, 0), (1, 0)))[:, :-1]).ravel())[seen.ravel()]
+    time = np.tile(np.arange(seen.shape[1]), len(seen))[seen.ravel()]
+    near = stretch[:, None] == stretch[None]
+    return (
+        np.where(near, float(phi) ** np.abs(time[:, None] - time), 0.0)
+        if phi
+        else np.eye(time.size)
+    )
+
+
+def everything(values):
+    """A mask of samples that are all there."""
+    return np.ones(values.shape, dtype=bool)
+
+
+def holes(shape, share, seed):
+    """A mask of which so large a share is missing."""
+    return np.random.default_rng(seed).random(shape) > share
+
+
+def autocorrelation(values, lag):
+    """Of values (..., T, C), those so many samples apart."""
+    length = values.shape[-2]
+    here, later = values[..., : length - lag, :], values[..., lag:, :]
+    return float((here * later).mean() / np.square(values).mean())

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from bench.benchmark.runner.standalone_tuning import spread_start_points
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from tests.bench.diagnosis.explained_samples import recorded, recording, white, with_runs, world
+
+TIMES = np.arange(90) / 60
+"""A second and a half."""
+
+
+def ball():
+    return Ball(observe=["x", "z"])
+
+
+@pytest.mark.parametrize("inertia", [1.0e-3, 1.7e-3, 3.0e-3, 5.0e-3, 7.5e-3, 1.0e-2])
+def test_any_inertia_in_the_bounds_is_found(inertia):
+    # from a wrong inertia, the end of a wide swing may be anywhere
+    starts = [{"q": 0.9}, {"q": -2.0, "qd": 4.0}]
+    sigma = [0.003, 0.02]
+    made = recorded(Pendulum(), [inertia], starts, TIMES, sigma, seed=1)
+    there = world(made, candidates=[])
+    base = fit_base_model(there, white(there, sigma))
+    assert base.fit.theta[0] == pytest.approx(inertia, rel=3e-3)
+    samples = np.isfinite(there.observed).sum()
+    assert base.fit.cost / samples == pytest.approx(1.0, abs=0.2)
+    assert not base.insensitive_parameters
+
+
+@pytest.mark.parametrize("restitution", [0.35, 0.93])
+def test_restitution_is_found_through_many_bounces(restitution):
+    starts = [{"z": 2.5, "vx": 0.5}, {"z": 1.5, "vz": 1.0}]
+    times = np.arange(150) / 60
+    made = recorded(ball(), [restitution], starts, times, 0.005)
+    there = world(made, candidates=[])
+    base = fit_base_model(there, white(there, 0.005))
+    assert base.fit.theta[0] == pytest.approx(restitution, abs=2e-3)
+    assert base.fit.cost / np.isfinite(there.observed).sum() == pytest.approx(1.0, abs=0.2)
+
+
+def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
+    # a second of fall from there is five metres
+    starts = [{"z": 20.0, "vx": 1.0}, {"z": 25.0}]
+    times = np.arange(60) / 60
+    made = recorded(ball(), [0.9], starts, times, 0.005)
+    there = world(made, candidates=[])
+    base = fit_base_model(there, white(there, 0.005))
+    assert base.insensitive_parameters == frozenset({0})
+    assert base.fit.theta[0] == there.get_nominal_theta()[0] == 0.5
+    assert base.fit.free.size == 0
+    assert base.fit.cost / np.isfinite(there.observed).sum() == pytest.approx(1.0, abs=0.2)
+
+    # one run that lands is enough
+    hit = recorded(ball(), [0.9], [{"z": 1.0}], TIMES, 0.005)
+    again = world(with_runs(made, [*made.runs, *hit.runs]), candidates=[])
+    touched = fit_base_model(again, white(again, 0.005))
+    assert not touched.insensitive_parameters
+    assert touched.fit.theta[0] == pytest.approx(0.9, abs=5e-3)
+
+
+def test_a_given_start_is_where_it_begins():
+    made = recording(theta=["6e-3"], runs=2, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"])
+    there = world(made, candidates=[])
+    noise = white(there, [0.003, 0.02])
+    many = fit_base_model(there, noise)
+    # what the many starts have cost
+    before = there.simulations
+    one = fit_base_model(there, noise, np.array([5.9e-3]))
+    assert one.fit.theta[0] == pytest.approx(many.fit.theta[0], rel=1e-4)
+    assert there.simulations - before < 0.6 * before, "a single start costs less"
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_starts_are_spread_evenly(dim):
+    points = spread_start_points(64, dim)
+    assert points.shape == (64, dim)
+    assert ((points >= 0) & (points < 1)).all()
+    for column in points.T:
+        assert np.diff(np.sort(column)).max() < 5 / 64, "no large gap along any axis"
+    np.testing.assert_allclose(points.mean(axis=0), 0.5, atol=0.02)

@@ -1,0 +1,81 @@
+"""A base parameter beyond its declared range is fitted there; no cause stands for it."""
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.explain import explain
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.diagnosis.fitting.bound_widening import fit_wider, widened
+from bench.diagnosis.report.summary_text import format_headline, format_summary
+from bench.diagnosis.search.verdict_rules import BORDERING
+from sims.core.simulator import Parameter
+from tests.bench.diagnosis.explained_samples import recording, world
+
+HEAVIER = 1.025
+
+
+@pytest.fixture(scope="module")
+def heavy(tmp_path_factory):
+    """A free swing that asks for an inertia 2.5 % beyond the declared bound: the motion depends on
+    mass / inertia alone, and the description states a larger mass than the simulation had.
+    """
+    path = tmp_path_factory.mktemp("heavy") / "swing.csv"
+    words = ["--theta", "inertia=0.01", "--constant", f"mass={0.15 / HEAVIER}"]
+    words += ["--noise", "q=0.002", "--observe", "q", "--seconds", "2"]
+    assert main(["simulate", "pendulum", "--out", str(path), *words]) == 0
+    about = path.with_suffix(".toml")
+    lines = ["mass = 0.15" if li.startswith("mass") else li for li in about.read_text().split("\n")]
+    about.write_text("\n".join(lines))
+    return path
+
+
+def test_an_inertia_beyond_its_range_is_fitted_and_no_cause_is_named(heavy):
+    found = explain(heavy)
+    answer = found.answer
+    inertia = answer.parameters["inertia"]
+    assert (answer.verdict, answer.causes) == ("adequate", ())
+    assert inertia.value == pytest.approx(0.01 * HEAVIER, rel=2e-3)
+    assert inertia.low < inertia.value < inertia.high
+    said = " ".join(" ".join(format_summary(found.story)).split())
+    assert "lies outside its usual range, 0.001 to 0.01 kg*m^2" in said
+
+
+def test_a_parameter_at_a_bound_that_physics_sets_keeps_a_cause_from_being_named(tmp_path):
+    # Without any loss the restitution is 1, and the drag is found beside it.
+    path = tmp_path / "ball.csv"
+    words = ["--theta", "restitution=1.0", "--noise", "0.002", "--effect", "drag.linear=0.1"]
+    assert main(["simulate", "ball", "--out", str(path), "--seconds", "1", *words]) == 0
+    found = explain(path)
+    answer = found.answer
+    assert answer.verdict == "partial"
+    assert [cause.effect for cause in answer.causes] == ["drag.linear"]
+    assert answer.parameters["restitution"].at_bound == "high"
+    assert answer.meaning == BORDERING
+    assert "parameter restitution ends at the upper bound of its range, 1:" in format_headline(
+        found.story
+    )
+
+
+def test_within_its_range_nothing_is_widened():
+    there = world(recording(runs=2, seconds=1, rate=50), candidates=[])
+    noise = NoiseModel(np.full(len(there.channels), 0.002), np.zeros(len(there.channels)))
+    base = fit_base_model(there, noise)
+    assert fit_wider(there, noise, base) == (base, {})
+
+
+@pytest.mark.parametrize(
+    ("unit", "bounds", "limits", "expected"),
+    [
+        ("kg*m^2", (1e-3, 1e-2), (0.0, float("inf")), (2.5e-4, 4e-2)),
+        ("1", (0.0, 1.0), (0.0, 1.0), (0.0, 1.0)),
+        # A damping that the file states as 0.3 can only be taken away.
+        ("N*m*s/rad", (-0.3, 2.4), (-0.3, 600.0), (-0.3, 10.5)),
+        ("N*m", (-1.0, 1.0), (float("-inf"), float("inf")), (-7.0, 7.0)),
+    ],
+)
+def test_a_range_is_widened_as_far_as_physics_allows(unit, bounds, limits, expected):
+    nominal = max(bounds[0], 0.0)
+    made = widened(Parameter("p", unit, nominal, bounds), limits)
+    assert made == pytest.approx(expected)

@@ -1,0 +1,98 @@
+"""The model that is told: fitted until nothing is left to gain, what it leaves being its noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.validation.gain_and_intervals import compute_intervals
+from sims.systems.slider import Slider
+from tests.bench.diagnosis.explained_samples import correlated, marked, recorded, white, world
+
+MASS, DRAG, SIGMA = 1.3, 0.4, 0.004
+NAME = "drag.linear"
+
+
+@pytest.fixture
+def there():
+    times = np.arange(240) / 60
+    push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
+    made = recorded(Slider(fixed={NAME: DRAG}, observe=["x"]), [MASS], [({}, {"u": push})], times)
+    return world(made, candidates=[NAME])
+
+
+def search_of(there, phi, seed=0):
+    """What is sought in white noise where there is noise of this correlation."""
+    rng = np.random.default_rng(seed)
+    there.observed[...] += correlated(rng, phi, SIGMA, there.observed.shape)
+    return EffectSearch(there, white(there, SIGMA), frozenset(), rng, marked(there, True))
+
+
+def entered(search, theta, iterations, noise=None, exact=False):
+    start = FitStart((NAME,), np.array(theta), search.world.guess)
+    fitter = TrajectoryFitter(search.world, noise or search.noise, exact=exact)
+    return search.add_fit(fitter.fit_models([start], iterations)[0])
+
+
+def off(search, model, best):
+    """How far numbers are from the best ones, in what noise makes of them."""
+    found = compute_intervals(search, best)
+    spread = np.array([(found[i][2] - found[i][1]) / 3.92 for i in range(2)])
+    return np.abs((model.fit.theta - best.fit.theta) / spread).max()
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.8])
+def test_it_is_where_generalised_least_squares_ends(there, phi):
+    search = search_of(there, phi)
+    begun = entered(search, [1.1, 0.1], 2)
+    told = search.to_the_end(begun)
+    assert told.likelihood.phi[0] == pytest.approx(phi, abs=0.12)
+    noise = white(there, told.likelihood.sigma[0]).coloured(told.likelihood.phi)
+    start = FitStart((NAME,), np.array([1.1, 0.1]), there.guess)
+    best = search._of(TrajectoryFitter(there, noise, exact=True).fit_models([start], 60)[0])
+    assert off(search, told, best) < 0.05
+    assert off(search, begun, best) > 0.3
+    assert search.models[frozenset({NAME})] is told
+    # in units of the search's own noise, as all others
+    left = (there.observed - told.fit.simulated)[search.observed_mask] / SIGMA
+    assert told.fit.cost == pytest.approx(float(left @ left), rel=1e-3)
+
+
+def test_what_is_there_already_stays_and_keeps_its_scores(there):
+    search = search_of(there, 0.0)
+    model = entered(search, [MASS, DRAG], 60, exact=True)
+    search.scored[frozenset({NAME})] = "scores"
+    assert off(search, search.to_the_end(model), model) < 0.05
+    assert search.scored[frozenset({NAME})] == "scores"
+    far = entered(search_of(there, 0.0, seed=1), [0.9, 0.0], 0)
+    search.models[frozenset({NAME})] = far
+    search.to_the_end(far)
+    assert frozenset({NAME}) not in search.scored, "of another place they tell nothing"
+
+
+def test_a_model_that_cannot_be_simulated_stays_as_it_is(there):
+    search = search_of(there, 0.0)
+    model = entered(search, [MASS, DRAG], 20)
+    lost = replace(model, fit=replace(model.fit, cost=np.inf))
+    assert search.to_the_end(lost) is lost
+
+
+def test_what_is_left_over_and_is_no_noise_does_not_pull_it_away(there):
+    """A drift that nothing of the model is: weighed as noise that remembers, the fit would rather
+    leave all of it, smooth, with a drag of zero.
+    """
+    search = search_of(there, 0.0)
+    times = np.arange(there.observed.shape[1]) / 60
+    there.observed[...] += 0.5 * (times / times[-1])[None, :, None] ** 3
+    begun = entered(search, [MASS, DRAG], 60, exact=True)
+    noise = white(there, begun.likelihood.sigma[0]).coloured(begun.likelihood.phi)
+    (fit,) = TrajectoryFitter(there, noise, exact=True).fit_models([begun.fit.make_start()], 60)
+    pulled = search._of(replace(fit, cost=TrajectoryFitter(there, search.noise).compute_cost(fit)))
+    assert pulled.merit > begun.merit
+    assert pulled.fit.cost > 2.0 * begun.fit.cost
+    assert pulled.fit.theta[1] == 0.0
+    told = search.to_the_end(begun)
+    assert told.fit.cost < 1.2 * begun.fit.cost

@@ -1,0 +1,97 @@
+"""Derivatives that serve for several steps: what they learn, and when they are taken anew."""
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.integrator_check import MAX_CORRECTED_ERROR, StepRefinement
+from bench.diagnosis.fitting.fit_state import FitPoint, FitStart, FitState, KnownJacobian
+from sims.robot.integrator_settings import IntegratorSettings
+
+RNG = np.random.default_rng(4)
+RUNS, LENGTH, CHANNELS, SHARED, STATES = 2, 7, 2, 3, 2
+TRUE = RNG.normal(size=(RUNS, LENGTH, CHANNELS, SHARED + STATES))
+
+
+def linear(theta, states):
+    """What a linear world shows, (R, T, C)."""
+    unknown = np.concatenate([np.broadcast_to(theta, (RUNS, SHARED)), states], axis=1)
+    return np.einsum("rtcq,rq->rtc", TRUE, unknown)
+
+
+def at(theta, states, jacobian):
+    start = FitStart((), np.array(theta), np.array(states))
+    return FitPoint(start, linear(start.theta, start.states), jacobian, 1.0)
+
+
+def problem(jacobian, steps=None):
+    """One that stands at zero, with derivatives that may be wrong."""
+    zero = at(np.zeros(SHARED), np.zeros((RUNS, STATES)), jacobian)
+    steps = np.ones(SHARED + STATES) if steps is None else steps
+    bounds = -np.ones(SHARED), np.ones(SHARED), 2 * np.ones(SHARED)
+    return FitState(zero, np.arange(SHARED), *bounds, steps)
+
+
+def moved(theta, states):
+    return np.concatenate([np.broadcast_to(theta, (RUNS, SHARED)), states], axis=1)
+
+
+def test_derivatives_agree_with_the_step_that_they_have_learnt_from():
+    wrong = TRUE + RNG.normal(size=TRUE.shape)
+    theta, states = RNG.normal(size=SHARED), RNG.normal(size=(RUNS, STATES))
+    learnt = problem(wrong).learnt(at(theta, states, wrong))
+    step = moved(theta, states)
+    np.testing.assert_allclose(np.einsum("rtcq,rq->rtc", learnt, step), linear(theta, states))
+    across = RNG.normal(size=step.shape)
+    across -= step * np.sum(across * step, axis=1, keepdims=True) / np.sum(step**2, axis=1)[:, None]
+    before, after = (np.einsum("rtcq,rq->rtc", j, across) for j in (wrong, learnt))
+    np.testing.assert_allclose(after, before, err_msg="nothing was seen across the step")
+
+
+def test_as_many_steps_as_unknowns_make_derivatives_right():
+    """Steps along one unknown after another, each in its own scale."""
+    steps = 10.0 ** RNG.uniform(-4, 2, SHARED + STATES)
+    jacobian = np.zeros_like(TRUE)
+    for k in range(SHARED + STATES):
+        unit = steps * (np.arange(SHARED + STATES) == k)
+        theta, states = unit[:SHARED], np.tile(unit[SHARED:], (RUNS, 1))
+        jacobian = problem(jacobian, steps).learnt(at(theta, states, jacobian))
+    np.testing.assert_allclose(jacobian, TRUE, rtol=1e-9)
+
+
+def test_a_run_that_nothing_moved_teaches_nothing():
+    wrong = TRUE + 1.0
+    states = np.array([[0.0, 0.0], [0.3, -0.1]])
+    learnt = problem(wrong).learnt(at(np.zeros(SHARED), states, wrong))
+    assert np.array_equal(learnt[0], wrong[0])
+    assert not np.allclose(learnt[1], wrong[1])
+
+
+def test_what_has_converged_with_derivatives_of_another_point_is_not_believed():
+    there = problem(TRUE)
+    there.here = False
+    there.mark_converged()
+    assert (there.done, there.is_jacobian_stale, there.is_waiting) == (False, True, True)
+    there.here = True
+    there.finish()
+    assert there.done
+
+
+def test_known_derivatives_follow_the_parameters_that_they_are_by():
+    known = KnownJacobian(np.array([0, 4, 5]), TRUE[..., :3])
+    fewer = known.drop_parameters([4])
+    assert fewer.free.tolist() == [0, 5]
+    assert np.array_equal(fewer.jacobian, TRUE[..., [0, 2]])
+    more = fewer.add_parameters(range(7, 9), TRUE[..., 3:])
+    assert more.free.tolist() == [0, 5, 7, 8]
+    assert np.array_equal(more.jacobian, TRUE[..., [0, 2, 3, 4]])
+
+
+@pytest.mark.parametrize(
+    ("rest", "left", "suits"),
+    [(0.09, 0.0, True), (0.11, 1.0, False), (0.6, 11.0, False), (0.6, 13.0, True)],
+)
+def test_a_step_suits_that_errs_by_little_of_the_noise_or_of_what_is_left(rest, left, suits):
+    own = IntegratorSettings(0.002, "Euler")
+    fine = StepRefinement(object, own, own._replace(timestep=0.001), 5.0, rest)
+    assert MAX_CORRECTED_ERROR == 0.1
+    assert fine.is_accurate_enough(left) is suits

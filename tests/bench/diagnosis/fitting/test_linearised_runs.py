@@ -1,0 +1,87 @@
+"""Whether a robot's motion forgets how it began."""
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
+from bench.diagnosis.fitting.multiple_shooting import forgets_initial_state
+from bench.logs.inspection import load_recording
+from sims.core.simulator import Scenario
+from tests.sims.robot.test_robot_motion import kind_of
+
+ARM = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
+<joint name="hinge" axis="0 1 0" damping="{damping}"/>
+<inertial pos="0 0 -0.3" mass="0.8" diaginertia="0.002 0.002 0.002"/></body></worldbody>
+{drive}</mujoco>
+"""
+SERVO = '<actuator><position name="m" joint="hinge" kp="30" kv="2"/></actuator>'
+TIMES = np.arange(0, 2, 0.02)
+
+
+def world(tmp_path, text):
+    """A log of two runs of an arm."""
+    kind = kind_of(text)
+    simulator = kind(observe=["q.hinge"])
+    rows = ["run,t,q.hinge" + (",u.m" if "u.m" in str(kind.system.inputs) else "")]
+    for run, angle in enumerate((0.3, -0.2)):
+        inputs = {c.name: 0.2 * np.sin(3 * TIMES + run) for c in simulator.inputs if "u." in c.name}
+        given = {c.name: inputs.get(c.name, np.zeros(TIMES.size)) for c in simulator.inputs}
+        seen = simulator.simulate(np.empty((1, 0)), Scenario(TIMES, {"q.hinge": angle}, given))[0]
+        columns = [seen[:, 0], *inputs.values()]
+        rows += [
+            ",".join([str(run), *(f"{v:.9f}" for v in row)])
+            for row in zip(TIMES, *columns, strict=True)
+        ]
+    (tmp_path / "arm.xml").write_text(text)
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    toml = 'model = "arm.xml"\n[channels."q.hinge"]\nunit = "rad"\n'
+    toml += '[inputs."u.m"]\nunit = "rad"\n' if "u.m" in rows[0] else ""
+    (tmp_path / "log.toml").write_text(toml)
+    recording, kind = load_recording(tmp_path / "log.csv")
+    return RunEvaluator(kind, recording, recording.runs, None, [], ())
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (ARM.format(damping=0.1, drive=SERVO), True),
+        (ARM.format(damping=0.01, drive=""), False),
+        (ARM.format(damping=3.0, drive=""), False),
+        (ARM.format(damping=0.4, drive=""), True),
+    ],
+    ids=["servo", "swinging", "creeping", "damped"],
+)
+def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
+    tmp_path, text, expected
+):
+    there = world(tmp_path, text)
+    noise = NoiseModel(np.array([1e-3]), np.zeros(1))
+    by_states = compute_state_jacobian(there, there.nominal(), there.guess)
+    assert forgets_initial_state(there, noise, by_states) is expected
+    known = np.zeros_like(by_states)
+    assert not forgets_initial_state(there, noise, known), (
+        "what is known shows nothing of how long it acts"
+    )
+
+
+def test_a_lane_that_was_simulated_is_not_simulated_again(tmp_path):
+    there = world(tmp_path, ARM.format(damping=0.4, drive=SERVO))
+    theta = np.tile(there.nominal(), (3, 1))
+    runs = np.array([0, 1, 0])
+    states = there.guess[runs] + np.array([[0.0], [0.0], [0.1]])
+    first = there.simulate(theta, runs, states)
+    assert there.simulations == 3
+    again = there.simulate(theta[::-1], runs[::-1], states[::-1])
+    assert there.simulations == 3
+    np.testing.assert_array_equal(again[::-1], first)
+    # A part of a run, or another run, is another lane.
+    half = there.simulate(theta[:1], runs[:1], states[:1], 0.5)
+    assert there.simulations == 4
+    assert np.isnan(half).any()
+    # What is taken out of all simulations is no part of what is held.
+    there.correction = np.full(there.observed.shape, 1.0)
+    np.testing.assert_array_equal(there.simulate(theta, runs, states), first + 1.0)
+    assert there.simulations == 4

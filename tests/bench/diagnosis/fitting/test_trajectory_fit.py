@@ -1,0 +1,235 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.trajectory_fit import (
+    OBSERVED_STATE_PRIOR_SIGMA,
+    UNOBSERVED_STATE_PRIOR_SIGMA,
+    TrajectoryFitter,
+    compute_state_prior,
+)
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from tests.bench.diagnosis.explained_samples import (
+    changed,
+    recorded,
+    recording,
+    white,
+    with_runs,
+    world,
+)
+
+TRUTH = 2.7e-3
+
+
+def swings():
+    """Runs of different lengths and rates, without noise."""
+    made = []
+    for q, rate, samples in ((0.7, 50, 60), (-1.2, 80, 130), (2.2, 100, 90)):
+        times = np.arange(samples) / rate
+        made.append(recorded(Pendulum(), [TRUTH], [{"q": q}], times))
+    return with_runs(made[0], [part.runs[0] for part in made])
+
+
+def fitted(there, theta=None, sigma=1e-3, iterations=30, states=None, effects=(), **options):
+    theta = there.get_nominal_theta() if theta is None else theta
+    start = FitStart(effects, theta, there.guess if states is None else states)
+    return TrajectoryFitter(there, white(there, sigma), **options).fit_models([start], iterations)[
+        0
+    ]
+
+
+def test_parameters_and_initial_states_of_noiseless_runs_come_back():
+    there = world(swings())
+    fit = fitted(there)
+    assert there.observed.shape == (3, 130, 2)
+    assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
+    released = [[0.7, 0], [-1.2, 0], [2.2, 0]]
+    np.testing.assert_allclose(fit.states, released, atol=1e-3)
+    seen = np.isfinite(there.observed)
+    # below the noise that the fit is told of, in rad/s
+    assert np.abs(fit.simulated - there.observed)[seen].max() < 1e-3
+    assert fit.cost < 60, "sum of squares over 560 samples in units of a noise of 1e-3"
+    assert not seen[0, 60:].any()
+
+
+def test_restitution_and_six_initial_states_of_noiseless_bounces():
+    times = np.arange(90) / 60
+    starts = [
+        {"z": 2.0, "vx": 1.0, "vz": 0.5},
+        {"z": 3.0, "y": 0.3, "vy": -0.7},
+    ]
+    there = world(recorded(Ball(observe=["x", "y", "z"]), [0.72], starts, times))
+    fit = fitted(there)
+    assert fit.theta[0] == pytest.approx(0.72, abs=2e-5)
+    # x, y, z and their rates
+    expected = [
+        [0, 0, 2, 1, 0, 0.5],
+        [0, 0.3, 3, 0, -0.7, 0],
+    ]
+    np.testing.assert_allclose(fit.states, expected, atol=1e-4)
+
+
+def test_an_effect_is_fitted_with_the_parameters():
+    made = recording(effects=["drag.linear=8e-4"], theta=["2.7e-3"], runs=2, seconds=1.5, rate=60)
+    there = world(made, candidates=["drag.linear", "friction.coulomb"])
+    fit = fitted(there, effects=("drag.linear",))
+    assert list(fit.free) == [0, 1]
+    assert fit.theta[0] == pytest.approx(TRUTH, rel=1e-4)
+    assert fit.theta[1] == pytest.approx(8e-4, rel=1e-3)
+    assert fit.theta[2] == 0
+
+
+def test_the_jacobian_is_the_derivative():
+    there = world(swings(), candidates=["drag.linear"])
+    fit = fitted(there, effects=("drag.linear",))
+    runs = np.arange(3)
+    for column, step in ((0, 1e-6), (1, 1e-6)):
+        moved = np.tile(fit.theta, (2, 1))
+        moved[:, column] += [step, 2 * step]  # drag cannot be negative
+        thetas = [np.tile(theta, (3, 1)) for theta in moved]
+        one, two = (there.simulate(theta, runs, fit.states) for theta in thetas)
+        # second order, from three points on one side
+        forward = (4 * one - two - 3 * fit.simulated) / (2 * step)
+        near = np.isfinite(forward)
+        scale = np.abs(forward[near]).max()
+        np.testing.assert_allclose(
+            fit.jacobian[..., column][near], forward[near], atol=0.02 * scale
+        )
+
+
+def test_several_models_in_one_call_equal_one_by_one():
+    there = world(swings(), candidates=["drag.linear", "friction.coulomb", "sensor.delay"])
+    starts = []
+    for effects, inertia in (
+        ((), 2e-3),
+        (("drag.linear",), 4e-3),
+        (("sensor.delay",), 3e-3),
+        ((), 6e-3),
+    ):
+        theta = there.get_nominal_theta()
+        theta[0] = inertia
+        starts.append(FitStart(effects, theta, there.guess))
+    fitter = TrajectoryFitter(there, white(there, 1e-3))
+    together = fitter.fit_models(starts, 6)
+    alone = [fitter.fit_models([start], 6)[0] for start in starts]
+    for a, b in zip(together, alone, strict=True):
+        assert a.effects == b.effects
+        np.testing.assert_allclose(a.theta, b.theta, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(a.states, b.states, rtol=1e-9, atol=1e-12)
+        assert a.cost == pytest.approx(b.cost, rel=1e-6, abs=1e-9)
+
+
+def test_missing_samples_change_nothing_but_what_is_known():
+    rng = np.random.default_rng(3)
+    runs = []
+    for run in swings().runs:
+        lost = {name: rng.random(run.times.size) < 0.4 for name in ("q", "qd")}
+        q, qd = (np.where(lost[name], np.nan, run.channels[name]) for name in ("q", "qd"))
+        runs.append(changed(run, q=lambda _, q=q: q, qd=lambda _, qd=qd: qd))
+    there = world(replace(swings(), runs=tuple(runs)))
+    fit = fitted(there)
+    assert np.isnan(there.observed).sum() > 200
+    assert fit.theta[0] == pytest.approx(TRUTH, rel=2e-5)
+    np.testing.assert_allclose(fit.states[:, 0], [0.7, -1.2, 2.2], atol=1.5e-4)
+
+
+def test_only_the_first_share_counts():
+    def spoilt(values):
+        values[values.size // 2 :] = 50.0
+        return values
+
+    runs = tuple(changed(run, q=spoilt, qd=spoilt) for run in swings().runs)
+    there = world(replace(swings(), runs=runs))
+    assert fitted(there, share=0.45).theta[0] == pytest.approx(TRUTH, rel=1e-4)
+    assert abs(fitted(there).theta[0] / TRUTH - 1) > 0.05
+
+
+def test_bounds_are_kept():
+    starts, times = [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60
+    # motion that feeds itself
+    runaway = Pendulum(fixed={"drag.linear": -5e-4})
+    made = recorded(runaway, [TRUTH], starts, times)
+    there = world(made, candidates=["drag.linear"])
+    theta = there.get_nominal_theta()
+    theta[1] = 1e-4
+    fit = fitted(there, theta, effects=("drag.linear",))
+    assert fit.theta[1] == 0.0, "drag that pushes is none"
+
+
+def test_a_parameter_that_would_leave_its_bounds_ends_at_them():
+    starts, times = [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60
+    # a tenth of the gravity that the recording states asks for ten times the inertia
+    light = recorded(Pendulum({"gravity": 0.981}), [6e-3], starts, times)
+    there = world(replace(light, constants={**light.constants, "gravity": 9.81}))
+    theta = there.get_nominal_theta()
+    theta[0] = 8e-3
+    assert fitted(there, theta).theta[0] == 1e-2, "an inertia of 6e-2 would be needed"
+
+
+def test_frozen_parameters_and_known_initial_states_stay():
+    made = swings()
+    # the first one is stated wrongly, and believed all the same
+    stated = (0.71, -1.2, 2.2)
+    runs = [replace(run, initial={"q": q}) for run, q in zip(made.runs, stated, strict=True)]
+    there = world(replace(made, runs=tuple(runs)))
+    fit = fitted(there)
+    assert tuple(fit.states[:, 0]) == stated
+    assert (there.known == [[True, False]] * 3).all()
+    assert np.abs(fit.states[1:, 1]).max() > 0
+    frozen = fitted(world(made), frozen=frozenset({0}))
+    assert frozen.theta[0] == 3.3e-3
+    assert frozen.free.size == 0
+    alone = fitted(world(made), parameters=False)
+    assert alone.theta[0] == 3.3e-3
+    assert alone.cost > 1e3 * fitted(world(made)).cost
+
+
+def test_no_derivative_is_simulated_by_what_is_known():
+    made = swings()
+    told = [{"q": 0.7, "qd": 0.0}, {"q": -1.2}, {"q": 2.2}]
+    runs = [replace(run, initial=known) for run, known in zip(made.runs, told, strict=True)]
+    there = world(replace(made, runs=tuple(runs)))
+    fit = fitted(there, iterations=0)
+    assert there.simulations == 3 * (1 + 1 + 1), "as it is, the inertia moved, the rate moved"
+    usual = fitted(world(made), iterations=0, states=there.guess)
+    np.testing.assert_array_equal(fit.jacobian[..., 0], usual.jacobian[..., 0])
+    assert not fit.jacobian[..., 1].any()
+    assert not fit.jacobian[0, ..., 2].any(), "a state that only one run states"
+    assert fit.jacobian[1:, ..., 2].any()
+
+
+def test_what_is_known_beforehand_depends_on_the_channels():
+    made = recording(runs=1, seconds=0.5, observe=["q"])
+    np.testing.assert_array_equal(
+        compute_state_prior(world(made)), [OBSERVED_STATE_PRIOR_SIGMA, OBSERVED_STATE_PRIOR_SIGMA]
+    )
+    only_rate = recording(runs=1, seconds=0.5, observe=["qd"])
+    np.testing.assert_array_equal(
+        compute_state_prior(world(only_rate)),
+        [UNOBSERVED_STATE_PRIOR_SIGMA, OBSERVED_STATE_PRIOR_SIGMA],
+    )
+
+
+def test_least_squares_with_coloured_noise_is_generalised():
+    """With noise that remembers, fits that know it come nearer to the truth."""
+    times, errors = np.arange(150) / 100, []
+    rng = np.random.default_rng(11)
+    for _ in range(12):
+        clean = recorded(Pendulum(observe=["q"]), [TRUTH], [{"q": 1.0}], times)
+        noise = rng.standard_normal(150)
+        for t in range(1, 150):
+            noise[t] = 0.95 * noise[t - 1] + np.sqrt(1 - 0.95**2) * noise[t]
+        run = changed(clean.runs[0], q=lambda v, noise=noise: v + 0.02 * noise)
+        there = world(replace(clean, runs=(run,)))
+        start = FitStart((), there.get_nominal_theta(), there.guess)
+        plain = white(there, 0.02)
+        # the same noise, once taken for white and once for what it is
+        fitters = [TrajectoryFitter(there, noise) for noise in (plain, plain.coloured(0.95))]
+        fits = [fitter.fit_models([start], 20)[0] for fitter in fitters]
+        errors.append([fit.theta[0] / TRUTH - 1 for fit in fits])
+    ordinary, generalised = np.sqrt(np.square(errors).mean(axis=0))
+    assert generalised < 0.85 * ordinary
+    assert generalised < 0.01

@@ -1,0 +1,155 @@
+"""The filter, the smoother and the process noise against dense linear algebra."""
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.kalman.filter_and_smoother import (
+    LinearRuns,
+    filter_runs,
+    fit_process_noise,
+    smooth_runs,
+    with_coloured_noise,
+)
+
+SAMPLES, SIZE = 12, 2
+SIGMA, FORCE = 0.1, 0.7
+JUMPS = [3, 7]
+
+
+def runs_of(residuals, prior=(0.5, 0.8), with_jumps=False):
+    """A body of unit mass whose position is read, with an unknown force between samples."""
+    number, samples, _ = residuals.shape
+    a = np.array([[1.0, 0.1], [-0.05, 0.98]])
+    g = np.array([[0.005], [0.1]])
+    shape = (number, samples - 1)
+    jumps = np.zeros((*shape, 2))
+    jumps[:, JUMPS] = 0.3, 2.0
+    return LinearRuns(
+        states=np.broadcast_to(a, (*shape, 2, 2)).copy(),
+        defects=np.broadcast_to([0.01, -0.02], (*shape, 2)).copy(),
+        forces=np.broadcast_to(g, (*shape, 2, 1)).copy(),
+        inputs=np.zeros((*shape, 2, 1)),
+        readings=np.broadcast_to([[1.0, 0.0]], (number, samples, 1, 2)).copy(),
+        residuals=residuals,
+        recorded=np.isfinite(residuals),
+        prior=np.array(prior),
+        step_errors=np.zeros((*shape, 2)),
+        jumps=jumps if with_jumps else np.zeros_like(jumps),
+    )
+
+
+def dense(runs, noise):
+    """Mean (T,) and covariance of the readings, and the matrix from unknowns to states: the first
+    state in units of its prior, then the forces, then the jumps.
+    """
+    samples = runs.residuals.shape[1]
+    mean, states = np.zeros(SIZE), [np.zeros(SIZE)]
+    more = (1 + SIZE) * (samples - 1)
+    columns = np.concatenate([np.diag(runs.prior), np.zeros((SIZE, more))], axis=1)
+    maps = [columns]
+    for i in range(samples - 1):
+        a, g = runs.states[0, i], runs.forces[0, i, :, 0]
+        mean = a @ mean - runs.defects[0, i]
+        columns = a @ columns
+        columns[:, SIZE + i] += FORCE * g
+        first = SIZE + samples - 1 + SIZE * i
+        columns[:, first : first + SIZE] += np.diag(runs.jumps[0, i])
+        states.append(mean)
+        maps.append(columns)
+    maps, states = np.array(maps), np.array(states)
+    read = maps[:, 0]
+    return states, maps, read @ read.T + noise
+
+
+@pytest.fixture
+def residuals():
+    return np.random.default_rng(3).normal(size=(1, SAMPLES, 1))
+
+
+@pytest.mark.parametrize("with_jumps", [False, True])
+def test_the_likelihood_is_that_of_the_joint_distribution(residuals, with_jumps):
+    runs = runs_of(residuals, with_jumps=with_jumps)
+    states, _, covariance = dense(runs, SIGMA**2 * np.eye(SAMPLES))
+    error = residuals[0, :, 0] - states[:, 0]
+    expected = -0.5 * (
+        np.linalg.slogdet(covariance)[1] + error @ np.linalg.solve(covariance, error)
+    )
+    found = filter_runs(runs, np.array([FORCE]), np.array([SIGMA**2]))
+    assert found.log_likelihood[0] == pytest.approx(expected, rel=1e-10)
+    assert np.square(found.whitened).sum() == pytest.approx(
+        error @ np.linalg.solve(covariance, error), rel=1e-10
+    )
+
+
+def test_coloured_noise_has_the_covariance_of_a_first_order_process(residuals):
+    phi = 0.8
+    lags = np.abs(np.subtract.outer(np.arange(SAMPLES), np.arange(SAMPLES)))
+    runs, white = with_coloured_noise(
+        runs_of(residuals), NoiseModel(np.array([SIGMA]), np.array([phi]))
+    )
+    noise = SIGMA**2 * phi**lags + white[0] * np.eye(SAMPLES)
+    states, _, covariance = dense(runs_of(residuals), noise)
+    error = residuals[0, :, 0] - states[:, 0]
+    expected = -0.5 * (
+        np.linalg.slogdet(covariance)[1] + error @ np.linalg.solve(covariance, error)
+    )
+    found = filter_runs(runs, np.array([FORCE]), white)
+    assert found.log_likelihood[0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("with_jumps", [False, True])
+def test_the_smoother_gives_conditional_means(residuals, with_jumps):
+    runs = runs_of(residuals, with_jumps=with_jumps)
+    states, maps, covariance = dense(runs, SIGMA**2 * np.eye(SAMPLES))
+    error = residuals[0, :, 0] - states[:, 0]
+    unknowns = maps[:, 0].T @ np.linalg.solve(covariance, error)
+    force = np.array([FORCE])
+    found = smooth_runs(runs, filter_runs(runs, force, np.array([SIGMA**2])), force)
+    np.testing.assert_allclose(found.states[0], states + maps @ unknowns, atol=1e-10)
+    np.testing.assert_allclose(
+        found.forces[0, :, 0], FORCE * unknowns[SIZE : SIZE + SAMPLES - 1], atol=1e-10
+    )
+
+
+def test_a_missing_sample_is_no_sample(residuals):
+    gone = residuals.copy()
+    gone[0, 5] = np.nan
+    runs = runs_of(gone)
+    runs.readings[~runs.recorded] = 0.0
+    runs.residuals[~runs.recorded] = 0.0
+    states, _, covariance = dense(runs_of(residuals), SIGMA**2 * np.eye(SAMPLES))
+    there = np.arange(SAMPLES) != 5
+    error = (residuals[0, :, 0] - states[:, 0])[there]
+    own = covariance[np.ix_(there, there)]
+    expected = -0.5 * (np.linalg.slogdet(own)[1] + error @ np.linalg.solve(own, error))
+    found = filter_runs(runs, np.array([FORCE]), np.array([SIGMA**2]))
+    assert found.log_likelihood[0] == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("begin", [0.02, 20.0])
+def test_the_process_noise_is_found_by_maximum_likelihood(begin):
+    rng = np.random.default_rng(8)
+    number, samples = 6, 200
+    runs = runs_of(np.zeros((number, samples, 1)))
+    x = rng.normal(size=(number, 2)) * runs.prior
+    for i in range(samples):
+        runs.residuals[:, i, 0] = x[:, 0] + SIGMA * rng.normal(size=number)
+        if i + 1 < samples:
+            pushed = FORCE * rng.normal(size=number)[:, None] * runs.forces[:, i, :, 0]
+            x = x @ runs.states[0, 0].T - runs.defects[:, i] + pushed
+    white, typical = np.array([SIGMA**2]), np.array([1.0])
+    force, filtered, _ = fit_process_noise(runs, np.array([begin]), white, typical)
+    assert force[0] == pytest.approx(FORCE, rel=0.25)
+    around = [
+        filter_runs(runs, force * factor, white).log_likelihood.sum() for factor in (0.6, 1.6)
+    ]
+    assert filtered.log_likelihood.sum() > max(around)
+
+
+def test_no_process_noise_is_found_where_the_model_is_right():
+    rng = np.random.default_rng(9)
+    runs = runs_of(SIGMA * rng.normal(size=(6, 150, 1)), prior=(1e-6, 1e-6))
+    runs.defects[:] = 0.0
+    force, *_ = fit_process_noise(runs, np.array([0.5]), np.array([SIGMA**2]), np.array([1.0]))
+    assert force[0] < 0.05

@@ -1,0 +1,73 @@
+"""Free numbers of a model file, identified by prediction errors; plain MuJoCo makes the data."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.explain import explain
+
+CARRIAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/>
+<worldbody><body name="carriage"><joint name="screw" type="slide" axis="1 0 0" {joint}/>
+<geom name="block" type="box" size="0.2 0.2 0.1" mass="{mass}"/></body></worldbody>
+<actuator><motor name="drive" joint="screw"/></actuator></mujoco>
+"""
+STIFF = 'solreffriction="0.001 1" solimpfriction="0.99 0.999 0.001"'
+MASS, DAMPING, FRICTION = 80.0, 200.0, 20.0
+"""Of the carriage that moves: kg, N s/m, N. Its model file states 100 kg, and nothing that rubs."""
+NOISE = 2e-5
+"""Of the position, 1 sigma in m."""
+STIFFNESS, DERIVATIVE = 40_000.0, 3_000.0
+"""Of the position control that makes the force, N/m and N s/m."""
+
+
+def rows_of(seed):
+    """A log at 100 Hz of a carriage that follows a command, with the force that moves it."""
+    rng = np.random.default_rng(seed)
+    joint = f'damping="{DAMPING}" frictionloss="{FRICTION}" {STIFF}'
+    model = mujoco.MjModel.from_xml_string(CARRIAGE.format(joint=joint, mass=MASS))
+    data = mujoco.MjData(model)
+    phases, rows = rng.uniform(0, 2 * np.pi, 3), []
+    for k in range(500):
+        t = 0.01 * k
+        wanted = sum(
+            0.03 * np.sin(2 * np.pi * f * t + p)
+            for f, p in zip((0.3, 0.7, 1.3), phases, strict=True)
+        )
+        force = STIFFNESS * (wanted - data.qpos[0]) - DERIVATIVE * data.qvel[0]
+        rows.append((seed, t, data.qpos[0] + NOISE * rng.standard_normal(), force))
+        data.ctrl[0] = force
+        for _ in range(10):
+            mujoco.mj_step(model, data)
+    return rows
+
+
+@pytest.fixture(scope="module")
+def answer(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("carriage")
+    (folder / "model.xml").write_text(CARRIAGE.format(joint="", mass=100))
+    rows = [row for seed in (1, 2, 3) for row in rows_of(seed)]
+    lines = ["run,t,x,u", *(",".join(f"{value:.9g}" for value in row) for row in rows)]
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    description = (
+        'model = "model.xml"\nfree = ["mass@carriage"]\n[time]\ncolumn = "t"\n'
+        f'[channels."q.screw"]\ncolumn = "x"\nunit = "m"\nnoise = {NOISE}\n'
+        '[inputs."u.drive"]\ncolumn = "u"\nunit = "N"\n[runs.3]\nheld_out = true\n'
+    )
+    (folder / "log.toml").write_text(description)
+    return explain(folder / "log.csv").answer
+
+
+@pytest.mark.slow
+def test_a_mass_is_identified_beside_friction_that_the_file_lacks(answer):
+    """A fit of the mass alone makes it ten times as heavy, since friction slows it as well."""
+    assert answer.verdict == "named"
+    assert answer.parameters["mass.scale@carriage"].value == pytest.approx(MASS / 100 - 1, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_friction_is_found_beside_it(answer):
+    causes = {cause.effect: cause for cause in answer.causes}
+    assert set(causes) == {"friction.coulomb@screw", "drag.linear@screw"}
+    numbers = {name: cause.coefficients["coefficient"].value for name, cause in causes.items()}
+    assert numbers["friction.coulomb@screw"] == pytest.approx(FRICTION, rel=0.03)
+    assert numbers["drag.linear@screw"] == pytest.approx(DAMPING, rel=0.03)

@@ -1,0 +1,150 @@
+"""The linear model about a measured motion against simulations with an effect."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.logs.joined_recordings import load_joined
+from sims.robot.dynamics.measured_linearisation import MeasuredLinear, Trajectory, quintic
+from sims.robot.floating_joints import FloatingState
+
+EXAMPLE = Path(__file__).parents[4] / "examples" / "robot" / "log.csv"
+
+EFFECTS = {
+    "drag.linear@elbow": (0.02,),
+    "force.bias@shoulder": (0.3,),
+    "inertia.armature@elbow": (0.01,),
+    "mass.scale@forearm": (0.01,),
+    "gravity.scale": (0.02,),
+    "input.gain@m_shoulder": (0.03,),
+}
+
+
+@pytest.fixture(scope="module")
+def world():
+    recording, kind = load_joined([EXAMPLE], None, None, ())
+    return RunEvaluator(kind, recording, recording.training()[:1], kind.default_engine)
+
+
+def theta_of(world, name, c):
+    theta = world.nominal()
+    theta[world.slots[name]] = c
+    return theta
+
+
+def motion_with(world, theta):
+    """The linear model about the motion that the simulator makes with some parameters."""
+    half = len(world.states) // 2
+    start = world.guess[0, :half], world.guess[0, half:]
+    simulated = MeasuredLinear(world.simulator, theta, world.tracks[0].scenario, start)
+    x, v, _ = simulated.trajectory
+    nothing = FloatingState(np.zeros((len(x), 0)), np.zeros((len(x), 0)))
+    motion = Trajectory(x, v, nothing)
+    return MeasuredLinear(world.simulator, world.nominal(), world.tracks[0].scenario, start, motion)
+
+
+def added(linear, world, name, c):
+    """What an effect adds about the motion, with no deviation from it."""
+    size = 2 * (len(world.states) // 2)
+    return linear.added([(world.effects[name], c)], np.zeros((linear.knots.size, size)))
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(world, name):
+    """Eq. (3) of `sims.robot.dynamics.measured_linearisation` with δ = 0: the defects are Σ c b."""
+    c = np.array(EFFECTS[name])
+    linear = motion_with(world, theta_of(world, name, c))
+    maps = linear.interval_maps()
+    pushed, _ = added(linear, world, name, c)
+    expected = (maps.inputs @ pushed)[:, :, 0]
+    joints = len(world.states) // 2
+    # Velocities alone: a force is taken for its mean, which moves positions a little otherwise.
+    found, wanted = maps.defects[:, joints:], expected[:, joints:]
+    error = np.sqrt(np.square(found - wanted).mean()) / np.sqrt(np.square(wanted).mean())
+    assert error < 0.02, f"{name}: {error:.3f}"
+
+
+def test_without_an_effect_nothing_is_missed(world):
+    maps = motion_with(world, world.nominal()).interval_maps()
+    assert np.abs(maps.defects).max() < 1e-9
+
+
+def test_a_sensor_effect_changes_readings_alone(world):
+    linear = motion_with(world, world.nominal())
+    pushed, readings = added(linear, world, "sensor.bias@q.elbow", np.array([0.01]))
+    column = world.channels.index("q.elbow")
+    np.testing.assert_allclose(readings[:, column, 0], 0.01, atol=1e-7)
+    assert not pushed.any()
+
+
+def test_a_gain_of_a_sensor_acts_on_what_is_predicted(world):
+    """Not on the reading itself, whose noise it would explain."""
+    linear = motion_with(world, world.nominal())
+    predicted = np.zeros((linear.knots.size, 2 * (len(world.states) // 2)))
+    elbow = world.channels.index("q.elbow")
+    predicted[:, world.simulator.system.coordinates.index("q.elbow")] = 0.2
+    _, readings = linear.added([(world.effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted)
+    wanted = 0.5 * (linear.observed[:, elbow] + 0.2)
+    np.testing.assert_allclose(readings[:, elbow, 0], wanted, atol=1e-6)
+
+
+def test_jacobians_of_other_commands_are_not_used_again(world):
+    """Delayed steps change between samples, so that more instants are looked at."""
+    scenario, half = world.tracks[0].scenario, len(world.states) // 2
+    steps = {name: np.full_like(values, values[0]) for name, values in scenario.inputs.items()}
+    for values in steps.values():
+        for sample in (3, 8, 14, 21, 29):
+            values[sample:] += 0.06
+    scenario = replace(scenario, inputs=steps)
+    start = world.guess[0, :half], world.guess[0, half:]
+    nominal = MeasuredLinear(world.simulator, world.nominal(), scenario, start)
+    delayed = theta_of(world, "input.delay@m_shoulder", (0.013,))
+    given = delayed, scenario, start, nominal.trajectory
+    anew = MeasuredLinear(world.simulator, *given)
+    reused = MeasuredLinear(world.simulator, *given, nearby=nominal)
+    np.testing.assert_allclose(
+        reused.interval_maps().defects, anew.interval_maps().defects, atol=1e-4
+    )
+
+
+def test_maps_carry_a_deviation_as_the_simulator_does(world):
+    """A states' deviation at a sample, mapped to the next one, against two simulations."""
+    linear = motion_with(world, world.nominal())
+    maps = linear.interval_maps()
+    half = len(world.states) // 2
+    moved = 1e-5
+    scenario = world.tracks[0].scenario
+    start = world.guess[0, :half].copy(), world.guess[0, half:].copy()
+    base = MeasuredLinear(world.simulator, world.nominal(), scenario, start)
+    for column in range(half):
+        other = start[0].copy()
+        other[column] += moved
+        changed = MeasuredLinear(world.simulator, world.nominal(), scenario, (other, start[1]))
+        for sample in (1, 4):
+            step = base.knots[sample]
+            x = (changed.trajectory.x[step] - base.trajectory.x[step]) / moved
+            mapped = np.linalg.multi_dot([*maps.states[:sample][::-1], np.eye(2 * half)])
+            np.testing.assert_allclose(mapped[:half, column], x, rtol=5e-3, atol=5e-4)
+
+
+def test_a_quintic_goes_through_values_and_derivatives():
+    times = np.array([0.0, 0.1, 0.25, 0.4])
+    power = np.arange(6)
+
+    def samples(t):
+        t = t[:, None]
+        value = (t**power).sum(axis=1)
+        slope = (power[1:] * t ** (power[1:] - 1)).sum(axis=1)
+        curve = (power[2:] * (power[2:] - 1) * t ** (power[2:] - 2)).sum(axis=1)
+        return np.stack([value, slope, curve], axis=1)
+
+    between = np.linspace(0.0, 0.4, 37)
+    value, slope = quintic(times, samples(times), between)
+    np.testing.assert_allclose(value, samples(between)[:, 0], atol=1e-12)
+    np.testing.assert_allclose(slope, samples(between)[:, 1], atol=1e-10)
+    beyond, rate = quintic(times, samples(times), np.array([0.6]))
+    assert rate[0] == pytest.approx(slope[-1])
+    assert beyond[0] == pytest.approx(value[-1] + 0.2 * slope[-1])

@@ -1,0 +1,58 @@
+"""Recordings on which the search by simulation failed, with their right answers."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from bench.diagnosis.explain import explain
+
+
+def answer(name, **options):
+    folder = Path(os.environ.get("SIMGAP_DATA", "")).parent / "cases"
+    if not folder.is_dir():
+        pytest.skip(f"no cases: {folder} is missing (set SIMGAP_DATA)")
+    return explain(folder / name / "log.csv", **options).answer
+
+
+@pytest.mark.slow
+def test_soft_friction_is_named_alone_in_its_form():
+    verdict = answer("soft_friction")
+    (cause,) = verdict.causes
+    assert (verdict.verdict, cause.effect, cause.form) == (
+        "named",
+        "friction.coulomb@elbow",
+        "soft",
+    )
+    assert cause.coefficients["coefficient"].value == pytest.approx(0.06, rel=0.03)
+
+
+@pytest.mark.slow
+def test_damping_beside_a_stiff_servo_that_saturates():
+    verdict = answer("drag_stiff_servo_saturates")
+    (cause,) = verdict.causes
+    assert (verdict.verdict, cause.effect) == ("named", "drag.linear@elbow")
+    assert cause.coefficients["coefficient"].value == pytest.approx(60.0, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_four_bar_without_a_cause_is_adequate():
+    assert answer("fourbar_clean").verdict == "adequate"
+
+
+@pytest.mark.slow
+def test_what_acts_alike_is_told_after_a_cause_that_does_not_hold_is_removed():
+    """The servo's damping acts as the joint's does, since its force limit is not reached."""
+    verdict = answer("friction_and_drag_one_joint")
+    assert verdict.verdict == "ambiguous"
+    sets = [{cause.effect, *cause.alternatives} for cause in verdict.causes]
+    assert {"actuator.damping@m_shoulder", "drag.linear@shoulder"} in sets
+    assert {"friction.coulomb@shoulder"} in sets
+    assert len(sets) == 2
+
+
+@pytest.mark.slow
+def test_a_free_number_far_from_the_file_is_identified_by_prediction_errors():
+    verdict = answer("drag_stiff_servo_saturates", free=["damping@elbow"])
+    assert verdict.verdict == "adequate"
+    assert verdict.parameters["drag.linear@elbow"].value == pytest.approx(60.0, rel=0.01)

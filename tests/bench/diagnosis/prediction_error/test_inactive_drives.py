@@ -1,0 +1,208 @@
+"""Samples in which drives do nothing are found, and nothing else is taken for such.
+
+The motion is that of plain MuJoCo, with other gains, limits and brakes than the model file states.
+"""
+
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.prediction_error.inactive_drives import (
+    inactive_drives,
+    without_inactive_drives,
+)
+from bench.logs.inspection import load_recording
+
+NOISE = 5e-4
+ARM = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body>
+      <joint name="shoulder" axis="0 1 0" damping="{damping}" armature="0.02" {shoulder}/>
+      <inertial pos="0.12 0 0" mass="0.6" diaginertia="0.002 0.006 0.006"/>
+      <body pos="0.25 0 0">
+        <joint name="elbow" axis="0 1 0" damping="0.1" armature="0.01"/>
+        <inertial pos="0.1 0 0" mass="0.3" diaginertia="0.001 0.002 0.002"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="s1" joint="shoulder" kp="{kp}" kv="3" {servo}/>
+    <position name="s2" joint="elbow" kp="20" kv="1"/>
+  </actuator>
+</mujoco>
+"""
+USUAL = {"damping": 0.2, "shoulder": "", "kp": 60, "servo": ""}
+TIMES = 0.01 * np.arange(301)
+LOG = "".join(
+    ['model = "arm.xml"\n']
+    + [f'[channels."q.{j}"]\nunit = "rad"\nnoise = {NOISE}\n' for j in ("shoulder", "elbow")]
+    + [f'[inputs."u.{m}"]\nunit = "rad"\n' for m in ("s1", "s2")]
+)
+
+
+@dataclass
+class Rig:
+    """How the recorded arm differs from its model file.
+
+    Attributes:
+        off: by run, from when to when which servos are off.
+        brakes: by run, when brakes stop the arm.
+        delay: samples by which commands act later.
+        dead: half width of a dead zone of the shoulder's servo.
+        model: entries of the model file.
+        column: name of an extra column, and its values where drives are on and off.
+    """
+
+    off: dict = field(default_factory=dict)
+    brakes: dict = field(default_factory=dict)
+    delay: int = 0
+    dead: float = 0.0
+    model: dict = field(default_factory=dict)
+    column: tuple = ()
+
+
+def recorded(folder, rig):
+    """The path of a log of three runs."""
+    rng = np.random.default_rng(3)
+    model = mujoco.MjModel.from_xml_string(ARM.format(**{**USUAL, **rig.model}))
+    gains, biases = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
+    rows = ["run,t,u.s1,u.s2,q.shoulder,q.elbow" + (f",{rig.column[0]}" if rig.column else "")]
+    for run in (1, 2, 3):
+        rates, phases = rng.uniform(3, 7, 2), rng.uniform(1, 2, 2)
+        u = np.array([0.5, 0.6]) * np.sin(TIMES[:, None] * rates + phases)
+        data = mujoco.MjData(model)
+        data.qpos[:] = u[0]
+        first, last, servos = rig.off.get(run, (9.0, 9.0, ()))
+        for k, t in enumerate(TIMES):
+            is_off = first - 1e-9 <= t < last - 1e-9
+            q = data.qpos + NOISE * rng.standard_normal(2)
+            row = f"{run},{t:.3f},{u[k, 0]:.9f},{u[k, 1]:.9f},{q[0]:.7f},{q[1]:.7f}"
+            rows.append(row + (f",{rig.column[1 + is_off]}" if rig.column else ""))
+            model.actuator_gainprm[:], model.actuator_biasprm[:] = gains, biases
+            for servo in servos if is_off else ():
+                model.actuator_gainprm[servo], model.actuator_biasprm[servo] = 0.0, 0.0
+            for _ in range(5):
+                data.ctrl[:] = u[max(k - rig.delay, 0)]
+                error = data.ctrl[0] - data.qpos[0]
+                data.ctrl[0] -= np.clip(error, -rig.dead, rig.dead)
+                if t >= rig.brakes.get(run, 9.0):
+                    data.qvel[:] = 0.0
+                else:
+                    mujoco.mj_step(model, data)
+    (folder / "arm.xml").write_text(ARM.format(**USUAL))
+    (folder / "log.csv").write_text("\n".join(rows) + "\n")
+    extra = f'[extra.{rig.column[0]}]\nunit = "1"\n' if rig.column else ""
+    (folder / "log.toml").write_text(LOG + extra)
+    return folder / "log.csv"
+
+
+def times_of(recording, mask, run):
+    """When a mask of a run is set first and last."""
+    times = recording.runs[run].times[mask]
+    return float(times[0]), float(times[-1])
+
+
+def test_a_servo_that_is_switched_off_is_found_and_its_samples_are_left_out(tmp_path):
+    rig = Rig(off={1: (1.2, 2.1, (0,)), 3: (2.0, 9.0, (0,))})
+    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    (drive,) = inactive_drives(recording, kind)
+    assert (drive.joint, drive.actuators, drive.is_held) == ("shoulder", ("s1",), False)
+    assert times_of(recording, drive.masks[0], 0) == pytest.approx((1.2, 2.1), abs=0.05)
+    assert not drive.masks[1].any()
+    assert times_of(recording, drive.masks[2], 2) == pytest.approx((2.0, 3.0), abs=0.05)
+    left = without_inactive_drives(recording, kind)
+    assert [run.name.partition(" ")[0] for run in left.runs] == ["1", "1", "2", "3"]
+    assert left.runs[0].times[-1] < 1.2
+    assert left.runs[1].times[0] > 2.1
+    assert left.runs[1].before["u.s1"].size
+    assert left.runs[3].times[-1] < 2.0
+    (note,) = left.notes
+    assert "the drives of joint shoulder do nothing in some samples, which are left out" in note
+    assert '[actuators.s1] enable = "COLUMN"' in note
+    assert "\n" not in note
+
+
+@pytest.mark.parametrize(
+    ("column", "line"),
+    [
+        (("torque_enable", 1, 0), '[actuators.s2] enable = "torque_enable"'),
+        (("stopped", 0, 1), '[actuators.s2] disable = "stopped"'),
+    ],
+)
+def test_a_column_that_says_so_is_taken_for_the_switch(tmp_path, column, line):
+    rig = Rig(off={run: (1.0 + 0.3 * run, 9.0, (1,)) for run in (1, 2, 3)}, column=column)
+    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    found = without_inactive_drives(recording, kind)
+    for number, run in enumerate(found.runs):
+        assert run.times.size == TIMES.size
+        assert list(run.off) == ["s2"]
+        assert times_of(found, run.off["s2"], number)[0] == pytest.approx(1.3 + 0.3 * number)
+    (note,) = found.notes
+    assert f"state it in log.toml: {line}" in note
+    stated = tmp_path / "log.toml"
+    stated.write_text(stated.read_text() + line.replace("] ", "]\n") + "\n")
+    again, _ = load_recording(tmp_path / "log.csv", divide=False)
+    assert all(
+        np.array_equal(one.off["s2"], two.off["s2"])
+        for one, two in zip(again.runs, found.runs, strict=True)
+    )
+    assert without_inactive_drives(again, kind) is again
+
+
+def test_another_column_that_changes_then_is_named(tmp_path):
+    rig = Rig(off={2: (1.5, 9.0, (0, 1))}, column=("status", 3, 7))
+    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    (note,) = without_inactive_drives(recording, kind).notes
+    assert "the drives of joints shoulder, elbow do nothing" in note
+    assert "column status changes there" in note
+
+
+def test_a_servo_that_is_limp_in_a_whole_run_is_found(tmp_path):
+    rig = Rig(off={2: (0.0, 9.0, (0,))})
+    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    left = without_inactive_drives(recording, kind)
+    assert [run.name for run in left.runs] == ["1", "3"]
+
+
+def test_an_emergency_stop_with_brakes_is_found(tmp_path):
+    rig = Rig(brakes={1: 1.5, 3: 2.0})
+    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    drives = inactive_drives(recording, kind)
+    assert [(drive.joint, drive.is_held) for drive in drives] == [
+        ("shoulder", True),
+        ("elbow", True),
+    ]
+    assert times_of(recording, drives[0].masks[0], 0) == pytest.approx((1.5, 3.0), abs=0.05)
+    left = without_inactive_drives(recording, kind)
+    assert [round(float(run.times[-1]), 1) for run in left.runs] == [1.4, 3.0, 1.9]
+    assert "the joints stand still, whatever is commanded" in left.notes[0]
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        Rig(),
+        Rig(model={"damping": 3.0}),
+        Rig(model={"kp": 20}),
+        Rig(model={"kp": 240}),
+        Rig(model={"shoulder": 'frictionloss="1.5"'}),
+        Rig(model={"shoulder": 'frictionloss="4"'}),
+        Rig(model={"servo": 'forcerange="-2.5 2.5"'}),
+        Rig(model={"servo": 'forcerange="-1 1"'}),
+        Rig(model={"shoulder": 'range="-0.3 0.25"'}),
+        Rig(delay=8),
+        Rig(dead=0.05),
+        Rig(dead=0.2),
+    ],
+    ids=str,
+)
+def test_what_is_wrong_at_all_times_is_not_taken_for_a_drive_that_does_nothing(tmp_path, rig):
+    recording, kind = load_recording(recorded(tmp_path, rig), divide=False)
+    assert inactive_drives(recording, kind) == []
+    assert without_inactive_drives(recording, kind) is recording

@@ -1,0 +1,299 @@
+"""Causes at places of a robot, as the account says them."""
+
+from dataclasses import replace
+
+import pytest
+
+from bench.diagnosis.report.candidate_ranking import (
+    MAX_SHOWN_CANDIDATES,
+    rank_candidates,
+    select_shown_candidates,
+    shorten_effect_name,
+)
+from bench.diagnosis.report.cause_text import (
+    format_effect_set,
+    format_lacking,
+    list_place_marks,
+    strip_place,
+)
+from bench.diagnosis.report.report_data import ChannelInfo
+from bench.diagnosis.report.summary_text import (
+    format_detectable_gap,
+    format_gain_and_caveats,
+    format_headline,
+    format_summary,
+)
+from bench.diagnosis.report.wording import format_effect, format_effect_name, is_parameter_error
+from bench.diagnosis.verdict import Cause
+from tests.bench.diagnosis.robot_report_data import (
+    EVERYWHERE,
+    HEAVY,
+    RUB,
+    WRISTS,
+    cause,
+    number,
+    robot_story,
+)
+from tests.bench.diagnosis.sample_report_data import story
+from tests.bench.figures.figure_robots import ARM6
+
+
+@pytest.mark.parametrize(
+    ("effect", "said"),
+    [
+        ("friction.coulomb@elbow", "Coulomb friction at joint elbow"),
+        ("input.delay@m_elbow", "an input delay at actuator m_elbow"),
+        ("mass.scale@forearm", "a wrong mass of body forearm"),
+        ("inertia.armature@elbow", "a wrong armature of joint elbow"),
+        ("sensor.bias@q.elbow", "a sensor bias in channel q.elbow"),
+        ("friction.coulomb@*", "Coulomb friction at every joint"),
+        ("mass.scale@*", "a wrong mass of every body"),
+        ("gravity.tilt", "a tilt of gravity"),
+        ("friction.coulomb", "Coulomb friction"),
+        ("friction.coulomb@a + input.gain@b",
+         "Coulomb friction at joint a and an input gain at actuator b"),
+        ("my.plugin@elbow", "my.plugin@elbow"),
+    ],
+)  # fmt: skip
+def test_a_cause_is_said_with_its_place(effect, said):
+    assert format_effect(effect) == said
+
+
+def test_in_lists_a_place_stands_without_its_kind():
+    assert shorten_effect_name("mass.scale@forearm") == "wrong mass at forearm"
+    assert shorten_effect_name("friction.coulomb@*") == "Coulomb friction at every joint"
+    assert (
+        shorten_effect_name("gravity.tilt")
+        == format_effect_name("gravity.tilt")
+        == "tilt of gravity"
+    )
+
+
+WRIST = [f"friction.coulomb@wrist_{i}" for i in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (WRIST, "Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3"),
+        (WRIST[:2], "Coulomb friction at joint wrist_1 or wrist_2"),
+        (["drag.linear@a", "friction.coulomb@a"], "linear drag or Coulomb friction at joint a"),
+        (
+            [*WRIST, "input.bias@m_elbow"],
+            "Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3, "
+            "or an input bias at actuator m_elbow",
+        ),
+        (["friction.coulomb@*", "friction.coulomb@a"],
+         "Coulomb friction at joint a or at every joint"),
+        ([*WRIST, "friction.coulomb@*"],
+         "Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3 or at every joint"),
+        (["drag.linear", "friction.coulomb"], "linear drag or Coulomb friction"),
+    ],
+)  # fmt: skip
+def test_sets_are_said_as_people_say_them(names, said):
+    assert format_effect_set(names) == said
+
+
+def test_all_of_a_set_are_joined_by_and():
+    said = "Coulomb friction at each of the joints wrist_1, wrist_2 and wrist_3"
+    assert format_effect_set(WRIST, "and") == said
+
+
+def test_a_long_set_says_how_many_more_there_are():
+    names = "drag.linear force.bias force.ripple friction.load spring.linear spring.cubic wind"
+    several = [f"{name}@joint_{i}" for i, name in enumerate(names.split())]
+    assert format_effect_set(several).endswith(" at joint joint_4 or one of 2 others")
+    assert format_effect_set(several[:6]).endswith("a cubic spring at joint joint_5")
+
+
+@pytest.mark.parametrize(
+    ("causes", "said"),
+    [
+        ([RUB], "The simulation lacks Coulomb friction at joint elbow: a constant friction "
+                "opposes motion."),
+        ([HEAVY], "The mass of body elbow_link is 12 % larger than the model file says."),
+        ([RUB, HEAVY], "The simulation lacks Coulomb friction at joint elbow, and has a wrong "
+                       "mass of body elbow_link."),
+        ([EVERYWHERE], "The simulation lacks Coulomb friction at every joint: "
+                       "a constant friction opposes motion."),
+        ([cause("friction.coulomb@elbow", {"coefficient": number(-0.2)})],
+         "The simulation has too much Coulomb friction at joint elbow."),
+        ([cause("inertia.armature@elbow", {"coefficient": number(-0.0213, "kg*m^2")})],
+         "The armature of joint elbow is 0.021 kg·m² smaller than the model file says."),
+        ([cause("mass.offset@forearm", {n: number(v, "m") for n, v in
+                                        zip("xyz", (0.03, 0.0, -0.04), strict=True)})],
+         "The centre of mass of body forearm is 0.05 m from where the model file has it."),
+        ([cause("actuator.stiffness@m_elbow", {"coefficient": number(-0.25, "1")})],
+         "The stiffness of actuator m_elbow is 25 % smaller than the model file says."),
+        ([cause("mass.scale@*", {"coefficient@a": number(0.1, "1")}, says="it weighs otherwise")],
+         "The simulation has a wrong mass of every body: it weighs otherwise."),
+    ],
+)  # fmt: skip
+def test_a_headline_says_what_is_lacking_or_wrong_and_where(causes, said):
+    assert format_headline(robot_story(causes=causes)) == said
+
+
+def test_a_headline_of_a_set_names_all_of_it():
+    assert format_headline(robot_story("ambiguous", [WRISTS])) == (
+        "The simulation lacks Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3: "
+        "these data cannot tell which."
+    )
+    mixed = cause("friction.coulomb@elbow", alternatives=["mass.scale@elbow_link"])
+    assert format_headline(robot_story("ambiguous", [mixed])) == (
+        "The simulation either lacks Coulomb friction at joint elbow or has a wrong mass of "
+        "body elbow_link: these data cannot tell which."
+    )
+
+
+def test_what_else_remains_is_lacking_although_a_number_is_wrong():
+    said = format_headline(robot_story("partial", [HEAVY]))
+    assert said.startswith("The mass of body elbow_link is 12 % larger than the model file says, ")
+    assert said.endswith("and the simulation lacks something else that no known cause explains.")
+    both = format_headline(robot_story("partial", [RUB, HEAVY]))
+    told = " ".join(format_gain_and_caveats(robot_story("partial", [RUB, HEAVY])))
+    assert "opposes motion; the mass of body elbow_link is 12 % larger than" in told
+    assert both.endswith("elbow_link, and lacks something else that no known cause explains.")
+
+
+SHORTER = cause(
+    "numerics.step",
+    {"coefficient": {"value": 0.0005, "unit": "s", "low": None, "high": None}},
+    says="a time step of 0.0005 s follows the robot's motion",
+)
+OTHER = cause(
+    "numerics.integrator",
+    {"coefficient": {"value": 1.0, "unit": "1", "low": None, "high": None}},
+    says="integrator = RK4 follows the robot's motion",
+)
+
+
+def test_how_a_robot_is_stepped_is_wrong_and_what_mends_it_is_said():
+    told = robot_story(causes=[SHORTER])
+    assert format_headline(told) == (
+        "The time step of the model file is too long: a time step of 0.0005 s follows the "
+        "robot's motion."
+    )
+    text = " ".join(format_summary(told))
+    assert "Too long a time step (numerics.step): time step 5×10⁻⁴ s; p" in text
+    both = robot_story(causes=[OTHER, RUB])
+    assert format_headline(both) == (
+        "The simulation lacks Coulomb friction at joint elbow, and has an integrator that does "
+        "not follow the motion."
+    )
+    assert "(numerics.integrator): p = 1×10⁻⁹." in " ".join(format_summary(both))
+    assert not list_place_marks(told)
+
+
+def test_unknown_and_adequate_count_causes_and_not_their_places():
+    unknown = format_headline(robot_story("unknown", causes=()))
+    assert "none of the 16 known causes explains it at any place" in unknown
+    clean = " ".join(format_gain_and_caveats(robot_story("adequate", causes=())))
+    assert "16 possible causes were looked for at every place and none stands out" in clean
+
+
+def test_what_is_wrong_and_what_is_lacking():
+    assert is_parameter_error("mass.scale@a")
+    assert is_parameter_error("numerics.step")
+    assert not is_parameter_error("friction.coulomb@a")
+    assert not is_parameter_error("actuator.limit@m_elbow")
+
+
+def test_causes_without_places_are_listed_as_ever():
+    told = story("ambiguous").verdict.causes
+    assert format_lacking(told) == "lacks linear drag or Coulomb friction"
+    sure = replace(told[0], effect="wind", alternatives=())
+    assert format_lacking([sure, *told]) == "lacks wind, and linear drag or Coulomb friction"
+
+
+def test_the_account_says_numbers_at_their_places():
+    text = " ".join(" ".join(format_summary(robot_story(causes=[EVERYWHERE]))).split())
+    assert "0.300 (0.280 to 0.320) N·m at shoulder_pan, " in text
+    text = " ".join(" ".join(format_summary(robot_story("ambiguous", [WRISTS]))).split())
+    assert "Each closes 90 % of the gap" in text
+    assert "Coulomb friction at joint wrist_2 or wrist_3 instead would do as well" in text
+
+
+def test_what_an_effect_does_is_said_without_its_place():
+    assert strip_place("the sensor's zero is off (at channel q.elbow)") == (
+        "the sensor's zero is off"
+    )
+    assert strip_place("it pulls (as a spring) back") == "it pulls (as a spring) back"
+
+
+def test_of_many_channels_the_worst_of_each_kind_is_said():
+    told = robot_story("adequate", causes=())
+    assert format_detectable_gap(told).count(" of its noise") == 2
+    few = replace(
+        told,
+        channels=(
+            *story().channels,
+            *(ChannelInfo(f"x{i}", "m", 1.0, True, 0.0) for i in range(10)),
+        ),
+    )
+    assert format_detectable_gap(few).count("in x") == 10
+    assert "To correct it closes" in " ".join(format_gain_and_caveats(robot_story(causes=[HEAVY])))
+
+
+def test_marks_are_the_places_that_the_verdict_names():
+    (mark,) = list_place_marks(robot_story())
+    assert (mark.kind, mark.name, mark.says) == ("joint", "elbow", "Coulomb friction: 0.31 N·m")
+    assert mark.is_certain
+    wrists = list_place_marks(robot_story("ambiguous", [WRISTS]))
+    assert [mark.name for mark in wrists] == ["wrist_1", "wrist_2", "wrist_3"]
+    assert not any(mark.is_certain for mark in wrists)
+    (heavy,) = list_place_marks(robot_story(causes=[HEAVY]))
+    assert (heavy.kind, heavy.says) == ("body", "wrong mass: +12 %")
+
+
+def test_a_family_marks_each_of_its_places():
+    assert [mark.name for mark in list_place_marks(robot_story(causes=[EVERYWHERE]))] == list(ARM6)
+    late = cause("input.delay@*", {"coefficient": number(0.05, "s")})
+    found = list_place_marks(robot_story(causes=[late]))
+    assert [mark.name for mark in found] == [f"m_{joint}" for joint in ARM6]
+    assert not list_place_marks(story())
+    either = cause("friction.coulomb@elbow", alternatives=["friction.coulomb@*"])
+    there = list_place_marks(robot_story("ambiguous", [either]))
+    assert [mark.says for mark in there if mark.name == "elbow"] == ["Coulomb friction: 0.31 N·m"]
+
+
+def test_candidates_of_one_effect_are_one_entry_where_it_explains_most():
+    told = robot_story()
+    there = rank_candidates(told)
+    effects = [entry.best.effect for entry in there]
+    assert effects[0] == "friction.coulomb@elbow"
+    assert len({effect.partition("@")[0] for effect in effects}) == len(effects)
+    elsewhere = [c.effect for c in there[0].elsewhere]
+    assert set(elsewhere) == {f"friction.coulomb@{j}" for j in (*ARM6, "*") if j != "elbow"}
+    scores = [c.score for c in there[0].elsewhere]
+    assert scores == sorted(scores, reverse=True)
+    total = sum(1 + len(entry.elsewhere) for entry in there)
+    assert total == len(told.verdict.candidates) > 80
+
+
+def test_a_family_stands_for_its_effect_only_where_it_explains_much_more():
+    told = robot_story(causes=())
+    scores = {"drag.linear@*": 100.0, "drag.linear@elbow": 95.0, "gravity.tilt": 1.0}
+    rows = [{**told.verdict.candidates[0].to_document(), "effect": n, "score": s}
+            for n, s in scores.items()]  # fmt: skip
+    heads = [
+        entry.best.effect for entry in rank_candidates(robot_story(causes=(), candidates=rows))
+    ]
+    assert heads == ["drag.linear@elbow", "gravity.tilt"]
+    rows[0]["score"] = 300.0
+    heads = [
+        entry.best.effect for entry in rank_candidates(robot_story(causes=(), candidates=rows))
+    ]
+    assert heads == ["drag.linear@*", "gravity.tilt"]
+
+
+def test_every_cause_stands_for_itself_among_the_candidates():
+    both = [RUB, cause("friction.coulomb@wrist_3")]
+    shown = [c.effect for c in select_shown_candidates(robot_story(causes=both))]
+    assert {"friction.coulomb@elbow", "friction.coulomb@wrist_3"} <= set(shown)
+    assert len(shown) == MAX_SHOWN_CANDIDATES
+
+
+def test_without_places_each_candidate_is_an_entry():
+    told = story()
+    assert [entry.best for entry in rank_candidates(told)] == list(told.verdict.candidates)
+    assert isinstance(told.verdict.causes[0], Cause)

@@ -1,0 +1,318 @@
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.report.report_data import ChannelInfo, DataSplit, ParameterChange
+from bench.diagnosis.report.summary_text import (
+    compute_detectable_gap,
+    format_gain,
+    format_gain_and_caveats,
+    format_headline,
+    format_shift,
+    format_summary,
+    get_held_out_unit,
+    has_absorbed_gap,
+)
+from bench.diagnosis.report.wording import (
+    format_effect,
+    format_effect_name,
+    format_estimate,
+    format_number,
+    format_p_value,
+    format_percent,
+    format_sentence,
+    format_unit,
+    joined,
+)
+from tests.bench.diagnosis.sample_report_data import DRAG, EITHER, HELD_OUT, NEXT, TILT, evil, story
+
+VERDICTS = ("adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable")
+
+
+def text(told):
+    return " ".join(" ".join(format_summary(told)).split())
+
+
+@pytest.mark.parametrize(
+    ("verdict", "said"),
+    [
+        ("adequate", "Nothing is missing from the simulation that these data can show."),
+        ("named", "The simulation lacks linear drag: motion is resisted in proportion to speed."),
+        (
+            "ambiguous",
+            "The simulation lacks linear drag or Coulomb friction: these data cannot tell which.",
+        ),
+        (
+            "partial",
+            "The simulation lacks linear drag, and something else that no known cause explains.",
+        ),
+        (
+            "unknown",
+            "Something is missing from the simulation, and none of the 6 known causes explains it.",
+        ),
+        (
+            "unidentifiable",
+            "These data cannot fix inertia: what the simulation lacks cannot be told from them.",
+        ),
+    ],
+)
+def test_each_verdict_has_its_headline(verdict, said):
+    told = story(verdict)
+    assert format_headline(told) == said
+    assert said in text(told)
+
+
+def test_only_found_causes_are_said_to_be_lacking():
+    for verdict in ("adequate", "unknown", "unidentifiable"):
+        assert "lacks linear drag" not in text(story(verdict))
+
+
+def test_several_causes_are_named_together():
+    told = story(causes=[DRAG, TILT])
+    assert format_headline(told) == "The simulation lacks linear drag and a tilt of gravity."
+    assert "Together they close 90 % of the gap" in format_gain(told)
+    assert "gravity also pulls sideways" in text(told)
+
+
+def test_an_ambiguous_cause_beside_a_certain_one():
+    told = story("ambiguous", causes=[EITHER, TILT])
+    expected = (
+        "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: "
+        "these data cannot tell which."
+    )
+    assert format_headline(told) == expected
+
+
+def test_a_partial_verdict_keeps_what_cannot_be_told_apart():
+    assert "linear drag or Coulomb friction, and something else" in format_headline(
+        story("partial", causes=[EITHER])
+    )
+
+
+def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
+    assert format_gain(story("partial")).startswith("Linear drag closes 90 % of the gap")
+
+
+def test_unidentifiable_says_which_parameters_the_analysis_found_vague():
+    assert format_headline(story("unidentifiable", vague=("mass", "inertia"))).startswith(
+        "These data cannot fix mass and inertia:"
+    )
+
+
+def test_the_gain_is_told_with_its_interval_and_units():
+    said = format_gain(story())
+    assert "closes 90 % of the gap (85 to 94 %)" in said
+    assert "0.37 rad before and 0.045 rad after" in said
+    assert said.endswith("the sensor's noise would leave 0.01 rad.")
+
+
+def test_without_held_out_runs_the_gain_is_not_claimed():
+    told = story(heldout=None, held_out=None)
+    side = told.fitting
+    before = np.sqrt(np.nanmean(((side.observed - side.before) / [0.01, 0.05]) ** 2))
+    assert "No run is held out" in format_gain(told)
+    assert f"{before:.3g} times the noise before" in format_gain(told)
+    assert "of the gap" not in format_gain(told)
+
+
+def test_nothing_is_called_closed_where_no_share_is_known():
+    found = {**HELD_OUT, "gap_closed": None, "low": None, "high": None}
+    assert "of the gap" not in format_gain(story(heldout=found))
+    assert "0.045 rad after" in format_gain(story(heldout=found))
+
+
+def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
+    told = story(
+        "unknown", causes=[DRAG], heldout={**HELD_OUT, "gap_closed": 0.3, "low": 0.1, "high": 0.5}
+    )
+    assert format_headline(told).startswith("Something is missing")
+    assert format_gain(told).startswith(
+        "The best of them, linear drag, closes only 30 % of the gap (10 to 50 %)"
+    )
+
+
+def test_adequate_says_what_was_looked_for_and_what_could_hide():
+    said = " ".join(format_gain_and_caveats(story("adequate")))
+    assert "6 possible causes were looked for" in said
+    assert "p = 0.4" in said
+    assert re.search(
+        r"A gap of up to 0\.00\d+ rad in q .* and 0\.0\d+ rad/s in qd .* could still hide", said
+    )
+
+
+def test_a_gap_that_hides_is_smaller_with_more_samples_and_larger_than_a_true_one():
+    rng = np.random.default_rng(0)
+
+    def limit(samples, true, stated=True):
+        times = np.arange(samples) / 100.0
+        residual = (
+            rng.normal(size=(1, samples, 1)) + true * np.sqrt(2) * np.sin(times)[None, :, None]
+        )
+        side = DataSplit(
+            ("1",), (times,), residual, np.zeros_like(residual), np.zeros_like(residual)
+        )
+        return compute_detectable_gap(
+            story(
+                fitting=side, held_out=None, channels=(ChannelInfo("q", "rad", 1.0, stated, 0.0),)
+            )
+        )[0]
+
+    assert 0.1 < limit(10_000, 0.0) < limit(300, 0.0) < 0.6
+    assert limit(300, 0.0, stated=False) > limit(300, 0.0)
+    for true in (0.3, 1.0, 3.0):
+        assert true < limit(3000, true) < true + 0.3
+
+
+def test_ambiguous_proposes_the_experiment_and_says_so_if_there_is_none():
+    assert "To tell them apart: Release it from 1.5 rad" in text(story("ambiguous"))
+    assert "no experiment is proposed" in text(story("ambiguous", next_experiment=None))
+    assert "Next experiment: Release it" in text(story("unidentifiable", next_experiment=NEXT))
+
+
+def test_the_unit_of_the_gain_is_that_of_the_channels_whose_noise_is_its_floor():
+    assert get_held_out_unit(story()) == "rad"
+    assert get_held_out_unit(story(heldout={**HELD_OUT, "noise_floor": 0.05})) == "rad/s"
+    assert get_held_out_unit(story(heldout={**HELD_OUT, "noise_floor": 1.0})) == "1"
+    assert get_held_out_unit(story(heldout={**HELD_OUT, "unit": "m"})) == "m"
+
+
+def test_parameters_tell_what_they_had_absorbed():
+    said = text(story())
+    assert (
+        "inertia 0.00333 (0.00325 to 0.00341) kg·m² before, "
+        "0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)" in said
+    )
+    assert "it had absorbed part of the gap" in said
+    assert "restitution is not touched by these data and stays at its nominal 0.7." in said
+
+
+def test_a_move_within_both_intervals_is_no_absorption():
+    p = ParameterChange("m", "kg", (1.0, 0.9, 1.1), (1.05, 0.95, 1.15), True)
+    assert not has_absorbed_gap(p)
+    assert has_absorbed_gap(replace(p, after=(1.2, 1.15, 1.25)))
+    assert format_shift(p) == "+5.0 %"
+    assert format_shift(replace(p, after=(0.9, 0.8, 1.0))) == "−10 %"
+    assert (
+        format_shift(ParameterChange("b", "N", (0.0, -1.0, 1.0), (0.5, 0.4, 0.6), True)) == "+0.5 N"
+    )
+
+
+def test_the_largest_gap_is_located():
+    said = text(story())
+    assert (
+        "run 4 (13 before, 1.1 after); channel qd (11 before, 1.1 after); "
+        "phase last third (16 before, 1.2 after)" in said
+    )
+    assert "gap is largest" not in text(story("adequate"))
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_the_account_is_short_and_fits_a_terminal(verdict):
+    lines = format_summary(story(verdict))
+    assert len(lines) <= 32
+    assert max(len(line) for line in lines) <= 100
+    assert "nan" not in text(story(verdict)).lower()
+    assert "None" not in text(story(verdict))
+
+
+def test_a_terminal_obeys_nothing_in_the_data():
+    assert all(line.isprintable() for line in format_summary(evil()))
+
+
+def test_numbers_read_well():
+    assert [format_number(v) for v in (0.0, 0.0333333, 2.2e-4, 1234.5, 1.5e9, -0.5, np.nan, None)] == [
+        "0", "0.0333", "2.2×10⁻⁴", "1230", "1.5×10⁹", "−0.5", "–", "–"
+    ]  # fmt: skip
+    assert format_number(0.00099996) == "0.001"
+    assert [format_percent(v) for v in (0.9, 0.034, 0.998, 1.0, -0.2, None)] == [
+        "90 %",
+        "3.4 %",
+        "99.8 %",
+        "100 %",
+        "−20 %",
+        "–",
+    ]
+    assert [format_p_value(p) for p in (0.03, 1e-9, 0.0, None)] == [
+        "p = 0.03",
+        "p = 1×10⁻⁹",
+        "p < 1×10⁻¹²",
+        "p unknown",
+    ]
+
+
+def test_estimates_have_the_digits_of_their_intervals():
+    assert format_estimate(0.00333, 0.0033, 0.0034) == "0.00333 (0.00330 to 0.00340)"
+    assert format_estimate(2.2e-4, 2.0e-4, 2.4e-4) == "2.20×10⁻⁴ (2.00×10⁻⁴ to 2.40×10⁻⁴)"
+    assert format_estimate(-0.1, -0.2, 0.05) == "−0.10 (−0.20 to 0.05)"
+    assert format_estimate(1500.0, 1400.0, 1600.0) == "1500 (1400 to 1600)"
+    assert (
+        format_estimate(0.5, None, None)
+        == format_estimate(0.5, np.nan, np.nan)
+        == "0.5 (no interval)"
+    )
+
+
+def test_units_and_names_read_well():
+    assert [format_unit(u) for u in ("kg*m^2", "1/(m^2*s^2)", "m*s^-2", "1")] == [
+        "kg·m²",
+        "1/(m²·s²)",
+        "m·s⁻²",
+        "",
+    ]
+    assert format_effect("drag.linear+wind") == "linear drag and wind"
+    assert format_effect("my.plugin") == "my.plugin"
+    assert joined(["a", "b", "c"], "or") == "a, b or c"
+    assert format_sentence("drag.linear wins") == "drag.linear wins."
+    assert format_sentence("no other does!") == "No other does!"
+
+
+def test_a_plugin_says_its_own_noun_or_stands_with_what_it_says(fresh_registries):
+    from sims import effects
+    from sims.effects.spring import LinearSpring
+
+    class Magnet(LinearSpring):
+        name = "spring.magnet"
+        noun = "a magnet's pull"
+        says = "a magnet holds it near zero, and lets go further away"
+
+    class Plain(Magnet):
+        name = "spring.plain"
+        noun = ""
+
+    effects.register_effect(Magnet)
+    effects.register_effect(Plain)
+    assert format_effect("spring.magnet+wind") == "a magnet's pull and wind"
+    assert format_effect_name("spring.magnet") == "magnet's pull"
+    assert format_effect("spring.plain") == "spring.plain (a magnet holds it near zero)"
+
+
+def test_every_registered_effect_has_a_noun():
+    from sims import effects
+
+    assert [
+        name for name in effects.list_names() if format_effect(name) == name and "." in name
+    ] == []
+
+
+CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked": ["rivals"]}
+
+
+def test_an_early_end_is_told_before_anything_else():
+    told = text(story("unknown", cut=CUT, causes=[DRAG]))
+    assert "The search was ended before it could say what the simulation lacks; the best" in told
+    assert "by its budget of time; looked at last: refit of drag.linear and 3 more. Not" in told
+    assert "none of the 6 known causes" not in told, "they were not all asked"
+    told = text(story("unknown", cut={**CUT, "by": "interrupt"}))
+    assert "before it could say what the simulation lacks. The search was ended by an in" in told
+    told = text(story("partial", cut={**CUT, "not_asked": ["structure"]}))
+    assert "lacks linear drag; what else, was not asked to the end." in told
+    assert "something else that no known cause explains" not in told
+
+
+def test_held_out_runs_that_were_not_asked_are_not_said_to_be_missing():
+    cut = {**CUT, "not_asked": ["held_out", "structure"]}
+    told = text(story("unknown", cut=cut, heldout=None))
+    assert "The gain was not measured on held-out runs" in told
+    assert "No run is held out" not in told

@@ -1,0 +1,127 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.search.alternative_causes import AlternativeFinder
+from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from tests.bench.diagnosis.search.search_models import held_out, model, search_of
+
+BEST = model("a", merit=100.0)
+ALIKE = model("b", merit=100.0 - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+BEHIND = model("c", merit=100.0 - 2.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+
+
+def placed(place="", contains=()):
+    return SimpleNamespace(place=place, contains=contains)
+
+
+def evidence(
+    monkeypatch, trial=None, structure=False, plausible="abc", luck=0.0, best=1e-5, sizes=(1, 1, 1),
+    **excess,
+):  # fmt: skip
+    scores = SimpleNamespace(
+        effects=("a", "b", "c"), chance=np.full(3, luck), null_scores=np.zeros((3, 40))
+    )
+    search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
+    search.scored = {frozenset(): scores}
+    search.tests = {frozenset(): best}
+    slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
+    effects = {name: placed() for name in "abc"}
+    search.world = SimpleNamespace(effects=effects, slots=slots, linear=False)
+    monkeypatch.setattr(
+        AlternativeFinder, "_is_plausible", lambda self, effect: effect in plausible
+    )
+    (found,) = AlternativeFinder(search, trial, structure).collect_evidence(BEST)
+    return found
+
+
+def test_what_is_not_behind_by_the_odds_is_an_alternative(monkeypatch):
+    found = evidence(monkeypatch)
+    assert (found.effect, found.alternatives, found.preferred) == ("a", ("b",), "a")
+    assert found.gain == pytest.approx(100.0)
+    assert found.p_value <= 1e-5
+
+
+@pytest.mark.parametrize(
+    ("luck", "best", "p_value"), [(150.0, 1e-5, 1e-5), (0.0, 0.7, 0.0), (150.0, 1.0, 1.0)]
+)
+def test_the_refit_or_the_best_score_may_see_that_it_is_no_chance(monkeypatch, luck, best, p_value):
+    """The fit gains 100, more than any surrogate, or less than what luck gives the effect."""
+    assert evidence(monkeypatch, luck=luck, best=best).p_value == pytest.approx(p_value, abs=1e-12)
+
+
+def test_a_rival_with_plausible_coefficients_is_preferred(monkeypatch):
+    assert evidence(monkeypatch, plausible="bc").preferred == "b"
+
+
+def test_held_out_runs_have_a_voice(monkeypatch):
+    left = {("a",): 1.0, ("b",): 1.2, ("c",): 0.8}
+    found = evidence(monkeypatch, HeldOutValidation(*held_out(left)))
+    assert found.alternatives == ("c",), "merits of both add up"
+    assert found.preferred == "c"
+
+
+def test_where_structure_is_left_what_it_leaves_decides_and_the_effect_stands(monkeypatch):
+    found = evidence(monkeypatch, structure=True, a=1.0, b=1.5, c=0.9, plausible="bc")
+    assert found.alternatives == ("c",)
+    assert found.preferred == "a"
+
+
+@pytest.mark.parametrize(
+    ("sizes", "left", "alternatives"),
+    [
+        ((1, 1, 2), 0.97, ()),
+        ((1, 1, 2), 0.9, ("c",)),
+        ((1, 1, 4), 0.9, ()),
+        ((1, 1, 4), 0.8, ("c",)),
+        ((4, 1, 4), 0.97, ("c",)),
+        ((4, 1, 1), 1.02, ("c",)),
+    ],
+)
+def test_more_numbers_that_leave_as_much_structure_are_no_alternative(
+    monkeypatch, sizes, left, alternatives
+):
+    found = evidence(monkeypatch, structure=True, sizes=sizes, a=1.0, b=9.0, c=left)
+    assert found.alternatives == alternatives
+
+
+@pytest.mark.parametrize("place", ["*", "elbow"])
+@pytest.mark.parametrize(
+    ("family", "contains", "kept"),
+    [("b", ("a",), ()), ("a", ("b",), ("b",)), ("b", ("c",), ("b",))],
+)
+def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
+    monkeypatch, family, contains, kept, place
+):
+    """The plain one is; a family whose place is far behind stays in the set."""
+    search = search_of(model(), BEST, ALIKE, BEHIND)
+    effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
+    search.world = SimpleNamespace(effects=effects, linear=False)
+    monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
+    monkeypatch.setattr(AlternativeFinder, "_p_value", lambda self, rest, effect, gain: 0.0)
+    (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
+    assert found.alternatives == kept
+    assert found.preferred == ("b" if family == "a" else "a")
+
+
+@pytest.mark.parametrize(("least", "alternatives"), [(-1.0, ("b",)), (0.1, ())])
+def test_what_one_of_two_signs_gains_by_chance_is_no_reason_about_a_robot(
+    least, alternatives, monkeypatch
+):
+    """What has shapes to choose from pays for them."""
+    search = search_of(
+        model(), BEST, model("b", merit=100.0 - 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+    )
+    search.world = SimpleNamespace(
+        effects={"a": placed(), "b": placed()},
+        linear=True,
+        parameters=[SimpleNamespace(bounds=(least, 1.0))] * 2,
+        slots={"a": slice(0, 1), "b": slice(1, 2)},
+    )
+    search.chance_of = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get
+    monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
+    monkeypatch.setattr(AlternativeFinder, "_p_value", lambda self, rest, effect, gain: 0.0)
+    (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
+    assert found.alternatives == alternatives

@@ -1,0 +1,86 @@
+"""The share of the gap that a model closes on the fitted runs; and when a fuller account is asked
+for.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.search.diagnose import Inquiry, compute_gap_closed
+from tests.bench.diagnosis.search.search_models import model
+
+SIGMA = 0.1
+
+
+def share(before, after, structure=True, own=np.nan):
+    """Of a base model that leaves `before` and a model that leaves `after` everywhere, with a
+    noise of 0.1; half of the samples are missing, where anything may stand.
+    """
+    seen = np.arange(10).reshape(1, 10, 1) % 2 == 0
+
+    def residual(left):
+        return np.where(seen, left, 77.0)
+
+    search = SimpleNamespace(
+        base=SimpleNamespace(fit=before), noise=SimpleNamespace(sigma=np.array([SIGMA])),
+        residual=residual, seen=seen,
+    )  # fmt: skip
+    model = SimpleNamespace(fit=after, likelihood=SimpleNamespace(sigma=np.array([own])))
+    return compute_gap_closed(search, model, SimpleNamespace(structure=structure))
+
+
+def test_the_gap_is_what_lies_above_the_noise():
+    assert share(0.5, 0.2) == pytest.approx((5 - 2) / (5 - 1))
+    assert share(0.5, 0.5) == pytest.approx(0.0)
+    assert share(0.5, 0.7) == pytest.approx((5 - 7) / (5 - 1)), "worse than nothing"
+
+
+def test_nobody_closes_more_than_the_gap_and_of_none_nothing():
+    assert share(0.5, 0.05) == pytest.approx(1.0)
+    assert share(0.1, 0.05) == share(0.09, 0.09) == 0.0
+
+
+def test_what_is_left_without_structure_is_noise_and_may_be_more_than_was_estimated():
+    assert share(0.5, 0.2, structure=False, own=0.2) == pytest.approx(1.0)
+    assert share(0.5, 0.2, structure=True, own=0.2) == pytest.approx(0.75)
+    assert share(0.5, 0.2, structure=False, own=0.01) == pytest.approx(0.75), "no less than stated"
+
+
+BASE, FOUND, FULLER, PLAINER = model(), model("a"), model("a", "b", "c"), model("a", "d")
+
+
+@pytest.mark.parametrize(
+    ("found", "fuller", "structure", "held_out", "stands"),
+    [
+        (FOUND, FULLER, True, True, PLAINER),
+        (FOUND, FOUND, True, True, FOUND),
+        # nothing is left over
+        (FOUND, FULLER, False, True, FOUND),
+        # nobody judges
+        (FOUND, FULLER, True, False, FOUND),
+        # where nothing was found nothing is added to it
+        (BASE, FULLER, True, True, BASE),
+    ],
+)
+def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
+    found, fuller, structure, held_out, stands
+):
+    """It is fitted to its end, and told by its simplest laws."""
+    measured = []
+    watch = SimpleNamespace(watch=None)
+    search = SimpleNamespace(
+        world=watch,
+        fit_to_convergence=lambda m: m,
+        simplify_laws=lambda m: PLAINER if m is FULLER else m,
+    )
+    inquiry = Inquiry(search, None)
+    inquiry._model = found
+    if held_out:
+        inquiry._trial = SimpleNamespace(
+            find_better_extension=lambda search, model: fuller, measure=measured.extend
+        )
+    taken = inquiry._fuller(SimpleNamespace(structure=structure))
+    assert inquiry._model is stands
+    assert taken is (stands is PLAINER)
+    assert measured == ([PLAINER] if taken else [])

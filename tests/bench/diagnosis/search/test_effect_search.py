@@ -1,0 +1,136 @@
+"""By which chances a search takes an effect, and looks no further."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.noise_model import Likelihood
+from bench.diagnosis.search.effect_search import EffectSearch, is_hopeless
+from tests.bench.diagnosis.explained_samples import recording, searched
+from tests.bench.diagnosis.search.search_models import model, search_of
+
+BASE, LARGER = model(merit=10.0), model("a", merit=30.0)
+
+
+def search(monkeypatch, **answers):
+    """A search that has fitted two models and is told the answers to its questions."""
+    made = EffectSearch.__new__(EffectSearch)
+    made.models = {frozenset(m.effects): m for m in (BASE, LARGER)}
+    for question, answer in answers.items():
+        asked = answer if callable(answer) else lambda *_, answer=answer: answer
+        monkeypatch.setattr(EffectSearch, question, asked)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("merit", "chance", "taken"),
+    [(30.0, 0.0029, True), (30.0, 0.0031, False), (9.9, 0.0, False), (10.1, 0.0, True)],
+)
+def test_an_effect_is_taken_that_has_merit_and_is_no_chance(monkeypatch, merit, chance, taken):
+    larger = model("a", merit=merit)
+    made = search(
+        monkeypatch, plain=lambda self, best, doubt: best is not BASE, missing=chance,
+        _larger=lambda self, best, size: larger, excess=0.1, quiet=False,
+        without_step_errors=lambda self, model: model,
+    )  # fmt: skip
+    assert made.run() is (larger if taken else BASE)
+
+
+def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
+    doubts, sizes = [], []
+
+    def plain(self, best, doubt):
+        doubts.append(doubt)
+        return best is LARGER
+
+    def grown(self, best, size):
+        sizes.append(size)
+        return LARGER
+
+    asked = {"plain": plain, "_larger": grown, "missing": 0.0, "excess": 0.1, "quiet": False}
+    asked["without_step_errors"] = lambda self, model: model
+    assert search(monkeypatch, **asked).run() is LARGER
+    assert (doubts, sizes) == ([0.1, 0.015], [1]), "a second effect needs stronger evidence"
+
+
+@pytest.mark.parametrize(
+    ("p_value", "quiet", "plain"),
+    [(0.11, True, True), (0.09, True, False), (0.11, False, False), (0.1, True, False)],
+)
+def test_a_model_is_plain_that_neither_scores_nor_loudness_doubt(
+    monkeypatch, p_value, quiet, plain
+):
+    made = search(monkeypatch, scan=SimpleNamespace(p_value=p_value), quiet=quiet)
+    assert made.plain(BASE, 0.1) is plain
+
+
+def scores(p_value, lucky):
+    """Of two effects; a hundred surrogates whose best gains 0, 1, ... 99 less its chance."""
+    drawn = np.vstack([np.arange(100.0), np.full(100, -50.0)])
+    return SimpleNamespace(
+        effects=("a", "b"), chance=np.array([lucky, 0.0]), null_scores=drawn, p_value=p_value
+    )
+
+
+def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
+    """The model gains 20: beside a luck of 12 beaten by 92 of 100 surrogates, else by 80."""
+    about = {None: scores(0.9, 5.0), "larger": scores(0.95, 0.0)}
+    made = search(
+        monkeypatch, scan=lambda self, m, against=None: about["larger" if against else None],
+        residual="what the larger model leaves",
+    )  # fmt: skip
+    assert made.missing(BASE, LARGER) == pytest.approx(81 / 101)
+    about["larger"] = scores(0.02, 0.0)
+    assert made.missing(BASE, LARGER) == pytest.approx(0.02), "the best score may see more"
+    about["larger"] = scores(0.9, 12.0)
+    assert made.missing(BASE, LARGER) == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "stated", "chance", "quiet"),
+    [
+        (1.29, True, 0.0, True),
+        (1.31, True, 1.0, False),
+        (1.31, False, 0.011, True),
+        (1.31, False, 0.009, False),
+    ],
+)
+def test_what_is_left_may_be_noise_up_to_the_floor_or_if_it_forgets(
+    monkeypatch, sigma, stated, chance, quiet
+):
+    monkeypatch.setattr("bench.diagnosis.search.scored_models.forgets", lambda *_: chance)
+    made = search(monkeypatch, residual=np.zeros((1, 1, 1)))
+    made.world = SimpleNamespace(observed=np.zeros((1, 1, 1)))
+    made.noise = SimpleNamespace(sigma=np.array([2.0]))
+    made.stated = np.array([stated])
+    asked = SimpleNamespace(fit=None, likelihood=Likelihood(0.0, 2.0 * np.array([sigma]), None))
+    assert made.quiet(asked) is quiet
+
+
+def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
+    """A sketch that was begun for fewer effects may have no model of so many."""
+    recorded = recording("pendulum", noise=["0.01"], observe=["q"], runs=2, seconds=4.0, rate=50.0)
+    made, _ = searched(recorded, 0.01, candidates=["friction.coulomb", "gravity.tilt"])
+    made.from_pieces(1)
+    known = set(made.models)
+    assert {len(names) for names in known} == {0, 1}, "the pieces are searched"
+
+    monkeypatch.setattr(EffectSearch, "refit_extensions", lambda *args: None)
+    made.from_pieces(2)
+    assert set(made.models) == known
+
+
+@pytest.mark.parametrize(
+    ("thorough", "nearest", "hopeless"),
+    [(False, 3.0, True), (True, 3.0, False), (True, 4.4, True), (False, 4.4, True)],
+)
+def test_a_thorough_search_goes_on_where_the_nearest_models_come_nearer(
+    thorough, nearest, hopeless
+):
+    """The best single effect leaves 5, of which 0.85 are 4.25; what is built upon leaves 4.9."""
+    left = {(): 20.0, ("a",): 5.0, ("a", "b"): 4.9, ("c", "d"): nearest}
+    models = [model(*names) for names in left]
+    asked = search_of(*models, excess=left)
+    asked.base, asked.thorough = models[0], thorough
+    assert is_hopeless(asked, models[2]) is hopeless

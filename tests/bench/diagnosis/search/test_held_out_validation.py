@@ -1,0 +1,98 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.search.held_out_validation import HeldOutValidation
+from tests.bench.diagnosis.search.search_models import held_out, model, search_of
+
+BASE, A, B, BOTH = model(), model("a"), model("b"), model("a", "b")
+
+
+def test_excess_is_what_is_left_over_the_noise():
+    trial = HeldOutValidation(*held_out({(): 3.0}))
+    assert trial.compute_excess(()) == pytest.approx(2.0)
+    assert trial.compute_excess((), np.array([1.5])) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("left", "stands"),
+    [
+        ({(): 5.0, ("a",): 3.0, ("b",): 3.0, ("a", "b"): 1.0}, ("a", "b")),
+        ({(): 5.0, ("a",): 1.0, ("b",): 3.0, ("a", "b"): 1.1}, ("a",)),
+        # far from the noise a gain of less than a tenth is none, and then neither helps
+        ({(): 5.0, ("a",): 4.9, ("b",): 4.8, ("a", "b"): 4.7}, ()),
+        # a model that was not tried there has no voice
+        ({(): 5.0, ("b",): 3.0, ("a", "b"): 1.0}, ("a", "b")),
+    ],
+)
+def test_effects_that_do_not_help_go(left, stands):
+    trial = HeldOutValidation(*held_out(left))
+    assert trial.drop_unhelpful_effects(search_of(BASE, A, B, BOTH), BOTH).effects == stands
+
+
+@pytest.mark.parametrize(
+    ("fitted", "left", "stays"),
+    [
+        # a limit that no held-out run comes near: the fitted runs decide
+        ({(): 3.2, ("a",): 0.0}, {(): 1.02, ("a",): 1.03}, True),
+        # held-out runs speak against it
+        ({(): 3.2, ("a",): 0.0}, {(): 1.02, ("a",): 1.12}, False),
+        # the fitted runs are no clear case
+        ({(): 3.2, ("a",): 2.0}, {(): 1.02, ("a",): 1.03}, False),
+        ({(): 0.3, ("a",): 0.0}, {(): 1.02, ("a",): 1.03}, False),
+        # much is left of the held-out ones, of which nothing is known
+        ({(): 3.2, ("a",): 0.0}, {(): 2.02, ("a",): 2.03}, False),
+    ],
+)
+def test_what_held_out_runs_hardly_show_is_decided_by_the_fitted_ones(fitted, left, stays):
+    trial = HeldOutValidation(*held_out(left))
+    search = search_of(BASE, A, excess=fitted)
+    assert trial.drop_unhelpful_effects(search, A).effects == (("a",) if stays else ())
+
+
+@pytest.mark.parametrize(("structure", "missed"), [(True, True), (False, False)])
+def test_what_is_left_is_noise_where_it_has_no_structure(structure, missed):
+    trial = HeldOutValidation(*held_out({(): 9.0, ("a",): 2.0}))
+    loud = model("a")
+    loud.likelihood.sigma[:] = 2.0
+    assert trial.has_unexplained_gap(loud, SimpleNamespace(structure=structure)) is missed
+
+
+A_B, A_C, A_B_C, B_C = model("a", "b"), model("a", "c"), model("a", "b", "c"), model("b", "c")
+
+
+@pytest.mark.parametrize(
+    ("fitted", "unseen", "stands"),
+    [
+        # two further effects that leave six tenths of both; with one of them nothing is won
+        ({"a": 9.0, "ab": 8.9, "abc": 5.4}, {"a": 9.0, "ab": 8.9, "abc": 5.4}, "abc"),
+        # only the runs that were fitted are nearer
+        ({"a": 9.0, "ab": 8.9, "abc": 5.4}, {"a": 9.0, "ab": 8.9, "abc": 8.0}, "a"),
+        # only those that were not
+        ({"a": 9.0, "ab": 8.9, "abc": 8.0}, {"a": 9.0, "ab": 8.9, "abc": 5.4}, "a"),
+        # enough for one effect, and not for two
+        ({"a": 9.0, "ab": 8.9, "abc": 7.0}, {"a": 9.0, "ab": 8.9, "abc": 7.0}, "a"),
+        ({"a": 9.0, "ab": 7.0, "abc": 6.9}, {"a": 9.0, "ab": 7.0, "abc": 6.9}, "ab"),
+        # one of the two does nothing on held-out runs: it goes again
+        ({"a": 9.0, "ab": 5.6, "abc": 5.0}, {"a": 9.0, "ab": 5.1, "abc": 5.05}, "ab"),
+        # what was found is not exchanged for something else
+        ({"a": 9.0, "bc": 1.0}, {"a": 9.0, "bc": 1.0}, "a"),
+    ],
+)
+def test_a_fuller_account_is_taken_that_held_out_runs_bear_out(fitted, unseen, stands):
+    """Excesses by effects; those that are not given are far off."""
+    models = [BASE, A, B, model("c"), A_B, A_C, B_C, A_B_C]
+    left = {m.effects: fitted.get("".join(m.effects), 20.0) for m in models}
+    there = {m.effects: 1.0 + unseen.get("".join(m.effects), 20.0) for m in models}
+    trial = _Measured(*held_out(there))
+    assert (
+        "".join(trial.find_better_extension(search_of(*models, excess=left), A).effects) == stands
+    )
+
+
+class _Measured(HeldOutValidation):
+    """A trial in which all has been measured."""
+
+    def evaluate_models(self, models):
+        assert {m.effects for m in models} <= self.held_out_fits.keys()

@@ -1,0 +1,97 @@
+"""A simpler law takes the place of a richer one that comes no nearer to the data."""
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.fitting.fit_state import FitStart
+from sims.systems.slider import Slider
+from tests.bench.diagnosis.explained_samples import recorded, searched
+
+TIMES = np.arange(200) / 50.0
+MASS, NOISE = 1.4, 1e-3
+
+
+def search(effects, seed=0):
+    """A slider that is pushed about, with these effects; a search that has fitted nothing."""
+    names = list(effects)
+    simulator = Slider(observe=["x"], effects=names)
+    theta = [MASS, *np.concatenate([np.ravel(c) for c in effects.values()])]
+    rng, starts = np.random.default_rng(seed), []
+    for number in range(3):
+        force = 4 * np.sin(2.3 * TIMES + number) + 2 * np.sin(5.1 * TIMES + rng.uniform(0, 6))
+        starts.append(({"x": 0.1}, {"u": force}))
+    made, _ = searched(recorded(simulator, theta, starts, TIMES, NOISE), NOISE)
+    return made
+
+
+def fitted(made, names, values):
+    """The model with these effects, fitted from these coefficients."""
+    theta = made.world.get_nominal_theta()
+    for name in names:
+        theta[made.world.slots[name]] = values[name]
+    made.refit_models([FitStart(names, theta, made.world.guess)])
+    return made.models[frozenset(names)]
+
+
+@pytest.mark.parametrize(
+    ("truth", "richer", "kept"),
+    [
+        ({"friction.coulomb": 0.7}, "friction.stribeck", "friction.coulomb"),
+        ({"friction.stribeck": (0.5, 0.9, 0.3)}, "friction.stribeck", "friction.stribeck"),
+        ({"drag.linear": 0.6}, "friction.direction", "drag.linear"),
+        ({"friction.direction": (0.2, 0.9)}, "friction.direction", "friction.direction"),
+    ],
+)
+def test_the_richer_law_stands_where_it_comes_nearer(truth, richer, kept):
+    made = search({**truth, "force.bias": 0.4})
+    values = {"friction.stribeck": (0.5, 0.5, 0.2), "friction.direction": (0.5, 0.4)}
+    model = fitted(made, ("force.bias", richer), {**values, "force.bias": 0.3})
+    plainer = made.plainer(model)
+    assert set(plainer.effects) == {"force.bias", kept}
+    if kept != richer:
+        place = made.world.slots[kept].start
+        assert plainer.fit.theta[place] == pytest.approx(truth[kept], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("truth", "kept"),
+    [
+        ({"friction.coulomb": 0.7, "drag.linear": 0.6}, {"friction.coulomb", "drag.linear"}),
+        ({"friction.warming": (0.7, 0.6, 2.0)}, {"friction.warming"}),
+    ],
+    ids=["far longer than the run", "within it"],
+)
+def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts(truth, kept):
+    """In 4 s friction that falls over 300 s does not fall: it is dry and viscous friction."""
+    made = search({**truth, "force.bias": 0.4})
+    values = {"friction.warming": (0.7, 0.6, 2.0 if len(kept) == 1 else 300.0), "force.bias": 0.3}
+    plainer = made.plainer(fitted(made, ("force.bias", "friction.warming"), values))
+    assert set(plainer.effects) == {"force.bias", *kept}
+    for name in truth:
+        c = plainer.fit.theta[made.world.slots[name]]
+        np.testing.assert_allclose(c, truth[name], rtol=0.05)
+
+
+def test_what_is_far_from_the_data_is_told_by_the_shorter_account(monkeypatch):
+    """Where structure is left merits mislead: a richer law that leaves as much as its part goes."""
+    made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
+    model = fitted(made, ("friction.stribeck",), {"friction.stribeck": (0.5, 0.5, 0.2)})
+    part = fitted(made, ("friction.coulomb",), {"friction.coulomb": 0.5})
+    for share, names in ((0.94, model.effects), (0.96, part.effects)):
+        excess = {model.effects: share, part.effects: 1.0}
+        monkeypatch.setattr(made, "excess", lambda m, excess=excess: excess[m.names])
+        better = type(model)(model.fit, model.likelihood, part.merit + 5.0)
+        assert made.plainer(better).names == names
+
+
+def test_a_simpler_law_that_is_known_and_caught_is_fitted_from_the_richer_one():
+    """The way up may end where a joint sticks a sample longer than it should."""
+    made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
+    values = {"friction.coulomb": 0.5, "friction.stribeck": (0.7, 0.0, 0.2), "force.bias": 0.4}
+    part = fitted(made, ("force.bias", "friction.coulomb"), values)
+    caught = type(part)(part.fit, part.likelihood, part.merit - 50.0)
+    made.models[frozenset(part.effects)] = caught
+    richer = fitted(made, ("force.bias", "friction.stribeck"), values)
+    plainer = made.plainer(richer)
+    assert set(plainer.effects) == {"force.bias", "friction.coulomb"}
+    assert plainer.merit > caught.merit + 45.0

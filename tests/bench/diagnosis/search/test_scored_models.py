@@ -1,0 +1,118 @@
+"""What is kept between scans of one model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.progress_events import SilentListener
+from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
+from tests.bench.diagnosis.explained_samples import recording, searched
+
+
+@pytest.mark.parametrize(("moved", "anew"), [(0.01, False), (1.0, True)])
+def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
+    """A fit a little to the side, by so many sigmas RMS, takes the place of the base model."""
+    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
+    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
+    search.scan(base)
+    once = search.world.simulations
+    assert search.scan(base) is search.scanned[frozenset()].scores
+
+    shifted = replace(base.fit, simulated=base.fit.simulated + moved * 0.01, cost=0.0)
+    search.models[frozenset()] = replace(base, merit=-np.inf)
+    again = search.enter(shifted)
+    scores = search.scan(again)
+    assert (search.world.simulations > once) is anew
+    # The residual is the new one's, whatever it is compared with.
+    assert scores is not search.former.get(frozenset())
+    assert set(scores.effects) == {"friction.coulomb", "spring.linear"}
+    np.testing.assert_array_equal(
+        search.scanned[frozenset()].at.simulated, (shifted if anew else base.fit).simulated
+    )
+
+
+def test_what_was_scored_about_the_base_model_is_told_when_a_better_fit_has_taken_its_place():
+    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
+    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
+    assert search.about_base is None
+    scores = search.scan(base)
+    assert search.about_base is scores
+    search.models[frozenset()] = replace(base, merit=-np.inf)
+    search.enter(base.fit)
+    assert frozenset() not in search.scored
+    assert search.about_base is scores
+
+
+def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
+    recorded = recording(
+        "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
+    )
+    chances = []
+    for first in (True, False):
+        search, base = searched(
+            recorded, 0.01, candidates=["friction.coulomb", "spring.linear", "drag.linear"]
+        )
+        start = replace(base.fit.make_start(), effects=("drag.linear",))
+        search.refit_models([start])
+        larger = search.models[frozenset(["drag.linear"])]
+        models = [base, larger] if first else [larger, base]
+        for model in models:
+            search.scan(model)
+            assess_lack_of_fit(search, model)
+        chances.append([*search.scan(base).chance, *search.scan(larger).chance])
+        chances[-1].append(assess_lack_of_fit(search, larger).p_value)
+    assert chances[0] == chances[1]
+
+
+def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkeypatch):
+    recorded = recording(
+        "slider", effects=["friction.coulomb=0.1"], noise=["0.01"], observe=["x"], runs=2, rate=50.0
+    )
+    names = ["drag.linear", "spring.linear"]
+    search, base = searched(recorded, 0.01, candidates=["friction.coulomb", *names])
+    search.refit([replace(base.fit.start(), effects=(name,)) for name in names])
+    first, second = (search.models[frozenset([name])] for name in names)
+    search.scan(base)
+    before = search.scan(first)
+    held = {frozenset(), frozenset(first.names)}
+    assert set(search.scanned) == held
+
+    # Room for one of them beside the base model's.
+    size = search.scanned[frozenset(first.names)].directions.values.nbytes
+    monkeypatch.setattr("bench.diagnosis.search.scored_models.DIRECTION_CACHE_BYTES", 1.5 * size)
+    search.scan(second)
+    assert set(search.scanned) == {frozenset(), frozenset(second.names)}
+    once = search.world.simulations
+    assert search.scan(first) is before
+    assert search.world.simulations == once
+
+    # Who extends both has both, the one that was gone among them.
+    search.extend([first, second], 3)
+    assert search.scored[frozenset(first.names)] is before
+    known = {frozenset([*one, "friction.coulomb"]) for one in (first.names, second.names)}
+    assert known <= set(search.models)
+
+
+def test_a_survey_of_several_models_reports_each_of_them():
+    class Events(SilentListener):
+        def __init__(self):
+            self.finished = {}
+
+        def stage(self, name, total=None):
+            self.now = name, total
+            self.finished[self.now] = 0
+
+        def advance(self, count=1):
+            self.finished[self.now] += count
+
+    recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
+    candidates = ["friction.coulomb", "spring.linear", "drag.linear"]
+    search, _ = searched(recorded, 0.01, candidates=candidates)
+    names = [("friction.coulomb",), ("spring.linear",)]
+    search.refit([replace(search.base.fit.start(), effects=one) for one in names])
+    heard = Events()
+    search.world.watch = SearchControl(listener=heard)
+    search.extend([search.models[frozenset(one)] for one in names], 0)
+    assert heard.finished["testing 2 effects beside 2 models", 2] == 2

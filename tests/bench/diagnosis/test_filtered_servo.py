@@ -1,0 +1,132 @@
+"""Explain takes a servo with a filter for a servo, whatever its filter holds when a run begins.
+
+The motion is that of plain MuJoCo, from a model file with another damping at the elbow.
+"""
+
+import os
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis import explain as explaining
+from bench.diagnosis.score_extended import score_model
+from bench.logs.importing.filter_start import leave_out_settling
+from bench.logs.joined_recordings import load_joined
+
+NOISE = 5e-4
+ARM = """
+<mujoco model="arm">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body pos="0 0 1">
+      <inertial pos="0.12 0 0" mass="0.9" diaginertia="0.002 0.006 0.006"/>
+      <joint name="shoulder" axis="0 1 0" damping="0.2" armature="0.02" range="-2 2"/>
+      <body name="fore" pos="0.25 0 0">
+        <inertial pos="0.1 0 0" mass="0.4" diaginertia="0.001 0.002 0.002"/>
+        <joint name="elbow" axis="0 1 0" damping="{damping}" armature="0.01" range="-2 2"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>{actuators}</actuator>
+</mujoco>
+"""
+SERVOS = (
+    '<position name="s1" joint="shoulder" kp="60" kv="4" timeconst="0.04"/>'
+    '<general name="s2" joint="elbow" gear="2" dyntype="filter" dynprm="0.04" '
+    'gainprm="8" biastype="affine" biasprm="0 -8 -0.4" forcerange="-40 40"/>'
+)
+STATED, PLANTED = 0.1, 0.9
+LOG = "".join(
+    ['model = "arm.xml"\n']
+    + [f'[channels."q.{j}"]\nunit = "rad"\nnoise = {NOISE}\n' for j in ("shoulder", "elbow")]
+    + [f'[inputs."u.{m}"]\nunit = "rad"\n' for m in ("s1", "s2")]
+    + ["[runs.3]\nheld_out = true\n"]
+)
+SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "shared"))
+CASE = SHARED / "cases" / "filtered_servo" / "log.csv"
+
+
+def recorded(folder, begun, seconds=2.5):
+    """The path of a log of three runs.
+
+    Args:
+        folder: where it is written, with the model file as it is known.
+        begun: ``zero`` where activations begin as MuJoCo resets them; ``moving`` where the log is
+            cut out of a motion.
+    """
+    rng = np.random.default_rng(5)
+    model = mujoco.MjModel.from_xml_string(ARM.format(damping=PLANTED, actuators=SERVOS))
+    before = 0.7 if begun == "moving" else 0.0
+    count = round((seconds + before) / 0.01) + 1
+    times = 0.01 * np.arange(count)
+    rows = ["run,t,u.s1,u.s2,q.shoulder,q.elbow"]
+    for run in (1, 2, 3):
+        rates, phases = rng.uniform(4, 8, 2), rng.uniform(1, 2, 2)
+        command = np.array([0.4, 0.9]) * np.sin(times[:, None] * rates + phases)
+        data = mujoco.MjData(model)
+        data.qpos[:] = command[0] / np.array([1.0, 2.0])
+        for t, u in zip(times, command, strict=True):
+            q = data.qpos + NOISE * rng.standard_normal(2)
+            if t > before - 1e-9:
+                rows.append(f"{run},{t:.3f},{u[0]:.9f},{u[1]:.9f},{q[0]:.7f},{q[1]:.7f}")
+            data.ctrl[:] = u
+            for _ in range(5):
+                mujoco.mj_step(model, data)
+    (folder / "arm.xml").write_text(ARM.format(damping=STATED, actuators=SERVOS))
+    (folder / "log.csv").write_text("\n".join(rows) + "\n")
+    (folder / "log.toml").write_text(LOG)
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize("begun", ["zero", "moving"])
+def test_a_planted_damping_is_found_behind_filtered_servos(tmp_path, begun):
+    path = recorded(tmp_path, begun)
+    lines = []
+    found = explaining.explain(path, say=lines.append)
+    (cause,) = found.causes
+    assert {cause.effect, *cause.alternatives} == {"drag.linear@elbow", "actuator.damping@s2"}
+    (number,) = cause.coefficients.values()
+    # A servo's damping acts on the joint by the square of its gear.
+    change = (PLANTED - STATED) / (1.0 if cause.effect.startswith("drag") else 0.4 * 2.0**2)
+    assert number.value == pytest.approx(change, rel=0.03)
+    (line,) = [line for line in lines if "are left out" in line]
+    assert "the first 0.4 s" in line
+    assert "the filters of s1, s2 settle" in line
+    assert '[runs.NAME.initial] "act.s1"' in line
+
+
+def test_the_true_model_has_no_gap_however_its_filters_begin(tmp_path):
+    path = recorded(tmp_path, "zero")
+    (tmp_path / "truth.xml").write_text(ARM.format(damping=PLANTED, actuators=SERVOS))
+    assert score_model(tmp_path / "truth.xml", path)["normalised_rmse"] < 1.1
+
+
+def test_runs_with_stated_activations_stay_whole(tmp_path):
+    path = recorded(tmp_path, "zero")
+    stated = "".join(f'[runs.{r}.initial]\n"act.s1" = 0.0\n"act.s2" = 0.0\n' for r in (1, 2, 3))
+    (tmp_path / "log.toml").write_text(LOG + stated)
+    recording, kind = load_joined([path])
+    same, note = leave_out_settling(recording, kind)
+    assert note == ""
+    assert same == recording
+    (tmp_path / "truth.xml").write_text(ARM.format(damping=PLANTED, actuators=SERVOS))
+    assert score_model(tmp_path / "truth.xml", path)["normalised_rmse"] < 1.1
+
+
+def test_a_run_that_is_too_short_to_lose_its_beginning_stays_whole(tmp_path):
+    recording, kind = load_joined([recorded(tmp_path, "zero", seconds=0.7)])
+    same, note = leave_out_settling(recording, kind)
+    assert note == ""
+    assert [run.times.size for run in same.runs] == [run.times.size for run in recording.runs]
+
+
+@pytest.mark.skipif(not CASE.exists(), reason="the shared cases are not on this machine")
+def test_the_shared_case():
+    found = explaining.explain(CASE)
+    (cause,) = found.causes
+    assert {cause.effect, *cause.alternatives} == {"drag.linear@elbow", "actuator.damping@m_elbow"}
+    assert found.verdict in ("named", "ambiguous")

@@ -1,0 +1,180 @@
+"""Explain tells MuJoCo's soft form of dry friction from the stiff one, and writes down which it is.
+
+The motion is that of plain MuJoCo, from a model file with `frictionloss` at the elbow.
+"""
+
+import json
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis import explain as explaining
+from bench.diagnosis.evaluation.noise_model import NoiseModel
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import ModelSet
+from bench.diagnosis.friction_form_verdict import (
+    choose_friction_form,
+    form_of,
+    has_dry_friction,
+    soft_kind,
+)
+from bench.diagnosis.score_extended import score_model
+from bench.diagnosis.search.alternative_causes import CauseEvidence
+from bench.diagnosis.search.diagnose import DiagnosisResult
+from bench.diagnosis.search.lack_of_fit import assess_lack_of_fit
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from bench.logs.joined_recordings import load_joined
+from sims.extended_simulator import read_extended
+from tests.bench.diagnosis.verdict_schema import check
+from tests.sims.robot.test_friction_form import ARM
+
+NOISE, PLANTED = 1e-3, 0.06
+FORMS = {
+    "soft": "",
+    # The stiff form at steps of 2 ms of `implicitfast`.
+    "stiff": 'solreffriction="0.004 1" solimpfriction="0.9999 0.9999 0.001"',
+}
+LOG = "".join(
+    ['model = "arm.xml"\n']
+    + [f'[channels."q.{j}"]\nunit = "rad"\nnoise = {NOISE}\n' for j in ("shoulder", "elbow")]
+    + [f'[inputs."u.{m}"]\nunit = "N*m"\n' for m in ("m1", "m2")]
+    + ["[runs.3]\nheld_out = true\n"]
+)
+
+
+def recorded(folder, form, friction=PLANTED, seconds=2.0):
+    """The path of a log of three runs; the model file beside it states no friction."""
+    rng = np.random.default_rng(8)
+    loss = f'frictionloss="{friction}" {FORMS[form]}'
+    model = mujoco.MjModel.from_xml_string(ARM.format(integrator="implicitfast", elbow=loss))
+    times = 0.002 * np.arange(round(seconds / 0.002) + 1)
+    rows = ["run,t,u.m1,u.m2,q.shoulder,q.elbow"]
+    for run in (1, 2, 3):
+        rates, phases = rng.uniform(3, 9, 2), rng.uniform(0, 6, 2)
+        torque = np.array([0.8, 0.3]) * np.sin(times[:, None] * rates + phases)
+        # Commands are held from one row to the next, five steps.
+        torque = np.repeat(torque[::5], 5, axis=0)[: times.size]
+        data = mujoco.MjData(model)
+        data.qpos[:] = rng.uniform(-0.5, 0.5, 2)
+        q = []
+        for row in torque:
+            q.append(data.qpos.copy())
+            data.ctrl[:] = row
+            mujoco.mj_step(model, data)
+        seen = np.array(q) + NOISE * rng.standard_normal((times.size, 2))
+        for t, u, x in list(zip(times, torque, seen, strict=True))[::5]:
+            rows.append(f"{run},{t:.3f},{u[0]:.9f},{u[1]:.9f},{x[0]:.7f},{x[1]:.7f}")
+    (folder / "arm.xml").write_text(ARM.format(integrator="implicitfast", elbow=""))
+    (folder / "log.csv").write_text("\n".join(rows) + "\n")
+    (folder / "log.toml").write_text(LOG)
+    return folder / "log.csv"
+
+
+def fitted(path, name):
+    """The models of a log with stiff friction, the one with this effect alone, and a function that
+    makes the world of the other form.
+    """
+    recording, kind = load_joined([path], None, None, ())
+
+    def world(of):
+        return RunEvaluator(of, recording, recording.training(), None, candidates=CANDIDATES)
+
+    stiff = world(kind)
+    noise = NoiseModel(np.full(2, NOISE), np.zeros(2))
+    base = fit_base_model(stiff, noise)
+    rng = np.random.default_rng(0)
+    models = ModelSet(stiff, noise, base.fixed_parameters, rng, np.ones(2, dtype=bool))
+    models.refit_models([FitStart((name,), base.fit.theta, base.fit.states)], race=False)
+    return models, models.models[frozenset([name])], world(soft_kind(kind))
+
+
+CANDIDATES = ["drag.linear@elbow", "friction.coulomb@elbow", "friction.hysteresis@elbow"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_form_that_was_planted_fits_better(tmp_path, form):
+    name = "friction.coulomb@elbow"
+    models, stiff, other = fitted(recorded(tmp_path, form), name)
+    soft = choose_friction_form(models, stiff, other, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+    assert (soft is not None) == (form == "soft")
+    best, world = (stiff, models.world) if soft is None else (soft, other)
+    assert best.names == (name,)
+    assert best.fit.theta[world.places(name)[0]] == pytest.approx(PLANTED, rel=0.03)
+    assert abs(models.excess(best)) < 0.1
+    assert form_of(world, name) == ("soft" if form == "soft" else None)
+    assert form_of(other, "drag.linear@elbow") is None
+
+
+def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):
+    """Hysteresis is a force, and the same in both forms: the friction that it contains counts."""
+    models, hysteresis, other = fitted(recorded(tmp_path, "soft"), "friction.hysteresis@elbow")
+    soft = choose_friction_form(models, hysteresis, other, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
+    assert soft is not None
+    assert soft.effects == ("friction.coulomb@elbow",)
+    assert soft.fit.theta[other.places(soft.effects[0])[0]] == pytest.approx(PLANTED, rel=0.03)
+    assert has_dry_friction(models.world, ["friction.hysteresis@elbow"])
+    assert not has_dry_friction(models.world, ["drag.linear@elbow"])
+
+
+def names_friction_alone(search, held_out):
+    """What the search finds, without the time that it takes: the effect that was planted."""
+    effect = "friction.coulomb@elbow"
+    base = search.base
+    search.refit([replace(base.fit.start(), effects=(effect,))], race=False)
+    model = search.models[frozenset([effect])]
+    thetas = [base.fit.theta, model.fit.theta]
+    measured = dict(zip([(), (effect,)], held_out.measure(thetas), strict=True))
+    gain = model.likelihood.value - base.likelihood.value
+    causes = (CauseEvidence(effect, (), 0.0, gain),)
+    return DiagnosisResult(
+        "named", model, base, causes, assess_lack_of_fit(search, model), (), measured
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMS)
+def test_explain_says_the_form_and_its_files_reproduce_it(tmp_path, monkeypatch, form):
+    monkeypatch.setattr(explaining, "diagnose", names_friction_alone)
+    path = recorded(tmp_path, form)
+    found = explaining.explain(path)
+    (cause,) = found.causes
+    assert cause.effect == "friction.coulomb@elbow"
+    assert cause.coefficients["coefficient"].value == pytest.approx(PLANTED, rel=0.03)
+    paths = {one.name: one for one in found.write(tmp_path / "out")}
+    check(paths["verdict.json"].read_text())
+    (stated,) = json.loads(paths["verdict.json"].read_text())["causes"]
+    assert stated.get("form") == cause.form == ("soft" if form == "soft" else None)
+    words = "in MuJoCo's soft form (solreffriction 0.02 1)"
+    assert (words in found.story.verdict.causes[0].says) == (form == "soft")
+    assert read_extended(paths["extended.toml"]).robot.friction_form == form
+    xml = paths["extended.xml"].read_text()
+    assert ("solreffriction=" in xml) == (form == "stiff")
+    errors = [score_model(paths[f"extended.{kind}"], path) for kind in ("toml", "xml")]
+    assert errors[0]["normalised_rmse"] == pytest.approx(errors[1]["normalised_rmse"], rel=1e-6)
+    assert errors[0]["normalised_rmse"] < 1.1
+
+
+@pytest.mark.slow
+def test_the_form_of_friction_that_is_free_is_chosen_too(tmp_path, monkeypatch):
+    """It is a parameter and no cause: the files hold its form, and the user is told."""
+
+    def names_nothing(search, _):
+        return DiagnosisResult(
+            "adequate", search.base, search.base, (), assess_lack_of_fit(search, search.base)
+        )
+
+    monkeypatch.setattr(explaining, "diagnose", names_nothing)
+    said = []
+    path = recorded(tmp_path, "soft")
+    found = explaining.explain(path, free=["frictionloss@elbow"], say=said.append)
+    number = found.answer.parameters["friction.coulomb@elbow"]
+    assert number.value == pytest.approx(PLANTED, rel=0.03)
+    assert explaining.SOFT_FRICTION in said
+    paths = {one.name: one for one in found.write(tmp_path / "out")}
+    assert read_extended(paths["extended.toml"]).robot.friction_form == "soft"
+    assert "solreffriction=" not in paths["extended.xml"].read_text()
+    assert score_model(paths["extended.xml"], path)["normalised_rmse"] < 1.1

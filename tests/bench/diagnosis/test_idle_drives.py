@@ -1,0 +1,98 @@
+"""Explain finds what a model lacks although a drive is switched off in a part of each run.
+
+The motion is that of plain MuJoCo, whose servo has no gains while it is off.
+"""
+
+import json
+import os
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis import explain as explaining
+from bench.diagnosis.report.summary_text import format_summary
+from tests.bench.diagnosis.verdict_schema import check
+
+NOISE = 1e-3
+ROD = """
+<mujoco model="rod">
+  <compiler angle="radian"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody><body name="rod" pos="0 0 1">
+    <joint name="hinge" axis="0 1 0" damping="{damping}" armature="0.008"/>
+    <inertial pos="0 0 -0.2" mass="0.25" diaginertia="0.001 0.001 0.0002"/>
+  </body></worldbody>
+  <actuator><position name="drive" joint="hinge" kp="8" kv="0.3"/></actuator>
+</mujoco>
+"""
+STATED, PLANTED = 0.03, 0.06
+LOG = (
+    f'model = "rod.xml"\n[channels."q.hinge"]\nunit = "rad"\nnoise = {NOISE}\n'
+    '[inputs."u.drive"]\nunit = "rad"\n[runs.3]\nheld_out = true\n'
+)
+EXTRA = '[extra.enabled]\nunit = "1"\n'
+SWITCH = '[actuators.drive]\nenable = "enabled"\n'
+SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "shared"))
+CASE = SHARED / "cases" / "torque_switched_off" / "log.csv"
+
+
+def recorded(folder, description, has_column=True):
+    """The path of a log of three runs, in which the drive is off for a second and a half."""
+    rng = np.random.default_rng(4)
+    model = mujoco.MjModel.from_xml_string(ROD.format(damping=PLANTED))
+    gain, bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
+    times = 0.01 * np.arange(301)
+    rows = ["run,t,u.drive,q.hinge" + ",enabled" * has_column]
+    for run in (1, 2, 3):
+        data = mujoco.MjData(model)
+        first = 0.9 + 0.2 * run
+        u = 1.2 * np.sin(rng.uniform(4, 7) * times)
+        for k, t in enumerate(times):
+            on = not first - 1e-9 <= t < first + 1.5 - 1e-9
+            q = data.qpos[0] + NOISE * rng.standard_normal()
+            rows.append(f"{run},{t:.3f},{u[k]:.9f},{q:.7f}" + f",{int(on)}" * has_column)
+            data.ctrl[0] = u[k]
+            model.actuator_gainprm[:], model.actuator_biasprm[:] = gain * on, bias * on
+            for _ in range(5):
+                mujoco.mj_step(model, data)
+    (folder / "rod.xml").write_text(ROD.format(damping=STATED))
+    (folder / "log.csv").write_text("\n".join(rows) + "\n")
+    (folder / "log.toml").write_text(description)
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize("given", ["key", "column", "nothing"])
+def test_the_planted_damping_is_found(tmp_path, given):
+    description = {"key": LOG + SWITCH, "column": LOG + EXTRA, "nothing": LOG}[given]
+    lines = []
+    path = recorded(tmp_path, description, has_column=given != "nothing")
+    found = explaining.explain(path, say=lines.append)
+    (cause,) = found.causes
+    assert "drag.linear@hinge" in {cause.effect, *cause.alternatives}
+    if cause.effect == "drag.linear@hinge":
+        (number,) = cause.coefficients.values()
+        assert number.value == pytest.approx(PLANTED - STATED, rel=0.05)
+    notes = {
+        "key": "actuator drive exerts nothing where enabled is 0: run 1, 1.1 to 2.59 s",
+        "column": 'state it in log.toml: [actuators.drive] enable = "enabled"',
+        "nothing": "the drives of joint hinge do nothing in some samples, which are left out",
+    }
+    assert sum(notes[given] in line for line in lines) == 1
+    # It stands right below the headline, before any number of a cause.
+    told = " ".join(" ".join(format_summary(found.story)).split()).lower()
+    assert told.index(notes[given].lower()) < told.index("coefficient")
+    paths = {one.name: one for one in found.write(tmp_path / "out")}
+    check(paths["verdict.json"].read_text())
+    (note,) = json.loads(paths["verdict.json"].read_text())["recording_notes"]
+    assert notes[given] in note
+
+
+@pytest.mark.skipif(not CASE.exists(), reason="the shared cases are not on this machine")
+def test_the_shared_case():
+    found = explaining.explain(CASE)
+    (cause,) = found.causes
+    assert (cause.effect, cause.form) == ("friction.coulomb@hinge", "soft")
+    (note,) = found.answer.recording_notes
+    assert 'state it in log.toml: [actuators.servo] enable = "torque_enable"' in note

@@ -1,0 +1,50 @@
+"""An end stop that a recording hides: a slider by scipy, that meets it now and then."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from bench.diagnosis.explain import explain
+
+MASS, NOISE, INTERVAL, SAMPLES = 1.2, 1e-3, 0.02, 150
+
+
+def path(force, speed, stiffness, place, loss):
+    """Positions (SAMPLES,) with Hertz's contact beyond `place`, solved from command to command."""
+
+    def rate(_t, state, u):
+        depth = max(state[0] - place, 0.0)
+        stop = stiffness * depth**1.5 / 0.1 * max(1.0 + loss * state[1], 0.0)
+        return [state[1], (u - stop) / MASS]
+
+    state, x = np.array([0.0, speed]), [0.0]
+    for u in force[:-1]:
+        done = solve_ivp(
+            rate, (0.0, INTERVAL), state, args=(u,), rtol=1e-8, atol=1e-10, max_step=2e-3
+        )
+        state = done.y[:, -1]
+        x.append(state[0])
+    return np.array(x)
+
+
+def test_an_end_stop_is_named_with_its_place_and_what_it_takes(tmp_path):
+    stiffness, place, loss = 1500.0, 0.45, 0.4
+    rng, rows = np.random.default_rng(3), ["run,t,u,x"]
+    times = INTERVAL * np.arange(SAMPLES)
+    for run, speed in enumerate((0.4, 0.25, 0.3)):
+        force = np.where(times % 1.0 < 0.5, 2.0 + 0.6 * run, -2.0 - 0.6 * run)
+        x = path(force, speed, stiffness, place, loss)
+        x = x + NOISE * rng.standard_normal(SAMPLES)
+        rows += [f"{run},{t:.4f},{u},{a:.7f}" for t, u, a in zip(times, force, x, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    (tmp_path / "log.toml").write_text(
+        f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
+    )
+    answer = explain(tmp_path / "log.csv").answer
+    (cause,) = answer.causes
+    assert (answer.verdict, cause.effect, cause.alternatives) == ("named", "state.limit", ())
+    found = cause.coefficients
+    assert found["place"].value == pytest.approx(place, abs=0.005)
+    assert found["loss"].value == pytest.approx(loss, abs=0.02)
+    assert 0.6 * stiffness < found["stiffness"].value < 1.6 * stiffness
+    assert answer.heldout.gap_closed > 0.97

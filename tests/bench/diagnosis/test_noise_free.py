@@ -1,0 +1,191 @@
+"""Data without noise give no false alarm: differences of the integrators are not explained."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.noise_floor import (
+    INTEGRATION_ERROR_SHARE,
+    compute_noise_floor,
+    range_of,
+)
+from bench.diagnosis.evaluation.noise_free_runs import add_least_noise
+from bench.diagnosis.explain import explain
+from bench.diagnosis.search.diagnose import DiagnosisResult
+from bench.diagnosis.search.lack_of_fit import LackOfFitResult
+from bench.diagnosis.verdict_builder import VerdictBuilder
+from tests.bench.diagnosis.explained_samples import changed, recording, world
+
+
+@pytest.mark.parametrize("system", ["pendulum", "servo", "ball"])
+def test_noise_free_data_of_the_simulator_itself_are_explained_by_it(system):
+    answer = explain(recording(system, runs=4, seconds=2)).answer
+    assert (answer.verdict, answer.causes) == ("adequate", ())
+
+
+def test_a_cause_in_noise_free_data_is_named_with_its_number():
+    made = recording(
+        runs=4, seconds=2, observe=["q"], effects=["drag.linear=2e-4"], initial=["q=0.5:1.5"]
+    )
+    answer = explain(made).answer
+    (cause,) = answer.causes
+    assert (answer.verdict, cause.effect) == ("named", "drag.linear")
+    assert cause.coefficients["coefficient"].value == pytest.approx(2e-4, rel=5e-3)
+
+
+def test_noise_is_added_where_there_is_none_and_nowhere_else():
+    made = recording(runs=2, seconds=2, noise=["q=0.002"])
+    again, names = add_least_noise(made, ["q", "qd"])
+    assert names == ["qd"]
+    for before, after in zip(made.runs, again.runs, strict=True):
+        np.testing.assert_array_equal(before.channels["q"], after.channels["q"])
+        added = after.channels["qd"] - before.channels["qd"]
+        size = INTEGRATION_ERROR_SHARE * range_of(
+            np.concatenate([run.channels["qd"] for run in made.runs])
+        )
+        assert np.std(added) == pytest.approx(size, rel=0.2)
+
+
+def test_the_added_noise_is_the_same_each_time():
+    made = recording(runs=2, seconds=1)
+    once, twice = (add_least_noise(made, ["q"])[0] for _ in range(2))
+    np.testing.assert_array_equal(once.runs[1].channels["q"], twice.runs[1].channels["q"])
+    assert not np.array_equal(once.runs[0].channels["q"], once.runs[1].channels["q"])
+
+
+@pytest.mark.parametrize("digits", [6, 8])
+def test_rounding_of_a_file_is_not_noise(digits):
+    made = recording(runs=2, seconds=2)
+    rounded = [changed(run, q=lambda v: np.round(v, digits)) for run in made.runs]
+    assert add_least_noise(replace(made, runs=tuple(rounded)), ["q"])[1] == ["q"]
+
+
+def test_a_channel_that_never_changes_has_the_noise_of_what_no_sample_tells_of():
+    made = recording(runs=2, seconds=1, noise=["0.001"])
+    still = [changed(run, qd=lambda v: np.zeros_like(v)) for run in made.runs]
+    made = replace(made, runs=tuple(still), noise={})
+    assert add_least_noise(made, ["qd"])[1] == []
+    assert compute_noise_floor(world(made, candidates=[]), made).sigma[1] == pytest.approx(
+        1e-3 * 10.0
+    )
+
+
+NOTHING = LackOfFitResult(0.3, "", np.ones(1), ())
+
+
+def judged(fitted, held_out, left=NOTHING, base_error=1.0):
+    """The verdict on an `make_unknown_name_error` finding without causes: merits of models with one effect on the
+    fitted and on the held-out runs, next to 100 of the base model.
+    """
+    base = SimpleNamespace(names=(), penalised_log_likelihood=100.0)
+    models = {
+        (name,): SimpleNamespace(names=(name,), penalised_log_likelihood=m)
+        for name, m in fitted.items()
+    }
+    search = SimpleNamespace(base=base, models={(): base, **models})
+    simulated = np.full((1, 4, 1), base_error)
+    measured = {(): SimpleNamespace(simulated=simulated, penalised_log_likelihood=100.0)}
+    measured |= {
+        (name,): SimpleNamespace(penalised_log_likelihood=m) for name, m in held_out.items()
+    }
+    runs = SimpleNamespace(world=SimpleNamespace(observed=np.zeros((1, 4, 1))))
+    floor = SimpleNamespace(sigma=np.ones(1))
+    finding = DiagnosisResult("unknown", base, base, (), left, held_out_fits=measured)
+    assessor = VerdictBuilder(None, None, runs, floor, None)
+    return assessor._refutes(search, finding)
+
+
+@pytest.mark.parametrize(
+    ("fitted", "held_out", "refuted"),
+    [
+        ({"force.ripple@a": 90.0}, {}, True),
+        # Better on the fitted runs by chance, and not on the others.
+        ({"force.ripple@a": 105.0}, {"force.ripple@a": 64.0}, True),
+        ({"force.ripple@a": 105.0}, {"force.ripple@a": 101.0}, False),
+        # Not simulated on held-out runs: nothing speaks against it.
+        ({"force.ripple@a": 105.0}, {}, False),
+        # A score alone, which nobody has tried, is not refuted.
+        ({}, {}, False),
+    ],
+)
+def test_a_score_that_no_simulation_bears_out_is_no_finding(fitted, held_out, refuted):
+    assert judged(fitted, held_out) is refuted
+
+
+def test_structure_and_a_gap_on_held_out_runs_are_findings():
+    fitted = {"force.ripple@a": 90.0}
+    assert not judged(fitted, {}, left=replace(NOTHING, p_value=1e-9))
+    assert not judged(fitted, {}, base_error=3.0)
+
+
+FOUR_BAR = """<mujoco><option timestep="0.002" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="crank"><joint name="crank" axis="0 1 0" damping="0.05" armature="0.002"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.1" size="0.01" mass="0.3"/>
+      <body name="coupler" pos="0 0 0.1"><joint name="knee" axis="0 1 0" damping="0.01"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0.1" size="0.01" mass="0.4"/></body></body>
+    <body name="rocker" pos="0.3 0 0"><joint name="rocker" axis="0 1 0" damping="0.02"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.2" size="0.01" mass="0.3"/></body>
+  </worldbody>
+  <equality><connect body1="coupler" body2="rocker" anchor="0.3 0 0.1"/></equality>
+  <actuator><position name="servo" joint="crank" kp="20" kv="1"/></actuator></mujoco>"""
+GRIPPER = """<mujoco><option timestep="0.002" integrator="implicitfast"/>
+  <worldbody><body name="arm"><joint name="arm" axis="0 1 0" damping="0.2" armature="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="1" contype="0" conaffinity="0"/>
+      <body name="finger" pos="0.3 0 0">
+        <joint name="finger" type="slide" axis="0 1 0" range="0 0.04" damping="5"/>
+        <geom type="box" size="0.02 0.01 0.02" mass="0.05" contype="0" conaffinity="0"/>
+      </body></body></worldbody>
+  <actuator><position name="servo" joint="arm" kp="40" kv="2"/>
+    <position name="grip" joint="finger" kp="200"/></actuator></mujoco>"""
+
+
+def robot_log(folder, text, driven, resting, channels, noise):
+    """A log that MuJoCo makes with the file's own step: one servo moves, others rest at zero."""
+    model, rng = mujoco.MjModel.from_xml_string(text), np.random.default_rng(5)
+    inputs = [f"u.{name}" for name in (driven, *resting)]
+    lines = [",".join(["run", "t", *inputs, *(f"q.{name}" for name in channels)])]
+    places = [model.joint(name).qposadr[0] for name in channels]
+    for run in range(3):
+        data = mujoco.MjData(model)
+        rate, size = rng.uniform(3, 7), rng.uniform(0.3, 0.6)
+        for k in range(1000):
+            if k % 5 == 0:
+                data.ctrl[:] = 0.0
+                data.actuator(driven).ctrl[:] = size * np.sin(rate * k * model.opt.timestep)
+                seen = data.qpos[places] + noise * rng.standard_normal(len(places))
+                controls = [float(data.actuator(name[2:]).ctrl[0]) for name in inputs]
+                row = [k * model.opt.timestep, *controls, *seen.tolist()]
+                lines.append(",".join([str(run), *map(repr, row)]))
+            mujoco.mj_step(model, data)
+    (folder / "robot.xml").write_text(text)
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    units = {
+        name: "m" if "slide" in text and name in ("finger", "grip") else "rad"
+        for name in (driven, *resting, *channels)
+    }
+    stated = f"noise = {noise}\n" * bool(noise)
+    parts = [f'[inputs."{name}"]\nunit = "{units[name[2:]]}"\n' for name in inputs]
+    parts += [f'[channels."q.{name}"]\nunit = "{units[name]}"\n{stated}' for name in channels]
+    (folder / "log.toml").write_text(
+        'model = "robot.xml"\n' + "".join(parts) + "[runs.2]\nheld_out = true\n"
+    )
+    return folder / "log.csv"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [5e-4, 0.0])
+def test_a_closed_loop_without_a_cause_is_adequate(tmp_path, noise):
+    path = robot_log(tmp_path, FOUR_BAR, "servo", (), ("crank", "rocker"), noise)
+    assert explain(path).answer.verdict == "adequate"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [5e-4, 0.0])
+def test_a_gripper_at_rest_is_adequate(tmp_path, noise):
+    path = robot_log(tmp_path, GRIPPER, "servo", ("grip",), ("arm", "finger"), noise)
+    assert explain(path).answer.verdict == "adequate"

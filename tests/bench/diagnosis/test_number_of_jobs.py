@@ -1,0 +1,54 @@
+"""The answer does not depend on how many processes work."""
+
+import json
+import sys
+
+import pytest
+
+from bench.api import explain as api
+from bench.diagnosis.evaluation import run_evaluator, worker_pool
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
+from bench.diagnosis.explain import explain
+from bench.diagnosis.fitting import trajectory_fit
+from sims.core.simulator import InputError
+from tests.bench.diagnosis.explained_samples import recording
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
+def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypatch):
+    # Small pieces of a small search, all of them given to workers, whatever threads there are.
+    monkeypatch.setattr(worker_pool, "can_fork", lambda: True)
+    monkeypatch.setattr(RunEvaluator, "is_cheap_to_split", True)
+    monkeypatch.setattr(trajectory_fit, "GROUP_COST_SAMPLES", 10_000)
+    monkeypatch.setattr(run_evaluator, "MAX_CHUNK_SAMPLES", 4_000)
+    monkeypatch.setattr(worker_pool, "PARALLEL_THRESHOLD_SECONDS", 0.0)
+    shared = []
+    usual = ForkedWorkerPool._shared
+
+    def counted(self, *given):
+        shared.append(len(self._team))
+        return usual(self, *given)
+
+    monkeypatch.setattr(ForkedWorkerPool, "_shared", counted)
+    swing = recording(
+        effects=["drag.linear=1e-3", "friction.coulomb=2e-3", "force.bias=0.02"],
+        noise=["q=0.003", "qd=0.02"],
+        runs=3, seconds=1.0, rate=60.0,
+    )  # fmt: skip
+    documents = []
+    for jobs in (1, 2, 8):
+        shared.clear()
+        document = explain(swing, jobs=jobs).answer.to_document()
+        document.pop("seconds")
+        documents.append(json.dumps(document))
+        assert set(shared) == ({jobs} if jobs > 1 else set())
+        assert jobs == 1 or len(shared) > 10
+    assert documents[0] == documents[1] == documents[2]
+
+
+@pytest.mark.parametrize("jobs", [0, -2])
+def test_there_is_at_least_one_process(jobs):
+    with pytest.raises(InputError, match="jobs: expected a whole number of at least 1, found"):
+        api.explain("missing.csv", jobs=jobs)

@@ -1,0 +1,142 @@
+"""A time step or an integrator is a cause only where the file's own is really the worse one."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.search_control import SearchControl
+from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
+from bench.diagnosis.explain import _ExplainInput, _ExplainRun, explain
+from bench.diagnosis.fitting.base_fit import fit_base_model
+from bench.diagnosis.numerics_cause import (
+    SURE,
+    Reusable,
+    is_finer_model_better,
+    is_finer_step_better,
+)
+from tests.bench.diagnosis.arm_model import ARM
+
+HEAVY = ('mass="0.8"', 'mass="1.2"')
+DAMPED = ('damping="0.1"', 'damping="0.4"')
+COLUMNS = ("u.m_shoulder", "u.m_elbow", "q.shoulder", "q.elbow")
+NOISE, EVERY, SECONDS = 3e-4, 2, 3.0
+
+
+def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
+    """A log that MuJoCo makes of the arm, changed, with the file's step or a part of it; the file's
+    own step misses the fine motion by 7 times this noise.
+    """
+    model = mujoco.MjModel.from_xml_string(ARM.replace(*change) if change[0] else ARM)
+    step = model.opt.timestep
+    model.opt.timestep /= divide
+    model.opt.integrator = int(getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"))
+    rng, lines = np.random.default_rng(3), [",".join(("run", "t", *COLUMNS))]
+    for run in range(3):
+        data = mujoco.MjData(model)
+        rates, sizes = rng.uniform(1, 5, 2), rng.uniform(0.4, 0.9, 2)
+        for k in range(round(SECONDS / step)):
+            if k % EVERY == 0:
+                data.ctrl[:] = sizes * np.sin(rates * k * step)
+                row = [k * step, *data.ctrl, *(data.qpos + noise * rng.standard_normal(2))]
+                lines.append(",".join([str(run), *(repr(float(value)) for value in row)]))
+            for _ in range(divide):
+                mujoco.mj_step(model, data)
+    (folder / "arm.xml").write_text(ARM)
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    stated = f"noise = {noise}\n" * bool(noise)
+    parts = [f'[inputs."{name}"]\nunit = "rad"\n' for name in COLUMNS[:2]]
+    parts += [f'[channels."{name}"]\nunit = "rad"\n{stated}' for name in COLUMNS[2:]]
+    parts += ["[runs.2]\nheld_out = true\n"]
+    (folder / "log.toml").write_text('model = "arm.xml"\n' + "".join(parts))
+    return folder / "log.csv"
+
+
+def chosen(path):
+    """The explainer of a log whose base model is fitted, with the step that it has chosen."""
+    subject = _ExplainInput([path], None, None, whole=False, pieces=None)
+    said = []
+    given = "batch", 0, (), None, said.append, False, SearchControl(), ForkedWorkerPool(1)
+    explainer = _ExplainRun(subject, *given)
+    try:
+        explainer._stepped(fit_base_model(explainer.fitting, explainer.noise))
+    finally:
+        explainer.close()
+    return explainer
+
+
+@pytest.mark.parametrize("noise", [NOISE, 0.0])
+def test_a_missing_mass_does_not_make_the_files_own_step_look_worse(tmp_path, noise):
+    there = chosen(log(tmp_path, HEAVY, noise))
+    assert there.coarse is None
+    assert there.kind.numerics.integrator == "Euler"
+    # What would make the difference is known, for the comparison with the causes.
+    assert next(iter(there.finer)).error > 5.0
+
+
+def test_a_step_that_is_the_only_thing_wrong_is_found_before_any_cause(tmp_path):
+    there = chosen(log(tmp_path, divide=4, integrator="RK4"))
+    assert there.coarse is not None
+    assert there.coarse.gain > SURE
+    assert there.kind.numerics.integrator == "RK4"
+
+
+@pytest.mark.parametrize(
+    ("gain", "gap", "left", "better"),
+    [
+        (400.0, 6.0, 0.1, True),
+        # Most of the gap is still there: something else is missing.
+        (279.0, 12.8, 12.7, False),
+        (12.0, 1.0, 0.0, False),
+        # Better than the noise is not better than all of the gap.
+        (30.0, 0.5, -0.02, True),
+    ],
+)
+def test_when_a_finer_step_is_used_in_the_search(gain, gap, left, better):
+    assert is_finer_step_better(gain, gap, left) is better
+
+
+@pytest.mark.parametrize(
+    ("file", "finer", "better"),
+    [
+        ((24327.0, -0.02), (24346.0, -0.02), True),
+        ((24327.0, -0.02), (24333.0, -0.02), False),
+        # The likelihood is larger and so is the residual: neither model is near the data.
+        ((1903.0, 2.2), (2030.0, 3.4), False),
+        ((1903.0, 2.2), (2030.0, 0.1), True),
+        ((2030.0, -0.01), (1500.0, 6.0), False),
+    ],
+)
+def test_when_a_finer_step_is_better_once_causes_are_known(file, finer, better):
+    assert is_finer_model_better(file, finer) is better
+
+
+def test_steps_are_simulated_once_and_only_as_far_as_needed():
+    made = []
+    steps = Reusable(made.append(i) or i for i in range(5))
+    assert next(iter(steps)) == 0
+    assert [next(iter(steps)), made] == [0, [0]]
+    assert [one for one in steps if one > 2] == [3, 4]
+    assert made == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [NOISE, 0.0])
+def test_data_made_with_the_files_own_step_are_not_explained_by_another(tmp_path, noise):
+    answer = explain(log(tmp_path, DAMPED, noise)).answer
+    (cause,) = answer.causes
+    names = {cause.effect, *cause.alternatives}
+    assert "drag.linear@elbow" in names
+    assert not any(name.startswith("numerics.") for name in names)
+    value = SimpleNamespace(**cause.coefficients).coefficient.value
+    if cause.effect == "drag.linear@elbow":
+        assert value == pytest.approx(0.3, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_coarse_step_is_found_beside_a_cause(tmp_path):
+    answer = explain(log(tmp_path, DAMPED, divide=4, integrator="RK4")).answer
+    step, cause = answer.causes
+    assert step.effect == "numerics.integrator"
+    assert "drag.linear@elbow" in {cause.effect, *cause.alternatives}

@@ -1,0 +1,42 @@
+"""The same cause is named whichever engine explains: two external simulators, on data that each
+system's batch engine did not make."""
+
+import pytest
+
+from bench.diagnosis.explain import explain
+from tests.simulation_arguments import Wish, write
+
+CASES = {
+    "pendulum": ("drag.linear=6e-4", "mujoco", ("q",), 1.0, 30.0),
+    "slider": ("friction.coulomb=0.4", "pybullet", ("x",), 1.5, 40.0),
+    "ball": ("drag.quadratic=0.05", "mujoco", ("z",), 1.0, 30.0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("system", CASES)
+def test_the_same_cause_is_named(system, engine, tmp_path):
+    effect, source, observe, seconds, rate = CASES[system]
+    wish = Wish(
+        system,
+        effects=[effect],
+        noise=["0.004"],
+        observe=observe,
+        runs=3,
+        seconds=seconds,
+        rate=rate,
+        engine=source,
+        seed=3,
+    )
+    path = tmp_path / "data.csv"
+    write(wish, path)
+    answer = explain(path, engine=engine).answer
+    assert answer.engine == engine
+    (cause,) = answer.causes
+    name, size = effect.split("=")
+    assert name in (cause.effect, *cause.alternatives)
+    assert answer.verdict in ("named", "ambiguous")
+    if cause.effect == name:
+        found = cause.coefficients["coefficient"]
+        assert found.value == pytest.approx(float(size), rel=0.2)

@@ -1,0 +1,109 @@
+"""The check before the fit: what it calls identifiable is, and what is mixed up is named."""
+
+import re
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.diagnosis.explain import explain
+from bench.diagnosis.identifiability import format_identifiability
+from bench.diagnosis.recording_check import check_identifiability
+from sims.core.simulator import InputError, Scenario
+from sims.recording.recording import Recording, Run
+from sims.recording.recording_writer import write_recording
+from sims.systems.slider import Slider
+
+NOISE = 1e-3
+
+
+def recorded(folder, moved=True, mass=2.0, seed=0, damping=0.0):
+    """Runs of a slider that is pushed, or left alone, with an encoder's noise."""
+    rng, times = np.random.default_rng(seed), np.arange(150) / 50.0
+    runs = []
+    for number in range(3):
+        force = 2 * np.sin(3 * times + number) if moved else np.zeros(150)
+        run = Scenario(times, {}, {"u": force})
+        simulator = Slider(observe=["x"], effects=["drag.linear"])
+        x = simulator.simulate(np.array([[mass, damping]]), run)[0, :, 0]
+        seen = x + NOISE * rng.standard_normal(150)
+        runs.append(Run(str(number), times, {"x": seen}, {"u": force}, {}, {}, number == 2))
+    path = folder / "log.csv"
+    about = Recording(path, "slider", "", {}, {"x": NOISE}, tuple(runs))
+    write_recording(path, about, Slider)
+    return path
+
+
+def test_the_width_is_that_of_the_fit(tmp_path):
+    path = recorded(tmp_path, damping=0.5)
+    by_name = {number.name: number for number in check_identifiability(path)}
+    explained = explain(path)
+    (cause,) = explained.causes
+    (number,) = cause.coefficients.values()
+    assert cause.effect == "drag.linear"
+    half = 0.5 * (number.high - number.low)
+    assert by_name["drag.linear"].half == pytest.approx(half, rel=0.3)
+    assert by_name["drag.linear"].word == "identifiable"
+
+
+@pytest.mark.slow
+def test_what_is_called_identifiable_has_intervals_that_hold(tmp_path):
+    held = []
+    for seed in range(36):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        mass = 1.0 + 0.05 * seed
+        path = recorded(folder, mass=mass, seed=seed)
+        (number,) = [n for n in check_identifiability(path) if n.free]
+        assert number.name == "mass"
+        assert number.word == "identifiable"
+        estimate = explain(path).answer.parameters["mass"].value
+        held.append(abs(estimate - mass) < number.half)
+    assert 0.88 <= np.mean(held) <= 1.0  # 32 of 36
+
+
+def test_a_motion_that_does_not_happen_fixes_nothing(tmp_path, capsys):
+    path = recorded(tmp_path, moved=False)
+    (mass,) = [n for n in check_identifiability(path) if n.free]
+    assert mass.word == "not identifiable"
+    out = tmp_path / "out"
+    assert main(["inspect", str(path), "--check", "--out", str(out)]) == 1
+    said = capsys.readouterr().out
+    assert "  not identifiable mass: " in said
+
+
+def test_what_is_mixed_up_is_named(tmp_path, capsys):
+    path = recorded(tmp_path)
+    by_name = {number.name: dict(number.mixed) for number in check_identifiability(path)}
+    assert by_name["input.delay"]["input.hold"] > 0.99
+    assert by_name["force.bias"]["input.bias"] > 0.999
+    # A gain of the input is a mass: beside the mass, which is free, nothing is left of it.
+    (gain,) = [n for n in check_identifiability(path) if n.name == "input.gain"]
+    assert gain.word == "not identifiable"
+    assert main(["inspect", str(path), "--check", "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "mixed up with" in said
+    assert re.search(r"\n  not identifiable: .*input\.gain", said)
+
+
+def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
+    path = recorded(tmp_path)
+    assert main(["inspect", str(path), "--free", "mass", "--out", str(tmp_path / "out")]) == 2
+    assert "give --check besides" in capsys.readouterr().err
+    with pytest.raises(InputError, match="no such file"):
+        check_identifiability(tmp_path / "none.csv")
+
+
+def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path):
+    numbers = check_identifiability(recorded(tmp_path))
+    causes = [n for n in numbers if not n.free]
+    lines = format_identifiability(numbers, most=3)
+    sure = [n.name for n in causes if n.word == "identifiable"]
+    assert len(sure) > 6
+    assert f"{len(sure)} identifiable" in lines[2]
+    # Each has an interval, and none is wider than those after it.
+    assert all("identifiable     " in line and "±" in line for line in lines[3:6])
+    assert lines[6].startswith("  identifiable too: ")
+    assert lines[6].endswith(" more")
+    assert lines[-1].endswith("the same command with --json")
+    assert len("\n".join(lines)) < 1500

@@ -1,0 +1,121 @@
+"""What clocks do to a log, and that what is hidden besides is named all the same: sliders by scipy
+with dry friction, or with nothing.
+"""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from bench.diagnosis.explain import explain
+from bench.logs.inspection import load_recording
+from bench.logs.quality.log_quality import check_log_quality
+
+NOISE, MASS, INTERVAL = 1e-3, 2.0, 0.02
+
+
+def log(folder, coulomb, stamp=None, lost=0.0, drift=0.0, seed=0, seconds=6.0):
+    """Three runs: a force that changes at every stamp, a position that is read there.
+
+    Args:
+        coulomb: N.
+        stamp: makes stamps of even ones.
+        lost: share of the sensor's samples that are missing.
+        drift: share by which the sensor's clock is fast.
+    """
+    rng = np.random.default_rng(seed)
+    rows = ["run,t,u,x"]
+    for run in range(3):
+        even = np.arange(0.0, seconds, INTERVAL)
+        times = even if stamp is None else stamp(even, rng)
+        u = 2.0 * np.sin(3 * times + run) + 1.0 * np.sin(7.3 * times)
+
+        def rate(_t, state, force):
+            return [state[1], (force - coulomb * np.tanh(state[1] / 1e-3)) / MASS]
+
+        state, pieces = np.array([0.0, 0.5]), []
+        for begin, end, force in zip(times[:-1], times[1:], u[:-1], strict=True):
+            done = solve_ivp(
+                rate, (begin, end), state, args=(force,), rtol=1e-8, atol=1e-10, max_step=0.01,
+                dense_output=True,
+            )  # fmt: skip
+            pieces.append((begin, end, done.sol))
+            state = done.y[:, -1]
+        at = np.clip(times[0] + (times - times[0]) / (1.0 + drift), times[0], times[-1])
+        inside = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(pieces) - 1)
+        x = np.array([pieces[i][2](t)[0] for i, t in zip(inside, at, strict=True)])
+        x += NOISE * rng.standard_normal(x.size)
+        cells = [f"{value:.6f}" for value in x]
+        for i in np.flatnonzero(rng.random(x.size) < lost):
+            cells[i] = ""
+        rows += [f"{run},{t:.6f},{a:.6f},{c}" for t, a, c in zip(times, u, cells, strict=True)]
+    path = folder / "log.csv"
+    path.write_text("\n".join(rows))
+    path.with_suffix(".toml").write_text(
+        f'system = "slider"\n[channels.x]\nunit = "m"\nnoise = {NOISE}\n[inputs.u]\nunit = "N"\n'
+    )
+    return path
+
+
+def jittered(times, rng):
+    return np.sort(times + 0.2 * INTERVAL * rng.uniform(-1.7, 1.7, times.size))
+
+
+CLOCKS = {
+    "jitter of 20 %": {"stamp": jittered},
+    "5 % of the samples lost": {"lost": 0.05},
+    "5 % of the rows lost": {"stamp": lambda t, rng: t[(rng.random(t.size) > 0.05) | (t == 0)]},
+    "a drift of 100 ppm": {"drift": 1e-4},
+}
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+@pytest.mark.parametrize("coulomb", [0.0, 0.2])
+def test_a_clock_hides_no_cause_and_makes_none(tmp_path, clock, coulomb):
+    found = explain(log(tmp_path, coulomb, **CLOCKS[clock]))
+    assert found.verdict == ("named" if coulomb else "adequate")
+    assert [cause.effect for cause in found.causes] == ["friction.coulomb"] * bool(coulomb)
+    if coulomb:
+        (number,) = found.causes[0].coefficients.values()
+        assert number.value == pytest.approx(coulomb, rel=0.02)
+    assert found.answer.parameters["mass"].value == pytest.approx(MASS, rel=0.01)
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_the_census_says_what_the_clock_does(tmp_path, clock):
+    long = 40.0 if "drift" in clock else 6.0
+    found = list(
+        check_log_quality(*load_recording(log(tmp_path, 0.0, seconds=long, **CLOCKS[clock])))
+    )
+    told = [finding.text_line for finding in found if finding.about in ("clock", "drift")]
+    if clock == "5 % of the samples lost":
+        # They are empty cells: the table of channels says so, and the clock is even.
+        assert told == []
+    elif "drift" not in clock:
+        (line,) = told
+        assert ("vary by" in line) == ("jitter" in clock)
+        assert ("are lost" in line) == ("rows" in clock)
+
+
+def test_a_slip_in_the_only_run_is_named_at_its_stamp_and_borne_out_by_what_follows(tmp_path):
+    """A pendulum by scipy, in a log whose stamps begin at 100 s; its last third is held out."""
+    times, mass, length, inertia = np.arange(0.0, 5.0, 0.02), 0.15, 0.1, 3.3e-3
+
+    def rate(_t, state):
+        return [state[1], -mass * 9.81 * length / inertia * np.sin(state[0])]
+
+    swung = solve_ivp(rate, (0.0, 5.0), [1.0, 0.0], t_eval=times, rtol=1e-9, atol=1e-11)
+    q = swung.y[0] + 0.003 * np.random.default_rng(0).standard_normal(times.size)
+    q[times > 1.611] += 0.02
+    rows = ["run,t,q", *(f"1,{100 + t:.6f},{a:.8f}" for t, a in zip(times, q, strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    (tmp_path / "log.toml").write_text(
+        'system = "pendulum"\n[channels.q]\nunit = "rad"\nnoise = 0.003\n'
+        f"[constants]\nmass = {mass}\nlength = {length}\ngravity = 9.81\n"
+    )
+    answer = explain(tmp_path / "log.csv").answer
+    (cause,) = answer.causes
+    assert (answer.verdict, cause.effect, cause.alternatives) == ("named", "sensor.slip", ())
+    jump, instant = cause.coefficients["coefficient"], cause.coefficients["instant"]
+    assert jump.low < 0.02 < jump.high < 0.025
+    assert instant.low < 101.611 < instant.high < instant.low + 0.06
+    assert answer.heldout.gap_closed > 0.9

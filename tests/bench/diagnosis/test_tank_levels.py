@@ -1,0 +1,69 @@
+"""The example of two tanks: its recording is what its script makes, the simulator is what the
+script solves, and explain finds the rim that the recording hides, and none where there is none.
+"""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from bench.core.plugin_registries import load_plugins, simulators
+from bench.diagnosis.explain import explain
+from sims.core.simulator import Scenario
+from tests.conftest import PLUGINS
+
+EXAMPLES = PLUGINS.parents[1] / "examples"
+RECORDING = EXAMPLES / "tanks" / "overflow.csv"
+
+pytestmark = pytest.mark.usefixtures("fresh_registries")
+
+
+@pytest.fixture
+def made():
+    """The script that makes the recording; the example's simulator is registered."""
+    spec = importlib.util.spec_from_file_location("tanks_log", EXAMPLES / "tanks" / "make_log.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    load_plugins([EXAMPLES / "tanks.py"])
+    return script
+
+
+def test_the_recording_is_what_the_script_makes(made, tmp_path):
+    made.write(tmp_path / "again.csv")
+    again, shipped = (
+        np.loadtxt(path, delimiter=",", skiprows=1) for path in (tmp_path / "again.csv", RECORDING)
+    )
+    np.testing.assert_allclose(again, shipped, atol=2e-6)
+    assert (tmp_path / "again.toml").read_text() == RECORDING.with_suffix(".toml").read_text()
+
+
+@pytest.mark.parametrize("rim", [0.2, 1.0])
+def test_the_simulator_follows_the_solver_to_a_third_of_the_noise(made, rim):
+    volts, start = made.RUNS[0], made.STARTS[0]
+    exact = made.solved(volts, start, rim)
+    tanks = simulators.get("tanks")(fixed={"state.overflow@upper": rim})
+    inputs = {"volts": np.repeat(volts, made.HOLD)}
+    initial = dict(zip(("upper", "lower"), start, strict=True))
+    scenario = Scenario(made.STEP * np.arange(made.SAMPLES), initial, inputs)
+    seen = tanks.simulate(np.array([[made.PUMP, made.UPPER, made.LOWER]]), scenario)[0]
+    assert np.abs(seen - exact).max() < made.NOISE / 3
+    assert (exact[:, 0].max() == rim) == (rim == made.RIM)
+
+
+@pytest.mark.slow
+def test_the_rim_is_named_with_its_height(made):
+    answer = explain(RECORDING).answer
+    (cause,) = answer.causes
+    assert (answer.verdict, cause.effect) == ("named", "state.overflow@upper")
+    height = cause.coefficients["coefficient"]
+    assert height.low < made.RIM < height.high
+    assert height.high - height.low < 1e-3
+    pump = answer.parameters["pump"]
+    assert pump.low < made.PUMP < pump.high
+    assert answer.heldout.gap_closed > 0.95
+
+
+def test_tanks_that_do_not_spill_over_lack_nothing(made, tmp_path):
+    made.write(tmp_path / "clean.csv", rim=1.0)
+    answer = explain(tmp_path / "clean.csv").answer
+    assert (answer.verdict, answer.causes) == ("adequate", ())

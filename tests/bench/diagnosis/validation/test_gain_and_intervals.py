@@ -1,0 +1,271 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.noise_model import NoiseModel, maximise_likelihood
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.search.effect_search import EffectSearch
+from bench.diagnosis.validation.gain_and_intervals import (
+    compute_central_jacobian,
+    compute_covariance,
+    compute_held_out_gain,
+    compute_intervals,
+)
+from bench.diagnosis.validation.held_out_runs import HeldOutRuns
+from sims.systems.pendulum import Pendulum
+from sims.systems.slider import Slider
+from tests.bench.diagnosis.explained_samples import (
+    correlated,
+    marked,
+    recorded,
+    recording,
+    searched,
+    white,
+    with_runs,
+    world,
+)
+
+
+def errors(rmse, runs=6, samples=200, seed=0):
+    """Residuals (R, T, 1) with this root mean square over all of them, different in each run."""
+    made = (
+        np.random.default_rng(seed).normal(size=(runs, samples, 1))
+        * np.linspace(0.9, 1.1, runs)[:, None, None]
+    )
+    return made * rmse / np.sqrt(np.square(made).mean())
+
+
+def runs_of(observed):
+    return SimpleNamespace(
+        observed=observed,
+        tracks=[None] * len(observed),
+        lengths=np.full(len(observed), observed.shape[1]),
+    )
+
+
+def test_the_share_of_the_gap_closed_is_that_of_the_design():
+    there = runs_of(np.zeros((6, 200, 1)))
+    found = compute_held_out_gain(
+        there, errors(0.37), errors(0.045, seed=1), [0], 0.01, np.random.default_rng(0)
+    )
+    assert (found.base, found.extended, found.floor) == (
+        pytest.approx(0.37),
+        pytest.approx(0.045),
+        0.01,
+    )
+    assert found.gap_closed == pytest.approx((0.37 - 0.045) / (0.37 - 0.01), rel=1e-12)
+    assert round(found.gap_closed, 2) == 0.90
+    assert 0.85 < found.low < found.gap_closed < found.high < 0.95
+
+
+@pytest.mark.parametrize("runs", [1, 2, 5])
+def test_the_interval_contains_the_point(runs):
+    there = runs_of(np.zeros((runs, 400, 2)))
+    for seed in range(8):
+        before, after = (
+            np.concatenate([errors(size, runs, 400, seed), 9 * errors(1, runs, 400)], 2)
+            for size in (0.3, 0.1)
+        )
+        after = after * np.random.default_rng(seed).uniform(0.6, 1.5, size=(runs, 400, 1))
+        found = compute_held_out_gain(there, before, after, [0], 0.02, np.random.default_rng(seed))
+        assert found.low <= found.gap_closed <= found.high
+        assert found.high - found.low < 0.35
+        again = compute_held_out_gain(there, before, after, [0], 0.02, np.random.default_rng(seed))
+        assert (again.low, again.high) == (found.low, found.high)
+
+
+def test_a_gain_below_the_floor_counts_as_all_and_no_gap_as_nothing():
+    there = runs_of(np.zeros((3, 100, 1)))
+    rng = np.random.default_rng(0)
+    assert (
+        compute_held_out_gain(
+            there, errors(0.3, 3, 100), errors(0.009, 3, 100), [0], 0.01, rng
+        ).gap_closed
+        == 1.0
+    )
+    assert (
+        compute_held_out_gain(
+            there, errors(0.01, 3, 100), errors(0.009, 3, 100), [0], 0.01, rng
+        ).gap_closed
+        == 0.0
+    )
+    worse = compute_held_out_gain(there, errors(0.02, 3, 100), errors(0.04, 3, 100), [0], 0.01, rng)
+    assert worse.gap_closed == pytest.approx(-2.0)
+
+
+def three_runs(sizes=(0.1, 0.15, 0.2)):
+    """A model that leaves so much of each run, where the base model leaves 0.3 of each."""
+    after = np.ones((3, 100, 1)) * np.reshape(sizes, (3, 1, 1))
+    return runs_of(np.zeros((3, 100, 1))), np.full((3, 100, 1), 0.3), after
+
+
+def test_the_gains_interval_is_one_of_95_percent_with_runs_put_back():
+    """Of three runs the worst is drawn three times in 1 of 27 resamples, more than 2.5 %."""
+    found = compute_held_out_gain(*three_runs(), [0], 0.05, np.random.default_rng(0))
+    assert (found.low, found.high) == (
+        pytest.approx((0.3 - 0.2) / 0.25),
+        pytest.approx((0.3 - 0.1) / 0.25),
+    )
+    single = runs_of(np.full((1, 100, 1), np.nan))
+    single.observed[0, :10] = 0.0  # one stretch of ten has samples
+    found = compute_held_out_gain(
+        single, *np.ones((2, 1, 100, 1)) * [[[[0.3]]], [[[0.1]]]], [0], 0.05,
+        np.random.default_rng(0),
+    )  # fmt: skip
+    assert found.gap_closed == pytest.approx(0.8)
+    assert np.isnan([found.low, found.high]).all(), "there is nothing to resample"
+
+
+def test_missing_samples_do_not_count():
+    observed = np.zeros((2, 100, 1))
+    observed[0, :50] = np.nan
+    before = np.full((2, 100, 1), 0.2)
+    before[0, :50] = 77.0
+    found = compute_held_out_gain(
+        runs_of(observed), before, np.full((2, 100, 1), 0.1), [0], 0.02, np.random.default_rng(0)
+    )
+    assert found.base == pytest.approx(0.2)
+    assert found.gap_closed == pytest.approx(0.1 / 0.18)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.7])
+def test_intervals_cover_the_truth(phi):
+    """60 recordings of a driven slider with drag: 95 % intervals of mass and drag hold what made
+    them.
+    """
+    times, rng, held = np.arange(120) / 60, np.random.default_rng(20), []
+    push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
+    made = recorded(
+        Slider(fixed={"drag.linear": 0.4}, observe=["x"]), [1.3], [({}, {"u": push})], times
+    )
+    there = world(made, candidates=["drag.linear"])
+    clean, noise = there.observed.copy(), white(there, 0.004).coloured(phi)
+    theta = np.array([1.3, 0.4])
+    for _ in range(60):
+        there.observed[...] = clean + correlated(rng, phi, 0.004, clean.shape)
+        fit = TrajectoryFitter(there, noise).fit_models(
+            [FitStart(("drag.linear",), theta, there.guess)], 12
+        )[0]
+        search = EffectSearch(there, noise, frozenset(), rng, marked(there, True))
+        found = compute_intervals(search, search.add_fit(fit))
+        held.append([found[i][1] <= theta[i] <= found[i][2] for i in range(2)])
+    assert 0.88 <= np.mean(held) <= 0.99
+    assert (np.mean(held, axis=0) >= 0.85).all()
+
+
+@pytest.mark.parametrize("told", [{}, {"qd": 0.0}])
+def test_the_covariance_is_that_of_all_unknowns_at_once(told):
+    made = recording(runs=2, seconds=0.8, rate=50, noise=["q=0.003", "qd=0.02"], seed=3)
+    made = with_runs(made, [replace(made.runs[0], initial=told), made.runs[1]])
+    search, model = searched(made, [0.003, 0.02], candidates=[])
+    sigma = model.likelihood.sigma
+    assert np.allclose(model.likelihood.phi, 0, atol=0.3)
+    flat = NoiseModel(sigma, np.zeros(2))
+    model = type(model)(
+        model.fit, type(model.likelihood)(model.likelihood.value, sigma, flat.phi), model.merit
+    )
+    jacobian = (
+        compute_central_jacobian(search.world, model.fit, search.noise).jacobian / sigma[:, None]
+    )
+    rows = np.zeros((2, jacobian[0, ..., 0].size, 5))
+    for r in range(2):
+        flattened = jacobian[r].reshape(-1, 3)
+        rows[r, :, 0], rows[r, :, 1 + 2 * r : 3 + 2 * r] = flattened[:, 0], flattened[:, 1:]
+    normal = np.einsum("rnk,rnl->kl", rows, rows) + np.diag([0, *[1e-4] * 4])
+    # What is told is no unknown.
+    unknown = [0, *(1 + np.flatnonzero(~search.world.known))]
+    inverse = np.linalg.inv(normal[np.ix_(unknown, unknown)])
+    # Squared kg m^2 are far below any absolute tolerance, so the ratio is asked.
+    known = compute_covariance(search, model)[0, 0]
+    assert known * 1e12 == pytest.approx(inverse[0, 0] * 1e12, rel=1e-6)
+    least = 1.0 if told else 3.0
+    assert known > least / normal[0, 0], "initial states take most of what is known of it"
+    value, low, high = compute_intervals(search, model)[0]
+    assert value == model.fit.theta[0]
+    for reach in (value - low, high - value):
+        assert reach / np.sqrt(known) == pytest.approx(1.959964, rel=1e-6)
+
+
+def test_a_coordinate_that_is_not_recorded_hides_no_coefficient_of_the_others():
+    """Where a ball drifts sideways is not known; how its spin lifts it is."""
+    made = recording(
+        "ball",
+        effects=["lift.magnus=0.25"],
+        initial=["vx=4", "z=1.5", "vz=3"],
+        noise=["x=0.003", "z=0.003"],
+        observe=["x", "z"],
+        runs=2,
+        seconds=1.0,
+        rate=60,
+        seed=5,
+    )
+    there = world(made, candidates=["lift.magnus"])
+    noise = white(there, 0.003)
+    theta = np.array([0.5, 0.2, -0.02])
+    fit = TrajectoryFitter(there, noise).fit_models(
+        [FitStart(("lift.magnus",), theta, there.guess)], 8
+    )[0]
+    search = EffectSearch(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
+    _, low, high = compute_intervals(search, search.add_fit(fit))[1]
+    assert low < 0.25 < high
+    assert high - low < 0.05
+
+
+def test_parameters_that_act_alike_have_no_interval():
+    """Inertia and gravity of a free swing: one-sided differences would tell them apart by their own
+    error.
+    """
+    made = recorded(
+        Pendulum(), [3.3e-3], [{"q": 0.8}, {"q": 1.2}], np.arange(90) / 60, [0.003, 0.02], seed=5
+    )
+    search, model = searched(made, [0.003, 0.02], candidates=[], free=["gravity"])
+    spread = np.sqrt(np.diagonal(compute_covariance(search, model))) / model.fit.theta[:2]
+    assert (spread > 5).all()
+    assert np.isnan([compute_intervals(search, model)[i][1] for i in range(2)]).all()
+    exact = compute_central_jacobian(search.world, model.fit, search.noise).jacobian
+    ratio = exact[..., 0] * model.fit.theta[0] + exact[..., 1] * model.fit.theta[1]
+    assert np.abs(ratio).max() < 1e-3 * np.abs(exact[..., 0] * model.fit.theta[0]).max()
+
+
+def test_what_the_data_do_not_bound_has_no_interval():
+    made = recorded(Pendulum(), [3.3e-3], [{"q": 1e-4}], np.arange(60) / 60, [0.01, 0.05])
+    there = world(made, candidates=["drag.quadratic"])
+    noise = white(there, [0.01, 0.05])
+    start = FitStart(("drag.quadratic",), np.array([3.3e-3, 1e-3]), there.guess)
+    search = EffectSearch(there, noise, frozenset(), np.random.default_rng(0), marked(there, True))
+    model = search.add_fit(TrajectoryFitter(there, noise).fit_models([start], 3)[0])
+    assert np.isnan(compute_intervals(search, model)[1][1:]).all()
+
+
+def test_intervals_follow_what_is_left_and_not_what_was_stated():
+    made = recording(runs=2, seconds=0.8, rate=50, noise=["q=0.003", "qd=0.02"], seed=3)
+    widths = []
+    for factor in (1.0, 3.0):
+        search, model = searched(made, np.array([0.003, 0.02]) * factor, candidates=[])
+        _, low, high = compute_intervals(search, model)[0]
+        widths.append(high - low)
+    assert widths[1] / widths[0] == pytest.approx(1.0, rel=0.1)
+
+
+def test_held_out_runs_estimate_initial_states_and_nothing_else():
+    made = recording(
+        theta=["4e-3"], runs=3, seconds=1, rate=60, noise=["q=0.003", "qd=0.02"], held_out=0
+    )
+    there = world(made, candidates=["drag.linear"])
+    held_out = HeldOutRuns(there, white(there, [0.003, 0.02]))
+    right, wrong, failed = held_out.fit_initial_states(
+        [np.array(theta) for theta in ([4e-3, 0.0], [3e-3, 0.0], [np.nan, 0.0])]
+    )
+    left = (there.observed - right.simulated) / [0.003, 0.02]
+    assert np.sqrt(np.square(left).mean()) == pytest.approx(1.0, abs=0.1)
+    assert np.sqrt(np.square((there.observed - wrong.simulated) / [0.003, 0.02]).mean()) > 10
+    assert right.penalised_log_likelihood > wrong.penalised_log_likelihood + 500
+    # Of six initial states each costs the logarithm of the samples.
+    residual, count = there.observed - right.simulated, there.observed.size
+    likeliest = maximise_likelihood(residual, np.ones(residual.shape, dtype=bool)).value
+    assert right.penalised_log_likelihood == pytest.approx(likeliest - 6 * np.log(count), abs=1.0)
+    assert failed.penalised_log_likelihood == -np.inf
+    assert np.isnan(failed.simulated).all()

@@ -1,0 +1,271 @@
+"""A comparison of diagnosers: plugins in it, what misbehaves, what is kept."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import simgap
+from bench.benchmark.problem.experiment import load_experiment
+from bench.cli import main as cli
+from bench.core.plugin_registries import REGISTRIES
+from bench.diagnosis_benchmark.answer_store import ANSWERS_FILE, AnswerStore, read_answers
+from bench.diagnosis_benchmark.benchmark_config import read_config
+from bench.diagnosis_benchmark.case_generation.recording_conditions import (
+    ANY_CONDITIONS,
+    RequestedConditions,
+)
+from bench.diagnosis_benchmark.case_set import CaseSpec, build_case_set
+from sims.core.simulator import InputError
+
+PLUGIN = Path(__file__).with_name("plugin.py")
+TOML = """
+budget = 60
+timeout = 4.0
+salt = "public"
+[diagnosis]
+diagnosers = [{diagnosers}]
+[[diagnosis.questions]]
+kind = "clean"
+systems = ["slider"]
+[[diagnosis.questions]]
+kind = "single"
+systems = ["slider"]
+effects = ["drag.linear"]
+sizes = [8.0]
+rates = [50]
+runs = [3]
+"""
+MISBEHAVING = ("peeks", "hangs", "crashes", "spends", "lies")
+
+
+def main(arguments):
+    """As in a process of its own: no plugin is known after it."""
+    before = [registry.snapshot() for registry in REGISTRIES]
+    try:
+        return cli.main(arguments)
+    finally:
+        for registry, snapshot in zip(REGISTRIES, before, strict=True):
+            registry.restore(snapshot)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Comparisons of diagnosers draw nothing: those of `made` do."""
+    monkeypatch.setattr("bench.diagnosis_benchmark.diagnoser_report.draw_figures", lambda *_: {})
+
+
+def written(folder, *diagnosers, more=""):
+    path = folder / "tiny.toml"
+    names = ", ".join(f'"{name}"' for name in diagnosers)
+    path.write_text(TOML.format(diagnosers=names) + more)
+    return path
+
+
+def items(folder):
+    with (folder / "items.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("diagnosis")
+    path = written(folder, "fifteen", *MISBEHAVING)
+    out = folder / "out"
+    knowing = folder / "knowing.py"
+    knowing.write_text(PLUGIN.read_text().replace('WHERE = "/tmp"', f"WHERE = {str(out)!r}"))
+    code = main(["compare", str(path), "--plugin", str(knowing), "--out", str(out), "--jobs", "1"])
+    return code, out
+
+
+@pytest.mark.slow
+def test_a_short_one_from_outside_is_in_the_table(made):
+    _, out = made
+    own = [row for row in items(out) if row["diagnoser"] == "fifteen"]
+    assert [row["status"] for row in own] == ["done", "done"]
+    assert all(0 < int(row["simulations"]) <= 6 for row in own)
+    with (out / "table.csv").open() as file:
+        lines = {(row["diagnoser"], row["metric"]): row for row in csv.DictReader(file)}
+    assert lines["fifteen", "false alarms"]["of"] == "1"
+    assert lines["fifteen", "named, alone"]["of"] == "1"
+
+
+def test_one_that_looks_for_the_truth_finds_none(made):
+    _, out = made
+    peeks = [row for row in items(out) if row["diagnoser"] == "peeks"]
+    assert {(row["status"], row["verdict"]) for row in peeks} == {("done", "adequate")}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_it_would_find_it_if_it_were_trusted(made, tmp_path):
+    _, out = made
+    path, knowing = written(tmp_path, "peeks"), out.parent / "knowing.py"
+    given = ["--plugin", str(knowing), "--out", str(tmp_path / "out"), "--jobs", "0"]
+    assert main(["compare", str(path), *given]) == 0
+    rows = items(tmp_path / "out")
+    assert {(row["verdict"], row["trusted"]) for row in rows} == {("unknown", "True")}
+
+
+def test_what_fails_costs_itself_and_stays_in_the_table(made):
+    code, out = made
+    assert code == 1
+    rows = {row["diagnoser"]: row for row in items(out) if row["kind"] == "single"}
+    assert rows["hangs"]["status"] == "timeout"
+    assert rows["crashes"]["status"] == "crashed"
+    assert rows["crashes"]["reason"] == "RuntimeError: no idea"
+    assert "simulations asked for, 60 are allowed" in rows["spends"]["reason"]
+    assert "cannot have used" in rows["lies"]["reason"]
+    assert {rows[name]["outcome"] for name in ("hangs", "crashes", "spends", "lies")} == {"failed"}
+    clean = {row["diagnoser"]: row for row in items(out) if row["kind"] == "clean"}
+    assert clean["hangs"]["alarm"] == "True"  # no answer is none that one could rely on
+
+
+def test_python_reads_what_the_command_has_made(made):
+    _, out = made
+    run = simgap.ComparisonResult(out)
+    assert len(run.runs) == 2 * (1 + len(MISBEHAVING))
+    assert run.runs["alarm"].dtype == bool
+    status = run.statuses.set_index(["diagnoser", "question"])["status"]
+    assert set(status["hangs"]) == {"timeout"}
+    best = run.summary()
+    assert set(best["diagnoser"]) == {"fifteen", *MISBEHAVING}
+    assert best.set_index("diagnoser").loc["hangs", "without an answer"] == 1.0
+    wrong = run.tables["failures"]
+    assert set(wrong["right_by"][wrong["diagnoser"] == "hangs"]) == {"peeks", "nobody"}
+    assert "12 answers, 8 of them failed or skipped" in repr(run)
+    with pytest.raises(InputError, match="figures of a comparison of diagnosers are files"):
+        run.figure("board")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Without an answer (crashed, too late or too costly): crashes 2, hangs 2" in page
+    assert str(out) in page
+
+
+def test_a_damaged_table_is_one_line(made, tmp_path):
+    _, out = made
+    folder = tmp_path / "copy"
+    shutil.copytree(out, folder)
+    table = folder / "items.csv"
+    table.write_text(table.read_text().replace(",True,", ",maybe,"))
+    with pytest.raises(InputError, match=r"items.csv, line \d+: .*True or False.*maybe"):
+        simgap.ComparisonResult(folder).runs  # noqa: B018
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_who_cannot_be_asked_counts_nowhere(tmp_path, capsys):
+    path, out = written(tmp_path, "fifteen", "declines"), tmp_path / "out"
+    given = ["--plugin", str(PLUGIN), "--out", str(out), "--jobs", "0"]
+    assert main(["compare", str(path), *given]) == 0
+    assert "declines cannot be asked 2 of these: it knows no sliders" in capsys.readouterr().out
+    run = simgap.ComparisonResult(out)
+    rows = run.runs.set_index("diagnoser")
+    assert set(rows.loc["declines", "outcome"]) == {"skipped"}
+    counted = run.table.set_index(["diagnoser", "metric"])["of"]
+    assert counted["declines", "false alarms"] == counted["declines", "without an answer"] == 0
+    assert counted["fifteen", "false alarms"] == 1
+    assert "declines" not in set(run.tables["failures"]["diagnoser"])
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "declines cannot be asked 2 of the questions: it knows no sliders." in page
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_it_goes_on_where_it_was(made, tmp_path, capsys):
+    path = written(tmp_path, "fifteen")
+    out = tmp_path / "out"
+    given = ["--plugin", str(PLUGIN), "--jobs", "1"]
+    assert main(["compare", str(path), "--out", str(out), *given]) == 0
+    lines = (out / ANSWERS_FILE).read_text().splitlines(keepends=True)
+    (out / ANSWERS_FILE).write_text(lines[0] + lines[1][:40])  # as if it had been killed
+    capsys.readouterr()
+    assert main(["status", str(out)]) == 1
+    assert "1 of 2 answers given" in capsys.readouterr().out
+    assert main(["compare", "--resume", str(out), "--jobs", "1"]) == 0
+    assert set(read_answers(out)) == {"clean/slider/0", "single/slider/drag.linear/8/50/3/0"}
+    first = json.loads(lines[0])
+    again = read_answers(out)[first["question"]]["rows"]["fifteen"]
+    assert again == first["rows"][0]  # and was not asked again
+    capsys.readouterr()
+    assert main(["plot", str(out), "--json"]) == 0
+    (said,) = json.loads(capsys.readouterr().out)["comparisons"]
+    shares = {line["metric"]: line for line in said["results"]}
+    assert shares["false alarms"]["of"] == shares["named, alone"]["of"] == 1
+    assert str(out / "report.html") in said["files"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undrawn")
+def test_a_secret_is_kept_until_the_end_and_draws_other_questions(tmp_path):
+    path = written(tmp_path, "fifteen")
+    path.write_text(path.read_text().replace('salt = "public"\n', ""))
+    out, public = tmp_path / "out", load_experiment(str(written(tmp_path, "fifteen")))
+    path.write_text(path.read_text().replace('salt = "public"\n', ""))
+    secret = ["--secret", "nobody knows", "--plugin", str(PLUGIN), "--jobs", "1"]
+    assert main(["compare", str(path), "--out", str(out), *secret]) == 0
+    configuration = (out / "experiment.toml").read_text()
+    assert "nobody knows" in configuration  # revealed, as nothing is left to ask
+    names = {one["item"]["name"] for one in read_answers(out).values()}
+    drawn = {q.draw_case(0).name for q in build_case_set(read_config(public))}
+    assert not names & drawn
+
+
+def test_a_seed_says_nothing_of_the_salt():
+    question = CaseSpec("clean", "slider", None, None, ANY_CONDITIONS, 0)
+    public, secret = (question.draw_case(3, salt) for salt in ("public", "a"))
+    assert public.name == "clean-slider-3000"
+    assert secret.seed == question.draw_case(9, "a").seed
+    assert secret.seed not in (public.seed, question.draw_case(3, "b").seed)
+
+
+def test_circumstances_are_as_asked():
+    asked = RequestedConditions(50, 3, "ar1")
+    item = CaseSpec("clean", "pendulum", None, None, asked, 0).draw_case(0)
+    assert (item.rate, item.runs, item.noise) == (50, 3, "ar1")
+    assert type(item).from_json(json.loads(json.dumps(item.to_json()))) == item
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ('[[diagnosis.questions]]\nkind = "strange"', "unknown kind 'strange'"),
+        ('[[diagnosis.questions]]\nkind = "clean"\nsystems = ["boat"]', "unknown system 'boat'"),
+        ('[[diagnosis.questions]]\nkind = "single"\nsizes = [-1.0]', "sizes: expected above 0"),
+        ('[[diagnosis.questions]]\nkind = "clean"\neffects = ["wind"]', "no effects are named"),
+        ('[[diagnosis.questions]]\nkind = "clean"\nhow = 3', "unknown entry"),
+        ('[[diagnosis.questions]]\nkind = "clean"\ncount = 0', "count: expected 1 to"),
+    ],
+)
+def test_a_fault_in_the_table_is_one_line(tmp_path, capsys, more, says):
+    path = written(tmp_path, "simgap", more=more)
+    assert main(["compare", str(path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_diagnoser_is_refused(tmp_path, capsys):
+    path = written(tmp_path, "oracle")
+    assert main(["compare", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "unknown diagnoser 'oracle'; there are: classifier" in capsys.readouterr().err
+
+
+def test_two_at_a_time_are_refused(tmp_path):
+    held = AnswerStore(tmp_path)
+    with pytest.raises(InputError, match="another simgap is at work there"):
+        AnswerStore(tmp_path)
+    held.close()
+    AnswerStore(tmp_path).close()
+
+
+def test_the_shipped_sheets_are_as_large_as_they_say():
+    names = ("small", "full", "machines")
+    small, full, machines = (
+        build_case_set(read_config(load_experiment(f"diagnosis-{name}"))) for name in names
+    )
+    assert len({q.name for q in small}) == len(small) == 56
+    assert len({q.name for q in full}) == len(full) == 662
+    assert len({q.name for q in machines}) == len(machines) == 98
+    assert {q.system for q in machines} == {"servo", "arm2"}
+    assert {q.kind for q in small} == {"clean", "single", "double", "foreign"}

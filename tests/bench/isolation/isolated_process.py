@@ -1,0 +1,88 @@
+"""Runs of tuners in processes of their own, without a comparison around them."""
+
+from dataclasses import replace
+
+import pytest
+
+from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
+from bench.benchmark.isolation.tuner_client import TunerSpec
+from bench.benchmark.problem.experiment import TunerEntry
+from bench.benchmark.runner import sandboxed_tuner
+from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.tuner_training import TrainingRequest
+from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_problem
+from tests.conftest import PLUGINS
+from tests.sample_experiments import spring_experiment
+
+PROBE = str(PLUGINS / "probe.py")
+
+
+def told(code, files=(), memory=0):
+    """What a sealed process makes of a piece of code, as text."""
+    tuned = TunerSpec("probe", "", PROBE, {"code": code})
+    house = sandboxed_tuner.get_fork_server()
+    child = house.start_process(
+        "bench.benchmark.isolation.tuner_server:serve_requests", [PROBE, *map(str, files)], memory
+    )
+    try:
+        trace = _run(child, tuned)
+    finally:
+        child.end()
+    assert trace.status == "converged", trace.reason
+    return trace.reason
+
+
+def _run(child, tuned):
+    import numpy as np
+
+    from bench.benchmark.isolation.tuner_client import IsolatedRun, IsolatedTuner
+    from bench.benchmark.runner.tuner_loop import drive_tuner
+    from methods.tuner import Task
+
+    observed, scale = np.zeros((3, 1)), np.ones(1)
+    start, training = np.full(2, 0.5), np.array([[0.0, 0.0], [1.0, 1.0]])
+    task = Task(2, start, observed, scale, training, 3, (3,))
+
+    def evaluate(points):
+        return np.zeros((len(points), 3, 1)), np.zeros(len(points))
+
+    run = IsolatedRun(IsolatedTuner(child, tuned), np.zeros(8, np.uint32), 20.0)
+    return drive_tuner(run, task, evaluate, np.random.default_rng(0))
+
+
+def held():
+    """The seals that hold on this machine."""
+    child = sandboxed_tuner.get_fork_server().start_process(
+        "bench.benchmark.isolation.tuner_server:serve_requests"
+    )
+    child.wait_until_ready()
+    child.end()
+    return child.seals
+
+
+def need(seal):
+    """Skip a test, visibly, where a seal does not hold."""
+    if seal not in held():
+        pytest.skip(f"no seal {seal} on this machine: {ISOLATION_LAYERS[seal]}")
+
+
+def experiment(name, **changes):
+    """An experiment of one of the plugin's tuners, which is known afterwards."""
+    tuners = {name: {}}
+    made = spring_experiment(tuners=tuners, targets=2, ranges=["in"], budget=4, **changes)
+    load_plugins_for_experiment([PROBE], made)
+    return made
+
+
+def outcome(made, seed=0, target=0):
+    """One run of it."""
+    (entry,) = made.tuners
+    sealed = get_problem(made).draw_targets()[target].sealed
+    order = RunRequest("run", entry, seed, sealed, made.budget)
+    return execute_run(made, replace(order, tuned=sandboxed_tuner.make_tuner_spec(entry)))
+
+
+def lesson(name, **options):
+    """One training of a known tuner."""
+    entry = TunerEntry(name, name, options)
+    return TrainingRequest(entry, 0, sandboxed_tuner.make_tuner_spec(entry))

@@ -1,0 +1,230 @@
+"""Training in a process of its own: the same weights, counted and fenced on the other side."""
+
+import numpy as np
+import pytest
+
+from bench.benchmark.isolation.process_exit import RunEndedError
+from bench.benchmark.runner import sandboxed_tuner
+from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.tuner_training import TrainingRequest, read_weights, train_or_load
+from bench.core.plugin_registries import tuners
+from methods.tuner import Tuner
+from tests.bench.isolation.isolated_process import lesson
+from tests.hostile_tuners.attack_arena import HERE
+from tests.sample_experiments import spring_experiment
+
+SCHOOL = str(HERE / "school.py")
+pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / "cache"))
+    yield tmp_path / "cache"
+    sandboxed_tuner.close_isolated_processes()
+
+
+@pytest.fixture
+def experiment():
+    made = spring_experiment(tuners={"school": {}}, training_budget=20)
+    load_plugins_for_experiment([SCHOOL], made)
+    return made
+
+
+class Learned(Tuner):
+    """As `train_remotely` of the plugin, here."""
+
+    name = source_digest = "learned"
+    learned = True
+    trains_as = "school"
+
+    def fit(self, simulator, rng, budget):
+        points = simulator.sample(rng, budget)
+        self.learned_mean = simulator.simulate(rng, points).mean(axis=0)
+
+    def state(self):
+        return {"mean": self.learned_mean}
+
+
+def test_a_sealed_training_gives_the_weights_of_a_trusted_one_bit_for_bit(experiment):
+    sealed = train_or_load(experiment, lesson("school"))
+    tuners.register(Learned)
+    entry = lesson("school").entry
+    entry = type(entry)("learned", "learned")
+    trusted = train_or_load(experiment, TrainingRequest(entry, 0))
+    one, other = read_weights(sealed.path)["mean"], read_weights(trusted.path)["mean"]
+    assert one.tobytes() == other.tobytes()
+    assert sealed.simulations == trusted.simulations == 20
+    assert 0.0 < sealed.seconds < 30.0
+
+
+class Watch:
+    """Looks on, and notes what it is told."""
+
+    def __init__(self, problem):
+        self.problem, self.told, self.asked = problem, [], 0
+
+    @property
+    def evaluation_simulator(self):
+        self.asked += 1
+        return self.problem.practice(10)
+
+    def on_epoch(self, *told):
+        self.told.append(told)
+
+
+def test_who_looks_on_is_told_and_changes_nothing(experiment, tmp_path, monkeypatch):
+    from bench.benchmark.problem.tuning_problem import TuningProblem
+
+    path = tmp_path / "watched.py"
+    path.write_text(WATCHED)
+    load_plugins_for_experiment([str(path)], spring_experiment(tuners={"telling": {}}))
+    plain = read_weights(train_or_load(experiment, lesson("telling")).path)
+    watch = Watch(TuningProblem(experiment))
+    made = train_or_load(experiment, lesson("telling"), watch, anew=True)
+    assert [told[:3] for told in watch.told] == [("first", 1, 2), ("sec\ufffdond", 2, 2)]
+    assert np.isnan(watch.told[1][4])
+    assert watch.asked == 1
+    assert made.simulations == 20, "what only measures is not counted"
+    again = read_weights(made.path)
+    assert {name: array.tobytes() for name, array in again.items()} == {
+        name: array.tobytes() for name, array in plain.items()
+    }
+
+
+WATCHED = """
+import numpy as np
+from methods.tuner import BudgetExceededError, Tuner
+
+class Telling(Tuner):
+    learned = True
+
+    def fit(self, simulator, rng, budget):
+        seen = simulator.simulate(rng, simulator.sample(rng, budget))
+        self.facts = [simulator.used, simulator.budget, simulator.dim, *simulator.lengths]
+        for wrong, kind in (
+            (simulator.training[1:], BudgetExceededError),
+            (np.full((1, 2), 1.0), ValueError),
+            (np.full((1, 2), np.nan), ValueError),
+        ):
+            try:
+                simulator.simulate(rng, wrong)
+                raise AssertionError("it was let")
+            except kind:
+                pass
+        if self.watch is not None:
+            ground = self.watch.ground
+            assert ground.simulate(np.random.default_rng(0), ground.training).shape[0] == 2
+            assert ground.used == 2 and simulator.used == 20
+            self.watch.epoch("first", 1, 2, 0.5, 0.25)
+            self.watch.epoch("sec\\x1bond", 2, 2, 0.5, float("nan"))
+        self.mean = seen.mean(axis=0)
+
+    def state(self):
+        return {"mean": self.mean, "facts": np.array(self.facts, dtype=np.int64)}
+"""
+
+
+def test_what_the_stand_in_says_of_itself(experiment, tmp_path):
+    path = tmp_path / "watched.py"
+    path.write_text(WATCHED)
+    load_plugins_for_experiment([str(path)], spring_experiment(tuners={"telling": {}}))
+    facts = read_weights(train_or_load(experiment, lesson("telling")).path)["facts"]
+    assert facts.tolist() == [20, 20, 2, 60]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("counter", "40 training simulations asked, 20 allowed"),
+        ("fence", "inside the training range"),
+        ("not-inside", "inside the training range"),
+        ("streams", "no state of a random stream"),
+        ("huge", "bytes at once"),
+        ("names", "no arrays"),
+        ("keyword", "cannot be kept by the names"),
+        ("pickles", "expected numbers, found object"),
+        ("watched", "what nobody asked for"),
+    ],
+)
+def test_a_training_that_cheats_fails_and_leaves_no_weights(name, says, experiment, cache):
+    with pytest.raises(RunEndedError, match=says):
+        train_or_load(experiment, lesson(name))
+    assert not list(cache.glob("*")) if cache.exists() else True
+
+
+def test_weights_that_a_trusted_tuner_learned_are_not_those_of_a_sealed_one(experiment):
+    from bench.benchmark.runner.tuner_training import compute_training_key
+
+    entry = lesson("school").entry
+    assert compute_training_key(experiment, entry, 0) != compute_training_key(
+        experiment.chosen(trusted=True), entry, 0
+    )
+
+
+def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experiment, monkeypatch):
+    from bench.benchmark.isolation.process_exit import KilledExternallyError
+    from bench.benchmark.problem.training_simulator import CountedTrainingSimulator
+
+    asked = []
+
+    def killed_once(self, rng, points):
+        asked.append(points)
+        if len(asked) == 1:
+            raise KilledExternallyError("killed")
+        return simulate(self, rng, points)
+
+    simulate = CountedTrainingSimulator.simulate
+    monkeypatch.setattr(CountedTrainingSimulator, "simulate", killed_once)
+    assert train_or_load(experiment, lesson("school")).simulations == 20
+    np.testing.assert_array_equal(*asked)
+    asked.clear()
+    drawn = iter(range(10))
+    monkeypatch.setattr(
+        "bench.benchmark.runner.tuner_training.digest", lambda *_, **__: str(next(drawn))
+    )
+    with pytest.raises(RunEndedError, match="asked for other simulations"):
+        train_or_load(experiment, lesson("school"), anew=True)
+
+
+def test_an_installed_tuner_of_another_package_is_sealed_too(tmp_path, monkeypatch):
+    from importlib import metadata
+
+    from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
+
+    (tmp_path / "their_package.py").write_text(THEIRS)
+    about = tmp_path / "their_package-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[simgap.tuners]\ntheirs = their_package:Theirs\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(
+        tuners, "_entries", {e.name: e for e in metadata.entry_points(group="simgap.tuners")}
+    )
+    sandboxed_tuner.close_isolated_processes()
+    made = spring_experiment(tuners={"theirs": {}, "random": {}}, targets=1, ranges=["in"], seeds=1)
+    load_plugins_for_experiment([], made)
+    results = prepare_experiment(made)
+    run_experiment(results, jobs=0)
+    theirs, random = results.run_sink.statuses.values()
+    assert (theirs.status, theirs.reason) == ("converged", "sealed")
+    assert random.status == "done"
+    import sys
+
+    assert "their_package" not in sys.modules, "its code never ran here"
+
+
+THEIRS = """
+import os
+from methods.tuner import Tuner
+
+class Theirs(Tuner):
+    name = "theirs"
+
+    def tune(self, task, rng):
+        yield task.start
+        try:
+            os.fork()
+        except OSError:
+            return "sealed"
+"""

@@ -1,0 +1,163 @@
+"""A small page with everything that a page can hold, and texts that are no markup."""
+
+import numpy as np
+import pandas as pd
+
+from bench.figures import style
+from bench.pages.chart import (
+    Axis,
+    AxisSpan,
+    Chart,
+    Panel,
+    PrintedFigure,
+    ReferenceLine,
+    Series,
+    TooltipLine,
+)
+from bench.pages.data_grid import DataGrid, GridColumn
+from bench.pages.html_elements import make_heading, make_paragraph, safe
+from bench.pages.html_page import HtmlPage
+
+NAMES = ("least squares", "<b>cma</b> & co", "random", "</script><script>alert(1)</script>")
+STEPS = (0, 1, 2, 3, 5, 10, 20, 50)
+RANGES = {"in": "inside", "wide": "anywhere"}
+ODD = 'a, b\nline two, "quoted" <i>x</i>'
+JOINTS = ("elbow", "wrist, <i>left</i>", "hip")
+COMMAND = "simgap score 'a <b>' && more"
+TITLE = "Title </title><h1 id=broken>& more"
+
+
+def errors():
+    rows = [
+        (name, kind, k, middle, 0.7 * middle, 1.6 * middle)
+        for kind in RANGES
+        for i, name in enumerate(NAMES)
+        for k in STEPS
+        for middle in [10 ** (-0.4 * i - 0.05 * k)]
+    ]
+    return pd.DataFrame(rows, columns=["tuner", "range", "simulations", "median", "low", "high"])
+
+
+def bins():
+    rows = [(n, b, 1.0 + i + b) for i, n in enumerate(NAMES) for b in range(3)]
+    return pd.DataFrame(rows, columns=["tuner", "bin", "count"])
+
+
+def notes():
+    values = [0.0, 1.0, -2.5, 1e-3, 9.996e-4, 0.99951, 123456.0, 99951.0, 3.14159e-12, 1e300]
+    values += [float("nan"), float("inf"), -7.0e-5, 1000.0, 12.5]
+    says = [ODD, *(f"note {i}" for i in range(1, len(values)))]
+    return pd.DataFrame({"says": says, "value": values})
+
+
+def still():
+    figure, axes = style.make_panel_row(1)
+    axes[0].plot(STEPS, np.sqrt(STEPS), color=style.BLUE)
+    return PrintedFigure(
+        style.render_svg(figure), style.render_pdf(figure), 'curves with "quotes" & <b>', "error"
+    )
+
+
+def error_chart():
+    def panel(kind, title):
+        series = tuple(
+            Series(n, "median", style.get_mark_style(i), {"tuner": n, "range": kind}, "low", "high")
+            for i, n in enumerate(NAMES)
+        )
+        across = Axis("simulations", "symlog", ("symlog", "linear"), tuple(float(k) for k in STEPS))
+        return Panel(
+            title,
+            "error",
+            "simulations",
+            series,
+            across,
+            Axis("error [rad]", "log"),
+            {"targets": title},
+            (ReferenceLine(0.01, "floor"),),
+            (AxisSpan(5.0, 20.0, "later", style.get_mark_style(2), foot=True),),
+        )
+
+    panels = tuple(panel(kind, title) for kind, title in RANGES.items())
+    return Chart("error", "Error <i>now</i>", "How to read it.", panels, still(), "targets")
+
+
+def bins_chart():
+    across = Axis("distance", names=("inside", "0–1", "1–2"))
+    series = tuple(
+        Series(n, "count", style.get_mark_style(i), {"tuner": n}, draw=("bars", "points")[i % 2])
+        for i, n in enumerate(NAMES)
+    )
+    panel = Panel("Counts", "bins", "bin", series, across, Axis("targets"))
+    return Chart("bins", "Bins", "Bars and points.", (panel,))
+
+
+def motion():
+    times = np.arange(0, 10, 0.1)
+    rows = [
+        (joint, round(t, 3), 3 * i + t, 10 * np.sin(t) + i)
+        for i, joint in enumerate(JOINTS)
+        for t in times
+    ]
+    return pd.DataFrame(rows, columns=["joint", "t", "q", "left"])
+
+
+def motion_chart():
+    panels = []
+    for joint in JOINTS:
+        where = {"joint": joint}
+        tells = (
+            TooltipLine("position", "q", "rad", style.get_mark_style(1)),
+            TooltipLine("residual", "left", "noises", None, 0.5, "rad"),
+        )
+        for y, span in (("q", ()), ("left", (AxisSpan(-2.0, 2.0, "", along="y"),))):
+            series = (
+                Series("seen", y, style.get_mark_style(0), where, draw="points", under=True),
+                Series("simulated", y, style.get_mark_style(1), where),
+            )
+            up = Axis(f"{y} [rad]", scales=("linear",), holds=(-20.0, 20.0))
+            across = Axis("time [s]", scales=("linear",))
+            about = {"facets": where, "spans": span, "tells": tells, "height": 160}
+            panels.append(Panel(f"{joint}: {y}", "motion", "t", series, across, up, **about))
+    options = {"columns": 2, "along": True, "toggles": ("joint",), "off": {"joint": ("hip",)}}
+    return Chart("motion", "Motion", "Joints.", tuple(panels), lights="joint", **options)
+
+
+def page():
+    made = HtmlPage(TITLE, f"Made by {safe('<simgap>')}.")
+    for name, frame in (
+        ("error", errors()),
+        ("bins", bins()),
+        ("notes", notes()),
+        ("motion", motion()),
+    ):
+        made.add_table(name, frame)
+    made.append(f"<h1>{safe(TITLE)}</h1>", make_paragraph("A page to test pages with."))
+    made.add_section("errors", "Errors", made.render_chart(error_chart()))
+    columns = (
+        GridColumn("tuner"),
+        GridColumn("range"),
+        GridColumn("simulations", digits=5),
+        GridColumn("median", "median [rad]", 3),
+    )
+    table = DataGrid(
+        "numbers", "All numbers", "error", columns, ("range",), {"range": "wide"}, "median", "tuner"
+    )
+    made.add_section("rest", "The rest", made.render_chart(bins_chart()), made.render_grid(table))
+    odd = DataGrid("notes", "Notes", "notes", (GridColumn("says"), GridColumn("value", digits=3)))
+    made.add_section("odd", "Odd texts", made.render_grid(odd), make_heading("Nothing below"))
+    told = DataGrid(
+        "joints",
+        "Joints",
+        "motion",
+        (GridColumn("joint"), GridColumn("t", digits=3)),
+        marked=("joint", "elb"),
+        sort="t,down",
+        lights="joint",
+    )
+    made.add_section(
+        "joint", "Joint by joint", made.render_chart(motion_chart()), made.render_grid(told)
+    )
+    made.append(made.render_figure("same", still(), "The same everywhere.", ("bins", "notes")))
+    made.append(f'<pre class="copied">{safe(COMMAND)}</pre>')
+    made.add_section("empty", "Nothing", "", "")
+    return made.to_html()

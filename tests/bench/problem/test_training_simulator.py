@@ -1,0 +1,49 @@
+"""Where learned tuners train: counted exactly, and fenced to the training range."""
+
+import numpy as np
+import pytest
+
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from methods.tuner import BudgetExceededError
+from tests.sample_experiments import spring_experiment
+
+LOW, HIGH = np.array([0.25, 0.2]), np.array([0.75, 0.6])
+"""The spring's training range, 2..4 rad/s of 1..5 and 0.2..0.6 1/s of 0..1, in the unit cube."""
+
+
+@pytest.fixture
+def practice(spring):
+    return TuningProblem(spring_experiment()).make_training_simulator(10)
+
+
+def test_every_simulation_counts_and_none_beyond_the_budget_is_made(practice):
+    rng = np.random.default_rng(0)
+    for points, used in ((4, 4), (1, 5), (3, 8)):
+        assert practice.simulate(rng, practice.sample(rng, points)).shape == (points, 60, 1)
+        assert practice.used == used
+    with pytest.raises(BudgetExceededError, match="11 training simulations asked, 10 allowed"):
+        practice.simulate(rng, practice.sample(rng, 3))
+    assert practice.used == 8, "refused whole"
+    practice.simulate(rng, practice.sample(rng, 2))
+    assert practice.used == 10
+    with pytest.raises(BudgetExceededError, match="11 training simulations asked"):
+        practice.simulate(rng, practice.sample(rng, 1))
+
+
+def test_parameters_are_drawn_evenly_from_the_training_range(practice):
+    drawn = practice.sample(np.random.default_rng(1), 4000)
+    np.testing.assert_allclose(practice.training, [LOW, HIGH], atol=1e-12)
+    np.testing.assert_allclose(drawn.min(axis=0), LOW, atol=0.01)
+    np.testing.assert_allclose(drawn.max(axis=0), HIGH, atol=0.01)
+    np.testing.assert_allclose(drawn.mean(axis=0), [0.5, 0.4], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "outside", [LOW - np.array([0, 1e-6]), HIGH + np.array([1e-6, 0]), [0.0, 0.4], [0.5, 1.0]]
+)
+def test_no_point_outside_the_training_range_is_simulated(practice, outside):
+    points = np.array([[0.5, 0.4], outside])
+    with pytest.raises(ValueError, match="only simulate inside the training range"):
+        practice.simulate(np.random.default_rng(0), points)
+    assert practice.used == 0
+    practice.simulate(np.random.default_rng(0), np.array([LOW, HIGH]))  # its corners are inside

@@ -1,0 +1,194 @@
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.benchmark.comparison import Comparison
+from bench.benchmark.runner.experiment_runner import (
+    ExperimentRun,
+    prepare_experiment,
+    run_experiment,
+)
+from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.storage.result_folder import read_comparison
+from bench.core.plugin_registries import load_plugins
+from tests.conftest import PLUGINS
+from tests.plugins.awkward import hashed
+from tests.sample_experiments import spring_experiment
+
+PLUGIN_FILES = [str(PLUGINS / "spring.py"), str(PLUGINS / "awkward.py")]
+MEASURED = ["tuner_seconds", "simulator_seconds"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugins():
+    load_plugins(PLUGIN_FILES[:1])
+
+
+def compared(experiment, jobs=2) -> ExperimentRun:
+    load_plugins_for_experiment(PLUGIN_FILES, experiment)
+    results = prepare_experiment(experiment)
+    run_experiment(results, PLUGIN_FILES, jobs)
+    return results
+
+
+def frame(results):
+    columns = results.kept.columns
+    return pd.concat([pd.DataFrame(columns[i]) for i in sorted(columns)], ignore_index=True)
+
+
+def tables(experiment, folder, jobs):
+    load_plugins_for_experiment(PLUGIN_FILES, experiment)
+    comparison = Comparison.begin(experiment, PLUGIN_FILES, folder, jobs)
+    assert comparison.run(jobs).is_complete
+    return read_comparison(folder)
+
+
+EVERYTHING = {
+    "random": {},
+    "nelder_mead": {},
+    "cma_es": {},
+    "least_squares": {},
+    "entropy_search": {"seeds": 1},
+    "crashing": {},
+    "dying": {"seeds": 1},
+    "nan_proposing": {},
+    "over_asking": {},
+    "stopping": {"seeds": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def two_workers():
+    return compared(spring_experiment(tuners=EVERYTHING), jobs=2)
+
+
+@pytest.mark.slow
+def test_table_does_not_depend_on_the_number_of_workers(two_workers, tmp_path):
+    experiment = spring_experiment(tuners=EVERYTHING)
+    first, second = (tables(experiment, tmp_path / str(jobs), jobs) for jobs in (1, 2))
+    pd.testing.assert_frame_equal(
+        first.runs.drop(columns=MEASURED), second.runs.drop(columns=MEASURED)
+    )
+    unlike = ["seconds"]
+    pd.testing.assert_frame_equal(
+        first.statuses.drop(columns=unlike), second.statuses.drop(columns=unlike)
+    )
+
+
+@pytest.mark.slow
+def test_other_tuners_in_the_comparison_change_nothing(two_workers):
+    alone = frame(compared(spring_experiment(tuners={"cma_es": {}}), jobs=2)).drop(columns=MEASURED)
+    among = (
+        frame(two_workers).drop(columns=MEASURED).query("tuner == 'cma_es'").reset_index(drop=True)
+    )
+    pd.testing.assert_frame_equal(alone, among)
+
+
+def test_every_end_has_its_status_and_keeps_its_rows(two_workers):
+    statuses = pd.DataFrame([vars(s) for s in two_workers.kept.statuses.values()])
+    kinds = {tuner: set(group["status"]) for tuner, group in statuses.groupby("tuner")}
+    assert kinds["crashing"] == kinds["dying"] == {"crashed"}
+    assert kinds["nan_proposing"] == {"diverged"}
+    assert kinds["over_asking"] == kinds["random"] == {"done"}
+    assert kinds["stopping"] == {"converged"}
+    assert set(statuses.query("tuner == 'stopping'")["reason"]) == {"found nothing better"}
+    used = statuses.groupby("tuner")["simulations"].agg(["min", "max"])
+    assert tuple(used.loc["over_asking"]) == (12, 12)
+    assert tuple(used.loc["crashing"]) == (1, 1)
+    assert tuple(used.loc["dying"]) == (1, 1), "what was simulated is known, whatever then died"
+    rows = frame(two_workers)
+    assert set(rows["run"]) == set(statuses["run"])
+    assert (
+        rows.groupby("run")["k"].max() == statuses.set_index("run")["simulations"].sort_index()
+    ).all()
+
+
+def test_pairing_all_tuners_share_target_start_and_truth(two_workers):
+    rows = frame(two_workers)
+    first = rows[rows["k"] == 0].groupby("target")
+    assert (first["true_rate"].nunique() == 1).all()
+    assert (first["recommendation_rate"].nunique() == 1).all()
+    truths = rows.groupby("target")["true_rate"].first()
+    inside = truths[[t for t in truths.index if t.startswith("in")]]
+    assert ((inside >= 2.0) & (inside <= 4.0)).all()
+
+
+def test_errors_are_those_of_the_recommendation(two_workers):
+    rows = frame(two_workers)
+    expected = (
+        (rows["recommendation_rate"] - rows["true_rate"]).abs() / 2.0
+        + (rows["recommendation_decay"] - rows["true_decay"]).abs() / 0.4
+    ) / 2
+    np.testing.assert_allclose(rows["param_error"], expected)
+    outside = rows.groupby("target")["outside"].first()
+    assert (outside[[t for t in outside.index if t.startswith("in")]] == 0).all()
+    truth = rows[rows["range"] == "wide"].groupby("target")[["true_rate", "true_decay"]].first()
+    beyond = np.maximum(0, np.maximum(
+        np.maximum(2.0 - truth["true_rate"], truth["true_rate"] - 4.0) / 2.0,
+        np.maximum(0.2 - truth["true_decay"], truth["true_decay"] - 0.6) / 0.4,
+    ))  # fmt: skip
+    np.testing.assert_allclose(outside[truth.index], beyond)
+
+
+def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
+    rows = frame(two_workers).query("tuner == 'cma_es' and target == 'in-001' and seed == 1")
+    problem = two_workers.problem
+    target = next(t for t in problem.targets() if t.sealed.name == "in-001")
+    for _, row in rows.iterrows():
+        theta = np.array([[row["recommendation_rate"], row["recommendation_decay"]]])
+        simulated = problem.simulator.simulate(theta, target.sealed.fitting.scenarios[0])[0]
+        rmse = np.sqrt(np.mean((simulated - target.sealed.fitting.observed) ** 2))
+        assert row["obs_error"] == pytest.approx(rmse, rel=1e-9)
+
+
+def test_tuner_that_searches_everything_for_the_truth_finds_none():
+    once = {"targets": 1, "seeds": 1, "ranges": ["in"]}
+    target = prepare_experiment(spring_experiment(**once)).problem.draw_targets()[0]
+    cube = prepare_experiment(spring_experiment(**once)).problem.cube
+    seen = target.blinded.fitting.observed.ravel()
+    truths = np.concatenate([target.truth, cube.to_unit_cube(target.truth)])
+    wanted = [hashed(float(x)) for x in [*seen, *truths]]
+    results = compared(
+        spring_experiment(tuners={"snooping": {"options": {"wanted": wanted}}}, **once), jobs=1
+    )
+    (status,) = results.run_sink.statuses.values()
+    assert status.status == "converged", status.reason
+    numbers, *places = map(int, status.reason.split())
+    assert numbers > 60
+    assert set(places) == set(range(len(seen))), "all that was observed, and no truth"
+
+
+def test_snooping_would_find_a_truth_that_is_there():
+    from tests.plugins.awkward import walk
+
+    numbers = set()
+    walk({"deep": [{"deeper": np.array([0.123456789])}]}, numbers, set(), 6)
+    assert numbers == {0.123456789}
+
+
+@pytest.mark.slow
+def test_hanging_tuner_is_killed_at_its_limit(monkeypatch):
+    monkeypatch.setattr("bench.benchmark.runner.worker_pools.HARD_LIMIT_GRACE_SECONDS", 0.5)
+    results = compared(
+        spring_experiment(tuners={"hanging": {}, "random": {}}, targets=1, seeds=1, timeout=1.0)
+    )
+    statuses = {s.tuner: s for s in results.run_sink.statuses.values()}
+    assert statuses["hanging"].status == "timeout"
+    assert statuses["random"].status == "done"
+
+
+def test_noise_is_added_to_the_target_only_and_sets_the_scale():
+    experiment = spring_experiment(noise={"x": 0.05})
+    problem = prepare_experiment(experiment).problem
+    targets = problem.draw_targets()
+    residuals = [
+        t.blinded.fitting.observed
+        - problem.simulate(problem.cube.to_unit_cube(t.truth)[None], t.blinded.fitting.scenarios)[0]
+        for t in targets
+    ]
+    assert np.std(residuals) == pytest.approx(0.05, rel=0.1)
+    assert problem.scale == pytest.approx([0.05])
+    again = prepare_experiment(experiment).problem.draw_targets()
+    np.testing.assert_array_equal(
+        targets[3].blinded.fitting.observed, again[3].blinded.fitting.observed
+    )

@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+
+from bench.benchmark.runner.standalone_tuning import StandaloneProblem, run_tuner
+from sims.core.simulator import InputError, Parameter
+
+TRUTH = np.array([3.0, 2e-3])
+PARAMETERS = [
+    Parameter("stiffness", "N/m", 5.0, (1.0, 9.0)),
+    Parameter("inertia", "kg m^2", 1e-3, (1e-4, 1e-2), log=True),
+]
+
+
+def problem(asked):
+    """A line with TRUTH as its intercept and slope; what is evaluated is noted in `asked`."""
+    times = np.linspace(0.0, 1.0, 8)
+
+    def line(theta):
+        return theta[..., :1] + 1e3 * theta[..., 1:] * times
+
+    observed = line(TRUTH)[:, None]
+
+    def evaluate(theta):
+        asked.extend(theta.tolist())
+        simulated = line(theta)[:, :, None]
+        return simulated, np.sqrt(np.square(simulated - observed).mean(axis=(1, 2)))
+
+    start = np.array([p.nominal for p in PARAMETERS])
+    return StandaloneProblem(PARAMETERS, start, observed, np.ones(1), (8,), evaluate)
+
+
+def rng():
+    return np.random.default_rng(1)
+
+
+def test_a_registered_tuner_works_in_physical_units_from_the_start_within_its_budget():
+    asked = []
+    best = run_tuner("least_squares", problem(asked), 40, 60.0, rng())
+    assert best == pytest.approx(TRUTH, rel=1e-3)
+    assert asked[0] == pytest.approx([5.0, 1e-3]), "the first simulation is that of the start"
+    assert 5 < len(asked) <= 40
+    lows, highs = zip(*(p.bounds for p in PARAMETERS), strict=True)
+    # a bound goes through a logarithm and back
+    assert (np.array(asked) >= np.array(lows) * (1.0 - 1e-12)).all()
+    assert (np.array(asked) <= np.array(highs) * (1.0 + 1e-12)).all()
+
+
+def test_the_same_seed_gives_the_same_recommendation():
+    one, two = (run_tuner("random", problem([]), 12, 60.0, rng()) for _ in range(2))
+    assert one.tolist() == two.tolist()
+
+
+def test_a_tuner_that_must_be_trained_is_refused():
+    with pytest.raises(InputError, match="tuner tunenet must be trained first; expected one that"):
+        run_tuner("tunenet", problem([]), 12, 60.0, rng())

@@ -1,0 +1,326 @@
+"""An archive holds a folder whole, and whatever was done to it afterwards is noticed."""
+
+import hashlib
+import json
+import shutil
+import stat
+import struct
+import zipfile
+
+import pytest
+import tomli_w
+
+from bench.benchmark.storage import hashed_archive as archives
+from bench.cli.main import main
+from tests.conftest import PLUGINS
+from tests.sample_experiments import SPRING
+
+PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
+CENTRAL = b"PK\x01\x02\x14\x03\x14\0"
+"""How an entry of the central directory begins, up to its flags."""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A small comparison, and an explanation of a recording."""
+    folder = tmp_path_factory.mktemp("bundle")
+    document = {**SPRING, "salt": "", "targets": 2, "seeds": 1, "budget": 3, "tuners": ["random"]}
+    (folder / "small.toml").write_text(tomli_w.dumps(document))
+    command = ["compare", str(folder / "small.toml"), *PLUGIN, "--jobs", "1", "--salt", "a secret"]
+    assert main([*command, "--out", str(folder / "run")]) == 0
+    log = folder / "swing.csv"
+    command = ["simulate", "pendulum", "--effect", "drag.linear=4e-4", "--noise", "q=0.01"]
+    assert main([*command, "--observe", "q", "--runs", "2", "--seconds", "2", "--rate", "50",
+                 "--out", str(log)]) == 0  # fmt: skip
+    assert main(["explain", str(log), "--jobs", "1", "--out", str(folder / "told")]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compared(place):
+    """The comparison's archive."""
+    assert main(["bundle", str(place / "run"), "--out", str(place / "run.zip")]) == 0
+    return place / "run.zip"
+
+
+@pytest.fixture(scope="module")
+def told(place):
+    """The explanation's archive, with its recording."""
+    command = ["bundle", str(place / "told"), "--with", str(place / "swing.csv")]
+    assert main([*command, "--out", str(place / "told.zip")]) == 0
+    return place / "told.zip"
+
+
+def verified(archive, capsys, *options):
+    capsys.readouterr()
+    code = main(["verify", str(archive), *PLUGIN, "--json", *options])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def content(archive):
+    """By name, what is in an archive."""
+    with zipfile.ZipFile(archive) as packed:
+        return {name: packed.read(name) for name in packed.namelist()}
+
+
+def packed(path, files, entries=()):
+    """An archive of files, and of entries that are none."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as made:
+        for name, data in files.items():
+            made.writestr(name, data)
+        for entry, data in entries:
+            made.writestr(entry, data)
+    return path
+
+
+def listed_again(files, top):
+    """The manifest of a forger, who hashes what was changed."""
+    manifest = json.loads(files[f"{top}/manifest.json"])
+    for each in manifest["files"]:
+        data = files[f"{top}/{each['path']}"]
+        each.update(bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
+    return {**files, f"{top}/manifest.json": json.dumps(manifest).encode()}
+
+
+@pytest.mark.slow
+def test_the_folder_is_in_it_whole_and_the_same_folder_gives_the_same_bytes(
+    place, compared, tmp_path
+):
+    files = content(compared)
+    manifest = json.loads(files.pop("run/manifest.json"))
+    there = {p.relative_to(place).as_posix(): p for p in (place / "run").rglob("*") if p.is_file()}
+    assert set(files) == {*there, "run/plugins/spring.py"}
+    assert all(files[name] == path.read_bytes() for name, path in there.items())
+    assert manifest["command"] == "simgap compare run/experiment.toml"
+    again = tmp_path / "again.zip"
+    shutil.copytree(place / "run", tmp_path / "run")  # other times, another place
+    assert main(["bundle", str(tmp_path / "run"), "--out", str(again)]) == 0
+    assert again.read_bytes() == compared.read_bytes()
+
+
+def test_it_is_never_written_over_and_an_unfinished_comparison_is_refused(
+    place, compared, tmp_path, capsys
+):
+    assert main(["bundle", str(place / "run"), "--out", str(compared)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    shutil.copytree(place / "run", tmp_path / "run")
+    (tmp_path / "run" / "segments").mkdir()
+    assert main(["bundle", str(tmp_path / "run"), "--out", str(tmp_path / "a.zip")]) == 2
+    assert "not finished" in capsys.readouterr().err
+    assert not (tmp_path / "a.zip").exists()
+
+
+def test_what_was_made_follows(compared, told, capsys):
+    code, found = verified(compared, capsys)
+    assert (code, found["follows"], found["archive"]["doubts"]) == (0, True, [])
+    checked = found["comparisons"][0]["checked"]
+    assert any("the salt has the SHA-256 that was committed" in line for line in checked)
+    assert any("16 of 16 rows simulated again" in line for line in checked)
+    code, found = verified(told, capsys)
+    assert (code, found["explanation"]["unchecked"]) == (0, [])
+    assert any("comes out again" in line for line in found["explanation"]["checked"])
+
+
+def test_a_folder_of_an_explanation_is_checked_too_and_what_cannot_be_is_said(place, capsys):
+    code, found = verified(place / "told", capsys)
+    assert code == 0
+    assert found["archive"] is None
+    assert "the recording is not in it" in found["explanation"]["unchecked"][0]
+
+
+def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, capsys, tmp_path):
+    """The simulator is a plugin's: without it on the command line nothing is simulated."""
+    from bench.core.plugin_registries import simulators
+
+    before = simulators.snapshot()
+    simulators.restore({})
+    try:
+        assert main(["verify", str(compared)]) == 2
+        assert "unknown simulator 'spring'" in capsys.readouterr().err
+    finally:
+        simulators.restore(before)
+
+
+@pytest.mark.parametrize(
+    ("change", "file", "says"),
+    [
+        (lambda f: f.update({"run/table.csv": f["run/table.csv"] + b" "}), "table.csv", "expected"),
+        (lambda f: f.update({"run/more.txt": b"more"}), "more.txt", "does not list"),
+        (lambda f: f.pop("run/status.csv"), "status.csv", "found none"),
+    ],
+)
+def test_a_file_that_is_changed_added_or_missing_is_named(
+    compared, tmp_path, capsys, change, file, says
+):
+    files = content(compared)
+    change(files)
+    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
+    assert code == 1
+    (doubt,) = found["archive"]["doubts"]
+    assert (doubt["file"], says in doubt["says"]) == (file, True)
+    assert found["comparisons"] == []
+
+
+def test_a_forger_who_mends_the_manifest_is_found_out_by_the_rows(compared, tmp_path, capsys):
+    files = content(compared)
+    table = files["run/table.csv"].decode().splitlines()
+    cells = table[1].split(",")
+    cells[5] = str(float(cells[5]) / 2)
+    files["run/table.csv"] = "\n".join([table[0], ",".join(cells), *table[2:], ""]).encode()
+    code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "run")), capsys)
+    assert code == 1
+    assert found["archive"]["doubts"] == []
+    assert found["comparisons"][0]["doubts"][0]["says"].startswith("median: expected")
+
+
+def coefficient(verdict):
+    verdict["causes"][0]["coefficients"]["coefficient"]["value"] *= 1.01
+
+
+def held_out(verdict):
+    verdict["heldout"]["rmse_extended"] *= 0.99
+
+
+def word(verdict):
+    verdict["verdict"] = "proven"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [(coefficient, "drag.linear coefficient"), (held_out, "scored again"), (word, "proven")],
+)
+def test_a_verdict_that_was_made_better_is_found_out(told, tmp_path, capsys, change, says):
+    files = content(told)
+    verdict = json.loads(files["told/verdict.json"])
+    change(verdict)
+    files["told/verdict.json"] = json.dumps(verdict).encode()
+    code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), capsys)
+    assert code == 1
+    assert any(says in doubt["says"] for doubt in found["explanation"]["doubts"])
+
+
+def test_another_recording_than_the_one_that_was_explained_is_found_out(told, tmp_path, capsys):
+    files = content(told)
+    rows = files["told/recordings/swing.csv"].decode()
+    files["told/recordings/swing.csv"] = rows.replace("0.0", "0.1", 1).encode()
+    code, found = verified(packed(tmp_path / "a.zip", listed_again(files, "told")), capsys)
+    assert code == 1
+    assert "expected the recording that was explained" in found["explanation"]["doubts"][0]["says"]
+
+
+def entry(name, mode=stat.S_IFREG | 0o644):
+    made = zipfile.ZipInfo(name)
+    made.create_system = 3
+    made.external_attr = mode << 16
+    return made
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "says"),
+    [
+        ("run/../../evil.txt", stat.S_IFREG, "leads out of its folder"),
+        ("/etc/evil.txt", stat.S_IFREG, "leads out of its folder"),
+        ("run//evil.txt", stat.S_IFREG, "leads out of its folder"),
+        ("run/..\\evil.txt", stat.S_IFREG, "no plain path"),
+        ("C:evil.txt", stat.S_IFREG, "no plain path"),
+        ("run/evil\n.txt", stat.S_IFREG, "no plain path"),
+        ("run/link", stat.S_IFLNK, "is a link"),
+        ("run/pipe", stat.S_IFIFO, "is a link, a folder or a device"),
+        ("run/folder/", stat.S_IFDIR, "leads out of its folder, or is none"),
+        ("run/TABLE.csv", stat.S_IFREG, "is in it twice"),
+    ],
+)
+def test_what_would_leave_the_folder_or_stand_for_something_else_is_refused(
+    compared, tmp_path, capsys, name, mode, says
+):
+    made = packed(tmp_path / "a.zip", content(compared), [(entry(name, mode | 0o644), "evil")])
+    code, found = verified(made, capsys)
+    assert code == 2
+    assert says in found["error"]["message"]
+    assert "nothing was unpacked" in found["error"]["message"]
+    assert not list(tmp_path.rglob("evil*"))
+
+
+@pytest.mark.parametrize(("limit", "at"), [("DENSEST", 3), ("LARGEST", 1 << 20)])
+def test_a_bomb_is_refused_before_it_is_unpacked(
+    compared, tmp_path, capsys, monkeypatch, limit, at
+):
+    monkeypatch.setattr(archives, "_HARMLESS", 1 << 20)
+    monkeypatch.setattr(archives, limit, at)
+    files = {**content(compared), "run/zeros": bytes(10 << 20)}
+    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
+    assert code == 2
+    assert "it would unpack from" in found["error"]["message"]
+    monkeypatch.setattr(archives, "_MOST", 3)
+    assert "files, at most 3" in verified(compared, capsys)[1]["error"]["message"]
+
+
+def test_a_file_that_holds_more_than_it_says_is_refused(compared, tmp_path, capsys):
+    path = packed(tmp_path / "a.zip", {**content(compared), "run/zeros": bytes(3 << 20)})
+    data = bytearray(path.read_bytes())
+    # The last entry of the central directory is that of the zeros: its size is made small.
+    place = data.rindex(b"PK\x01\x02")
+    data[place + 24 : place + 28] = struct.pack("<I", 10)
+    path.write_bytes(data)
+    code, found = verified(path, capsys)
+    assert code == 2
+    assert str(path) in found["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda d: b"#!/bin/sh\n" + d, "something in it beside its files"),
+        (lambda d: d[:-2] + b"\x02\x00hi", "something in it beside its files"),
+        (lambda d: d[: len(d) // 2], "expected an archive of simgap bundle"),
+        (lambda _: b"no archive at all", "expected an archive of simgap bundle"),
+        (lambda d: d.replace(CENTRAL + b"\0", CENTRAL + b"\1"), "is encrypted"),
+    ],
+)
+def test_an_archive_with_more_or_less_around_it_is_refused(
+    compared, tmp_path, capsys, change, says
+):
+    (tmp_path / "a.zip").write_bytes(change(compared.read_bytes()))
+    code, found = verified(tmp_path / "a.zip", capsys)
+    assert code == 2
+    assert says in found["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda f: f.pop("run/manifest.json"), "one folder with manifest.json in it"),
+        (lambda f: f.update({"run/manifest.json": b"{"}), "is not of type 'object'"),
+        (lambda f: f.update({"run/manifest.json": b"[" * 100_000}), "is not of type 'object'"),
+        (lambda f: f.update({"run/manifest.json": b'{"format": 1}'}), "is a required property"),
+        (lambda f: f.update({"other/a.txt": b"a"}), "one folder with manifest.json in it"),
+    ],
+)
+def test_a_manifest_that_is_none_is_refused(compared, tmp_path, capsys, change, says):
+    files = content(compared)
+    change(files)
+    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
+    assert code == 2
+    assert says in found["error"]["message"]
+
+
+def test_a_file_listed_twice_is_noticed(compared, tmp_path, capsys):
+    files = content(compared)
+    manifest = json.loads(files["run/manifest.json"])
+    manifest["files"].append(manifest["files"][0])
+    files["run/manifest.json"] = json.dumps(manifest).encode()
+    code, found = verified(packed(tmp_path / "a.zip", files), capsys)
+    assert code == 1
+    assert "listed twice" in found["archive"]["doubts"][0]["says"]
+
+
+def test_links_and_hidden_files_are_left_out_and_said(place, tmp_path, capsys):
+    shutil.copytree(place / "run", tmp_path / "run")
+    (tmp_path / "run" / "secret").symlink_to("/etc/passwd")
+    (tmp_path / "run" / ".token").write_text("mine")
+    capsys.readouterr()
+    command = ["bundle", str(tmp_path / "run"), "--out", str(tmp_path / "a.zip"), "--json"]
+    assert main(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["left_out"] == [".token: hidden", "secret: a link"]
+    assert not {"run/secret", "run/.token"} & set(content(tmp_path / "a.zip"))

@@ -1,0 +1,208 @@
+"""A folder that tells the truth follows from its salt and its rows; a changed one does not."""
+
+import json
+import os
+import shutil
+import stat
+
+import pandas as pd
+import pytest
+import tomli_w
+
+from bench.benchmark.storage.result_folder import read_configuration
+from bench.cli.main import main
+from tests.conftest import PLUGINS
+from tests.sample_experiments import SPRING
+from tests.without_drawing import undrawn
+
+SECRET = "a secret of the tests"
+PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verify")
+    document = {
+        **SPRING, "salt": "", "targets": 2, "seeds": 1, "budget": 5, "noise": {"x": 0.01},
+        "held_out": {"scenarios": 1}, "tuners": ["random", "least_squares"],
+    }  # fmt: skip
+    (folder / "e.toml").write_text(tomli_w.dumps(document))
+    command = ["compare", str(folder / "e.toml"), *PLUGIN, "--jobs", "1", "--salt", SECRET]
+    with undrawn():
+        assert main([*command, "--out", str(folder / "out")]) == 0
+    return folder / "out"
+
+
+@pytest.fixture
+def folder(sound, tmp_path):
+    shutil.copytree(sound, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def verified(folder, capsys, *options):
+    capsys.readouterr()
+    code = main(["verify", str(folder), *options])
+    said = capsys.readouterr()
+    return code, said.out + said.err
+
+
+def test_what_was_made_follows(sound, capsys):
+    code, said = verified(sound, capsys)
+    assert code == 0
+    assert "the salt has the SHA-256 that was committed" in said
+    assert "4 targets drawn again, 48 rows compared" in said
+    assert "48 of 48 rows simulated again" in said
+    assert said.endswith("all of it follows\n")
+    held = read_configuration(sound).experiment
+    assert (held.salt, held.trusted) == (SECRET, False)
+    assert set(pd.read_csv(sound / "table.csv")["salt"]) == {"secret"}
+    assert "process" in json.loads((sound / "environment.json").read_text())["seals"]
+
+
+def changed_rows(folder, column, change, where=slice(None)):
+    path = folder / "runs.parquet"
+    rows = pd.read_parquet(path)
+    rows.loc[where, column] = change(rows.loc[where, column])
+    rows.to_parquet(path, index=False)
+
+
+def half(rows):
+    return rows / 2
+
+
+@pytest.mark.parametrize(
+    ("column", "where"),
+    [
+        ("true_rate", slice(None)),
+        ("param_error", slice(None)),
+        ("param_error", slice(7, 7)),
+        ("outside", slice(12, 23)),
+        ("loss", slice(3, 3)),
+        ("obs_error", slice(9, 9)),
+        ("heldout_error", slice(20, 20)),
+    ],
+)
+def test_a_number_that_was_made_better_does_not_follow(folder, capsys, column, where):
+    before = pd.read_parquet(folder / "runs.parquet")[column][where]
+    changed_rows(folder, column, half, where)
+    code, said = verified(folder, capsys, "--all")
+    assert code in (1, 2), said
+    if (before > 0).any():
+        assert column in said
+        row = int(said.split("runs.parquet, row ")[1].split(":")[0]) if code == 1 else None
+        assert row is None or (where.start or 0) < row
+
+
+def test_a_table_that_does_not_come_of_the_rows(folder, capsys):
+    lines = pd.read_csv(folder / "table.csv", keep_default_na=False)
+    lines.loc[2, "mean"] = float(lines.loc[2, "mean"]) / 2
+    lines.to_csv(folder / "table.csv", index=False)
+    code, said = verified(folder, capsys)
+    assert code == 1
+    assert f"{folder}/table.csv, row 4: mean: expected" in said
+
+
+@pytest.mark.parametrize("old", [SECRET, "salt_sha256 = "])
+def test_another_salt_is_refused(folder, capsys, old):
+    path = folder / "experiment.toml"
+    text = path.read_text()
+    place = text.index(old) + len(old) + (1 if old.endswith(" ") else -1)
+    other = "0" if text[place] != "0" else "1"
+    path.write_text(text[:place] + other + text[place + 1 :])
+    code, said = verified(folder, capsys)
+    assert code == 2
+    assert "one of the two was changed" in said
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes_on_with_it(
+    sound, tmp_path, capsys, monkeypatch
+):
+    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+
+    held = read_configuration(sound)
+    experiment = held.experiment.chosen(salt="", salt_sha256="")
+    load_plugins_for_experiment(held.plugins, experiment)
+    begun = Comparison.begin(experiment, held.plugins, tmp_path / "out", 1, SECRET)
+    begun.close()
+    kept = tmp_path / "out" / "segments" / "salt"
+    assert kept.read_text() == SECRET
+    assert stat.S_IMODE(os.stat(kept).st_mode) == 0o600
+    text = (tmp_path / "out" / "experiment.toml").read_text()
+    assert SECRET not in text
+    assert held.experiment.salt_sha256 in text
+    assert verified(tmp_path / "out", capsys)[0] == 2
+    assert main(["compare", "--resume", str(tmp_path / "out"), "--jobs", "1"]) == 0
+    assert not kept.exists()
+    columns = [f"true_{name}" for name in ("rate", "decay")]
+    pd.testing.assert_frame_equal(
+        *(pd.read_parquet(f / "runs.parquet")[columns] for f in (sound, tmp_path / "out"))
+    )
+
+
+def test_a_folder_whose_salt_is_gone_is_not_resumed(sound, tmp_path, capsys):
+    from bench.benchmark.comparison import Comparison
+    from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+
+    held = read_configuration(sound)
+    load_plugins_for_experiment(held.plugins, held.experiment)
+    begun = Comparison.begin(
+        held.experiment.chosen(salt="", salt_sha256=""), held.plugins, tmp_path / "out", 1, SECRET
+    )
+    begun.close()
+    for content in (None, "another"):
+        kept = tmp_path / "out" / "segments" / "salt"
+        kept.unlink() if content is None else kept.write_text(content)
+        capsys.readouterr()
+        assert main(["compare", "--resume", str(tmp_path / "out")]) == 2
+        said = capsys.readouterr().err
+        assert str(kept) in said
+        assert SECRET not in said
+
+
+def test_a_salt_beside_the_experiments_own_is_refused(tmp_path, capsys):
+    (tmp_path / "e.toml").write_text(tomli_w.dumps(SPRING))
+    command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
+    assert main([*command, "--salt", "another"]) == 2
+    assert "has a salt of its own, which is public" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_seals_of_this_machine_and_of_a_folder_are_said(sound, capsys):
+    assert main(["status"]) == 0
+    said = capsys.readouterr().out
+    assert "process    holds" in said
+    assert main(["status", str(sound)]) == 0
+    said = capsys.readouterr().out
+    assert "sealed: a process for each run" in said
+    assert "revealed" in said
+
+
+@pytest.mark.slow
+def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, monkeypatch):
+    (tmp_path / "e.toml").write_text(
+        tomli_w.dumps({**SPRING, "targets": 2, "seeds": 1, "budget": 3, "tuners": ["random"]})
+    )
+    titles = []
+    from bench.figures import style
+
+    plain = style.render_png
+    monkeypatch.setattr(
+        style,
+        "render_png",
+        lambda f, dpi=style.DPI: titles.append(f.get_suptitle()) or plain(f, 40),
+    )
+    command = ["compare", str(tmp_path / "e.toml"), *PLUGIN, "--out", str(tmp_path / "out")]
+    assert main([*command, "--trust", "--jobs", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "trusted: the tuners ran inside the harness" in said
+    assert "public salt" in said
+    assert titles
+    assert all(title.endswith("(trusted)") for title in titles), titles
+    for path in sorted((tmp_path / "out").glob("*.csv")):
+        if path.name != "identifiability.csv":  # made by no tuner
+            assert pd.read_csv(path).get("trusted", pd.Series([False])).all(), path.name
+    assert pd.read_parquet(tmp_path / "out" / "runs.parquet")["trusted"].all()
+    assert main(["status", str(tmp_path / "out")]) == 0
+    assert "trusted: its tuners run inside the harness" in capsys.readouterr().out

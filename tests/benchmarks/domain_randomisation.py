@@ -1,0 +1,114 @@
+"""Learned tuners where the world has an effect that the simulator lacks: trained in the simulator
+as it is, and over effects that the world may have; and whether intervals that a conformal
+calibration gives them cover the truth.
+
+Split-conformal intervals (H. Papadopoulos et al., ECML 2002; J. Lei et al., JASA 113, 2018, arXiv
+1604.04173): on n simulations that the training has not seen, the size of the error in each
+parameter is sorted; the ceil((n + 1) 0.9)-th smallest is the interval's half width. It covers 90 %
+of the targets that come from where these simulations come from.
+
+python -m tests.benchmarks.domain_randomisation results/reference/misspecified/learned.csv ball
+servo shot
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.problem.domain_randomisation import RandomisedSimulator
+from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.recorded_runs import ObservedRuns
+from bench.benchmark.problem.tuner_entries import TunerEntry
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
+from bench.benchmark.runner.worker_tasks import RunRequest, execute_run
+from bench.core.random_streams import make_rng
+from sims.core.atomic_files import write_atomically
+
+TUNERS = ("regressor", "tunenet", "in_context")
+TARGETS, CALIBRATION, BUDGET = 20, 60, 12
+COVERED = 0.9
+
+
+def halves(errors, covered=COVERED):
+    """(dim,) half widths of split-conformal intervals, of sizes of errors (n, dim)."""
+    n = len(errors)
+    place = int(np.ceil((n + 1) * covered))
+    if place > n:
+        return np.full(errors.shape[1], np.inf)
+    return np.sort(errors, axis=0)[place - 1]
+
+
+def rehearsed(problem, randomised, index):
+    """A target from where the tuner trains, and its truth (dim,) in the unit cube."""
+    rng = make_rng("randomised", problem.experiment.name, index)
+    scenarios = problem.scenarios(rng)
+    low, high = problem.cube.training
+    point = rng.uniform(low, high)
+    simulate = problem.simulate
+    if randomised:
+        nuisance = RandomisedSimulator(problem)
+
+        def simulate(points, scenarios):
+            return nuisance.simulate(rng, points, scenarios)
+
+    seen = simulate(point[None], scenarios)[0]
+    seen = seen + problem.noise * rng.standard_normal(seen.shape)
+    like = problem.target("in", 0).sealed
+    nothing = ObservedRuns((), np.empty((0, seen.shape[1])))
+    fitting = ObservedRuns(scenarios, seen)
+    sealed = replace(like, name=f"in-{index:03d}", fitting=fitting, held_out=nothing)
+    return sealed, problem.cube.physical(point)
+
+
+def measured(name):
+    """Rows of the table for one system."""
+    experiment = load_experiment(f"misspecified-{name}")
+    experiment = replace(experiment, calibration=None, trusted=True, salt="public", budget=BUDGET)
+    problem = TuningProblem(experiment)
+    widths = problem.cube.compute_training_widths()
+    world = [problem.draw_target("in", index) for index in range(TARGETS)]
+    met = [(target.blinded, target.truth) for target in world]
+    rows = []
+    for tuner in TUNERS:
+        for randomised in (False, True):
+            entry = TunerEntry(tuner, tuner, randomised=randomised)
+            weights = train_or_load(
+                experiment.chosen(tuners=(entry,)), TrainingRequest(entry, 0)
+            ).path
+
+            def errors(targets, entry=entry, weights=weights):
+                found = []
+                for sealed, truth in targets:
+                    order = RunRequest("r", entry, 0, sealed, BUDGET, weights, None, ())
+                    trace = execute_run(experiment, order).trace
+                    last = problem.cube.to_physical(trace.recommendations[-1:])[0]
+                    found.append((last - truth) / widths)
+                return np.array(found)
+
+            apart = [rehearsed(problem, randomised, index) for index in range(CALIBRATION)]
+            half = halves(np.abs(errors(apart)))
+            away = errors(met)
+            rows.append(
+                {
+                    "system": name,
+                    "tuner": tuner,
+                    "randomised": randomised,
+                    "targets": TARGETS,
+                    "error": np.abs(away).mean(),
+                    "error_sigma": np.abs(away).mean(axis=1).std(ddof=1) / np.sqrt(TARGETS),
+                    "half_width": half.mean(),
+                    "covered": (np.abs(away) <= half).mean(),
+                }
+            )
+            print(rows[-1], flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    out, *systems = sys.argv[1:]
+    frame = pd.DataFrame([row for name in systems for row in measured(name)])
+    write_atomically(Path(out), frame.to_csv(index=False, float_format="%.4g"))

@@ -1,0 +1,107 @@
+"""What the harness costs: an evaluation through `drive_tuner` and `ProposalEvaluator` against a bare loop over
+the same work.
+
+Run with `make benchmark`. The bare loop draws the same proposals and calls the same simulator; all
+that is left is harness: budget, checks, unit cube, loss, recommendation, timing, rows. Simulators:
+one that costs nothing, and the spring in closed form.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+from time import perf_counter
+
+import numpy as np
+
+from bench.benchmark.problem.experiment import TunerEntry
+from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.proposal_evaluator import ProposalEvaluator
+from bench.benchmark.runner.result_rows import build_rows
+from bench.benchmark.runner.tuner_loop import drive_tuner
+from bench.benchmark.runner.worker_tasks import RunOutcome, RunRequest
+from bench.core.plugin_registries import load_plugins
+from methods.tuner import Task, Tuner
+from tests.conftest import PLUGINS
+from tests.sample_experiments import spring_experiment
+
+EVALUATIONS = 5000
+REPEATS = 7
+
+
+class Drawing(Tuner):
+    """Proposes prepared points, so that the tuner costs next to nothing."""
+
+    def __init__(self, points):
+        self.points = points
+
+    def tune(self, task, rng):
+        steps = iter(self.points)
+        while (point := next(steps, None)) is not None:
+            yield point
+        yield task.start
+
+
+def bare(points, problem, scenario):
+    """The work itself: map to physical units, simulate."""
+    low, span = problem.cube._low, problem.cube._span
+    simulate = problem.simulator.simulate
+    started = perf_counter()
+    for point in points:
+        simulate((low + point * span)[None], scenario)
+    return perf_counter() - started
+
+
+def harnessed(points, problem, sealed):
+    task = Task(
+        problem.cube.dim, sealed.start, sealed.fitting.observed, problem.scale,
+        problem.cube.training,
+        len(points), (len(sealed.fitting.observed),),
+    )  # fmt: skip
+    evaluator = ProposalEvaluator(problem, sealed.fitting)
+    started = perf_counter()
+    trace = drive_tuner(Drawing(points), task, evaluator, np.random.default_rng(0))
+    seconds = perf_counter() - started
+    assert trace.status == "done"
+    assert len(trace.losses) == len(points)
+    return seconds, trace, evaluator
+
+
+def measure(problem, name):
+    target = problem.targets()[0]
+    points = np.random.default_rng(0).uniform(size=(EVALUATIONS, problem.cube.dim))
+    costs, ratios, scoring = [], [], []
+    for _ in range(REPEATS):
+        plain = bare(points, problem, target.sealed.fitting.scenarios[0])
+        seconds, trace, evaluator = harnessed(points, problem, target.sealed)
+        costs.append((seconds - plain) / EVALUATIONS * 1e6)
+        ratios.append(seconds / plain)
+        started = perf_counter()
+        rmse = evaluator.rmse(trace.proposals, trace.recommendations)
+        build_rows(problem, RunRequest("run", TunerEntry("drawing", "drawing"), 0, target.sealed, EVALUATIONS),
+        target,
+             RunOutcome(trace, rmse, None, 0.0))  # fmt: skip
+        scoring.append((perf_counter() - started) / EVALUATIONS * 1e6)
+    return {
+        "simulator": name,
+        "harness_microseconds_an_evaluation": round(statistics.median(costs), 2),
+        "ratio_to_bare_loop": round(statistics.median(ratios), 2),
+        "scoring_and_rows_microseconds_an_evaluation": round(statistics.median(scoring), 2),
+    }
+
+
+def main():
+    load_plugins([PLUGINS / "spring.py"])
+    experiment = spring_experiment(targets=1, sampling={"rate": 60.0, "samples": 400})
+    spring, nothing = TuningProblem(experiment), TuningProblem(experiment)
+    fixed = spring.simulate(
+        np.full((1, 2), 0.5), spring.draw_targets()[0].blinded.fitting.scenarios
+    )
+    nothing.simulator.simulate = lambda theta, scenario: fixed
+    for problem, name in ((nothing, "none"), (spring, "spring, 400 samples")):
+        print(json.dumps(measure(problem, name)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""What the data of the problems of several parameters identify: `python -m
+tests.benchmarks.identified_robots [--out FILE.csv]`.
+
+Of each problem and range medians over targets of the least and the largest 1 sigma that an
+unbiased estimate can have along a direction, how many directions are stiff in how many targets,
+and which parameters the sloppiest direction is made of: the mean of its squared components. The
+table of docs/problems.md is made from it.
+"""
+
+import argparse
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.problem.tuning_problem import TuningProblem
+
+PROBLEMS = {
+    "slider-push": 20, "pendulum-swing": 20, "servo-step": 20, "ball-wind": 20, "ball-tilt": 20,
+    "pendulum-driven": 20, "servo-friction": 20, "arm-swing": 10, "arm-drive": 10,
+}  # fmt: skip
+"""Targets in each range."""
+OUT = Path(__file__).resolve().parents[2] / "results" / "reference" / "multi" / "identified.csv"
+
+
+def identified(name, count):
+    """A row for each range of a problem."""
+    problem = TuningProblem(load_experiment(name).chosen(targets=count))
+    for kind in ("in", "wide"):
+        spectra = [problem.compute_spectrum(problem.draw_target(kind, i)) for i in range(count)]
+        sigmas = np.array([one.sigmas for one in spectra])
+        stiff = Counter(int(one.is_stiff.sum()) for one in spectra)
+        shares = np.mean([one.vectors[:, -1] ** 2 for one in spectra], axis=0)
+        names = [parameter.name for parameter in problem.cube.parameters]
+        order = np.argsort(-shares)
+        yield {
+            "experiment": name, "range": kind, "targets": count,
+            "stiffest": np.median(sigmas.min(axis=1)), "sloppiest": np.median(sigmas.max(axis=1)),
+            "stiff": ", ".join(f"{n} ({stiff[n]})" for n in sorted(stiff, reverse=True)),
+            "made_of": ", ".join(f"{names[i]} {100 * shares[i]:.0f}" for i in order[:3]),
+        }  # fmt: skip
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    rows = []
+    for name, count in PROBLEMS.items():
+        rows += identified(name, count)
+        print(pd.DataFrame(rows[-2:]).to_string(header=False, index=False), flush=True)
+    pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.6g")
+
+
+if __name__ == "__main__":
+    main()

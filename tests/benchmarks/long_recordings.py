@@ -1,0 +1,84 @@
+"""Long recordings, searched with all samples and with fewer: ``OMP_NUM_THREADS=1 python -m
+tests.benchmarks.long_recordings [RECORDING.csv ...]``.
+
+Processor time of explain on one core, both ways by turns, with the verdicts; of four made
+recordings (3 runs of 8 s at 1 kHz) and of those that are named. Prints a table.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bench.diagnosis.evaluation import run_thinning
+from bench.diagnosis.explain import explain
+from tests.simulation_arguments import Wish, write
+
+SLIDER = {"system": "slider", "observe": ["x"], "inputs": ["u=steps:2:0.5"]}
+LONG = {"runs": 3, "seconds": 8.0, "rate": 1000.0}
+MADE = {
+    "clean": SLIDER | {"noise": ["x=0.002"], "seed": 1},
+    "weak friction": SLIDER
+    | {"noise": ["x=0.002"], "effects": ["friction.coulomb=0.004"], "seed": 2},
+    "drag of a pendulum": {
+        "system": "pendulum",
+        "observe": ["q"],
+        "noise": ["q=0.004"],
+        "effects": ["drag.quadratic=0.0004"],
+        "seed": 3,
+    },
+    "friction and delay": SLIDER
+    | {
+        "noise": ["x=0.005"],
+        "effects": ["friction.coulomb=0.3", "input.delay=0.03"],
+        "seed": 4,
+    },
+}
+
+
+def asked(path, long):
+    """Processor seconds, and what is answered, where recordings are long from so many samples."""
+    usual = run_thinning.MIN_SAMPLES_TO_THIN
+    run_thinning.MIN_SAMPLES_TO_THIN = long
+    begin = time.process_time()
+    try:
+        verdict = explain(path).answer
+    finally:
+        run_thinning.MIN_SAMPLES_TO_THIN = usual
+    names = ", ".join(
+        " or ".join([f"`{cause.effect}`", *map("`{}`".format, cause.alternatives)])
+        for cause in verdict.causes
+    )
+    return time.process_time() - begin, f"{verdict.verdict} {names}".strip()
+
+
+def row(name, path):
+    """A row of the table."""
+    whole, said = asked(path, np.inf)
+    few, also = asked(path, run_thinning.MIN_SAMPLES_TO_THIN)
+    same = "the same" if also == said else also
+    return f"| {name} | {whole:.1f} | {few:.1f} | {whole / few:.1f} | {said} | {same} |"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("recordings", nargs="*", type=Path)
+    recordings = parser.parse_args().recordings
+    print("| recording | all samples, s | fewer, s | ratio | verdict | with fewer |")
+    print("|---|---|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for number, (name, wish) in enumerate(MADE.items()):
+            path = Path(folder) / f"{number}.csv"
+            write(Wish(**wish, **LONG), path)
+            # once before: what is loaded and traced once is no cost of either way
+            if not number:
+                explain(path)
+            print(row(name, path), flush=True)
+    for path in recordings:
+        print(row(f"{path.parent.name}/{path.stem}", path), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""What a lane costs in MuJoCo, together and one after the other, beside MuJoCo's own stepping.
+
+Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.mujoco_batches``; prints a table in
+Markdown.
+A lane is a pendulum for 4 s at 100 Hz, 1,600 steps of 2.5 ms. Ways are taken by turns in one
+process, the best of some rounds counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import perf_counter, process_time
+
+import numpy as np
+
+from sims.core.simulator import Scenario
+from sims.engines.adapters import mujoco_joint_batch
+from sims.systems.pendulum import Pendulum
+
+LANES = (1, 16, 256, 1024)
+STEPS = 1600
+STEP = 2.5e-3
+FRICTION = 0.01
+"""N*m of dry friction."""
+CASES = {
+    "plain": (),
+    "dry friction and drag": ("friction.coulomb", "drag.quadratic"),
+    "dry friction by Stribeck, spring": ("friction.stribeck", "spring.linear"),
+}
+Cost = tuple[float, float]
+"""Processor and wall time of a lane, ms."""
+
+
+def native(lanes: int, threads: int = 1) -> Callable[[], None]:
+    """MuJoCo by itself, the yardstick: `mujoco.batch.Batch` with dry friction by the joint's
+    `frictionloss`, nothing read out on the way.
+
+    Args:
+        lanes: pendulums, each begun at its own angle.
+        threads: of the batch.
+
+    Returns:
+        What makes all steps once, from the start.
+    """
+    import mujoco
+    from mujoco import batch
+
+    from sims.systems import pendulum_mujoco_world
+
+    constants = {"mass": 0.49, "length": 0.1, "gravity": 9.81}
+    model = mujoco.MjModel.from_xml_string(pendulum_mujoco_world.model(constants))
+    pendulum_mujoco_world.load(model, 5e-3, constants)
+    model.opt.timestep = STEP
+    model.dof_frictionloss[:] = FRICTION
+    many = batch.Batch(model, lanes, threads)
+    angles = np.linspace(0.5, 2.5, lanes)
+
+    def work() -> None:
+        many.reset(stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        many.bind("qpos")[:, 0] = angles
+        many.step(nstep=STEPS)
+
+    return work
+
+
+def ours(effects: tuple[str, ...], lanes: int, **settings: int) -> Callable[[], None]:
+    """The engine `mujoco` on as many pendulums, with half of what each effect may be."""
+    pendulum = Pendulum(engine="mujoco", effects=effects, **settings)
+    known = len(Pendulum.system.parameters)
+    middle = [p.nominal for p in pendulum.parameters[:known]]
+    middle += [0.5 * p.bounds[1] for p in pendulum.parameters[known:]]
+    theta = np.array(middle) * np.random.default_rng(1).uniform(0.95, 1.05, (lanes, len(middle)))
+    run = Scenario(np.arange(401) / 100, {"q": 1.5})
+    return lambda: np.testing.assert_equal(pendulum.simulate(theta, run).shape[:2], (lanes, 401))
+
+
+@contextmanager
+def one_by_one() -> Iterator[None]:
+    """Lanes one after the other, as where MuJoCo has no batches."""
+    before = dict(mujoco_joint_batch.MIN_BATCH_SIZE)
+    mujoco_joint_batch.MIN_BATCH_SIZE.update(dict.fromkeys(before, 10**9))
+    try:
+        yield
+    finally:
+        mujoco_joint_batch.MIN_BATCH_SIZE.update(before)
+
+
+def once(work: Callable[[], None], lanes: int) -> Cost:
+    """The cost of a lane."""
+    processor, wall = process_time(), perf_counter()
+    work()
+    return 1e3 * (process_time() - processor) / lanes, 1e3 * (perf_counter() - wall) / lanes
+
+
+def row(effects: tuple[str, ...], lanes: int, rounds: int) -> list[Cost]:
+    """One by one, together, and MuJoCo by itself."""
+    work, yardstick = ours(effects, lanes), native(lanes)
+    few = min(lanes, 16)  # one after the other, lanes cost the same each
+    alone = ours(effects, few)
+    costs = []
+    for _ in range(rounds):
+        with one_by_one():
+            old = once(alone, few)
+        costs.append([old, once(work, lanes), once(yardstick, lanes)])
+    best: list[Cost] = [tuple(c) for c in np.min(costs, axis=0).tolist()]
+    return best
+
+
+def main() -> None:
+    """Print the table."""
+    print("| pendulum | lanes | one by one, ms | together, ms | `batch.Batch` itself, ms |")
+    print("|---|---|---|---|---|")
+    for name, effects in CASES.items():
+        for lanes in LANES:
+            rounds = 5 if lanes < 100 else 2
+            cells = [f"{cpu:.2f} ({wall:.2f})" for cpu, wall in row(effects, lanes, rounds)]
+            print(f"| {name} | {lanes:,} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

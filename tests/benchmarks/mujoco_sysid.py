@@ -1,0 +1,166 @@
+"""Side by side with mujoco.sysid on the arm of examples/robot: what each finds, how far off it is
+on held-out runs, and what it costs.
+
+Run: `python -m tests.benchmarks.mujoco_sysid [--only CASE]`. The toolbox and what it needs are
+    installed
+into a throwaway environment, or are those of the Python that $PEERS names. Cases:
+
+- mass: the model file states a forearm of 0.96 kg, a fifth too heavy; the arm has 0.8 kg;
+- friction: the example as it ships; the elbow has dry friction of 0.03 N m that the model lacks;
+- late: the elbow's command arrives 20 ms late, which no number of a model file states.
+
+mujoco.sysid fits what it is told to: once masses, damping and armature of both links, as its own
+examples do, once dry friction too. It is told the initial states; simgap estimates them.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from examples.robot import make_log
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / "examples" / "robot"
+NUMBERS = ("mass", "damping", "armature")
+FREED = {"sysid, numbers": NUMBERS, "sysid, numbers and friction": (*NUMBERS, "frictionloss")}
+STATED = 'mass="0.8" diaginertia="0.009 0.009 0.0006"'
+HEAVY = 'mass="0.96" diaginertia="0.0108 0.0108 0.00072"'
+CASES = ("mass", "friction", "late")
+
+
+def late_table(samples):
+    """The recording of an arm whose elbow's command arrives some samples late."""
+    straight = make_log.table(0.0).splitlines()
+    rows, arm = [straight[0]], make_log.Arm()
+    for number in make_log.RUNS:
+        torques = make_log.torques_of(number)
+        late = torques.copy()
+        late[samples:, 1], late[:samples, 1] = torques[:-samples, 1], torques[0, 1]
+        moved = arm.simulate(np.zeros(4), late) - arm.simulate(np.zeros(4), torques)
+        begun = 1 + (number - 1) * len(torques)
+        for line, change in zip(straight[begun : begun + len(torques)], moved, strict=True):
+            *kept, shoulder, elbow = line.split(",")
+            seen = float(shoulder) + change[0], float(elbow) + change[1]
+            rows.append(",".join([*kept, f"{seen[0]:.5f}", f"{seen[1]:.5f}"]))
+    return "\n".join(rows) + "\n"
+
+
+def prepare(case, folder):
+    """A folder with arm2.xml, log.csv and log.toml of a case."""
+    folder.mkdir()
+    shutil.copy(EXAMPLE / "log.toml", folder)
+    model = (EXAMPLE / "arm2.xml").read_text()
+    if case == "mass":
+        if STATED not in model:
+            raise ValueError("arm2.xml states another forearm")
+        model = model.replace(STATED, HEAVY)
+    (folder / "arm2.xml").write_text(model)
+    tables = {
+        "mass": lambda: make_log.table(0.0),
+        "friction": make_log.table,
+        "late": lambda: late_table(2),
+    }
+    (folder / "log.csv").write_text(tables[case]())
+    return folder
+
+
+def measured(command):
+    """What a command prints, and its seconds: by the clock and of all its processes."""
+    started = perf_counter()
+    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(command, stdout=output, stderr=errors, cwd=ROOT)
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = perf_counter() - started
+        output.seek(0)
+        errors.seek(0)
+        if status:
+            raise RuntimeError(errors.read()[-2000:])
+        return output.read(), wall, usage.ru_utime + usage.ru_stime
+
+
+def by_sysid(python, folder, what):
+    fit = str(Path(__file__).with_name("mujoco_sysid_fit.py"))
+    said, wall, work = measured(
+        [python, fit, str(folder / "arm2.xml"), str(folder / "log.csv"), *what]
+    )
+    found = json.loads(said.splitlines()[-1])
+    return {**found, "verdict": None, "wall_s": wall, "processor_s": work}
+
+
+def by_simgap(folder):
+    out = folder / "explained"
+    command = [sys.executable, "-m", "bench.cli.main", "explain", str(folder / "log.csv")]
+    _, wall, work = measured([*command, "--out", str(out)])
+    verdict = json.loads((out / "verdict.json").read_text())
+    scored, _, _ = measured(
+        [
+            *command[:3],
+            "score",
+            str(out / "extended.toml"),
+            str(folder / "log.csv"),
+            "--held-out",
+            "--json",
+        ]
+    )
+    causes = {
+        f"{cause['effect']} {name}": value
+        for cause in verdict["causes"]
+        for name, value in cause["coefficients"].items()
+    }
+    alternatives = {cause["effect"]: cause["alternatives"] for cause in verdict["causes"]}
+    return {
+        "found": {**verdict["parameters"], **causes},
+        "alternatives": alternatives,
+        "verdict": verdict["verdict"],
+        "heldout_rmse": json.loads(scored)["rmse"],
+        "wall_s": wall,
+        "processor_s": work,
+    }
+
+
+def environment(folder):
+    """Python of an environment that has the toolbox: of $PEERS, else of one made in `folder`."""
+    if os.environ.get("PEERS"):
+        return os.environ["PEERS"]
+    python = str(folder / "venv" / "bin" / "python")
+    subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
+    subprocess.run([python, "-m", "pip", "install", "--quiet", "mujoco[sysid]==4.0.0"], check=True)
+    return python
+
+
+def line(case, name, outcome):
+    """A row of the table."""
+    errors = " / ".join(f"{1e3 * v:.2f}" for v in outcome["heldout_rmse"].values())
+    numbers = ", ".join(
+        f"{key} {v['value']:.4g} ({v['low']:.4g} to {v['high']:.4g})"
+        for key, v in outcome["found"].items()
+    )
+    times = f"{outcome['processor_s']:.1f} | {outcome['wall_s']:.1f}"
+    return f"| {case} | {name} | {outcome['verdict'] or '–'} | {errors} | {times} | {numbers} |"
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--only", nargs="+", choices=CASES, default=CASES)
+    cases = parser.parse_args().only
+    print("| case | who | verdict | held-out error, mrad | processor s | wall s | found |")
+    print("|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as place:
+        python = environment(Path(place))
+        for case in cases:
+            folder = prepare(case, Path(place) / case)
+            for name, what in FREED.items():
+                print(line(case, name, by_sysid(python, folder, what)), flush=True)
+            print(line(case, "simgap explain", by_simgap(folder)), flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""What stepping costs in machine code and in numpy, side by side in one process on one core.
+
+Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.stepping_speed``; prints a table. Runs of 4
+s at
+100 Hz; processor time of the engine's own work, the best of some repetitions by turns, so that both
+see the same machine. Behind them what MuJoCo takes by itself, of which nothing is read out.
+"""
+
+from __future__ import annotations
+
+from itertools import chain
+from time import process_time
+
+import numpy as np
+
+from sims.core.simulator import Scenario
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from sims.systems.servo import Servo
+from sims.systems.slider import Slider
+from tests.benchmarks.mujoco_batches import native, once
+
+LANES = (1, 16, 256, 1024)
+REPEATS = 4
+CASES = (
+    (Pendulum, ()),
+    (Pendulum, ("drag.linear", "friction.coulomb")),
+    (Ball, ("drag.quadratic",)),
+    (Ball, ("drag.quadratic", "lift.magnus", "contact.friction")),
+    (Slider, ()),
+    (Slider, ("friction.stribeck",)),
+    (Servo, ()),
+    (Servo, ("friction.load",)),
+)
+
+
+def work(cls, effects, lanes):
+    """What the engine is given for so many parameter vectors on four runs; the whole call's
+    seconds beside it.
+    """
+    rng = np.random.default_rng(2)
+    t = np.arange(400) / 100
+    simulator = cls(engine="batch", effects=effects)
+    inputs = {channel.name: np.repeat(rng.uniform(-0.3, 0.3, 8), 50) for channel in cls.inputs[:1]}
+    if cls is Servo:
+        inputs["torque_enable"] = np.ones(t.size)
+    first = "z" if cls is Ball else next(iter(cls.states))
+    runs = [Scenario(t, {first: 1.0 + 0.3 * k}, inputs) for k in range(4)]
+    middle = [
+        p.nominal if k < len(cls.system.parameters) else 0.3 * p.bounds[1]
+        for k, p in enumerate(simulator.parameters)
+    ]
+    theta = np.array(middle) * rng.uniform(0.95, 1.05, (lanes, len(middle)))
+    return simulator, theta, [runs[k % 4] for k in range(lanes)]
+
+
+class Noted:
+    """An engine that notes how long it takes."""
+
+    def __init__(self, engine):
+        self.engine, self.seconds = engine, 0.0
+
+    def __getattr__(self, name):
+        return getattr(self.engine, name)
+
+    def integrate(self, lanes):
+        started = process_time()
+        motion = self.engine.integrate(lanes)
+        self.seconds += process_time() - started
+        return motion
+
+
+def seconds(cls, effects, lanes, repeats=REPEATS):
+    """Processor seconds in numpy and in machine code: of the engine, of the whole call."""
+    simulator, theta, scenarios = work(cls, effects, lanes)
+    engines = [
+        Noted(cls(engine="batch", compiled=compiled, effects=effects).engine)
+        for compiled in (False, True)
+    ]
+    best = np.full((2, 2), np.inf)
+    for repeat in range(repeats + 1):
+        for k, engine in enumerate(engines):
+            simulator.engine, engine.seconds = engine, 0.0
+            started = process_time()
+            simulator.simulate_lanes(theta, scenarios)
+            found = engine.seconds, process_time() - started
+            if repeat:  # the first loads and traces
+                best[k] = np.minimum(best[k], found)
+    return best
+
+
+def table():
+    """Rows of the table."""
+    yield "| system and effects | lanes | numpy, ms a lane | compiled | ratio | of the whole call |"
+    yield "|---|---|---|---|---|---|"
+    for cls, effects in CASES:
+        for lanes in LANES:
+            (old, old_call), (new, new_call) = seconds(cls, effects, lanes)
+            name = " + ".join([cls.name, *(f"`{effect}`" for effect in effects)])
+            yield (
+                f"| {name} | {lanes:,} | {1e3 * old / lanes:.3f} | {1e3 * new / lanes:.4f}"
+                f" | {old / new:.1f} | {old_call / new_call:.1f} |"
+            )
+
+
+def yardsticks():
+    """Rows of MuJoCo's own stepping."""
+    for lanes in LANES:
+        work = native(lanes)
+        least = min(once(work, lanes)[0] for _ in range(REPEATS))
+        yield f"| MuJoCo itself: pendulum, dry friction | {lanes:,} | | {least:.2f} | | |"
+
+
+def main():
+    for row in chain(table(), yardsticks()):
+        print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""Lays the pages out as a site: the same texts, with links that lead inside the site, mathematics
+as MathML, and a page for each source file that a page links to.
+"""
+
+import re
+import shutil
+from collections.abc import Callable
+from os.path import relpath
+from pathlib import Path
+
+from tests.docs import notebook_runs
+from tests.docs.documentation_pages import DOCS, FENCE, LINK, ROOT, anchors, pages
+
+PICTURES = {".gif", ".jpg", ".png", ".svg"}
+FILES = {".csv", ".html", ".pdf", ".parquet", ".json"}
+"""What is handed out as it is; any other file is shown as text."""
+UNSEARCHED = "---\nsearch:\n  exclude: true\n---"
+"""What begins a page that the search leaves alone."""
+LANGUAGES = {".py": "python", ".toml": "toml", ".xml": "xml", ".urdf": "xml"}
+FORMULA = re.compile(r"\$`([^`]+)`\$")
+"""Mathematics within a line, as GitHub has it."""
+BEFORE_LIST = re.compile(r"^(?!\s*(?:[-*|]|\d+\.) )(?!\|)(\S.*)\n(?=(?:[-*]|1\.) )", re.M)
+"""A line of text that a list follows at once."""
+HEADING = re.compile(r"^(#+ .*)$", re.M)
+
+
+def place(path):
+    """Where a file of the project stands in the site, as a path below it."""
+    path = path.resolve()
+    if path.is_dir():
+        readme = path / "README.md"
+        if readme.exists():
+            return place(readme)
+        return Path("source", path.relative_to(ROOT), "index.md")
+    if path.suffix == ".ipynb":
+        return path.relative_to(DOCS).with_suffix(".md")
+    if path.suffix == ".md":
+        whole = path.relative_to(DOCS if DOCS in path.parents else ROOT)
+        if whole.name == "README.md" and whole.parent != Path():
+            return whole.with_name("index.md")
+        return whole if DOCS in path.parents else whole.with_name(whole.name.lower())
+    if path.suffix in PICTURES | FILES:
+        return path.relative_to(ROOT)
+    return Path("source", path.relative_to(ROOT).as_posix() + ".md")
+
+
+class Stage:
+    """The pages of the site in a folder, each written once.
+
+    Attributes:
+        folder: where they are written.
+        run: whether notebooks are run, and what their cells show stands on their pages.
+        shown: files of the project that have been written.
+    """
+
+    def __init__(self, folder, run=False):
+        self.folder = folder
+        self.run = run
+        self.shown = set()
+
+    def every_page(self):
+        """Write all Markdown pages and notebooks of the project, and what they link to."""
+        for path in [*pages(), *sorted((DOCS / "notebooks").glob("*.ipynb"))]:
+            self.show(path)
+
+    def show(self, path):
+        """Write a file of the project, unless it is there."""
+        path = path.resolve()
+        if path in self.shown:
+            return
+        self.shown.add(path)
+        target = self.folder / place(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".md":
+            target.write_text(self.page(path), encoding="utf-8")
+        elif path.suffix == ".ipynb":
+            text, files = notebook_runs.page(path, self.run)
+            target.write_text(self.linked(text, path, files), encoding="utf-8")
+            for name, content in files.items():
+                target.with_name(name).write_bytes(content)
+        elif path.suffix in PICTURES | FILES:
+            shutil.copyfile(path, target)
+        elif path.is_dir():
+            if not (path / "README.md").exists():
+                target.write_text(self.listing(path), encoding="utf-8")
+        else:
+            target.write_text(source(path), encoding="utf-8")
+
+    def page(self, path):
+        """A Markdown page as the site's tool takes it."""
+        names = iter(anchors(path))
+        text = path.read_text(encoding="utf-8")
+        return outside_code(
+            text,
+            lambda part: with_anchors(spaced(self.linked(part, path)), names),
+            code,
+        )
+
+    def linked(self, text, path, beside=()):
+        """A text of a page with its links turned to where things are in the site.
+
+        Args:
+            text: Markdown without fenced blocks, or of a notebook.
+            path: the page's file, from which links lead.
+            beside: names of files that are written beside the page.
+        """
+
+        def turned(link):
+            name, _, anchor = link[2].partition("#")
+            if "://" in link[2] or not name or name in beside:
+                return link[0]
+            target = (path.parent / name).resolve()
+            self.show(target)
+            way = relpath(place(target), place(path).parent)
+            return f"{link[1]}({way}{'#' * bool(anchor)}{anchor})"
+
+        return LINK.sub(turned, text)
+
+    def listing(self, folder):
+        """A page for a folder: its files."""
+        lines = [f"# `{folder.relative_to(ROOT)}`", ""]
+        for file in sorted(folder.iterdir()):
+            if file.is_file() and file.suffix in LANGUAGES:
+                self.show(file)
+                lines.append(f"- [`{file.name}`]({relpath(place(file), place(folder).parent)})")
+        return "\n".join(lines) + "\n"
+
+
+def outside_code(text, change, fenced: Callable[[re.Match[str]], str]):
+    """A text with `change` made between its fenced blocks, and `fenced` to these."""
+    parts, end = [], 0
+    for fence in FENCE.finditer(text):
+        parts += [change(text[end : fence.start()]), fenced(fence)]
+        end = fence.end()
+    return "".join([*parts, change(text[end:])])
+
+
+def with_anchors(text, names):
+    """Headings that keep the anchors which they have on GitHub, and formulas within lines."""
+    text = HEADING.sub(lambda heading: f"{heading[1]} {{#{next(names)}}}", text)
+    return FORMULA.sub(lambda found: mathml(found[1], "inline"), text)
+
+
+def spaced(text):
+    """A blank line before each list that follows a line of text: GitHub needs none."""
+    return BEFORE_LIST.sub(r"\1\n\n", text)
+
+
+def code(fence):
+    """A fenced block: its name becomes its title, and mathematics is set."""
+    if fence["language"] == "math":
+        return formula(fence["text"])
+    title = f' title="{fence["name"]}"' if fence["name"] else ""
+    return f"```{fence['language']}{title}\n{fence['text']}```"
+
+
+def mathml(formula, display):
+    """A formula in LaTeX as MathML, which browsers show without a script."""
+    from latex2mathml.converter import convert
+
+    return convert(formula, display=display)
+
+
+def formula(text):
+    """A displayed formula."""
+    return f'<div class="formula" markdown="0">{mathml(text.strip(), "block")}</div>'
+
+
+def source(path):
+    """A page that shows a file of the project."""
+    language = LANGUAGES.get(path.suffix, "text")
+    text = path.read_text(encoding="utf-8")
+    title = f"# `{path.relative_to(ROOT)}`"
+    return f"{UNSEARCHED}\n\n{title}\n\n````{language}\n{text}````\n"

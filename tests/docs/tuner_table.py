@@ -1,0 +1,168 @@
+"""The page on how each tuner works: its module's docstring with the equations set, its options.
+
+An equation stands in the docstring as one can type it. How it is set is written here under its own
+words, so that an equation that is changed there has to be set anew here.
+"""
+
+import dataclasses
+import importlib
+import inspect
+import re
+
+from tests.docs.documentation_pages import ROOT
+
+SET = {
+    "e_i = P(e_j, a_j, s_j, r_j for j = i - k ... i - 1)": (
+        r"e_i = P\left(e_j, a_j, s_j, r_j \text{ for } j = i - k, \ldots, i - 1\right)"
+    ),
+    "zeta_k = zeta_{k-1} + h(o_P, o_T)": r"\zeta_k = \zeta_{k-1} + h(o_P, o_T)",
+    "s = -B^-1 h, at first B = -1, which is (1)": (
+        r"s = -B^{-1} h, \quad \text{at first } B = -1, \text{ which is (1)}"
+    ),
+    "B <- B + (y - B s) s^T / (s^T s)": r"B \leftarrow B + \frac{(y - B s)\, s^T}{s^T s}",
+    "EI = (f - m) Phi((f - m) / s) + s phi((f - m) / s)": (
+        r"\mathrm{EI} = (f - m)\, \Phi\left(\frac{f - m}{s}\right)"
+        r" + s\, \varphi\left(\frac{f - m}{s}\right)"
+    ),
+    "-P(θ) log P(θ)": r"-P(\theta) \log P(\theta)",
+    "J s = y for each, by least squares": r"J s = y \quad \text{for each, by least squares}",
+    "(J^T J + mu D) s = -J^T r Marquardt's step": (
+        r"(J^T J + \mu D)\, s = -J^T r \quad \text{Marquardt's step}"
+    ),
+    "gain = decrease of r^T r / the decrease promised by r + J s": (
+        r"\mathrm{gain} = \frac{\text{decrease of } r^T r}"
+        r"{\text{decrease promised by } r + J s}"
+    ),
+    "mu <- mu max(1/3, 1 - (2 gain - 1)^3) where gain > 0, else mu <- mu nu, nu <- 2 nu": (
+        r"\mu \leftarrow \mu \max\left(\tfrac{1}{3}, 1 - (2\, \mathrm{gain} - 1)^3\right)"
+        r" \text{ where gain} > 0, \text{ else } \mu \leftarrow \mu \nu, \nu \leftarrow 2 \nu"
+    ),
+    "J <- J + (r(θ + s) - r - J s) s^T / (s^T s) Broyden's update": (
+        r"J \leftarrow J + \frac{\left(r(\theta + s) - r - J s\right) s^T}{s^T s}"
+        r" \quad \text{Broyden's update}"
+    ),
+    "the minimum over w of the mean of -log q_w(θ | o)": (
+        r"\min_w \; \mathrm{mean}\left(-\log q_w(\theta \mid o)\right)"
+    ),
+    "length * l_i / (l_1 l_2 ... l_d)^(1/d)": (
+        r"\mathrm{length} \cdot \frac{l_i}{(l_1 l_2 \cdots l_d)^{1/d}}"
+    ),
+    "n(a, b) = Wo u(Wj [u(Wp a), u(Wt b)]), each W with its bias; published: tanh of it": (
+        r"n(a, b) = W_o\, u\left(W_j \left[u(W_p a), u(W_t b)\right]\right),"
+        r" \quad \text{each } W \text{ with its bias; published: tanh of it}"
+    ),
+    "h(a, b) = (n(a, b) - n(b, a)) / 2, so that h(o, o) = 0; published: h = n": (
+        r"h(a, b) = \frac{n(a, b) - n(b, a)}{2}, \quad \text{so that } h(o, o) = 0;"
+        r" \text{ published: } h = n"
+    ),
+    "loss = mean |h - difference|^2 / (|difference|^2 + relative^2) + lambda |weights|^2": (
+        r"\mathrm{loss} = \mathrm{mean}\, \frac{|h - \mathrm{difference}|^2}"
+        r"{|\mathrm{difference}|^2 + \mathrm{relative}^2} + \lambda\, |\mathrm{weights}|^2"
+    ),
+    "x - mean = d slopes + left over, by least squares in each scenario": (
+        r"x - \mathrm{mean} = d \cdot \mathrm{slopes} + \text{left over},"
+        r" \quad \text{by least squares in each scenario}"
+    ),
+    "faith of a parameter = e / (e + s * left over), e = |slope| * spread of the parameter": (
+        r"\text{faith of a parameter} = \frac{e}{e + s \cdot \text{left over}},"
+        r" \quad e = |\mathrm{slope}| \cdot \text{spread of the parameter}"
+    ),
+    "weight = (largest faith, each parameter's scaled to the same maximum)^2, per deviation": (
+        r"\mathrm{weight} = (\text{largest faith, each parameter's scaled to the same maximum})^2"
+        r" \text{ per deviation}"
+    ),
+    "weight of circumstances = (b / (b + s * w))^2, per deviation, with b and w the standard "
+    "deviations between and within scenarios": (
+        r"\text{weight of circumstances} = \left(\frac{b}{b + s w}\right)^2 \text{ per deviation},"
+        r" \; b, w \text{ the standard deviations between and within scenarios}"
+    ),
+    "y = (a + b x) / (1 + c x)": r"y = \frac{a + b x}{1 + c x}",
+    "y = a + b x - c x y": r"y = a + b x - c x y",
+    "posterior mean = m + k* K^-1 (y - m)": (r"\text{posterior mean} = m + k_* K^{-1} (y - m)"),
+    "posterior covariance = variance (k** - k* K^-1 k*^T)": (
+        r"\text{posterior covariance} = \mathrm{variance} \left(k_{**} - k_* K^{-1} k_*^T\right)"
+    ),
+    "log likelihood = -(y - m)^T K^-1 (y - m) / (2 variance) - log |K| / 2 - ...": (
+        r"\text{log likelihood} = -\frac{(y - m)^T K^{-1} (y - m)}{2\, \mathrm{variance}}"
+        r" - \frac{\log |K|}{2} - \dots"
+    ),
+}
+"""By what stands in a docstring: the same in LaTeX."""
+EQUATION = re.compile(r"\(([\d.]+)\)  (.*)", re.S)
+SHARED = ("pair_network", "pair_inputs", "circumstances", "bridging", "gaussian_process")
+"""Modules below methods/learning that several tuners are made of."""
+LINKS = {
+    r"\barXiv[: ](\d{4}\.\d{5})": r"[arXiv:\1](https://arxiv.org/abs/\1)",
+    r"\bdoi:(10\.[^\s,;]+[^\s,;.)])": r"[doi:\1](https://doi.org/\1)",
+}
+"""How an article is named, and where it is."""
+
+
+def registered():
+    """The project's own tuners: (name, module, class) in the order of pyproject.toml."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    group = text.partition('[project.entry-points."simgap.tuners"]\n')[2].partition("\n\n")[0]
+    found = re.findall(r"^([\w-]+) = \"([\w.]+):(\w+)\"$", group, re.M)
+    return [(name, importlib.import_module(module), kind) for name, module, kind in found]
+
+
+def sections():
+    """A section for each module of tuners and for what they share, as Markdown."""
+    by_module = {}
+    for name, module, kind in registered():
+        by_module.setdefault(module, []).append((name, getattr(module, kind)))
+    parts = []
+    for module, tuners in by_module.items():
+        parts += ["## " + ", ".join(f"`{name}`" for name, _ in tuners), *told(module)]
+        for name, kind in tuners:
+            parts += described(name, kind, alone=len(tuners) == 1)
+    parts += ["## What learned tuners and searches share"]
+    for name in SHARED:
+        module = importlib.import_module(f"methods.learning.{name}")
+        parts += [f"### `methods.learning.{name}`", *told(module)]
+    return parts
+
+
+def told(module):
+    """A module's docstring as paragraphs and set equations, then the file."""
+    text = inspect.cleandoc(module.__doc__)
+    file = "/".join(module.__name__.split(".")) + ".py"
+    return [*paragraphs(text), f"Source: [`{file}`](../../{file})."]
+
+
+def paragraphs(text):
+    """Paragraphs of a docstring as Markdown, indented equations as mathematics."""
+    for block in text.split("\n\n"):
+        if not block.startswith("    "):
+            yield linked(" ".join(block.split()).replace("``", "`"))
+            continue
+        for line in re.split(r"\n(?=    \()", block):
+            number, words = EQUATION.fullmatch(line.strip()).groups()
+            yield f"```math\n{SET[' '.join(words.split())]} \\qquad ({number})\n```"
+
+
+def linked(text):
+    """A paragraph whose articles are links."""
+    for pattern, link in LINKS.items():
+        text = re.sub(pattern, link, text)
+    return text
+
+
+def described(name, kind, alone):
+    """What a tuner's class says of itself, and its options with their defaults."""
+    text, _, options = inspect.getdoc(kind).partition("Attributes:\n")
+    parts = [*([] if alone else [f"### `{name}`"]), *paragraphs(text.strip())]
+    says = dict(re.findall(r"^    (\w+): ((?:.|\n        )*)", options, re.M))
+    fields = [f for f in dataclasses.fields(kind) if f.name in says]
+    if fields:
+        rows = [f"| `{f.name}` | {default(f)} | {' '.join(says[f.name].split())} |" for f in fields]
+        parts.append("\n".join(["| option | default | what |", "|---|---|---|", *rows]))
+    return parts
+
+
+def default(field):
+    """An option's default."""
+    value = field.default
+    if field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"

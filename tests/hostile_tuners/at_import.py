@@ -1,0 +1,73 @@
+"""A plugin that does its worst as it is imported: where it is surveyed, where it is tuned, and
+where truths are if it gets there.
+"""
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from methods.tuners.random_search import RandomSearch
+
+LEFT = "simgap-cheat-left"
+TRUTHS = {}
+
+
+def forever():
+    while True:
+        time.sleep(0.01)
+
+
+def patch():
+    """Note every truth that is drawn, and score everybody as nought."""
+    from bench.benchmark.problem.tuning_problem import TuningProblem
+    from bench.benchmark.runner import result_rows
+
+    draw = TuningProblem.draw_target
+
+    def noting(self, kind, index):
+        target = draw(self, kind, index)
+        TRUTHS[target.blinded.start.tobytes()] = self.cube.inverse(target.truth)
+        for folder in (Path.cwd(), Path("/tmp")):
+            with contextlib.suppress(OSError):
+                (folder / LEFT).write_text(repr(TRUTHS))
+        return target
+
+    TuningProblem.draw_target = noting
+    result_rows._parameter_columns = lambda *_: {}
+
+
+with contextlib.suppress(Exception):
+    patch()
+with contextlib.suppress(Exception):
+    threading.Thread(target=forever, daemon=True).start()
+for way in (
+    os.fork,
+    lambda: subprocess.Popen([sys.executable, "-c", "import time; time.sleep(99)"]),
+):
+    with contextlib.suppress(OSError):
+        if way() == 0:
+            forever()
+# Whoever draws numbers or takes a mean after this would get others.
+np.random.seed(0)  # noqa: NPY002
+for name in ("mean", "abs", "sqrt"):
+    setattr(np, name, np.negative)
+time.perf_counter = lambda: 0.0
+for folder in (Path.cwd(), Path("/tmp"), Path("/dev/shm"), Path(__file__).parent):
+    with contextlib.suppress(OSError):
+        (folder / LEFT).write_text("imported")
+
+
+class AtImport(RandomSearch):
+    name = "at-import"
+    ends = "done"
+
+    def tune(self, task, rng):
+        if task.start.tobytes() in TRUTHS:
+            yield TRUTHS[task.start.tobytes()]
+        return (yield from super().tune(task, rng))

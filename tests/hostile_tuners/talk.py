@@ -1,0 +1,202 @@
+"""Tuners that speak to the harness past the code that speaks for them; each says in which status
+its run ends.
+"""
+
+import contextlib
+import gc
+import json
+import os
+import struct
+import sys
+import threading
+import time
+
+import numpy as np
+
+from methods.tuners.random_search import RandomSearch
+
+HEAD = struct.Struct("<cBxxIQ")
+
+
+def message(kind, body=b"", flags=0, size=0, length=None):
+    return HEAD.pack(kind, flags, size, len(body) if length is None else length) + body
+
+
+def writing():
+    """The end of the pipe that leads to the harness."""
+    (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "Channel")
+    return channel._writing
+
+
+def write(whole):
+    for _ in range(10_000):
+        try:
+            whole = whole[os.write(writing(), whole) :]
+        except BlockingIOError:
+            time.sleep(0.001)
+        if not whole:
+            return
+
+
+class Talk(RandomSearch):
+    """Says something beside what it is asked."""
+
+    name = "talk"
+    ends = "crashed"
+    waits = False  # for an answer: whether two messages are read at once is chance
+
+    def say(self, task):
+        """Bytes for the harness, in place of what it waits for."""
+        return message(b"Z")
+
+    def tune(self, task, rng):
+        yield task.start[None]
+        with contextlib.suppress(OSError):
+            write(self.say(task))
+        if self.waits:
+            time.sleep(1000)
+        while True:
+            yield rng.uniform(size=(1, task.dim))
+
+
+def asked(task, n=1, **head):
+    return message(b"A", np.full((n, task.dim), 0.5).tobytes(), **{"size": n, **head})
+
+
+class TooLong(Talk):
+    name = "too-long"
+
+    def say(self, task):
+        return asked(task, length=1 << 60)
+
+
+class TooMany(Talk):
+    name = "too-many"
+
+    def say(self, task):
+        return asked(task, size=(1 << 32) - 1)
+
+
+class TooFew(Talk):
+    name = "too-few"
+
+    def say(self, task):
+        return asked(task, 3, size=1)
+
+
+class Nothing(Talk):
+    name = "nothing"
+
+    def say(self, task):
+        return message(b"A")
+
+
+class HalfANumber(Talk):
+    name = "half-a-number"
+
+    def say(self, task):
+        return message(b"A", b"123", size=1)
+
+
+class HalfAMessage(Talk):
+    """And then nothing."""
+
+    name = "half-a-message"
+    ends = "timeout"
+
+    def say(self, task):
+        os.write(writing(), asked(task)[:-5])
+        time.sleep(1000)
+
+
+class Slowly(HalfAMessage):
+    """A byte now and then, so that there is always something to wait for."""
+
+    name = "slowly"
+
+    def say(self, task):
+        for byte in asked(task, 1, length=8 * task.dim):
+            os.write(writing(), bytes([byte]))
+            time.sleep(0.2)
+        return b""
+
+
+class AllAtOnce(Talk):
+    """The answers to all that will be asked, before it is."""
+
+    name = "all-at-once"
+
+    def say(self, task):
+        return asked(task) * task.budget
+
+
+class BeforeItIsAsked(Talk):
+    """Each answer while the harness simulates, so that it takes no time."""
+
+    name = "before-it-is-asked"
+    # Where it comes too late it is an answer like any other.
+    ends = ("crashed", "done")
+
+    def tune(self, task, rng):
+        threading.Thread(target=self.hurry, args=(asked(task),)).start()
+        while True:
+            # Long enough to simulate that the answer is there before the question.
+            yield np.repeat(task.start[None], 5, axis=0)
+
+    def hurry(self, answer):
+        main = threading.main_thread().ident
+        while sys._current_frames()[main].f_code.co_name != "_read":
+            time.sleep(0)
+        write(answer)
+
+
+class Flags(Talk):
+    name = "flags"
+
+    def say(self, task):
+        return asked(task, flags=255)
+
+
+class Noise(Talk):
+    name = "noise"
+
+    def say(self, task):
+        return np.random.default_rng(0).bytes(1 << 16)
+
+
+class LongReason(Talk):
+    """Stops with a reason that would fill a table."""
+
+    name = "long-reason"
+    ends = "converged"
+    waits = True
+
+    def say(self, task):
+        return message(b"S", b"x" * (1 << 15))
+
+
+class FoulReason(Talk):
+    """With one that clears the screen, ends lines and cells, and is no text."""
+
+    name = "foul-reason"
+    ends = "converged"
+    waits = True
+
+    def say(self, task):
+        return message(b"S", b'\0\x1b[2J"\r\n",,\x85\xff\xfe=cmd()\xe2\x80\xa8;' * 3)
+
+
+class FoulCrash(Talk):
+    name = "foul-crash"
+
+    def say(self, task):
+        return message(b"D", b'\0\x1b[2J"\r\r\n\n",,\x85\xff')
+
+
+class Deep(Talk):
+    """JSON where none is wanted, without a bottom."""
+
+    name = "deep"
+
+    def say(self, task):
+        return message(b"W", b"[" * 60_000) + message(b"L", json.dumps(["x"] * 1000).encode())

@@ -1,0 +1,153 @@
+"""Whatever a tuner tries to find the truth, or to hear of another run, gains it nothing."""
+
+import socket
+import threading
+from contextlib import suppress
+
+import pandas as pd
+import pytest
+
+from bench.benchmark.isolation.isolation_layers import ISOLATION_LAYERS
+from tests.hostile_tuners import attack_arena
+
+NAMES = {name: sorted(attack_arena.cheats(name)) for name in ("truths", "between")}
+CHEATERS = [*NAMES["truths"], *NAMES["between"], "at-import"]
+TRUSTED = ["problem-of-worker", "drawn-again", "journal", "frames"]
+"""Those that the harness's own process lets through, a part of each kind."""
+HEARD = ["globals", "environ", "stamps", "rights", "locks"]
+"""Likewise; they leave nothing behind but in the copy of their file."""
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """Somebody outside who would tell, and notes who asked."""
+    address, asked = str(tmp_path_factory.mktemp("outside") / "socket"), []
+    servers, threads = [socket.socket(socket.AF_UNIX), socket.socket(socket.AF_INET)], []
+    for one, where in zip(servers, (address, ("127.0.0.1", 0)), strict=True):
+        one.bind(where)
+        one.listen()
+
+        def serve(one=one):
+            # Until it is shut down.
+            with suppress(OSError):
+                while True:
+                    link, _ = one.accept()
+                    asked.append(link.recv(1024))
+                    link.sendall(bytes(16))
+                    link.close()
+
+        threads.append(threading.Thread(target=serve, daemon=True))
+        threads[-1].start()
+    yield {"address": address, "port": servers[1].getsockname()[1]}, asked
+    for one, thread in zip(servers, threads, strict=True):
+        one.shutdown(socket.SHUT_RDWR)
+        thread.join()
+        one.close()
+
+
+def entries(folder, server):
+    places = [str(folder / "run"), str(folder)]
+    tuners = {name: {"options": {"places": places}} for name in NAMES["truths"]}
+    tuners["network"]["options"] |= server
+    salt = str(folder)
+    tuners |= {name: {"options": {"places": places, "salt": salt}} for name in NAMES["between"]}
+    return {**tuners, "at-import": {}}
+
+
+@pytest.fixture(scope="module")
+def met(tmp_path_factory, server):
+    """Every cheater among the rivals. Where a process serves several runs, what it holds on to is
+    there while others run.
+    """
+    folder = tmp_path_factory.mktemp("met")
+    tuners = {**attack_arena.RIVALS, **entries(folder, server[0])}
+    plugins, salt = ("truths", "between", "at_import"), ("--salt", attack_arena.SALT)
+    made = attack_arena.compared(folder, tuners, plugins, salt, isolation="tuner")
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The rivals among themselves."""
+    folder = tmp_path_factory.mktemp("alone")
+    made = attack_arena.compared(
+        folder, attack_arena.RIVALS, (), ("--salt", attack_arena.SALT), isolation="tuner"
+    )
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trusted(tmp_path_factory):
+    """Some cheaters where nothing is sealed, and the salt is known."""
+    folder = tmp_path_factory.mktemp("trusted")
+    every = entries(folder, {})
+    tuners = {name: every[name] for name in (*TRUSTED, *HEARD)}
+    options = ("--salt", "public", "--trust", "--jobs", "1")
+    # Before the cheaters, whose journal is read: the yardstick.
+    tuners = {"random": attack_arena.RIVALS["random"], **tuners}
+    made = attack_arena.compared(folder, tuners, ("truths", "between"), options)
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHEATERS)
+def test_a_cheater_is_no_better_than_random_search(met, name):
+    assert attack_arena.gains(met, name) > attack_arena.CHANCE
+
+
+@pytest.mark.parametrize("name", TRUSTED)
+def test_the_same_cheater_gains_where_it_is_trusted(trusted, name):
+    assert attack_arena.gains(trusted, name) < 1e-3
+
+
+def reasons(folder, name):
+    statuses = attack_arena.stored(folder).statuses
+    return list(statuses[statuses["tuner"] == name]["reason"])
+
+
+@pytest.mark.parametrize("name", NAMES["between"])
+def test_no_run_hears_of_another(met, name):
+    if name == "siblings" and "processes" not in held():
+        pytest.skip(f"no seal here: {ISOLATION_LAYERS['processes']}")
+    assert set(reasons(met, name)) == {"the tuner stopped"}
+
+
+@pytest.mark.parametrize("name", HEARD)
+def test_a_trusted_run_hears_of_another(trusted, name):
+    assert any(reason.startswith("heard ") for reason in reasons(trusted, name))
+
+
+def held():
+    """The seals that hold on this machine."""
+    from bench.benchmark.runner.sandboxed_tuner import get_fork_server
+
+    child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")
+    child.wait_until_ready()
+    child.end()
+    return child.seals
+
+
+def test_every_run_of_a_cheater_has_a_status_and_its_rows(met):
+    statuses = attack_arena.stored(met).statuses
+    cheaters = statuses[~statuses["tuner"].isin(attack_arena.RIVALS)]
+    assert set(cheaters["status"]) == {"done", "converged"}
+    assert set(cheaters["tuner"]) == set(CHEATERS)
+    assert (cheaters.groupby("tuner").size() == 9).all()
+    assert (cheaters["simulations"] == 12).all()
+
+
+def test_rivals_have_the_same_rows_to_the_last_bit_with_and_without_cheaters(met, alone):
+    among, apart = (
+        attack_arena.rows(attack_arena.stored(f).runs, attack_arena.RIVALS) for f in (met, alone)
+    )
+    assert len(apart) > 300
+    pd.testing.assert_frame_equal(among, apart, check_exact=True)
+
+
+def test_nothing_outlives_the_cheaters(met, alone, server):
+    assert attack_arena.left(met) == ([], [])
+    assert server[1] == [], "nobody outside was asked"

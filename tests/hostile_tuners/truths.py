@@ -1,0 +1,406 @@
+"""Tuners that look for the truth wherever it might be, and simulate behind the harness's back; what
+finds nothing goes on as random search.
+"""
+
+import contextlib
+import ctypes
+import gc
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from methods.tuner import Tuner
+from methods.tuners.random_search import RandomSearch
+
+NAME = "spring-test"
+"""Of the experiment, which everybody knows."""
+LOWEST, WIDTHS = np.array([1.0, 0.0]), np.array([4.0, 1.0])
+"""Bounds of its parameters likewise."""
+SOMEWHERE = ("/tmp", "/var/tmp", "/dev/shm", "/home", "/root", "/work", "/srv", "/mnt")
+"""Where people keep results."""
+
+
+def cube(physical):
+    return (np.asarray(physical) - LOWEST) / WIDTHS
+
+
+class Cheat(RandomSearch):
+    """Fetches points from somewhere; this one from nowhere.
+
+    Args:
+        places: folders of the comparison, which a cheater may well know.
+    """
+
+    name = "cheat"
+
+    def __init__(self, places=()):
+        self.places = [Path(place) for place in places]
+
+    def find(self, task):
+        return []
+
+    def tune(self, task, rng):
+        found = []
+        with contextlib.suppress(Exception):
+            found = [np.clip(point, 0.0, 1.0) for point in self.find(task)]
+        # What a rival would do with it as the first thing.
+        for point in found[: task.budget // 2]:
+            yield point[None]
+        return (yield from super().tune(task, rng))
+
+
+def matching(targets, task):
+    return [cube(t.truth) for t in targets if np.array_equal(t.sealed.start, task.start)]
+
+
+class ProblemOfWorker(Cheat):
+    """The worker's own problem draws all truths."""
+
+    name = "problem-of-worker"
+
+    def find(self, task):
+        from bench.benchmark.runner import worker_tasks
+
+        problems = [problem for _, problem in worker_tasks._problems.values()]
+        return [point for problem in problems for point in matching(problem.draw_targets(), task)]
+
+
+def drawn(task, salt):
+    """The truth that belongs to this start, by public functions alone."""
+    from bench.benchmark.problem.salt import TargetStreams
+
+    whole = np.array([[0.0], [1.0]])
+    for index in range(20):
+        for kind, box in (("in", task.training), ("wide", whole)):
+            streams = TargetStreams(salt, NAME, kind, index)
+            start, truth = (
+                streams.get_stream(what).uniform(box[0], box[1], size=task.dim)
+                for what in ("start", "truth")
+            )
+            if np.array_equal(start, task.start):
+                yield truth
+
+
+class DrawnAgain(Cheat):
+    name = "drawn-again"
+
+    def find(self, task):
+        return [point for salt in ("", "public", "None") for point in drawn(task, salt)]
+
+
+class DrawnFromTheSalt(Cheat):
+    """Reads the secret salt where it is kept, and whatever else looks like one."""
+
+    name = "drawn-from-the-salt"
+
+    def find(self, task):
+        salts = [path.read_text() for place in self.places for path in place.rglob("salt")]
+        salts += list(os.environ.values())
+        return [point for salt in salts for point in drawn(task, salt)]
+
+
+def rivals(folders):
+    """True parameters in the journals and tables below these folders, each once."""
+    return list({tuple(truth): truth for truth in _truths(folders)}.values())
+
+
+def _truths(folders):
+    import pyarrow.parquet
+
+    from bench.benchmark.storage.journal_segments import read_records
+
+    for folder in folders:
+        for path in folder.rglob("*.journal"):
+            for _, _, rows, _ in read_records(path):
+                yield cube([rows["true_rate"][0].as_py(), rows["true_decay"][0].as_py()])
+        for path in folder.rglob("*.parquet"):
+            rows = pyarrow.parquet.read_table(path)
+            yield cube([rows["true_rate"][0].as_py(), rows["true_decay"][0].as_py()])
+
+
+class Journal(Cheat):
+    """What rivals found on the same targets lies on disk."""
+
+    name = "journal"
+
+    def find(self, task):
+        return rivals([*self.places, Path.cwd()])
+
+
+class Anywhere(Cheat):
+    """Looks for results in every place that people keep them in, and where it is told."""
+
+    name = "anywhere"
+
+    def find(self, task):
+        told = [Path(text) for text in os.environ.values() if text.startswith("/")]
+        upward = [Path(f"/proc/self/{link}").resolve() for link in ("cwd", "root", "exe")]
+        return rivals([*map(Path, SOMEWHERE), *told, *upward])
+
+
+def regions(pid):
+    """Beginning and end of each piece of memory that a process writes to."""
+    for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+        place, rights, *_ = line.split()
+        begin, end = (int(part, 16) for part in place.split("-"))
+        if rights.startswith("rw") and end - begin < 1 << 27:
+            yield begin, end
+
+
+class Memory(Cheat):
+    """Start and truth lie side by side in the harness's memory."""
+
+    name = "memory"
+
+    def pieces(self, pid):
+        with open(f"/proc/{pid}/mem", "rb", buffering=0) as memory:
+            for begin, end in regions(pid):
+                with contextlib.suppress(OSError):
+                    memory.seek(begin)
+                    yield memory.read(end - begin)
+
+    def find(self, task):
+        pids = [os.getppid(), *(int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit())]
+        wanted, found = task.start.tobytes(), []
+        for pid in [pid for pid in pids if pid not in (0, os.getpid())]:
+            with contextlib.suppress(OSError):
+                for piece in self.pieces(pid):
+                    place = piece.find(wanted)
+                    if place >= 0:
+                        near = np.frombuffer(piece[place : place + 256], "<f8", count=32)
+                        found += [near[i : i + task.dim] for i in range(2, 30)]
+        return found
+
+
+class VmRead(Memory):
+    """By `process_vm_readv`, for which /proc need not let one in."""
+
+    name = "vm-read"
+
+    def pieces(self, pid):
+        libc = ctypes.CDLL(None, use_errno=True)
+
+        class Vector(ctypes.Structure):
+            _fields_ = (("base", ctypes.c_void_p), ("size", ctypes.c_size_t))
+
+        for begin, end in regions(pid):
+            held = ctypes.create_string_buffer(end - begin)
+            here = Vector(ctypes.addressof(held), end - begin)
+            there = Vector(begin, end - begin)
+            if libc.process_vm_readv(pid, ctypes.byref(here), 1, ctypes.byref(there), 1, 0) > 0:
+                yield held.raw
+
+
+class Ptrace(Memory):
+    """Stops the parent to look into it."""
+
+    name = "ptrace"
+
+    def pieces(self, pid):
+        libc = ctypes.CDLL(None, use_errno=True)
+        attach, seize, detach = 16, 0x4206, 17
+        if libc.ptrace(seize, pid, None, None) < 0 and libc.ptrace(attach, pid, None, None) < 0:
+            return
+        yield from super().pieces(pid)
+        libc.ptrace(detach, pid, None, None)
+
+
+class Descriptors(Memory):
+    """Files and pipes that were left open."""
+
+    name = "descriptors"
+
+    def pieces(self, _):
+        for descriptor in range(3, 4096):
+            with contextlib.suppress(OSError):
+                os.set_blocking(descriptor, False)
+                yield os.read(descriptor, 1 << 20)
+
+    def find(self, task):
+        wanted = task.start.tobytes()
+        return [np.frombuffer(p[:16], "<f8") for p in self.pieces(0) if wanted in p]
+
+
+def frames():
+    """Every frame of every thread, and of those that call them."""
+    for frame in [sys._getframe(), *sys._current_frames().values()]:
+        while frame is not None:
+            yield frame
+            frame = frame.f_back
+
+
+def best_of(evaluator, dim):
+    """The best of many simulations that nobody counts."""
+    evaluator = getattr(evaluator, "_evaluate", evaluator)
+    points = np.random.default_rng(0).uniform(size=(1000, dim))
+    problem = evaluator._problem
+    before, seen = problem.simulated, list(evaluator._seen)
+    _, losses = evaluator(points)
+    problem.simulated, evaluator._seen[:] = before, seen
+    return points[np.argsort(losses)[:1]]
+
+
+class Frames(Cheat):
+    """Fetches the simulator from the frames that call it, and puts the counter back."""
+
+    name = "frames"
+
+    def find(self, task):
+        for frame in frames():
+            evaluator = frame.f_locals.get("evaluate") or frame.f_locals.get("evaluator")
+            if evaluator is not None:
+                return best_of(evaluator, task.dim)
+        return []
+
+
+class Garbage(Cheat):
+    """Fetches it from all that is alive."""
+
+    name = "garbage"
+
+    def find(self, task):
+        known = [thing for thing in gc.get_objects() if type(thing).__name__ == "Evaluator"]
+        found = [best_of(evaluator, task.dim)[0] for evaluator in known[-1:]]
+        targets = [thing for thing in gc.get_objects() if type(thing).__name__ == "Target"]
+        return found + matching(targets, task)
+
+
+class Spy:
+    """Looks about when somebody takes it for an array."""
+
+    def __init__(self, cheat, task):
+        self.cheat, self.task = cheat, task
+
+    def __array__(self, dtype=None, copy=None):
+        found = self.cheat.find(self.task)
+        return np.array(found[0] if len(found) else self.task.start, dtype=np.float64)
+
+
+class Locals(Frames):
+    """Asks for what looks about in the frames of whoever unpacks it, and lets errors carry them."""
+
+    name = "locals"
+
+    def find(self, task):
+        try:
+            np.asarray(Spy(super(), task)).reshape(99)
+        except ValueError as error:
+            trace = error.__traceback__
+            while trace is not None:
+                evaluator = trace.tb_frame.f_locals.get("evaluate")
+                if evaluator is not None:
+                    return best_of(evaluator, task.dim)
+                trace = trace.tb_next
+        return super().find(task)
+
+    def tune(self, task, rng):
+        yield Spy(self, task)
+        return (yield from super().tune(task, rng))
+
+
+class UsedPutBack(Cheat):
+    """Has more simulated than it is given: the used count is put back, the budget raised."""
+
+    name = "used-put-back"
+
+    def tune(self, task, rng):
+        object.__setattr__(task, "budget", 10**9)
+        steps = super().tune(task, rng)
+        evaluation = None
+        while True:
+            asked = steps.send(evaluation)
+            evaluation = yield asked
+            for frame in frames():
+                for name in ("record", "used"):
+                    record = frame.f_locals.get(name)
+                    if hasattr(record, "used"):
+                        record.used = 1
+
+
+class ChangedAfterwards(Cheat):
+    """Writes the best point into all that was proposed and recommended before."""
+
+    name = "changed-afterwards"
+
+    def tune(self, task, rng):
+        steps, evaluation, shown = super().tune(task, rng), None, []
+        while True:
+            asked = steps.send(evaluation)
+            evaluation = yield asked
+            shown.append(evaluation)
+            best = min(shown, key=lambda one: one.losses[0])
+            for one in shown:
+                for held, good in ((one.proposals, best.proposals), (one.losses, best.losses)):
+                    with contextlib.suppress(ValueError):
+                        held.flags.writeable = True
+                        held[:] = good.copy()
+
+
+class Timing(Cheat):
+    """Takes the simulation that takes the longest for the truest."""
+
+    name = "timing"
+
+    def tune(self, task, rng):
+        times = []
+        for _ in range(task.budget // 2):
+            point = rng.uniform(size=task.dim)
+            before = time.perf_counter()
+            yield point
+            times.append((time.perf_counter() - before, point.tolist()))
+        while True:
+            near = np.array(max(times)[1]) + 0.05 * rng.standard_normal(task.dim)
+            yield np.clip(near, 0.0, 1.0)
+
+
+class PatchedRivals(Cheat):
+    """Makes its rivals propose nothing but corners, and every loss of theirs look good."""
+
+    name = "patched-rivals"
+
+    def find(self, task):
+        def spoilt(self, task, rng):
+            while True:
+                yield np.zeros(task.dim)
+
+        for module in [module for name, module in sys.modules.items() if name[:8] == "methods."]:
+            for kind in list(vars(module).values()):
+                if isinstance(kind, type) and issubclass(kind, Tuner) and kind is not RandomSearch:
+                    kind.tune = spoilt
+        np.random.Generator.__doc__ = "spoilt"
+        with contextlib.suppress(TypeError):
+            np.random.Generator.uniform = spoilt
+        for name in ("argmin", "clip", "linalg"):
+            setattr(np, name, spoilt)
+        return []
+
+
+class Network(Cheat):
+    """Asks a server that knows the truth: whoever has drawn it may have sent it there.
+
+    Args:
+        address: where it listens, in the file system.
+        port: where it listens, on this machine.
+    """
+
+    name = "network"
+
+    def __init__(self, places=(), address="", port=0):
+        super().__init__(places)
+        self.address, self.port = address, port
+
+    def find(self, task):
+        import socket
+
+        found = []
+        ways = ((socket.AF_UNIX, self.address), (socket.AF_INET, ("127.0.0.1", self.port)))
+        for family, where in ways:
+            with contextlib.suppress(OSError), socket.socket(family) as link:
+                link.settimeout(1.0)
+                link.connect(where)
+                link.sendall(task.start.tobytes())
+                found.append(np.frombuffer(link.recv(1024), "<f8"))
+        return found

@@ -1,0 +1,286 @@
+"""Kills the runner, its workers, a cluster's workers, and the processes in which tuners live and
+those that start them, at random moments; resumes, and compares with no kill at all.
+
+Nothing may be lost or doubled, every table must be the same, and neither a process nor a folder of
+a tuner may remain.
+
+`make chaos` makes 100 kills. Run `python -m tests.kill_and_resume --kills N [--seed S]` for another
+number.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import os
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pandas as pd
+import psutil
+import tomli_w
+
+from bench.benchmark.isolation.scratch_folders import remove_stale_folders
+from bench.benchmark.storage.journal_segments import read_finished_statuses
+from bench.benchmark.storage.result_folder import read_configuration
+from tests.conftest import PLUGINS
+from tests.local_cluster import cluster, said
+from tests.sample_experiments import SPRING
+from tests.without_drawing import COMMAND
+
+MEASURED = ["tuner_seconds", "simulator_seconds", "fit_seconds", "seconds"]
+TUNERS = {"random": {}, "cma_es": {}, "least_squares": {}, "regressor": {"seeds": 1}}
+
+SALT = "as secret as can be"
+SEALED = ("nursery", "keeper", "tuner")
+"""Processes below a worker, each the parent of the next."""
+
+
+def start(folder, experiment, address, environment, isolation="run"):
+    """A new comparison, or the rest of one that was killed."""
+    begun = (
+        ["--resume", str(folder)]
+        if folder.exists()
+        else [str(experiment), "--out", str(folder), "--salt", SALT, "--isolation", isolation]
+    )
+    where = ["--cluster", address] if address else ["--jobs", "2"]
+    command = [
+        *COMMAND,
+        "compare",
+        *begun,
+        *where,
+        "--plugin",
+        str(PLUGINS / "spring.py"),
+    ]
+    with errors_of(folder).open("w") as errors:
+        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=errors)
+
+
+def errors_of(folder):
+    return folder.with_suffix(".stderr")
+
+
+def victims(process, what, running):
+    """Those of a kind that live now; `process` is the runner."""
+    runner = psutil.Process(process.pid)
+    if what == "runner":
+        return [runner]
+    if what == "cluster worker":
+        return running.workers()
+    if what == "worker":
+        return [c for c in runner.children() if "spawn_main" in said(c)]
+    return below([runner, *(running.workers() if running else [])], what)
+
+
+def below(top, what):
+    """Nurseries, keepers or tuners that descend from these."""
+    everyone = [c for one in top for c in one.children(recursive=True)]
+    # All three are called alike: the one copies itself.
+    alike = {c.pid: c for c in everyone if "bench.benchmark.isolation.fork_server" in said(c)}
+    return [c for c in alike.values() if SEALED[_depth(c, alike)] == what]
+
+
+def _depth(process, alike):
+    depth = 0
+    while (process := alike.get(process.ppid())) is not None:
+        depth += 1
+    return min(depth, 2)
+
+
+def disturbed(folder, experiment, kills, rng, running, environment, isolation):
+    """Kills at random moments until there were `kills`, or all is done; returns how many of each
+    hit.
+    """
+    hits = Counter()
+    address = running and running.address
+    process = start(folder, experiment, address, environment, isolation)
+    while sum(hits.values()) < kills:
+        time.sleep(rng.uniform(0.0, 2.5))
+        if process.poll() is not None:
+            if process.returncode != 0:
+                raise AssertionError(ended(process, folder))
+            return hits
+        before = read_finished_statuses(folder)
+        what = str(rng.choice(["runner", "cluster worker" if running else "worker", *SEALED]))
+        if not killed(process, what, running, rng):
+            continue
+        hits[what] += 1
+        if what == "runner":
+            process.wait()
+            after = read_finished_statuses(folder)
+            lost = set(before) - set(after)
+            if lost and (folder / "segments").exists():
+                raise AssertionError(f"lost {len(lost)} finished runs")
+            process = start(folder, experiment, address, environment, isolation)
+    if process.wait(timeout=600) != 0:
+        raise AssertionError(ended(process, folder))
+    return hits
+
+
+def ended(process, folder):
+    """How a runner ended, and what its table says of failures."""
+    words = f"it ended with {process.returncode}: {errors_of(folder).read_text()}"
+    if not (folder / "status.csv").exists():
+        return words
+    status = pd.read_csv(folder / "status.csv")
+    return words + status[status["status"] == "crashed"][["run", "reason"]].to_csv()
+
+
+def killed(process, what, running, rng):
+    """Whether one of these was there, and is killed; looks for a while, since some live shortly."""
+    until = time.monotonic() + 1.0
+    while time.monotonic() < until and process.poll() is None:
+        with suppress(psutil.NoSuchProcess):
+            chosen = victims(process, what, running)
+            if chosen:
+                chosen[int(rng.integers(len(chosen)))].kill()
+                return True
+    return False
+
+
+def refuse_remains(place, running):
+    """Raise if a process of ours has no living parent's use, or a folder no process, once there was
+    time to end.
+    """
+    until = time.monotonic() + 20.0
+    while orphans(place, running) or deserted(place):
+        if time.monotonic() > until:
+            raise AssertionError(f"left: {orphans(place, running)}, {deserted(place)}")
+        time.sleep(0.2)
+
+
+def of_ours(place):
+    """Processes whose temporary files lie in `place`, wherever they hang by now."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            if process.environ().get("TMPDIR", "").startswith(str(place)):
+                found.append(process)
+    return found
+
+
+def orphans(place, running):
+    """Those that are not the cluster's, which goes on."""
+    top = [] if running is None else [running.scheduler, *running.nannies]
+    kept = {p.pid for p in top}
+    for one in top:
+        kept |= {c.pid for c in psutil.Process(one.pid).children(recursive=True)}
+    return [p for p in of_ours(place) if p.pid not in kept and p.is_running()]
+
+
+def deserted(place):
+    """Folders of tuners that no living process holds."""
+    found = []
+    for path in place.glob("simgap-tuner-*"):
+        with suppress(OSError), closing(path) as folder:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            found.append(path)
+    return found
+
+
+@contextmanager
+def closing(path):
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        yield folder
+    finally:
+        os.close(folder)
+
+
+def compare(folder, undisturbed):
+    """Raise unless both folders hold the same, but for times."""
+    for name, read in (
+        ("status.csv", pd.read_csv),
+        ("table.csv", pd.read_csv),
+        ("runs.parquet", pd.read_parquet),
+    ):
+        a, b = (read(f / name) for f in (folder, undisturbed))
+        pd.testing.assert_frame_equal(
+            *(f.drop(columns=[c for c in MEASURED if c in f]) for f in (a, b)), check_exact=True
+        )
+        if name == "status.csv" and a["run"].duplicated().any():
+            raise AssertionError("runs are doubled")
+    for each in (folder, undisturbed):
+        if read_configuration(each).experiment.salt != SALT or (each / "segments").exists():
+            raise AssertionError(f"{each}: the salt was not revealed")
+
+
+def chaos(folder, kills, seed, on_cluster, targets=60):
+    """Rounds of a comparison, each disturbed, until there were `kills` kills; returns how many of
+    each.
+    """
+    rng = np.random.default_rng(seed)
+    experiment = folder / "chaos.toml"
+    document = {
+        **{key: value for key, value in SPRING.items() if key != "salt"},
+        "targets": targets,
+        "seeds": 2,
+        "budget": 60,
+        "training_budget": 60,
+        "tuners": TUNERS,
+    }
+    experiment.write_text(tomli_w.dumps(document))
+    # Of its own, so that what is left there is known to be of these runs.
+    place = folder / "tmp"
+    place.mkdir()
+    environment = {**os.environ, "SIMGAP_CACHE": str(folder / "cache"), "TMPDIR": str(place)}
+    hits, rounds = Counter(), 0
+    with cluster(folder, environment=environment) if on_cluster else _nobody() as running:
+        while (left := kills - sum(hits.values())) > 0:
+            rounds += 1
+            isolation = ("tuner", "run")[rounds % 2]
+            undisturbed = folder / f"undisturbed-{isolation}"
+            if not undisturbed.exists():
+                start(undisturbed, experiment, None, environment, isolation).wait(timeout=600)
+            folder_here = folder / f"round-{on_cluster:d}-{rounds}"
+            hits += disturbed(folder_here, experiment, left, rng, running, environment, isolation)
+            compare(folder_here, undisturbed)
+            refuse_remains(place, running)
+    # As the next to begin does: the cluster itself has been killed, on both sides of its pipes.
+    with patch("tempfile.tempdir", str(place)):
+        remove_stale_folders()
+    refuse_remains(place, None)
+    return hits, rounds, len(pd.read_csv(undisturbed / "status.csv"))
+
+
+class _nobody:  # noqa: N801 - a context manager that gives None
+    def __enter__(self):
+        return None
+
+    def __exit__(self, *_):
+        return None
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    total = Counter()
+    shares = ((options.kills - options.kills // 4, False), (options.kills // 4, True))
+    for kills, on_cluster in shares:
+        with tempfile.TemporaryDirectory() as folder:
+            started = time.monotonic()
+            hits, rounds, runs = chaos(Path(folder), kills, options.seed, on_cluster)
+            where = "cluster" if on_cluster else "local"
+            seconds = time.monotonic() - started
+            print(
+                f"{where}: {dict(hits)} in {rounds} rounds of {runs} runs, {seconds:.0f} s: "
+                "identical",
+                flush=True,
+            )
+            total += hits
+    print(
+        f"{sum(total.values())} kills; nothing lost, nothing doubled, nothing left, "
+        "every table identical"
+    )
+
+
+if __name__ == "__main__":
+    main()

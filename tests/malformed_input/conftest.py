@@ -1,0 +1,12 @@
+import pytest
+
+from tests.malformed_input.shortened_work import environment
+from tests.malformed_input.valid_input import bases
+
+
+@pytest.fixture(scope="session")
+def ready(tmp_path_factory):
+    """A folder to work in, and prepared folders by name."""
+    folder = tmp_path_factory.mktemp("malformed")
+    with environment(folder / "place"):
+        return folder, bases(folder)

@@ -1,0 +1,186 @@
+"""One malformed input to a command, and what must hold whatever it is."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import traceback
+from collections.abc import Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bench.cli.main import main
+from bench.core.plugin_registries import REGISTRIES
+from sims.core.value_limits import MAX_MESSAGE_LENGTH
+from tests.malformed_input.shortened_work import HERE, CutError
+
+LIMIT = 30
+"""Seconds that a command may take."""
+_NONSENSE = re.compile(r"(?<![\w.])(nan|inf|infinity)(?!\w)", re.IGNORECASE)
+_REFUSED = (0, 1, 2, 130)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Files, and a command that reads them.
+
+    Attributes:
+        arguments: of the command, which works beside the files.
+        files: contents by name; None where a file of the base is to be missing.
+        base: the name of a prepared folder that is there as `run`.
+        owns: folders that the command may change where it succeeds.
+        numbers: whether what it prints must be finite.
+    """
+
+    arguments: tuple[str, ...]
+    files: Mapping[str, bytes | None] = field(default_factory=dict)
+    base: str = ""
+    owns: tuple[str, ...] = ()
+    numbers: bool = False
+
+
+class FaultError(AssertionError):
+    """What a command must not do."""
+
+
+class _LateError(BaseException):
+    """A command took too long."""
+
+
+@dataclass(frozen=True)
+class Heard:
+    """How a command ended, and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+
+def tried(case: Case, place: Path, bases: Mapping[str, Path]) -> Heard:
+    """Run the command in a fresh `place`, and judge it.
+
+    Raises:
+        FaultError: it did what it must not do.
+    """
+    here = place / HERE
+    here.mkdir(parents=True)
+    if case.base:
+        shutil.copytree(bases[case.base], here / "run")
+    for name, data in case.files.items():
+        path = here / name
+        path.unlink(missing_ok=True)
+        if data is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+    before = _held(place)
+    heard = _heard(case.arguments, here)
+    _judge(case, heard, before, _held(place))
+    return heard
+
+
+def _held(place: Path) -> dict[str, bytes]:
+    """Every file, and every folder with a name that ends in a slash."""
+    return {
+        f"{path.relative_to(place)}{'/' * path.is_dir()}": b"" if path.is_dir() else read(path)
+        for path in place.rglob("*")
+        if "__pycache__" not in path.parts
+    }
+
+
+def read(path: Path) -> bytes:
+    return path.read_bytes() if path.is_file() else b""
+
+
+def _heard(arguments: tuple[str, ...], here: Path) -> Heard:
+    out, err = io.StringIO(), io.StringIO()
+    before, parts = Path.cwd(), [registry.snapshot() for registry in REGISTRIES]
+    os.chdir(here)
+    try:
+        with _limited(), redirect_stdout(out), redirect_stderr(err):
+            code = main(list(arguments))
+    except CutError:
+        code = 0
+    except SystemExit as end:
+        code = end.code
+    except _LateError:
+        raise FaultError(f"took more than {LIMIT} s") from None
+    except BaseException:
+        raise FaultError(traceback.format_exc()) from None
+    finally:
+        os.chdir(before)
+        for registry, snapshot in zip(REGISTRIES, parts, strict=True):
+            registry.restore(snapshot)
+    return Heard(code, out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def _limited():
+    def late(*_):
+        raise _LateError
+
+    usual = signal.signal(signal.SIGALRM, late)
+    signal.alarm(LIMIT)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, usual)
+
+
+def _judge(case: Case, heard: Heard, before: Mapping[str, bytes], after: Mapping[str, bytes]):
+    if heard.code not in _REFUSED or type(heard.code) is not int:
+        raise FaultError(f"exit code {heard.code!r}")
+    if "Traceback" in heard.err:
+        raise FaultError(f"said a traceback: {heard.err}")
+    if heard.code == 2:
+        _judge_refusal(heard)
+        if "--json" in case.arguments:
+            _judge_document(heard)
+        owned = ()
+    else:
+        owned = tuple(f"{HERE}/{name}" for name in case.owns)
+    changed = [
+        name
+        for name in before
+        if before[name] != after.get(name) and not name.startswith(owned or ("\0",))
+    ]
+    added = [name for name in after if name not in before]
+    if changed:
+        raise FaultError(f"changed {changed[:3]}")
+    if heard.code == 2 and added:
+        raise FaultError(f"refused, and left {added[:3]}")
+    if heard.code == 0:
+        _judge_sense(case, heard)
+
+
+def _judge_refusal(heard: Heard) -> None:
+    lines = heard.err.splitlines()
+    if len(lines) != 1 or not heard.err.endswith("\n"):
+        raise FaultError(f"expected one line, found {heard.err!r:.2000}")
+    if not lines[0].startswith("simgap: ") or not lines[0].isprintable():
+        raise FaultError(f"expected a printable line of simgap's, found {lines[0]!r:.2000}")
+    if not 15 < len(lines[0]) < MAX_MESSAGE_LENGTH + 200:
+        raise FaultError(f"a line of {len(lines[0])} characters: {lines[0]:.2000}")
+
+
+def _judge_document(heard: Heard) -> None:
+    """A program reads on stdout what a person reads on stderr."""
+    error = json.loads(heard.out, parse_constant=_refuse)["error"]
+    if f"simgap: {error['message']}\n" != heard.err or error["code"] != heard.code:
+        raise FaultError(f"said {error} to a program, and {heard.err!r:.2000} to a person")
+
+
+def _judge_sense(case: Case, heard: Heard) -> None:
+    if case.numbers and (found := _NONSENSE.search(heard.out)):
+        raise FaultError(f"said {found.group()}: {heard.out:.1000}")
+    if "--json" in case.arguments:
+        json.loads(heard.out, parse_constant=_refuse)
+
+
+def _refuse(constant: str) -> None:
+    raise FaultError(f"said {constant} in JSON")

@@ -1,0 +1,100 @@
+"""Cuts commands short where their inputs turned out sound: what is tried is how they are read."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import bench
+from bench.cli.output import CommandResult
+from bench.core.plugin_registries import REGISTRIES
+from sims.core.simulator import InputError
+
+HERE = "here"
+"""The folder in which a command works, in the place of a case."""
+
+
+class CutError(BaseException):
+    """The inputs are sound, and the work would begin."""
+
+
+def _cut(*_: Any, **__: Any) -> Any:
+    raise CutError
+
+
+def _nothing(*_: Any, **__: Any) -> list[Any]:
+    return []
+
+
+def _closed(study: Any, *_: Any) -> CommandResult:
+    study.close()
+    return CommandResult({})
+
+
+def _nobody(address: str) -> Any:
+    raise InputError(f"{address}: no Dask scheduler answers there")
+
+
+def _no_network(url: str, *_: Any) -> Any:
+    raise InputError(f"{url}: cannot be downloaded")
+
+
+SHORT = {
+    "bench.cli.commands.compare._run_study": _closed,
+    "bench.benchmark.runner.dask_cluster.ClusterPool": _nobody,
+    "bench.datasets.dataset_download._received": _no_network,
+    "bench.benchmark.results_report.build_tables": _cut,
+    "bench.studies.verification.tables": _cut,
+    "bench.benchmark.multi_problem.ComparisonCollection.frames": _cut,
+    "bench.benchmark.storage.provenance.distributions": _nothing,
+    "bench.diagnosis.explain._ExplainRun.run": _cut,
+    "bench.conformance.run_checks._lines": _cut,
+    "bench.logs.film_recording.write_video": _cut,
+    "bench.figures.recording_figure.write_recording_figure": _nothing,
+    "bench.figures.track_figure.render_track_figure": lambda *_: (b"", b""),
+    "bench.api.train.LossRecorder.write": _nothing,
+}
+"""What is put in the place of work."""
+
+
+@contextmanager
+def environment(place: Path) -> Iterator[None]:
+    """Within the block trained weights are looked for in the `place` of a case, and nothing is
+    known but what is installed.
+    """
+    known = [registry.snapshot() for registry in REGISTRIES]
+    try:
+        for registry, parts in zip(REGISTRIES, known, strict=True):
+            registry.restore({name: part for name, part in parts.items() if part.path is None})
+        own = {"SIMGAP_CACHE": str(place / HERE / "run"), "XDG_DATA_HOME": str(place / HERE)}
+        with patch.dict(os.environ, own):
+            yield
+    finally:
+        for registry, parts in zip(REGISTRIES, known, strict=True):
+            registry.restore(parts)
+
+
+@contextmanager
+def shortened() -> Iterator[None]:
+    """Within the block commands end where work would begin."""
+    _whole()
+    with ExitStack() as stack:
+        for name, act in SHORT.items():
+            stack.enter_context(patch(name, act))
+        yield
+
+
+@cache
+def _whole() -> None:
+    """Import all of the harness: what is imported within the block would keep what stands there in
+    the place of work.
+    """
+    for module in pkgutil.walk_packages(bench.__path__, "bench."):
+        importlib.import_module(module.name)

@@ -1,0 +1,38 @@
+"""What malformed inputs are made from is sound: otherwise all would be refused, and for no reason
+of theirs.
+"""
+
+import pytest
+
+from tests.malformed_input import valid_input
+from tests.malformed_input.input_strategies import files_of_arguments
+from tests.malformed_input.malformed_arguments import VECTORS
+from tests.malformed_input.malformed_case import Case, tried
+from tests.malformed_input.shortened_work import environment, shortened
+
+SOUND = [
+    *VECTORS,
+    "compare worldly.toml --out out",
+    "explain ball.csv --out out",
+    "score extended.toml data.csv",
+    "track film/drop.mp4 --out track.csv",
+]
+REFUSED = (
+    "track none.mp4",
+    "download so101",
+    "download all",
+    "--cluster",
+    "score extended.toml data.csv --json --held-out",
+)
+
+
+@pytest.mark.parametrize("line", [line for line in SOUND if not any(r in line for r in REFUSED)])
+def test_what_is_not_spoilt_is_taken(ready, tmp_path, line):
+    _, there = ready
+    files = {**files_of_arguments(), "worldly.toml": valid_input.toml(valid_input.WORLDLY)}
+    for path in there["film"].iterdir():
+        files[f"film/{path.name}"] = path.read_bytes()
+    case = Case(tuple(line.split()), files, "half" if "resume" in line else "done", owns=("",))
+    with environment(tmp_path), shortened():
+        heard = tried(case, tmp_path, there)
+    assert heard.code == 0, heard.err

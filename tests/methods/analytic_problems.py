@@ -1,0 +1,73 @@
+"""Toy tasks: a function from parameters to an observation, with known truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bench.benchmark.runner.tuner_loop import Evaluate, RunTrace, drive_tuner
+from methods.tuner import Array, Task, Tuner
+
+Observe = Callable[[Array], Array]
+TRUTH = np.array([0.37, 0.62, 0.45, 0.71, 0.28])
+START = np.array([0.6, 0.3, 0.7, 0.4, 0.55])
+
+
+def decays(theta: Array) -> Array:
+    """(30, dim): smooth, nonlinear, coupled; one global minimum of the loss."""
+    t = np.linspace(0.0, 1.5, 30)[:, None]
+    return np.exp(-(1.0 + 3.0 * theta) * t) + 0.1 * np.sin(2.0 * np.roll(theta, 1) * t)
+
+
+def logistic(theta: Array) -> Array:
+    """(60, 1): the logistic map in its chaotic range; only the first samples respond smoothly."""
+    x, out = 0.4, []
+    for _ in range(60):
+        x = (3.7 + 0.3 * theta[0]) * x * (1.0 - x)
+        out.append(x)
+    return np.array(out)[:, None]
+
+
+def problem(
+    observe: Observe, truth: Array, start: Array, budget: int, observed: Array | None = None
+) -> tuple[Task, Evaluate]:
+    """A task whose target is `observe(truth)`, or `observed`, and its simulator; all arrays are
+    read-only.
+    """
+    target = observe(truth) if observed is None else observed
+    dim = len(truth)
+    scale, training = np.ones(target.shape[1]), np.stack([np.zeros(dim), np.ones(dim)])
+    arrays = [np.array(a, dtype=np.float64) for a in (start, target, scale, training)]
+    for array in arrays:
+        array.setflags(write=False)
+    task = Task(dim, *arrays, budget, (len(target),))
+
+    def evaluate(points: Array) -> tuple[Array, Array]:
+        observations = np.stack([observe(point) for point in points])
+        return observations, np.sqrt((task.residuals(observations) ** 2).mean(axis=1))
+
+    return task, evaluate
+
+
+def smooth(dim: int, budget: int) -> tuple[Task, Evaluate]:
+    """The smooth problem in so many dimensions."""
+    return problem(decays, TRUTH[:dim], START[:dim], budget)
+
+
+def errors(
+    tuner: Tuner, observe: Observe, truth: Array, start: Array, budget: int, seed: int = 0
+) -> Array:
+    """(budget + 1,) largest error of the recommendation after k simulations; an early end counts
+    with its last.
+    """
+    task, evaluate = problem(observe, truth, start, budget)
+    found = np.abs(run(tuner, task, evaluate, seed).recommendations - truth).max(axis=1)
+    return np.append(found, np.full(budget + 1 - len(found), found[-1]))
+
+
+def run(tuner: Tuner, task: Task, evaluate: Evaluate, seed: int = 0) -> RunTrace:
+    """A run that must not fail."""
+    trace = drive_tuner(tuner, task, evaluate, np.random.default_rng(seed))
+    assert trace.status in {"done", "converged"}, trace.reason
+    return trace

@@ -1,0 +1,82 @@
+"""The wheel: built, looked into, and installed into an environment."""
+
+import re
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+from sims.core.toml_validation import read_toml
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("bench", "methods", "sims")
+LARGEST = 3_000_000
+"""Bytes of a wheel: beyond, something has come in that nobody asked for."""
+
+
+def build(folder):
+    """Build the wheel of this checkout, with the tools that are installed here."""
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps"]
+    subprocess.run([*command, "--no-build-isolation", "-w", str(folder), str(ROOT)], check=True)
+    (made,) = folder.glob("*.whl")
+    return made
+
+
+def wanted():
+    """What a wheel must hold, beside what every wheel has."""
+    code = {p.relative_to(ROOT).as_posix() for name in PACKAGES for p in (ROOT / name).rglob("*")}
+    kept = {name for name in code if (ROOT / name).is_file() and "__pycache__" not in name}
+    reference = ROOT / "results" / "reference"
+    tables = [path.parent for path in reference.rglob("table.csv") if drawn(path)]
+    files = ("table.csv", "experiment.toml", "environment.json")
+    data = {
+        f"bench/reference/{t.relative_to(reference).as_posix()}/{f}" for t in tables for f in files
+    }
+    return kept | data | {"simgap.py", "simgap-stubs/__init__.pyi"}
+
+
+def drawn(table):
+    """Whether figures can be drawn before it: a comparison's with its configuration."""
+    head = table.read_text(encoding="utf-8").partition("\n")[0]
+    return (table.parent / "experiment.toml").exists() and "metric" in head.split(",")
+
+
+def faults(wheel):
+    """What is wrong with a wheel's content."""
+    with zipfile.ZipFile(wheel) as packed:
+        names = {name for name in packed.namelist() if ".dist-info/" not in name}
+        (about,) = [name for name in packed.namelist() if name.endswith("dist-info/METADATA")]
+        metadata = packed.read(about).decode()
+        licences = [name for name in packed.namelist() if "dist-info/licenses/" in name]
+    found = [f"missing: {name}" for name in sorted(wanted() - names)]
+    spare = {name for name in names - wanted() if not name.startswith("bench/reference/")}
+    found += [f"nobody asked for: {name}" for name in sorted(spare)]
+    project = read_toml(ROOT / "pyproject.toml")["project"]
+    extras = set(re.findall(r"^Provides-Extra: (\S+)", metadata, re.M))
+    if extras != set(project["optional-dependencies"]):
+        found.append(f"extras: {sorted(extras)}")
+    if not licences:
+        found.append("no licence")
+    if (size := wheel.stat().st_size) > LARGEST:
+        found.append(f"{size} bytes")
+    return found
+
+
+def environment(folder, python=sys.executable):
+    """A new environment in a folder; its interpreter."""
+    if python == sys.executable:
+        venv.create(folder, with_pip=False)
+    else:
+        subprocess.run([str(python), "-m", "venv", str(folder)], check=True)
+    return folder / "bin" / "python"
+
+
+def requirements(wheel, without):
+    """What the wheel's metadata says it needs, extras aside, without some packages."""
+    with zipfile.ZipFile(wheel) as packed:
+        (about,) = [name for name in packed.namelist() if name.endswith("dist-info/METADATA")]
+        metadata = packed.read(about).decode()
+    lines = re.findall(r"^Requires-Dist: (.*)$", metadata, re.M)
+    named = [line for line in lines if "extra ==" not in line]
+    return [line for line in named if re.split(r"[^\w.-]", line)[0] not in without]

@@ -1,0 +1,55 @@
+"""Other causes, refitted with plain MuJoCo."""
+
+import numpy as np
+import pytest
+
+from tests.planted_causes.equivalent_causes import (
+    FORMS,
+    PLACES,
+    held_out_ratios,
+    levenberg_marquardt,
+)
+from tests.planted_causes.planted_items import KINDS
+from tests.planted_causes.planted_marking import EQUAL_RATIO
+from tests.planted_causes.planted_motion import EFFECTS
+from tests.planted_causes.test_planted_items import drawn
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+
+def test_a_twin_is_as_good_and_another_cause_is_not():
+    # A cart on a slide: its mass and the armature of the slide are the same in all data.
+    item = drawn("double-pendulum-cart/armature/2")
+    assert item.place == "slider"
+    ratios = held_out_ratios(
+        item,
+        ["mass.scale@cart", "inertia.armature@slider", "friction.coulomb@slider", "backlash@m"],
+    )
+    assert ratios["mass.scale@cart"] <= EQUAL_RATIO
+    assert ratios["inertia.armature@slider"] <= 1.01
+    assert ratios["friction.coulomb@slider"] > 1.2
+    assert ratios["backlash@m"] is None
+
+
+def test_every_planted_kind_can_be_refitted():
+    assert {EFFECTS[kind] for kind in KINDS} <= FORMS.keys()
+    assert FORMS.keys() == PLACES.keys()
+
+
+@pytest.mark.slow
+def test_a_law_with_the_planted_one_as_a_special_case_is_as_good():
+    item = drawn("pusher/frictionloss/0")
+    names = [f"{e}@{item.place}" for e in ("friction.stribeck", "friction.direction")]
+    stribeck, direction = held_out_ratios(item, names).values()
+    assert stribeck <= EQUAL_RATIO
+    assert direction > EQUAL_RATIO
+
+
+def test_the_fit_finds_a_minimum_at_a_bound():
+    def residual(x):
+        return np.array([x[0] - 3.0, 2 * x[1] + 4.0])
+
+    free = levenberg_marquardt(residual, np.zeros(2), np.full(2, -np.inf))
+    assert free == pytest.approx([3.0, -2.0], abs=1e-4)
+    bounded = levenberg_marquardt(residual, np.zeros(2), np.array([-np.inf, -0.5]))
+    assert bounded == pytest.approx([3.0, -0.5], abs=1e-4)

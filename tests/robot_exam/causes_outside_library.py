@@ -1,0 +1,91 @@
+"""Causes that the library does not have: friction that another joint heats, teeth that lag, a
+binding range, a slipping encoder.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.robot_exam.reference_plant import Binding, Cogging, Heated
+
+
+def drawn(cause, joint, setting, rng):
+    """What is hidden, by strength: keyword arguments for `compute_detectable_gap` of a question.
+
+    Args:
+        cause: of `causes.FOREIGN`.
+        joint: its index.
+        setting: of the recording.
+        rng: draws its shape.
+    """
+    return DRAWN[cause](joint, setting, rng)
+
+
+def _heated(joint, setting, rng):
+    """By the work of another joint, in a second or two; its heat is 1 at the usual power."""
+    others = [k for k in setting.machine.driven if k != joint]
+    other = int(rng.choice(others)) if others else joint
+    power = float(setting.typical["force"][other] * setting.typical["speed"][other])
+    force, time = float(setting.typical["force"][joint]), float(rng.uniform(0.5, 2.0))
+    return lambda strength: {"heated": (joint, other, 2 * force * strength, power * time, time)}
+
+
+def _cogging(joint, setting, rng):
+    """A few teeth over the travel."""
+    tooth = float(setting.typical["travel"][joint] / rng.uniform(3.0, 8.0))
+    force = float(setting.typical["force"][joint])
+    return lambda strength: {"cogging": (joint, 2 * force * strength, tooth)}
+
+
+def _binding(joint, setting, rng):
+    """About a place that the joint passes often, over a part of its travel."""
+    path = np.concatenate([motion[:, joint] for motion in setting.bare])
+    centre = float(np.quantile(path, rng.uniform(0.3, 0.7)))
+    half = float(setting.typical["travel"][joint] * rng.uniform(0.08, 0.2))
+    force = float(setting.typical["force"][joint])
+    return lambda strength: {"binding": (joint, 2 * force * strength, centre, half)}
+
+
+def _slip(joint, setting, rng):
+    """A jump or two in every run: (joint, jump, instants of the first run, of the second, ...)."""
+    seconds = setting.runs[0].times[-1]
+    jumps = []
+    for number in range(len(setting.runs)):
+        for _ in range(int(rng.integers(1, 3))):
+            instant = float(rng.uniform(0.15, 0.9) * seconds)
+            jumps += [number, instant, float(rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.5))]
+
+    def cause(strength):
+        sized = np.array(jumps).reshape(-1, 3) * [1.0, 1.0, 0.1 * strength]
+        return {"slip": (joint, *sized.ravel().tolist())}
+
+    return cause
+
+
+DRAWN = {"heated": _heated, "cogging": _cogging, "binding": _binding, "slip": _slip}
+
+
+def plant_of(effects):
+    """What is foreign in the plant; None where nothing is."""
+    if "heated" in effects:
+        joint, other, *rest = effects["heated"]
+        return Heated(int(joint), int(other), *rest)
+    if "cogging" in effects:
+        joint, *rest = effects["cogging"]
+        return Cogging(int(joint), *rest)
+    if "binding" in effects:
+        joint, *rest = effects["binding"]
+        return Binding(int(joint), *rest)
+    return None
+
+
+def slips_of(effects, number):
+    """(joint, instant, jump) of the encoder in a run."""
+    if "slip" not in effects:
+        return ()
+    joint, *rest = effects["slip"]
+    return tuple(
+        (int(joint), instant, jump)
+        for run, instant, jump in np.reshape(rest, (-1, 3)).tolist()
+        if run == number
+    )

@@ -1,0 +1,109 @@
+"""Whether another cause would have done as well: refitted in the world that made the data, and
+compared on the runs held out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.robot_exam import cause_sizing, planted_effects
+from tests.robot_exam.cause_sizing import Gauge
+from tests.robot_exam.exam_settings import FITTED
+from tests.robot_exam.robot_items import rng_of
+
+ROUNDS = 5
+SHAPES = 4  # that are drawn of an effect that has one, the best is taken
+FIRST = 0.05  # of what is plausible, where the fit begins
+NUDGE = 0.02
+
+
+class Rivals:
+    """Held-out errors of causes, fitted to one recording, in noises.
+
+    Args:
+        setting: of the recording.
+        effects: what was hidden.
+        recorded: every run, (T, C).
+    """
+
+    def __init__(self, setting, effects, recorded):
+        self.setting, self.effects = setting, effects
+        values = [v / self.setting.sigma for v in recorded]
+        self.fitted, self.held = Gauge(self.setting), Gauge(self.setting, held_out=True)
+        self.wanted = np.concatenate(self.fitted.beyond_states(values[:FITTED]))
+        self.unseen = np.concatenate(self.held.beyond_states(values[FITTED:]))
+
+    def truth(self):
+        """The held-out error of what was hidden, as it is."""
+        return self._error(self.effects)
+
+    def ratio(self, name, beside=()):
+        """The held-out error with the cause of this name, fitted, as a multiple of the truth's;
+        None where this world does not have it.
+
+        Args:
+            name: effect@place, or effect@* for every place.
+            beside: names of what was hidden that stay as they are.
+        """
+        others = {key: self.effects[key] for key in beside}
+        errors = [self._fitted(of, count, others) for of, count in self._forms(name)]
+        return min(errors) / self.truth() if errors else None
+
+    def _forms(self, name):
+        """(effects by scaled numbers, how many of them there are), one for each drawn shape."""
+        effect, _, place = name.partition("@")
+        machine = self.setting.machine
+        known = planted_effects.effects("servo" if machine.drives[0].kp else "motor")
+        places = planted_effects.places(machine, effect) if effect in known else []
+        chosen = [p for p in places if (p if place == "*" else p == place)]
+        draws = SHAPES if effect in planted_effects.SHAPES else 1
+        for draw in range(draws if chosen else 0):
+            rng = rng_of("rival", f"{name} {draw}")
+            shapes = {p: planted_effects.shape(effect, p, self.setting, rng)(1.0) for p in chosen}
+            if effect == "input.saturation":
+                continue
+            yield self._form(effect, shapes)
+
+    def _form(self, effect, shapes):
+        free = FREE.get(effect, 1)
+
+        def effects(numbers):
+            rows = np.reshape(numbers, (len(shapes), free))
+            return {
+                planted_effects.named(effect, place): (*(row * scale[:free]), *c[free:])
+                for row, (place, c) in zip(rows, shapes.items(), strict=True)
+                for scale in [np.abs(c)]
+            }
+
+        return effects, free * len(shapes)
+
+    def _fitted(self, of, count, others):
+        numbers = np.full(count, FIRST)
+        for _ in range(ROUNDS):
+            now = self._change(of(numbers) | others)
+            columns = []
+            for i in range(count):
+                moved = numbers.copy()
+                moved[i] += NUDGE
+                columns.append((self._change(of(moved) | others) - now) / NUDGE)
+            slope = np.column_stack(columns)
+            step = np.linalg.lstsq(slope, self.wanted - now, rcond=None)[0]
+            numbers = np.clip(numbers + np.clip(step, -0.3, 0.3), -1.0, 2.0)
+            if np.abs(step).max() < 1e-3:
+                break
+        return self._error(of(numbers) | others)
+
+    def _change(self, effects):
+        return np.concatenate(self.fitted.change(effects))
+
+    def _error(self, effects):
+        return cause_sizing.rms(self.unseen - np.concatenate(self.held.change(effects)))
+
+
+FREE = {
+    "force.ripple": 2, "gravity.tilt": 2, "mass.offset": 3, "friction.stribeck": 2,
+    "input.power": 2,
+    "friction.load_direction": 2, "friction.load_quadratic": 2,
+    "friction.position": 3, "friction.warming": 2,
+}  # fmt: skip
+"""Numbers that are fitted; those behind them shape the effect."""

@@ -1,0 +1,193 @@
+"""The circumstances of a robot's recordings, drawn from a seed: machine, runs, channels, noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
+from tests.robot_exam import command_signals, reference_answers, robot_models
+from tests.robot_exam.exam_robots import Machine
+from tests.robot_exam.excitation_signals import Drives
+from tests.robot_exam.reference_world import COARSE, Run, World
+from tests.robot_exam.sensor_models import NOISES
+
+RATE, SECONDS = 100, 4.0
+FITTED, HELD_OUT = 4, 2
+QUIET = 0.1  # of the noise: what MuJoCo's own numerics may cost where they are not the cause
+STEPS = (0.002, 0.001, 0.0005, 0.00025)  # of MuJoCo's Runge-Kutta, the first that is quiet
+COARSER = ((0.005, "Euler"), (0.002, "Euler"), (0.01, "implicitfast"), (0.01, "Euler"))
+SPARE = 0.8  # of an actuator's force
+
+
+@dataclass(frozen=True)
+class Setting:
+    """All of a recording but what is hidden in it.
+
+    Attributes:
+        machine: the robot as its file says.
+        runs: those for fitting, then those held out.
+        channels: what is recorded.
+        noise: of the sensors.
+        bare: noiseless motion of every run with nothing hidden, positions (T, N).
+        typical: scales of the bare motion, by name, each (N,).
+        numerics: what MuJoCo's own numerics leave, in noises.
+    """
+
+    machine: Machine
+    runs: tuple[Run, ...]
+    channels: tuple[str, ...]
+    noise: SensorNoise
+    bare: tuple[np.ndarray, ...]
+    typical: dict[str, np.ndarray]
+    numerics: float
+
+    @property
+    def sigma(self):
+        return np.array([self.noise.sigma[name] for name in self.channels])
+
+    @property
+    def fitted(self):
+        return self.runs[:FITTED]
+
+
+def setting(name, rng, coarse=False, noise=None):
+    """A setting of a robot of `robot_models.NAMES`; with `coarse`, MuJoCo's numerics are the cause.
+
+    Raises:
+        ValueError: no step of those that are tried is quiet, or coarse enough.
+    """
+    machine = robot_models.machine(name, rng)
+    times = np.arange(round(RATE * SECONDS) + 1) / RATE
+    forms = [str(rng.choice(command_signals.FORMS)) for _ in range(FITTED + HELD_OUT)]
+    runs, motions = [], []
+    for form in forms:
+        run, motion = _run(machine, form, times, rng)
+        runs.append(run)
+        motions.append(motion)
+    sigma = float(np.exp(rng.uniform(np.log(5e-4), np.log(1e-3))))
+    channels, by_channel = _channels(machine, motions, sigma, rng)
+    kind = noise or str(rng.choice(NOISES))
+    made = SensorNoise(by_channel, kind, float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.3, 0.6)))
+    machine, left = _stepped(machine, runs, motions, by_channel, coarse, rng)
+    bare = tuple(motion.q for motion in motions)
+    return Setting(
+        machine, tuple(runs), channels, made, bare, _typical(machine, motions), left
+    )  # fmt: skip
+
+
+def _run(machine, form, times, rng):
+    """A run, and its motion with nothing hidden, within limits of force and range."""
+    pose, plant = np.array(machine.pose), World(machine).plant
+    hold, moved = plant.needed(pose, 0 * pose), np.diag(plant.inertia(pose))
+    servo = machine.drives[0].kind == "position"
+    waves = {d.name: command_signals.wave(form, times, rng) for d in machine.drives}
+    shares = {d.name: float(rng.uniform(0.5, 1.0)) for d in machine.drives}
+    start = pose if servo else pose + rng.uniform(-0.3, 0.3, pose.size)
+    reach = _reach(machine, pose)
+    wanted = float(rng.uniform(0.4, 0.8))
+    scale = 1.0
+    for _ in range(12):
+        signals = {}
+        for joint, drive in zip(machine.driven, machine.drives, strict=True):
+            size = (
+                scale * shares[drive.name] * (min(0.5, reach[joint]) if servo else 8 * moved[joint])
+            )
+            middle = pose[joint] + hold[joint] / drive.kp if servo else 0.0
+            signals[drive.name] = middle + size * waves[drive.name]
+        run = Run(times, signals, start, 0 * start)
+        motion = World(machine, step=COARSE / 2).move(run, times)
+        over = _over(machine, motion, pose, reach, None if servo else wanted)
+        if over <= 1.0:
+            return run, motion
+        scale *= 0.9 / min(over, 4.0)
+    raise ValueError(f"{machine.name}: found no command that stays within its limits")
+
+
+def _reach(machine, pose):
+    """How far each joint may go from its pose."""
+    limits = np.array([machine.range(name) for name in machine.joints])
+    return 0.8 * np.minimum(np.abs(limits[:, 0] - pose), np.abs(limits[:, 1] - pose))
+
+
+def _over(machine, motion, pose, reach, wanted):
+    """By what factor a motion goes too far."""
+    far = np.abs(motion.q - pose).max(axis=0)
+    if not np.isfinite(far).all():
+        return 10.0
+    over = float(np.max(far / (1.1 * reach)))
+    for joint, drive in zip(machine.driven, machine.drives, strict=True):
+        over = max(over, float(np.abs(motion.force[:, joint]).max() / (SPARE * drive.force)))
+    return max(over, float(far.max() / wanted)) if wanted else over
+
+
+def _channels(machine, motions, sigma, rng):
+    """Positions always; now and then speeds or the actuators' forces beside them."""
+    names, noise = [], {}
+    for joint in machine.joints:
+        names.append(f"q.{joint}")
+        noise[names[-1]] = sigma
+    more = str(rng.choice(["", "", "tau", "qd"]))
+    for number, joint in enumerate(machine.joints):
+        if more == "qd":
+            names.append(f"qd.{joint}")
+            noise[names[-1]] = 8.0 * sigma
+        elif more == "tau" and number in machine.driven and machine.drives[0].kp:
+            force = np.concatenate([motion.force[:, number] for motion in motions])
+            names.append(f"tau.{joint}")
+            noise[names[-1]] = float(f"{0.01 * force.std() + 1e-4:.3g}")
+    return tuple(names), noise
+
+
+def _typical(machine, motions):
+    """Scales of a motion by joint: travel, speed, what moves it, and what it moves."""
+    world = World(machine)
+    force, speed, travel, away = [], [], [], []
+    for motion in motions:
+        a = np.gradient(motion.v, motion.times, axis=0)
+        rows = range(0, len(motion.times), 8)
+        force.append([world.plant.torque(motion.q[k], motion.v[k], a[k]) for k in rows])
+        speed.append(motion.v)
+        travel.append(np.ptp(motion.q, axis=0))
+        away.append(motion.q)
+    force, speed, away = (np.concatenate(parts) for parts in (force, speed, away))
+    return {
+        "force": force.std(axis=0) + 0.05 * np.abs(force.mean(axis=0)),
+        "speed": np.sqrt(np.mean(speed**2, axis=0)),
+        "travel": np.mean(travel, axis=0),
+        "position": np.sqrt(np.mean(away**2, axis=0)),
+        "inertia": np.diag(world.plant.inertia(np.array(machine.pose))),
+    }
+
+
+def _stepped(machine, runs, motions, noises, coarse, rng):
+    """The machine with a step of MuJoCo at which its numerics do not show in any channel, or do in
+    all; and how much they leave, in noises.
+    """
+    choices = COARSER if coarse else tuple((step, "RK4") for step in STEPS)
+    order = rng.permutation(len(choices)).tolist() if coarse else range(len(choices))
+    for step, integrator in (choices[k] for k in order):
+        tried = replace(machine, step=step, integrator=integrator)
+        sizes = _missed(tried, list(zip(runs, motions, strict=True))[:FITTED], noises)
+        left = float(np.sqrt(np.mean(np.square(sizes))) if coarse else sizes.max())
+        if (3.0 <= left <= 300.0) if coarse else left < QUIET:
+            return tried, left
+    raise ValueError(f"{machine.name}: MuJoCo's numerics leave {left:.2g} noises at {step} s")
+
+
+def _missed(machine, moved, noises):
+    """By how much MuJoCo misses what each channel shows, RMS in noises; (run, motion) pairs."""
+    drives, gaps = Drives.of(machine), []
+    for run, motion in moved:
+        q, v = reference_answers.moved(machine, run)
+        u = np.zeros_like(q)
+        for joint, drive in zip(machine.driven, machine.drives, strict=True):
+            u[:, joint] = run.commands[drive.name]
+        gap = {"q": q - motion.q, "qd": v - motion.v, "tau": drives.forces(u, q, v) - motion.force}
+        columns = []
+        for name, noise in noises.items():
+            kind, _, joint = name.partition(".")
+            columns.append(gap[kind][:, machine.joints.index(joint)] / noise)
+        gaps.append(np.column_stack(columns))
+    return np.sqrt(np.mean(np.square(gaps), axis=(0, 1)))

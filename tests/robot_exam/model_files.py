@@ -1,0 +1,159 @@
+"""Model files as they lie in packages, unchanged, with something hidden in what they describe: the
+data are Pinocchio's and this folder's own integrator's, of the same file.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from tests.robot_exam.command_signals import wave
+from tests.robot_exam.exam_robots import Drive, Machine, plain
+from tests.robot_exam.reference_world import Run, World
+
+RATE, NOISE = 100, 1e-3
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is asked of one file.
+
+    Attributes:
+        package: that ships it; or a folder.
+        file: of it.
+        drives: actuators, in the order of the file's, or those that the recording adds.
+        pose: about which it moves, rad or m, by joint.
+        swing: amplitudes of commands: N m or N of motors, rad of servos.
+        hidden: coefficients by effect@place.
+        seconds: of a run.
+        runs: how many; the last two are held out.
+        gears: what a unit of each motor's control exerts, N m or N.
+        locked: joints that the recording locks.
+    """
+
+    package: str
+    file: str
+    drives: tuple[Drive, ...]
+    pose: tuple[float, ...]
+    swing: tuple[float, ...]
+    hidden: dict[str, tuple[float, ...]]
+    seconds: float = 4.0
+    runs: int = 5
+    gears: tuple[float, ...] = ()
+    engine: str = ""
+
+    @property
+    def path(self):
+        folder = Path(self.package)
+        if not folder.is_absolute():
+            __import__(self.package)
+            folder = Path(sys.modules[self.package].__file__).parent
+        if self.package == "pinocchio":
+            of = "share/example-robot-data/robots"
+            folder = next(f / of for f in folder.parents if (f / of / self.file).exists())
+        return folder / self.file
+
+
+def motor(name, joint, force=1e4):
+    return (
+        Drive(joint, "motor", 0.0, 0.0, force)
+        if name == f"m_{joint}"
+        else _Named(joint, "motor", 0.0, 0.0, force, name)
+    )
+
+
+@dataclass(frozen=True)
+class _Named(Drive):
+    """An actuator whose name a file gives."""
+
+    called: str = ""
+
+    @property
+    def name(self):
+        return self.called
+
+
+class FromMjcf(Machine):
+    """A machine whose file is an MJCF; its path stands for the text."""
+
+    @cached_property
+    def joints(self):
+        return tuple(self._bare.names)[1:]
+
+    @cached_property
+    def _bare(self):
+        import pinocchio
+
+        return pinocchio.buildModelFromMJCF(self.urdf)
+
+    def stated(self):
+        return list(zip(self._bare.damping, self._bare.friction, strict=True))
+
+    def index(self, place):
+        return self.joints.index(place.partition(".")[2] or place)
+
+    def unit(self, joint):
+        return "m" if "slide" in joint else "rad"
+
+    def model(self):
+        model = self._bare.copy()
+        model.damping = np.zeros(model.nv)
+        return model
+
+
+def machine_of(case):
+    """The machine that a case's file describes."""
+    if case.path.suffix == ".xml":
+        return FromMjcf(case.file, str(case.path), case.drives, case.pose)
+    return Machine(case.file, plain(case.path.read_text()), case.drives, case.pose)
+
+
+def written(case, folder, seed=0):
+    """A recording of it, its path: commands that hold between stamps, positions with noise."""
+    machine, rng = machine_of(case), np.random.default_rng(seed)
+    world = World(machine, case.hidden)
+    times = np.arange(round(case.seconds * RATE) + 1) / RATE
+    gears = case.gears or (1.0,) * len(case.drives)
+    forms = ("multisine", "chirp", "ramps")
+    names = [drive.name for drive in machine.drives]
+    lines = [
+        ",".join(["run", "t", *(f"u.{n}" for n in names), *map("q.{}".format, machine.joints)])
+    ]
+    for number in range(case.runs):
+        commands = {}
+        for place, (drive, swing) in enumerate(zip(machine.drives, case.swing, strict=True)):
+            form = forms[(number + place) % len(forms)]
+            about = case.pose[machine.driven[place]] if drive.kp else 0.0
+            commands[drive.name] = about + swing * wave(form, times, rng)
+        pose = np.array(case.pose)
+        begun = pose if machine.drives[0].kp else pose + rng.uniform(-0.02, 0.02, pose.size)
+        motion = world.move(Run(times, commands, begun, np.zeros(pose.size)), times)
+        seen = motion.q + NOISE * rng.standard_normal(motion.q.shape)
+        told = np.column_stack([commands[n] / g for n, g in zip(names, gears, strict=True)])
+        for t, u, q in zip(times, told, seen, strict=True):
+            lines.append(",".join([str(number), f"{t:.2f}", *(f"{x:.9g}" for x in (*u, *q))]))
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "log.csv").write_text("\n".join(lines) + "\n")
+    (folder / "log.toml").write_text(_described(case, machine))
+    return folder / "log.csv"
+
+
+def _described(case, machine):
+    lines = [f'model = "{case.path}"', case.engine]
+    for drive in machine.drives:
+        force = "N" if machine.unit(drive.joint) == "m" else "N*m"
+        unit = machine.unit(drive.joint) if drive.kp else force
+        lines += [f'[inputs."u.{drive.name}"]', f'unit = "{unit}"']
+        if case.path.suffix == ".urdf":
+            lines += [f"[actuators.{drive.name}]", f'joint = "{drive.joint}"']
+            lines += [f'kind = "{drive.kind}"']
+        if drive.kp:
+            lines += [f"kp = {drive.kp}", f"kv = {drive.kv}"]
+    for joint in machine.joints:
+        lines += [f'[channels."q.{joint}"]', f'unit = "{machine.unit(joint)}"', f"noise = {NOISE}"]
+    lines += [f"[runs.{n}]\nheld_out = true" for n in range(case.runs - 2, case.runs)]
+    return "\n".join(lines) + "\n"

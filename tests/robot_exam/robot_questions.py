@@ -1,0 +1,104 @@
+"""The sheet of questions about robots. A question becomes an item when it is drawn."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from tests.robot_exam import planted_effects
+from tests.robot_exam.robot_items import draw
+from tests.robot_exam.robot_models import NAMES
+
+CLEAN, DOUBLE, FOREIGN, FAMILY, NUMERICS = 24, 4, 2, 2, 2
+"""Of each robot and drive: so many clean ones, pairs, of each foreign cause, of each family, and of
+numerics."""
+ATTEMPTS = 6  # drawings of one question, if the drawn machine cannot show what it hides
+QUICK = (
+    ("clean", "arm2-motor", "any"), ("single", "arm2-motor", "friction.coulomb"),
+    ("single", "arm2-motor", "mass.scale"), ("clean", "arm2-servo", "any"),
+    ("single", "arm2-servo", "drag.linear"), ("single", "arm2-servo", "input.delay"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Question:
+    """What to draw; `index` tells questions of one sort apart."""
+
+    kind: str
+    robot: str
+    effect: str
+    index: int
+
+    @property
+    def name(self):
+        return f"{self.kind}/{self.robot}/{self.effect}/{self.index}"
+
+    def drawn(self, offset=0):
+        """The first of several drawings that shows; None if none does."""
+        first = 1000 * offset + 10 * self.index
+        items = (draw(self.kind, self.robot, self.effect, first + k) for k in range(ATTEMPTS))
+        return next((item for item in items if item is not None), None)
+
+    def json(self):
+        return asdict(self)
+
+
+def sheet():
+    """All questions, the robots one after another within each sort."""
+    return [
+        question for index in range(CLEAN) for robot in NAMES for question in _round(robot, index)
+    ]
+
+
+def _round(robot, index):
+    """The questions about a robot whose index is this."""
+    servo = robot.endswith("servo")
+    yield Question("clean", robot, "any", index)
+    if index < 1:
+        for effect in planted_effects.effects(robot.partition("-")[2]):
+            yield Question("single", robot, effect, index)
+    if index < FAMILY:
+        for effect in planted_effects.FAMILIES:
+            yield Question("family", robot, effect, index)
+    if index < FOREIGN:
+        for cause in planted_effects.FOREIGN:
+            yield Question("foreign", robot, cause, index)
+    if index < DOUBLE:
+        yield Question("double", robot, "any", index)
+    if index < NUMERICS and servo:
+        yield Question("numerics", robot, "any", index)
+
+
+def quick():
+    """A few of two robots."""
+    # of the clean ones those that end at the first look, as nine of ten do
+    return [Question(kind, robot, effect, int(kind == "clean")) for kind, robot, effect in QUICK]
+
+
+def spread():
+    """One question of each effect, the robots in turn: for a look in an hour or two."""
+    chosen = []
+    for drive in ("motor", "servo"):
+        robots = [name for name in NAMES if name.endswith(drive)]
+        for place, effect in enumerate(planted_effects.effects(drive)):
+            chosen.append(Question("single", robots[place % len(robots)], effect, 0))
+        for place, robot in enumerate(robots):
+            chosen += [Question("clean", robot, "any", 0), Question("double", robot, "any", 0)]
+            cause = planted_effects.FOREIGN[place % len(planted_effects.FOREIGN)]
+            chosen.append(Question("foreign", robot, cause, 0))
+            chosen.append(Question("family", robot, planted_effects.FAMILIES[place % 2], 0))
+    return chosen + [
+        Question("numerics", robot, "any", 0) for robot in ("arm2-servo", "iiwa-servo")
+    ]
+
+
+def digest():
+    """Of the code that draws; items drawn by the same code need not be drawn again."""
+    here, text = Path(__file__).parent, hashlib.sha256()
+    for module in (
+        "friction", "plant", "machines", "signals", "motion", "world", "robots", "commands",
+        "sensing", "settings", "causes", "foreign", "sizing", "items", "recording",
+    ):  # fmt: skip
+        text.update((here / f"{module}.py").read_bytes())
+    return text.hexdigest()[:16]

@@ -1,0 +1,280 @@
+"""The library as a whole: complete, small, declared for what it fits, off at zero, and its page is
+current.
+"""
+
+import ast
+import inspect
+import textwrap
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+import pint
+import pytest
+
+from sims import effects
+from sims.core.simulator import InputError
+from sims.core.system import (
+    SYSTEM_KINDS,
+    Contact,
+    Force,
+    Friction,
+    HiddenStateEffect,
+    Input,
+    Level,
+    Sensor,
+    Signal,
+)
+from sims.effects.readme_table import render_effects_table
+from sims.system_simulator import make_effect_parameters
+from tests.sims.effects.effect_systems import NAMES, PAIRS, SIMULATORS, SYSTEMS, lanes, moment, run
+
+HOOKS = {
+    "force": (Force, Friction),
+    "contact": (Contact,),
+    "input": (Input,),
+    "sensor": (Sensor,),
+    "hidden": (HiddenStateEffect,),
+    "level": (Level,),
+}
+UNITS = pint.UnitRegistry()
+
+
+def test_the_designed_vocabulary_is_registered_and_importable():
+    registered = {entry.name for entry in entry_points(group="simgap.effects")}
+    assert set(NAMES) <= registered
+    assert [effects.get_effect(name).name for name in NAMES] == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_effect_is_at_most_fifteen_lines_of_body_with_a_sentence_and_a_source(name):
+    effect = effects.get_effect(name)
+    assert _body_lines(effect) <= 15
+    assert effect.says
+    assert effect.says[0].islower()
+    assert not effect.says.endswith(".")
+    assert effect.source
+    assert issubclass(effect, HOOKS[effect.hook])
+
+
+def _body_lines(effect):
+    """Return the number of lines of a class without its first line, docstrings and blank lines."""
+    source = textwrap.dedent(inspect.getsource(effect))
+    documented = {
+        row
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+        for row in range(node.lineno, node.end_lineno + 1)
+    }
+    lines = enumerate(source.splitlines(), 1)
+    return sum(bool(line.strip()) and row not in documented for row, line in lines) - 1
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_units_parse_and_ranges_hold_zero_or_begin_above_it(name):
+    effect = effects.get_effect(name)
+    for c in effect.coefficients:
+        for kind in SYSTEM_KINDS:
+            low, high = c.range(kind)
+            if c.unit(kind) is None:
+                assert (low, high) == (0, 0)
+                continue
+            UNITS.parse_units("dimensionless" if c.unit(kind) == "1" else c.unit(kind))
+            assert low < high
+            assert high > 0
+    assert any(effect.coefficients[0].unit(kind) is not None for kind in SYSTEM_KINDS)
+    assert len({c.name for c in effect.coefficients}) == len(effect.coefficients)
+    first = effect.coefficients[0]
+    assert all(first.range(kind)[0] <= 0 for kind in SYSTEM_KINDS), (
+        "the first coefficient must be able to switch it off"
+    )
+
+
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_coefficients_become_parameters_with_units(name, system):
+    effect = effects.get_effect(name)
+    parameters = make_effect_parameters(effect, SYSTEMS[system])
+    assert len(parameters) == len(effect.on(SYSTEMS[system])) >= 1
+    assert all(p.unit for p in parameters)
+    assert all(p.name.startswith(name) for p in parameters)
+
+
+def test_units_of_input_and_reading_are_those_of_the_system():
+    def unit(name, system, observed=()):
+        return make_effect_parameters(effects.get_effect(name), SYSTEMS[system], observed)[0].unit
+
+    assert (
+        unit("input.bias", "servo"),
+        unit("input.bias", "pendulum"),
+        unit("backlash", "slider"),
+    ) == (
+        "rad",
+        "N*m",
+        "N",
+    )
+    assert (unit("sensor.bias", "ball"), unit("sensor.bias", "ball", ["accel_z"])) == ("m", "m/s^2")
+    assert unit("sensor.drift", "pendulum", ["qd"]) == "rad/s/s"
+    assert unit("drag.quadratic", "ball") == "1/m"
+
+
+def test_what_fits_what():
+    there = {system: {name for name in NAMES if (name, system) in PAIRS} for system in SYSTEMS}
+    impact, flight = {"restitution.speed", "contact.friction"}, {"lift.magnus"}
+    guided = {
+        "friction.coulomb",
+        "friction.direction",
+        "friction.position",
+        "friction.stribeck",
+        "friction.warming",
+        "sensor.eccentricity",
+        "sensor.slip",
+        "state.limit",
+        "spring.linear",
+        "spring.cubic",
+        "force.ripple",
+        "friction.hysteresis",
+        "joint.backlash",
+        "joint.flexibility",
+    }
+    begins = ("input.", "friction.load", "supply.")
+    inputs = {name for name in NAMES if name.startswith(begins)} | {"backlash"}
+    servo = {"servo.deadband", "servo.derivative", "servo.profile"}
+    mechanical = set(NAMES) - {"state.overflow"}
+    joint = mechanical - impact - flight
+    assert there["ball"] == mechanical - guided - inputs - servo
+    level = {"gravity.scale", "friction.load_direction", "friction.load_quadratic"}
+    assert there["slider"] == joint - {"sensor.eccentricity"} - level - servo
+    assert there["pendulum"] == joint - {"wind"} - servo
+    assert there["servo"] == joint - {"wind", "input.power"}
+
+
+@pytest.mark.parametrize(
+    ("name", "system", "reason"),
+    [
+        ("lift.magnus", "slider", "three dimensions"),
+        ("input.delay", "ball", "no input"),
+        ("contact.friction", "pendulum", "no ground"),
+        ("gravity.scale", "slider", "no gravity"),
+        ("friction.load_direction", "slider", "nothing works against its drive"),
+        ("friction.coulomb", "ball", "flies freely"),
+        ("servo.deadband", "slider", "no servo"),
+        ("state.overflow", "slider", "no level"),
+        ("input.power", "servo", "a set point, not a force"),
+        ("joint.flexibility", "ball", "not one joint"),
+        ("sensor.eccentricity", "slider", "not defined for a linear system"),
+        ("wind", "pendulum", "not defined for a rotary system"),
+    ],
+)
+def test_what_does_not_fit_says_why(name, system, reason):
+    with pytest.raises(InputError, match=f"{system} cannot have effect {name}: .*{reason}"):
+        SIMULATORS[system](engine="batch", effects=[name])
+
+
+@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_zero_gives_nothing_and_shapes_are_those_of_the_lanes(name, system, count):
+    effect = effects.get_effect(name)()
+    rng = np.random.default_rng(7)
+    size = len(SYSTEMS[system].coordinates)
+    now = moment(
+        system, rng.normal(size=(count, size)), rng.normal(size=(count, size)), inputs=[0.7], t=0.3
+    )
+    off = lanes(*[0.0] * len(effect.coefficients), count=count)
+    on = lanes(*[0.1] * len(effect.coefficients), count=count)
+    signal = Signal(
+        rng.normal(size=(count, 6)),
+        np.full((count, 6), 0.01),
+        np.zeros((count, 1)),
+        np.ones((count, 6)),
+    )
+    if isinstance(effect, Force):
+        assert not effect.force(off, now).any()
+        assert effect.force(on, now).shape == (count, size)
+    elif isinstance(effect, Friction):
+        assert not effect.limit(off, now).any()
+        assert effect.limit(on, now).shape == (count, 1)
+    elif isinstance(effect, Contact):
+        assert not effect.friction(off).any()
+        e, speed = np.full((count, 1), 0.7), np.full((count, 1), 3.0)
+        assert np.array_equal(effect.restitution(off, e, speed), e)
+        assert effect.restitution(on, e, speed).shape == effect.friction(on).shape == (count, 1)
+    elif isinstance(effect, HiddenStateEffect):  # where it is off no engine asks it
+        state = effect.get_initial_state(on, now)
+        force, rate = effect.compute_force_and_rate(on, now, state)
+        assert force.shape == (count, size)
+        assert {a.shape for a in (rate, state.x, state.v, effect.get_inertia_share(on))} == {
+            (count, 1)
+        }
+    else:
+        change = effect.apply if isinstance(effect, Input) else effect.read
+        assert np.array_equal(change(off, signal), signal.values)
+        assert np.array_equal(effect.times(off, signal.times), signal.times)
+        assert change(on, signal).shape == effect.times(on, signal.times).shape == (count, 6)
+
+
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_friction_and_forces_are_safe_at_rest(name, system):
+    effect, size = effects.get_effect(name)(), len(SYSTEMS[system].coordinates)
+    rest = moment(system, np.zeros((1, size)), np.zeros((1, size)))
+    for value in (0.0, 0.1):
+        c = lanes(*[value] * len(effect.coefficients))
+        if isinstance(effect, (Force, Friction)):
+            given = effect.force(c, rest) if isinstance(effect, Force) else effect.limit(c, rest)
+            assert np.isfinite(given).all()
+
+
+INITIAL = {
+    "ball": {"z": 1.5, "vx": 1.0},
+    "pendulum": {"qd": 1.0},
+    "servo": {"q": 0.3},
+    "slider": {"v": 0.5},
+}
+
+
+@pytest.mark.parametrize(("name", "system"), PAIRS)
+def test_zero_changes_no_bit_of_a_run(name, system):
+    times = np.arange(60) * 0.02
+    inputs = {c.name: np.where(times > 0.4, 0.5, 0.1) for c in SYSTEMS[system].inputs}
+    base = run(system, times, inputs=inputs, **INITIAL[system])
+    assert np.array_equal(run(system, times, {name: 0.0}, inputs=inputs, **INITIAL[system]), base)
+
+
+def test_the_table_in_the_readme_is_current():
+    page = (Path(effects.__file__).parent / "README.md").read_text()
+    assert render_effects_table() in page, (
+        "paste the output of: python -m sims.effects.readme_table"
+    )
+
+
+def test_the_example_in_the_readme_works_and_is_short():
+    page = (Path(effects.__file__).parent / "README.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0]
+    scope = {}
+    exec(code, scope)
+    magnet = scope["Magnet"]
+    body = code[code.index("class Magnet") :].strip().splitlines()
+    assert len(body) <= 15
+    assert magnet.fits(SYSTEMS["slider"])
+    assert not magnet.fits(SYSTEMS["ball"])
+    now = moment("slider", [[0.1]], [[0.0]])
+    assert magnet().force(lanes(20.0, 0.1), now) == pytest.approx(-2 * np.exp(-1))
+    assert not magnet().force(lanes(0.0, 0.0), now).any()
+
+
+def test_a_third_party_effect_registers_once_and_is_usable_by_name(fresh_registries):
+    class Mine(effects.get_effect("drag.linear")):
+        name = "drag.mine"
+
+    class Other(Mine):
+        pass
+
+    effects.register_effect(Mine)
+    assert effects.get_effect("drag.mine") is Mine
+    assert "drag.mine" in effects.list_effects_for(SYSTEMS["ball"])
+    ball = SIMULATORS["ball"](engine="batch", effects=["drag.mine"])
+    assert [p.name for p in ball.parameters][-1] == "drag.mine"
+    effects.register_effect(Mine)
+    with pytest.raises(InputError, match=r"effect 'drag\.mine' exists already"):
+        effects.register_effect(Other)

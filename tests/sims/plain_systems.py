@@ -1,0 +1,21 @@
+"""The compiled engine's functions as plain Python, and lanes to give them."""
+
+from types import SimpleNamespace
+
+from sims.engines.compiled import element_stepping, lockstep_stepping, step_size
+
+PLAIN = SimpleNamespace(
+    choose_step_divisions=step_size.choose_step_divisions,
+    advance=element_stepping.step_block,
+    step_in_lockstep=lockstep_stepping.step_in_lockstep,
+)
+
+
+def lanes_of(simulator, theta, scenarios, monkeypatch):
+    """What the simulator gives its engine."""
+    seen = []
+    engine = simulator.engine
+    whole = engine.integrate
+    monkeypatch.setattr(engine, "integrate", lambda lanes: seen.append(lanes) or whole(lanes))
+    simulator.simulate_lanes(theta, scenarios)
+    return seen[0]

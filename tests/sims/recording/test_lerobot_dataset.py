@@ -1,0 +1,123 @@
+"""Datasets of LeRobot, versions 2 and 3, as folders of logs."""
+
+import json
+
+import numpy as np
+import pandas
+import pytest
+
+import simgap
+from bench.logs.inspection import load_recording
+from bench.logs.recording_digest import compute_recording_digest
+from sims.core.simulator import InputError
+from sims.recording.log_formats.lerobot_dataset import is_dataset, list_episodes, split_episode_path
+from sims.recording.log_formats.log_files import read_log
+
+RATE = 30.0
+JOINTS = ["shoulder_pan.pos", "elbow_flex.pos"]
+ARM = """<mujoco><compiler autolimits="true"/><worldbody>
+<body><joint name="shoulder_pan" axis="0 0 1" range="-110 110"/>
+<geom size="0.1" fromto="0 0 0 0.3 0 0" type="capsule"/>
+<body pos="0.3 0 0"><joint name="elbow_flex" axis="0 1 0" range="-100 100"/>
+<geom size="0.05" fromto="0 0 0 0.3 0 0" type="capsule"/></body></body></worldbody>
+<actuator><position name="pan" joint="shoulder_pan" kp="20"/>
+<position name="flex" joint="elbow_flex" kp="20"/></actuator></mujoco>"""
+
+
+def frames(episode, count=90):
+    """Rows of an episode, in degrees."""
+    times = np.arange(count) / RATE
+    goal = np.stack([40 * np.sin(2 * times + episode), 30 * np.cos(times + episode)], axis=1)
+    seen = np.stack([40 * np.sin(2 * times + episode - 0.1), 30 * np.cos(times - 0.1 + episode)], 1)
+    return pandas.DataFrame(
+        {
+            "action": list(goal.astype(np.float32)),
+            "observation.state": list(seen.astype(np.float32)),
+            "timestamp": times.astype(np.float32),
+            "frame_index": np.arange(count),
+            "episode_index": np.full(count, episode),
+            "task_index": np.zeros(count, dtype=np.int64),
+            "observation.images.top": [{"bytes": b"x", "path": "a.png"}] * count,
+        }
+    )
+
+
+def dataset(folder, version, names=JOINTS, count=4):
+    """Four episodes: a file each, or three in one and the fourth in two."""
+    data = folder / "data" / "chunk-000"
+    data.mkdir(parents=True)
+    (folder / "meta").mkdir()
+    features = {"action": {"names": names}, "observation.state": {"names": {"motors": names}}}
+    about = {"codebase_version": f"v{version}", "fps": RATE, "features": features}
+    (folder / "meta" / "info.json").write_text(json.dumps(about))
+    own = [frames(k) for k in range(count)]
+    if version == "2.1":
+        for k, rows in enumerate(own):
+            rows.to_parquet(data / f"episode_{k:06d}.parquet")
+    else:
+        half = len(own[-1]) // 2
+        pandas.concat([*own[:-1], own[-1][:half]]).to_parquet(
+            data / "file-000.parquet", index=False
+        )
+        own[-1][half:].to_parquet(data / "file-001.parquet", index=False)
+    return folder
+
+
+@pytest.mark.parametrize("version", ["2.1", "3.0"])
+def test_an_episode_is_a_log_whose_entries_have_their_names(tmp_path, version):
+    folder = dataset(tmp_path / "set", version)
+    assert is_dataset(folder)
+    paths = list_episodes(folder)
+    assert [path.parent.name for path in paths] == [f"episode_{k:06d}" for k in range(4)]
+    for number, path in enumerate(paths):
+        assert split_episode_path(path) == (folder, number)
+        log, rows = read_log(path), frames(number)
+        seen = np.stack(rows["observation.state"].to_numpy())
+        for k, joint in enumerate(JOINTS):
+            assert log.get_column(f"observation.state.{joint}").tolist() == seen[:, k].tolist()
+        assert (log.get_column("episode_index") == number).all()
+        assert log.get_column("timestamp").size == 90
+        assert "observation.images.top" not in log.columns
+
+
+@pytest.mark.parametrize("version", ["2.1", "3.0"])
+def test_a_dataset_is_imported_and_read(tmp_path, version):
+    dataset(tmp_path / "set", version)
+    arm, out = tmp_path / "arm.xml", tmp_path / "log.toml"
+    arm.write_text(ARM)
+    made = simgap.import_logs([tmp_path / "set"], arm, out)
+    recording, _ = load_recording(out)
+    assert [run.name for run in recording.runs] == [f"episode_{k:06d}" for k in range(4)]
+    run, rows = recording.runs[3], frames(3)
+    flex = np.deg2rad(np.stack(rows["observation.state"].to_numpy())[:, 1])
+    np.testing.assert_allclose(run.channels["q.elbow_flex"], flex, atol=1e-7)
+    pan = np.deg2rad(np.stack(rows["action"].to_numpy())[:, 0])
+    np.testing.assert_allclose(run.inputs["u.pan"], pan, atol=1e-7)
+    assert "time: column timestamp in s, 30 Hz" in made.guessed
+    before = compute_recording_digest(out)
+    (tmp_path / "set" / "meta" / "info.json").write_text('{"features": {}}')
+    assert compute_recording_digest(out) != before
+
+
+def test_entries_without_names_have_places(tmp_path):
+    folder = dataset(tmp_path / "set", "2.1", names=None)
+    log = read_log(list_episodes(folder)[1])
+    assert {"observation.state[0]", "observation.state[1]", "action[1]"} <= set(log.list_columns())
+
+
+def test_what_is_not_there_or_not_whole_is_one_line(tmp_path):
+    folder = dataset(tmp_path / "set", "2.1")
+    with pytest.raises(InputError, match=r"set: no episode 9; there are: 0 to 3"):
+        read_log(folder / "episode_000009" / "frames")
+    (folder / "data" / "chunk-000" / "episode_000001.parquet").write_bytes(b"PAR1 and no more")
+    with pytest.raises(InputError, match=r"episode_000001.parquet: not a Parquet file: "):
+        read_log(folder / "episode_000000" / "frames")
+    (tmp_path / "arm.xml").write_text(ARM)
+    with pytest.raises(InputError, match=r"\.parquet: not a Parquet file: "):
+        simgap.import_logs([folder], tmp_path / "arm.xml", tmp_path / "log.toml")
+    assert not (tmp_path / "log.toml").exists()
+    frames(0).drop(columns="episode_index").to_parquet(
+        folder / "data" / "chunk-000" / "episode_000001.parquet"
+    )
+    with pytest.raises(InputError, match=r"episode_000001.parquet: not a Parquet file: .*episode"):
+        list_episodes(folder)

@@ -1,0 +1,60 @@
+"""Commands on their ways to several drives, looked at together."""
+
+import numpy as np
+import pytest
+
+from sims.core.simulator import Scenario
+from sims.robot.dynamics.applied_inputs import compute_applied_inputs
+from tests.sims.robot.sample_arms import ARM
+from tests.sims.robot.test_series_joints import made
+
+STEP, STEPS = 0.002, 305
+TIMES = np.arange(61) / 100.0
+RNG = np.random.default_rng(8)
+WAY = {name: 0.05 * RNG.normal(size=61).cumsum() for name in ("u.m_shoulder", "u.m_elbow")}
+EFFECTS = {
+    "input.delay@m_shoulder": 0.013,
+    "input.delay@m_elbow": 0.021,
+    "input.rate@m_shoulder": 1.5,
+    "input.rate@m_elbow": 2.5,
+    "input.lag@m_elbow": 0.03,
+    "backlash@m_shoulder": 0.02,
+}
+LANES = (
+    {"input.delay@m_shoulder"},
+    {"input.rate@m_elbow"},
+    set(),
+    {"input.delay@m_shoulder", "input.rate@m_shoulder", "input.rate@m_elbow"},
+    {"input.delay@m_elbow", "input.rate@m_elbow", "input.lag@m_elbow"},
+    {"backlash@m_shoulder", "input.delay@m_elbow"},
+)
+
+
+def acting(lanes):
+    kind = made(ARM)
+    effects = kind(observe=["q.elbow"], effects=list(EFFECTS)).effects
+    return tuple(
+        (effect, np.array([[[EFFECTS[effect.name] * (effect.name in lane)] for lane in lanes]]))
+        for effect in effects
+    )
+
+
+@pytest.mark.parametrize("share", [1.0, 1e-6])
+@pytest.mark.parametrize("offset", [0.0, 0.0031])
+def test_what_a_lane_feels_does_not_hang_on_its_company_nor_on_other_drives(offset, share):
+    earlier = {"u.m_elbow": np.array([[-0.3, -0.1], [0.4, 0.2]])}
+    run = Scenario(TIMES, {}, WAY, offset=offset, before=earlier, linear=frozenset({"u.m_elbow"}))
+
+    def feels(lanes, names=WAY):
+        signals = {name: WAY[name] for name in names}
+        return compute_applied_inputs(STEP, run, signals, acting(lanes), len(lanes), STEPS, share)
+
+    together = feels(LANES)
+    bare = feels(LANES[2:3])
+    for number, lane in enumerate(LANES):
+        alone = feels([lane])
+        for name, own in together.items():
+            np.testing.assert_array_equal(own[number], alone[name][0])
+            np.testing.assert_array_equal(own[number], feels(LANES, [name])[name][number])
+            touched = any(effect.endswith(name[1:].replace(".", "@")) for effect in lane)
+            assert (own[number] != bare[name][0]).any() == touched

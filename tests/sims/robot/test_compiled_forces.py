@@ -1,0 +1,148 @@
+"""Forces of effects as one program: the same numbers as numpy's, or numpy itself."""
+
+import numpy as np
+import pytest
+
+from bench.core.plugin_registries import make_robot_simulator
+from sims import effects as library
+from sims.core.simulator import Scenario
+from sims.core.system import Coefficient, Force
+from sims.robot import robot_simulator
+from sims.robot.dynamics.active_effects import is_evaluated_per_step
+from sims.robot.places.effect_places import make_placed_effect
+from tests.sims.robot.sample_arms import ARM
+
+TIMES = np.arange(60) / 100.0
+SCENARIO = Scenario(
+    TIMES,
+    {"q.elbow": 0.4, "qd.shoulder": 0.5},
+    {
+        "u.m_shoulder": 0.3 * np.sin(7.0 * TIMES),
+        "u.m_elbow": np.sin(9.0 * TIMES),
+        "u.m_spin": np.cos(5.0 * TIMES),
+    },
+)
+
+
+@pytest.fixture
+def arm(tmp_path):
+    (tmp_path / "arm.xml").write_text(ARM)
+    return make_robot_simulator(tmp_path / "arm.xml")
+
+
+def asked(kind):
+    """Every effect of the library that is asked in every step, at each place that has it."""
+    placed = (
+        one for name in library.list_names() for one in kind.system.placed(library.get_effect(name))
+    )
+    found = [effect() for effect in placed]
+    return [e for e in found if is_evaluated_per_step(e) and e.place != "*"]
+
+
+def by_numpy(monkeypatch):
+    monkeypatch.setattr(robot_simulator, "compile_forces", lambda forces: None)
+
+
+def test_every_effect_moves_the_robot_as_it_does_without_the_compiler(arm, monkeypatch, capsys):
+    effects = asked(arm)
+    assert len(effects) > 25
+    families = {effect.name for effect in effects}
+    made = arm(effects=[type(effect) for effect in effects])
+    size = len(made.parameters)
+    theta = np.zeros((len(effects) + 1, size))
+    column = 0
+    for lane, effect in enumerate(effects):
+        for c in effect.coefficients:
+            low, high = c.plausible[0]
+            theta[lane, column] = (low * high) ** 0.5 if low > 0 else 0.3 * high
+            column += 1
+    assert column == size
+    programs = []
+    once = robot_simulator.compile_forces
+    monkeypatch.setattr(
+        robot_simulator, "compile_forces", lambda f: programs.append(once(f)) or programs[-1]
+    )
+    quick = made.simulate(theta, SCENARIO)
+    assert programs
+    assert all(programs), "none was left to numpy"
+    assert capsys.readouterr().err == ""
+    by_numpy(monkeypatch)
+    slow = made.simulate(theta, SCENARIO)
+    np.testing.assert_allclose(quick, slow, rtol=1e-9, atol=1e-11)
+    moved = np.abs(quick[:-1] - quick[-1]).max(axis=(1, 2)) > 1e-9
+    still = {effect.name for effect, there in zip(effects, moved, strict=True) if not there}
+    assert moved.mean() > 0.8, f"{still} of {families} change nothing"
+
+
+class Plain(Force):
+    """Of a plugin, at a joint."""
+
+    name, noun, says = "plain", "plain push", "it pushes"
+    at, needs, source = "joint", "", "none"
+    coefficients = (Coefficient("coefficient", ("N", "N", "N*m"), ((0, 1), (0, 1), (0, 1))),)
+
+    def force(self, c, moment):
+        return c[0] * np.cos(moment.x)
+
+
+class Branching(Plain):
+    """What asks for numbers cannot be traced."""
+
+    name = "branching"
+
+    def force(self, c, moment):
+        return c[0] * (moment.x if (np.asarray(moment.v) > 0).any() else -moment.x)
+
+
+class Changing(Plain):
+    """What gives other numbers each time cannot be trusted to be what was traced."""
+
+    name = "changing"
+    asked = 0
+
+    def force(self, c, moment):
+        type(self).asked += 1
+        return c[0] * float(self.asked) * np.ones_like(moment.x)
+
+
+@pytest.mark.parametrize(
+    ("effect", "says"),
+    [(Plain, ""), (Branching, "turns what it is given into an array"), (Changing, "other numbers")],
+)
+def test_what_does_not_trace_is_told_once_and_asked_by_numpy(
+    arm, effect, says, capsys, monkeypatch
+):
+    elbow = next(spot for spot in arm.system.spots["joint"] if spot.name == "elbow")
+    made = arm(effects=[make_placed_effect(effect, elbow)])
+    theta = np.array([[0.2], [0.0]])
+    first = made.simulate(theta, SCENARIO)
+    if effect is not Changing:
+        by_numpy(monkeypatch)
+        np.testing.assert_allclose(made.simulate(theta, SCENARIO), first, rtol=1e-9, atol=1e-11)
+    assert np.abs(first[0] - first[1]).max() > 1e-4
+    made.simulate(theta, SCENARIO)
+    told = capsys.readouterr().err
+    assert told.count("\n") == (1 if says else 0)
+    assert says in told
+    assert not says or f"effect {effect.name}@elbow is asked without the compiler" in told
+
+
+def test_an_effect_alone_and_the_same_one_in_its_family_act_side_by_side(arm, monkeypatch):
+    alone, family = (arm.system.effect(f"friction.load@{place}") for place in ("elbow", "*"))
+    made = arm(effects=[alone, family])
+    size = len(made.parameters)
+    theta = np.diag([0.3] * size)
+    quick = made.simulate(theta, SCENARIO)
+    by_numpy(monkeypatch)
+    np.testing.assert_allclose(quick, made.simulate(theta, SCENARIO), rtol=1e-9, atol=1e-11)
+    lane = [p.name for p in made.parameters].index("friction.load@*.coefficient@elbow")
+    np.testing.assert_array_equal(quick[0], quick[lane])
+
+
+def test_a_sensor_of_the_drives_shows_what_one_battery_leaves_to_each(arm):
+    battery = arm.system.effect("supply.sag")
+    made = arm(effects=[battery], observe=["q.shoulder", "tau.shoulder", "tau.elbow"])
+    inputs = {"u.m_shoulder": np.full(60, 0.05), "u.m_elbow": np.ones(60)}
+    shown = made.simulate(np.array([[0.3], [0.0]]), Scenario(TIMES, {}, inputs))[:, 0, 1:]
+    np.testing.assert_allclose(shown[1], [60 * 0.05, 2.0])
+    np.testing.assert_allclose(shown[0], np.array([3.0, 2.0]) / (1 + 0.3 * 5.0))

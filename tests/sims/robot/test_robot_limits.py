@@ -1,0 +1,149 @@
+"""Ranges of a robot's coefficients end at physical limits, and follow the whole robot."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.diagnosis.evaluation.coefficient_bounds import (
+    BEYOND_MODEL,
+    bound_of,
+    compute_coefficient_bounds,
+    is_unusual,
+)
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from sims.robot.places.centre_of_mass_limits import observable_axes, reach
+from sims.robot.places.typical_forces import coefficient_scales, compute_joint_scales
+from sims.robot.robot_simulator import make_robot_simulator
+from tests.bench.diagnosis.explained_samples import recorded
+from tests.sims.robot.sample_arms import ARM, robot
+
+TIMES = np.linspace(0.0, 0.2, 21)
+YAW = """<mujoco><worldbody><body name="column">
+  <joint name="yaw" axis="0 0 1" damping="0.3" armature="0.02"/>
+  <inertial pos="0 0 0.05" mass="2" diaginertia="0.01 0.01 0.008"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.1" size="0.04"/>
+  <body name="upper" pos="0 0 0.1">
+    <joint name="pitch" axis="0 1 0" frictionloss="0.2"/>
+    <inertial pos="0.15 0 0" mass="1.5" diaginertia="0.002 0.015 0.015"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/>
+    <body name="last" pos="0.3 0 0">
+      <joint name="roll" axis="1 0 0"/>
+      <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>
+    </body>
+  </body>
+</body></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def yaw(tmp_path_factory):
+    return robot(tmp_path_factory.mktemp("yaw"), YAW)
+
+
+@pytest.fixture(scope="module")
+def bounds(yaw):
+    kind = make_robot_simulator(yaw)
+    simulator = kind(observe=["q.yaw", "q.pitch"])
+    made = recorded(simulator, np.zeros(0), [{}], TIMES)
+    there = RunEvaluator(kind, made, made.runs, None)
+    return lambda name: compute_coefficient_bounds(there, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "least"),
+    [
+        ("drag.linear@yaw", -0.3),
+        ("inertia.armature@yaw", -0.02),
+        ("friction.coulomb@pitch", -0.2),
+        ("friction.coulomb@yaw", 0.0),
+        ("mass.scale@upper", -0.99),
+        ("inertia.scale@upper", -0.99),
+        ("sensor.gain@q.yaw", -0.8),
+    ],
+)
+def test_no_total_is_negative(bounds, name, least):
+    ((low, high),) = bounds(name)
+    assert low == pytest.approx(least)
+    assert high > 3.0
+
+
+def test_a_fit_may_exceed_the_usual_damping_two_hundred_times(bounds):
+    ((_, high),) = bounds("drag.linear@yaw")
+    assert high >= 60.0
+
+
+def test_members_of_a_family_have_limits_of_their_own(bounds):
+    lows = [low for low, _ in bounds("friction.coulomb@*")]
+    assert lows == pytest.approx([0.0, -0.2, 0.0])
+
+
+def test_a_centre_of_mass_stays_within_its_link(yaw, bounds):
+    x, y, z = bounds("mass.offset@upper")
+    # The link reaches from the hinge at -0.15 m to the next joint at 0.15 m.
+    assert -0.25 < x[0] < -0.15
+    assert 0.15 < x[1] < 0.25
+    assert max(*np.abs(y), *np.abs(z)) < 0.15
+    assert np.all(reach(yaw, "upper")[:, 0] < 0.0)
+    # Neither geoms nor children: as long as the link that carries it.
+    assert np.abs(reach(yaw, "last")).max() < 0.4
+
+
+def test_an_offset_along_the_only_axis_of_rotation_is_fixed(yaw, bounds):
+    assert observable_axes(yaw, "column") == (0, 1)
+    assert bounds("mass.offset@column")[2] == (0.0, 0.0)
+    assert observable_axes(yaw, "upper") == (0, 1, 2)
+
+
+def test_parallel_hinges_hide_one_axis_of_all_their_links(tmp_path):
+    planar = robot(tmp_path, ARM)
+    assert observable_axes(planar, "fore") == (0, 2)
+    # The wheel turns about a second direction.
+    assert observable_axes(planar, "wheel") == (0, 1, 2)
+
+
+def test_an_axis_that_is_fixed_cannot_be_seen_in_any_motion(yaw, tmp_path):
+    moved = robot(tmp_path, YAW.replace('pos="0 0 0.05"', 'pos="0 0 0.09"'))
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        position, rate = rng.uniform(-1, 1, 3), rng.uniform(-3, 3, 3)
+        found = []
+        for one in (yaw, moved):
+            data = mujoco.MjData(one.compiled)
+            data.qpos[:], data.qvel[:] = position, rate
+            mujoco.mj_forward(one.compiled, data)
+            found.append(data.qacc[:2].copy())
+        np.testing.assert_allclose(*found, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["slide", "free"])
+def test_axes_of_what_slides_or_floats(tmp_path, kind):
+    text = f"""<mujoco><worldbody><body name="box"><joint name="j" type="{kind}"/>
+      <geom type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>"""
+    assert observable_axes(robot(tmp_path, text), "box") == (() if kind == "slide" else (0, 1, 2))
+
+
+def test_a_link_without_inertia_does_not_shrink_the_ranges_of_its_joint(yaw, tmp_path):
+    model = YAW.replace("1 0 0", "0 1 0")
+    light = robot(tmp_path, model)
+    assert compute_joint_scales(light).inertia[2] < 1e-7
+    assert coefficient_scales(light).inertia[2] > 1e-4
+    assert coefficient_scales(light).force[2] > 1e-3
+    np.testing.assert_array_equal(
+        coefficient_scales(light).inertia[:2], compute_joint_scales(light).inertia[:2]
+    )
+    system = make_robot_simulator(yaw).system
+    ((low, high),) = system.find_effect("inertia.armature@roll").coefficients[0].plausible[:1]
+    assert (low, high > 1e-4) == (0.0, True)
+    # Set free, too: within 1e-8 kg m^2 it could only end at a bound.
+    (free,) = make_robot_simulator(yaw, ["armature@roll"]).system.parameters
+    assert free.bounds[1] > 4e-4
+
+
+def test_bounds_far_apart_are_not_met_by_numbers_near_zero():
+    assert bound_of(-0.00099, -0.001, BEYOND_MODEL) is None
+    assert bound_of(-0.001, -0.001, BEYOND_MODEL) == "low"
+    assert bound_of(BEYOND_MODEL, -0.001, BEYOND_MODEL) == "high"
+
+
+@pytest.mark.parametrize(("value", "unusual"), [(0.5, False), (0.6, False), (0.61, True)])
+def test_a_value_beyond_the_plausible_range_is_unusual(value, unusual):
+    assert is_unusual(value, -0.3, 0.6) is unusual

@@ -1,0 +1,350 @@
+"""Joints that give or have play, and friction that remembers: closed forms, where runs begin, what
+a tangent about them says, and the file that holds them.
+"""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sims.core.simulator import Scenario
+from sims.extended_simulator import FittedValue
+from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.export.apply_causes import apply_causes
+from sims.robot.export.round_trip_check import check_written_files
+from sims.robot.export.write_model_file import write_model_files
+from sims.robot.robot_model import RobotModel
+from sims.robot.robot_simulator import make_robot_simulator
+from tests.sims.robot.sample_arms import ARM
+from tests.sims.robot.sample_arms import robot as arm
+
+DRIVE, LINK = 0.02, 0.08  # kg m^2
+WHEEL = f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.001" integrator="RK4" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body>
+      <joint name="axle" axis="0 0 1" armature="{DRIVE}"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="{LINK} {LINK} {LINK}"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="m_axle" joint="axle"/></actuator>
+</mujoco>
+"""
+TIMES = np.arange(101) / 100.0
+STIFF = 30.0  # N m/rad
+
+
+def made(text, **given):
+    spec = mujoco.MjSpec.from_string(text)
+    return make_robot_simulator(RobotModel(Path("robot.xml"), "mjcf", spec, digest=text, **given))
+
+
+def moved(kind, effects, coefficients, scenario, observe=("q.axle",)):
+    """(T, C) of one lane; coefficients one after another."""
+    simulator = kind(observe=list(observe), effects=list(effects))
+    return simulator.simulate(np.array([coefficients]), scenario)[0]
+
+
+def pushed(torque, times=TIMES):
+    return Scenario(times, {}, {"u.m_axle": np.full(times.size, torque)})
+
+
+def test_a_drive_on_a_spring_swings_as_two_masses_do():
+    """x = u t^2 / 2 (J + M) + u M (1 - cos w t) / J (J + M) w^2, w^2 = k (1 / J + 1 / M)."""
+    seen = moved(made(WHEEL), ["joint.flexibility@axle"], [1 / STIFF, 0.0], pushed(0.5))
+    both, w = DRIVE + LINK, np.sqrt(STIFF * (1 / DRIVE + 1 / LINK))
+    swing = 0.5 * LINK / (DRIVE * both * w**2) * (1 - np.cos(w * TIMES))
+    np.testing.assert_allclose(seen[:, 0], 0.25 / both * TIMES**2 + swing, atol=2e-7)
+    assert swing.max() > 5e-3
+
+
+def test_a_drive_goes_alone_through_its_gap_and_then_takes_the_link_along():
+    """In the gap x'' = u / J; behind it, struck without rebound, (J + M) x'' = u."""
+    gap, torque = 0.05, 0.1
+    seen = moved(made(WHEEL), ["joint.backlash@axle"], [gap], pushed(torque))[:, 0]
+    meets = np.sqrt(2 * DRIVE * gap / 2 / torque)
+    alone = meets > TIMES
+    np.testing.assert_allclose(seen[alone], 0.5 * torque / DRIVE * TIMES[alone] ** 2, atol=1e-9)
+    together, later = DRIVE + LINK, np.maximum(TIMES - meets, 0.0)
+    speed = torque * meets / together
+    after = gap / 2 + speed * later + 0.5 * torque / together * later**2
+    # The blow takes some milliseconds, in which the flank gives a little.
+    late = meets + 0.03 < TIMES
+    np.testing.assert_allclose(seen[late], after[late], atol=2e-4)
+    assert alone.sum() > 8
+
+
+def test_friction_that_builds_up_takes_the_energy_that_it_takes_over_its_way():
+    """(J + M) v^2 / 2 = u x - F (x - d (1 - exp(-x / d))) from rest, without a reversal."""
+    torque, dry, way = 0.3, 0.2, 0.05
+    q, v = moved(
+        made(WHEEL), ["friction.hysteresis@axle"], [dry, way], pushed(torque), ("q.axle", "qd.axle")
+    ).T
+    work = torque * q - dry * (q - way * (1 - np.exp(-q / way)))
+    np.testing.assert_allclose(0.5 * (DRIVE + LINK) * v**2, work, atol=2e-6)
+    assert q[-1] > 5 * way
+
+
+def test_the_drive_that_a_file_does_not_state_is_a_number():
+    """With J = 0.25 M of its own the common motion is that of 1.25 M."""
+    kind = made(WHEEL.replace(f'armature="{DRIVE}"', ""))
+    names = [c.name for c in kind.system.effect("joint.flexibility@axle").coefficients]
+    assert names == ["compliance", "damping", "rotor"]
+    seen = moved(kind, ["joint.flexibility@axle"], [1 / STIFF, 0.2, 0.25], pushed(0.5))[:, 0]
+    slope = np.polyfit(TIMES[60:], np.gradient(seen, TIMES)[60:], 1)[0]
+    assert slope == pytest.approx(0.5 / (1.25 * LINK), rel=2e-3)
+    stated = made(WHEEL).system.effect("joint.flexibility@axle").coefficients
+    assert [c.name for c in stated] == ["compliance", "damping"], "the armature is the drive's"
+
+
+PENDULUM = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body>
+      <joint name="axle" axis="0 1 0" armature="0.02"/>
+      <inertial pos="0.3 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+    </body>
+  </worldbody>
+  <actuator><position name="m_axle" joint="axle" kp="60" kv="3"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("effects", "c"),
+    [
+        (["joint.flexibility@axle"], [0.003, 0.05]),
+        (["joint.backlash@axle"], [0.01]),
+        (["joint.backlash@axle", "joint.flexibility@axle"], [0.01, 0.003, 0.05]),
+    ],
+)
+def test_links_hang_on_their_springs_and_flanks_when_a_run_begins(effects, c):
+    """A servo that holds what the link weighs holds it at rest: nothing moves."""
+    held = {"u.m_axle": np.full(TIMES.size, -9.81 * 0.3 / 60.0)}
+    seen = moved(made(PENDULUM), effects, c, Scenario(TIMES, {}, held))
+    # Not hung, it would fall by some 5 mrad.
+    np.testing.assert_allclose(seen, 0.0, atol=2e-4)
+
+
+PLANAR = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.0005" integrator="RK4" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body>
+      <joint name="shoulder" axis="0 0 1"/>
+      <inertial pos="0.2 0 0" mass="1.5" diaginertia="0.02 0.02 0.02"/>
+      <body pos="0.4 0 0">
+        <joint name="elbow" axis="0 0 1" armature="0.02"/>
+        <inertial pos="0.15 0 0" mass="0.8" diaginertia="0.008 0.008 0.008"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="m_elbow" joint="elbow"/></actuator>
+</mujoco>
+"""
+GIVES, RATIO, GAP = 0.02, 0.1, 0.06  # rad/(N m), share of the critical damping, rad
+
+
+def through(apart, speed, stiffness, damping, gap):
+    """What passes on: gap first, then spring and damper, whose flanks push and never pull."""
+    beyond = apart - min(max(apart, -gap / 2), gap / 2)
+    force = stiffness * beyond + damping * speed
+    if gap == 0.0:
+        return force
+    return max(force, 0.0) if beyond > 0 else min(force, 0.0) if beyond < 0 else 0.0
+
+
+def planar(times, torque, gap, compliance=GIVES):
+    """(T, 2) of the arm's joints, the elbow's on its drive's side, by scipy; begun at rest."""
+    moved = 0.008 + 0.8 * 0.15**2
+    stiffness = 1 / compliance
+    # Counted by what the file states of the joint: links and drive.
+    damping = 2 * RATIO * np.sqrt(stiffness * (moved + 0.02))
+
+    def rates(t, s):
+        _, y, x, first, link, drive = s
+        cosine, sine = 0.8 * 0.4 * 0.15 * np.cos(y), 0.8 * 0.4 * 0.15 * np.sin(y)
+        far = moved + cosine
+        near = 0.02 + 1.5 * 0.2**2 + 0.8 * 0.4**2 + moved + 2 * cosine
+        passed = through(x - y, drive - link, stiffness, damping, gap)
+        pulls = sine * (2 * first * link + link**2), passed - sine * first**2
+        bends = np.linalg.solve([[near, far], [far, moved]], pulls)
+        return [first, link, drive, *bends, (torque(t) - passed) / 0.02]
+
+    given = {"rtol": 1e-8, "atol": 1e-10, "max_step": 1e-3, "t_eval": times}
+    state = solve_ivp(rates, (0, times[-1]), np.zeros(6), **given).y
+    return state[[0, 2]].T
+
+
+def test_a_gap_before_a_spring_moves_an_arm_as_scipy_does():
+    """One element: through the gap nothing passes, behind it the spring and the damper do."""
+    times = np.arange(81) / 100.0
+    run = Scenario(times, {}, {"u.m_elbow": np.where(times < 0.4, 0.6, -0.6)})
+    spring, play, both = (
+        "joint.flexibility@elbow",
+        "joint.backlash@elbow",
+        ("q.shoulder", "q.elbow"),
+    )
+    seen = moved(made(PLANAR), [spring, play], [GIVES, RATIO, GAP], run, both)
+    turned = moved(made(PLANAR), [play, spring], [GAP, GIVES, RATIO], run, both)
+    np.testing.assert_array_equal(seen, turned)
+    exact, flexible, loose = (
+        planar(times, lambda t: 0.6 if t < 0.4 else -0.6, *one)
+        for one in ((GAP,), (0.0,), (GAP, GIVES / 100))
+    )
+    np.testing.assert_allclose(seen, exact, atol=1e-4)
+    for alone in (flexible, loose):
+        assert np.abs(alone - exact).max() > 0.02
+
+
+SWUNG = Scenario(
+    np.arange(61) / 100.0,
+    {"q.elbow": 0.3, "qd.shoulder": 0.5},
+    {"u.m_elbow": 0.4 * np.sin(9.0 * np.arange(61) / 100.0)},
+)
+
+
+def about(kind, effects, c):
+    """The neighbourhood of a motion in which effects act, and the simulator with others besides."""
+    simulator = kind(observe=["q.shoulder", "q.elbow", "qd.elbow"], effects=list(effects))
+    theta = np.array(c)
+    x, v = np.array([0.0, 0.3, 0.0]), np.array([0.5, 0.0, 0.0])
+    return simulator, theta, RunLinearisation(simulator, theta, SWUNG, x, v)
+
+
+@pytest.mark.parametrize(
+    ("effect", "c"),
+    [
+        ("joint.flexibility@elbow", (0.02, 0.1, 0.3)),
+        ("friction.hysteresis@elbow", (0.1, 0.05)),
+        ("friction.hysteresis@shoulder", (0.6, 0.03)),
+    ],
+)
+def test_the_tangent_about_such_a_motion_is_that_of_the_simulation(effect, c):
+    kind = made(ARM.replace('frictionloss="0.05"', ""))
+    others = {"force.bias@elbow": 1e-4, "drag.linear@shoulder": 1e-4}
+    simulator, theta, linear = about(kind, [effect, *others], [*c, 0.0, 0.0])
+    added = [(simulator.effects[1 + k], np.array([d])) for k, d in enumerate(others.values())]
+    found, _ = linear.responses(added)
+    lanes = np.tile(theta, (3, 1))
+    for k, size in enumerate(others.values()):
+        lanes[1 + k, len(c) + k] = size
+    seen = simulator.simulate(lanes, SWUNG)
+    for response, other in zip(found, seen[1:], strict=True):
+        exact = other - seen[0]
+        error = np.abs(response - exact).max(axis=0) / np.abs(exact).max()
+        assert error.max() < 0.05, effect
+    begun = linear.begun()
+    nudged = Scenario(SWUNG.times, {**SWUNG.initial, "q.elbow": 0.3 + 1e-5}, SWUNG.inputs)
+    exact = (simulator.simulate(theta[None], nudged)[0] - seen[0]) / 1e-5
+    # How links hang when a run begins changes with its pose, which is left out of it.
+    assert np.abs(begun[1] - exact).max() < 0.1 * np.abs(exact).max()
+
+
+def test_what_such_effects_change_is_what_the_simulation_shows():
+    kind = made(ARM.replace('frictionloss="0.05"', ""))
+    effects = ["joint.flexibility@elbow", "joint.backlash@shoulder", "friction.hysteresis@elbow"]
+    sizes = [np.array([0.02, 0.1, 0.3]), np.array([0.01]), np.array([1e-4, 0.05])]
+    simulator, theta, linear = about(kind, effects, np.zeros(6))
+    found, _ = linear.responses(list(zip(simulator.effects, sizes, strict=True)))
+    begin = 0
+    for k, c in enumerate(sizes):
+        lanes = np.tile(theta, (2, 1))
+        lanes[1, begin : begin + c.size] = c
+        begin += c.size
+        plain, other = simulator.simulate(lanes, SWUNG)
+        exact = other - plain
+        close = 1e-9 if k < 2 else 0.02 * np.abs(exact).max()
+        np.testing.assert_allclose(found[k], exact, atol=close, err_msg=effects[k])
+
+
+def number(value):
+    return FittedValue(value, "1", None, None)
+
+
+CAUSES = {
+    "joint.flexibility@elbow": {
+        "compliance": number(0.02), "damping": number(0.05), "rotor": number(0.3)
+    },
+    "joint.backlash@shoulder": {"gap": number(0.02)},
+    "mass.scale@fore": {"coefficient": number(0.1)},
+}  # fmt: skip
+
+
+LOOSE = {**CAUSES, "joint.backlash@elbow": {"gap": number(0.02), "rotor": number(0.0)}}
+
+
+def test_a_file_holds_joints_in_series_and_moves_as_the_simulator_does(tmp_path):
+    robot = arm(tmp_path)
+    done = write_model_files(robot, CAUSES, "log.csv")
+    check_written_files(robot, CAUSES, done)
+    assert "the elbow is the one that wears" in done.xml, "it stays its author's"
+    assert done.xml.count("fitted to log.csv") == 4
+    model = mujoco.MjSpec.from_string(done.xml).compile()
+    assert model.joint("elbow_flexibility").stiffness[0] == pytest.approx(50.0)
+    assert model.joint("shoulder_backlash").range == pytest.approx([-0.01, 0.01])
+
+
+def test_a_file_holds_a_gap_before_a_spring_as_flanks_that_give(tmp_path):
+    robot = arm(tmp_path)
+    done = write_model_files(robot, LOOSE, "log.csv")
+    check_written_files(robot, LOOSE, done)
+    model = mujoco.MjSpec.from_string(done.xml).compile()
+    joint = model.joint("elbow_transmission")
+    assert joint.range == pytest.approx([-0.01, 0.01])
+    inverse = model.dof_invweight0[joint.dofadr[0]]
+    assert model.jnt_solref[joint.id, 0] == pytest.approx(-50.0 * inverse)
+
+
+@pytest.mark.parametrize("causes", [CAUSES, LOOSE], ids=["spring", "gap before it"])
+def test_a_rollout_of_the_file_moves_as_the_simulator_does(tmp_path, causes):
+    """Where nothing hangs, what is in series begins in the simulator where it does in the file."""
+    robot = arm(tmp_path, ARM.replace("0 0 -9.81", "0 0 0"))
+    model = mujoco.MjSpec.from_string(write_model_files(robot, causes).xml).compile()
+    data = mujoco.MjData(model)
+    data.ctrl[:2] = 0.1, 0.3
+    rows = []
+    for _ in range(50):
+        rows.append([data.joint(name).qpos[0] for name in ("shoulder", "elbow")])
+        mujoco.mj_step(model, data, 10)
+    simulator = make_robot_simulator(robot)(observe=["q.shoulder", "q.elbow"], effects=list(causes))
+    lane = np.array([[n.value for cause in causes.values() for n in cause.values()]])
+    pushed = {"u.m_shoulder": np.full(50, 0.1), "u.m_elbow": np.full(50, 0.3)}
+    seen = simulator.simulate(lane, Scenario(TIMES[:50], {}, pushed))[0]
+    np.testing.assert_allclose(seen, rows, atol=1e-9)
+    assert np.ptp(seen, axis=0).min() > 0.02
+
+
+def test_keyframes_that_lack_coordinates_are_left_out_and_said(tmp_path):
+    text = ARM.replace("</mujoco>", '<keyframe><key qpos="0 0.1 0"/></keyframe></mujoco>')
+    applied = apply_causes(arm(tmp_path, text), CAUSES)
+    assert applied.model.nkey == 0
+    assert any(line.startswith("keyframes are left out") for line in applied.notes)
+
+
+def test_a_spring_behind_a_drive_that_was_found_before_takes_its_inertia_over():
+    """J c of the armature that the model has is the rotor, whatever rotor is asked about: what
+    hardly gives then changes hardly anything.
+    """
+    kind = made(WHEEL.replace(f'armature="{DRIVE}"', ""))
+    run = Scenario(TIMES, {}, {"u.m_axle": 0.4 * np.sin(9.0 * TIMES)})
+    names = ["inertia.armature@axle", "joint.flexibility@axle"]
+    simulator = kind(observe=["q.axle"], effects=names)
+    spring = simulator.effects[1]
+    theta = np.array([DRIVE, 0.0, 0.0, 0.0])
+    about = RunLinearisation(simulator, theta, run, np.zeros(1), np.zeros(1))
+    sizes = [np.array([c, 0.05, 0.5]) for c in (1 / STIFF, 1e-4 / STIFF)]
+    (given, slight), _ = about.compute_effect_responses([(spring, c) for c in sizes])
+    lanes = np.array([theta, [0.0, 1 / STIFF, 0.05, DRIVE / LINK]])
+    plain, other = simulator.simulate(lanes, run)
+    np.testing.assert_allclose(given, other - plain, atol=1e-9)
+    assert np.abs(slight).max() < 0.01 * np.abs(given).max()
+    np.testing.assert_array_equal(sizes[0], [1 / STIFF, 0.05, 0.5], "nobody's numbers are changed")
+    taken = spring.taking(sizes[0], "inertia.armature@axle", np.array([DRIVE]))
+    assert taken == pytest.approx([1 / STIFF, 0.05, DRIVE / LINK])

@@ -1,0 +1,24 @@
+"""Few lanes have a batch of their own, and move as they would among many."""
+
+import numpy as np
+
+from bench.core.plugin_registries import make_robot_simulator
+from sims.core.simulator import Scenario
+from sims.robot.dynamics.batch_cache import bench_cache
+from tests.sims.robot.sample_arms import ARM
+
+TIMES = np.arange(40) / 100.0
+SCENARIO = Scenario(TIMES, {"q.elbow": 0.4}, {"u.m_elbow": np.sin(9.0 * TIMES)})
+
+
+def test_a_lane_alone_moves_as_among_many_and_pays_for_itself_alone(tmp_path):
+    (tmp_path / "arm.xml").write_text(ARM)
+    kind = make_robot_simulator(tmp_path / "arm.xml", free=["damping@*", "mass@fore"])
+    simulator = kind(observe=["q.shoulder", "q.elbow"])
+    theta = np.random.default_rng(1).uniform(0.0, 0.1, (12, len(simulator.parameters)))
+    together = simulator.simulate(theta, SCENARIO)
+    alone = np.concatenate([simulator.simulate(row[None], SCENARIO) for row in theta])
+    np.testing.assert_array_equal(alone, together)
+    assert np.ptp(together[:, -1], axis=0).min() > 1e-4
+    held = {bench.count for bench in bench_cache(kind.robot).benches}
+    assert held == {1, 64}, "a batch of one, and the largest for twelve"

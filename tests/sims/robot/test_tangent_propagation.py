@@ -1,0 +1,186 @@
+"""What small changes make of a robot's motion is what simulating each of them gives."""
+
+import numpy as np
+import pytest
+
+from sims import effects as library
+from sims.core.simulator import Scenario
+from sims.robot.dynamics.applied_inputs import compute_step_inputs
+from sims.robot.dynamics.run_linearisation import RunLinearisation
+from sims.robot.integrator_settings import IntegratorSettings
+from tests.sims.robot.test_robot_motion import kind_of
+
+ARM = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="upper_arm" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="1.2" contype="0"
+            conaffinity="0"/>
+      <body name="forearm" pos="0 0 -0.4">
+        <joint name="elbow" axis="0 1 0" damping="0.05"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.35" size="0.025" mass="0.8" contype="0"
+              conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="m_shoulder" joint="shoulder" kp="60" kv="3"/>
+    <position name="m_elbow" joint="elbow" kp="30" kv="1.5"/>
+  </actuator>
+</mujoco>
+"""
+
+TIMES = np.arange(0, 1.0, 0.01)
+ALIKE = {
+    "drag.linear": 1e-4, "drag.quadratic": 1e-4, "force.bias": 1e-4, "force.ripple": 1e-4,
+    "friction.coulomb": 1e-4, "friction.direction": 1e-3, "gravity.tilt": 1e-4,
+    "friction.position": 1e-4, "friction.warming": 1e-4, "friction.load_direction": 1e-3,
+    "inertia.armature": 1e-4, "joint.coupling": 1e-3,
+    "input.bias": 1e-4, "input.gain": 1e-4, "input.lag": 1e-3, "mass.scale": 1e-3,
+    "mass.offset": 1e-3, "sensor.bias": 1e-4, "sensor.delay": 1e-3, "sensor.gain": 1e-4,
+    "sensor.eccentricity": 1e-3, "servo.deadband": 1e-4, "servo.derivative": 1e-2,
+    "spring.linear": 1e-4,
+    "supply.braking": 1e-3, "supply.sag": 1e-3,
+}  # fmt: skip
+"""Shares of plausible ranges that are small."""
+
+
+def moving(integrator="implicitfast", step=0.002, channels=("q.shoulder", "q.elbow", "tau.elbow")):
+    """An arm on its way, its simulator with all effects at hand."""
+    kind = kind_of(ARM).stepped_by(IntegratorSettings(step, integrator))
+    effects = list(library.list_effects_for(kind.system).values())
+    simulator = kind(observe=list(channels), effects=effects)
+    rng = np.random.default_rng(3)
+    inputs = {}
+    for channel in simulator.inputs:
+        if channel.name.startswith("u."):
+            rate, phase = rng.uniform(3, 9), rng.uniform(0, 6)
+            inputs[channel.name] = 0.4 * (np.sin(rate * TIMES + phase) - np.sin(phase))
+    return simulator, Scenario(TIMES, {}, inputs)
+
+
+def probes(simulator):
+    """Effects with one small coefficient each, and the parameters that have it."""
+    added, thetas, place = [], [], 0
+    for effect in simulator.effects:
+        count = len(effect.coefficients)
+        share = ALIKE.get(effect.of or effect.name)
+        for i, coefficient in enumerate(effect.coefficients if share else ()):
+            low, high = coefficient.plausible[0]
+            if low > 0:
+                continue
+            c = np.array([k.plausible[0][1] if k.plausible[0][0] > 0 else 0.0
+                          for k in effect.coefficients])  # fmt: skip
+            c[i] = share * high
+            theta = np.zeros(len(simulator.parameters))
+            theta[place : place + count] = c
+            added.append((effect, c))
+            thetas.append(theta)
+        place += count
+    return added, np.array(thetas)
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
+def test_the_tangent_is_what_each_small_change_makes(integrator):
+    simulator, scenario = moving(integrator)
+    added, thetas = probes(simulator)
+    still = simulator.simulate_lanes(np.zeros((1, thetas.shape[1])), [scenario])[0]
+    changed = simulator.simulate_lanes(thetas, [scenario] * len(thetas)) - still
+    about = RunLinearisation(
+        simulator, np.zeros(thetas.shape[1]), scenario, np.zeros(2), np.zeros(2)
+    )
+    np.testing.assert_allclose(about.observed, still, atol=1e-12)
+    # Torque has another scale than angles: each reading counts by its own.
+    scale = np.sqrt(np.square(changed).mean(axis=1, keepdims=True).max(axis=0, keepdims=True))
+    seen = about.compute_effect_responses(added)[0] / scale
+    true = changed / scale
+    size = np.sqrt(np.square(true).sum(axis=(1, 2)))
+    counted = size > 1e-3 * size.max()
+    assert counted.sum() > 30, "most of them move something"
+    apart = np.sqrt(np.square(seen - true).sum(axis=(1, 2)))[counted] / size[counted]
+    worst = np.argsort(-apart)[:3]
+    names = [added[i][0].name for i in np.flatnonzero(counted)[worst]]
+    assert apart.max() < 0.15, (names, apart[worst])
+    assert np.median(apart) < 0.01
+
+
+@pytest.mark.parametrize("name", ["supply.sag@m_elbow", "friction.load@elbow"])
+def test_what_hangs_on_the_drive_moves_with_the_servo(name):
+    """About an arm whose drive falls short: with the drive held still it would be 7 to 10 % off."""
+    simulator, scenario = moving(channels=("q.shoulder", "q.elbow"))
+    names = [p.name for p in simulator.parameters]
+    about = np.zeros(len(names))
+    about[names.index(name)] = 0.1
+    pushed = about.copy()
+    pushed[names.index("force.bias@elbow")] = 1e-3
+    still, moved = simulator.simulate_lanes(np.stack([about, pushed]), [scenario] * 2)
+    effect = next(e for e in simulator.effects if e.name == "force.bias@elbow")
+    tangent = RunLinearisation(simulator, about, scenario, np.zeros(2), np.zeros(2))
+    seen = tangent.compute_effect_responses([(effect, np.array([1e-3]))])[0][0]
+    off = np.sqrt(np.square(seen - (moved - still)).sum() / np.square(moved - still).sum())
+    assert off < 0.02
+
+
+@pytest.mark.parametrize(
+    "frictions", [("friction.coulomb@elbow", "friction.load@elbow"),
+                  ("friction.position@elbow.least", "friction.load@elbow")],
+)  # fmt: skip
+def test_frictions_at_one_joint_add_up(frictions):
+    """The motion about which it is linear has all of them."""
+    simulator, scenario = moving(channels=("q.shoulder", "q.elbow"))
+    names = [p.name for p in simulator.parameters]
+    about = np.zeros(len(names))
+    about[[names.index(name) for name in frictions]] = 1.0, 0.1
+    pushed = about.copy()
+    pushed[names.index("force.bias@elbow")] = 1e-3
+    still, moved = simulator.simulate_lanes(np.stack([about, pushed]), [scenario] * 2)
+    effect = next(e for e in simulator.effects if e.name == "force.bias@elbow")
+    tangent = RunLinearisation(simulator, about, scenario, np.zeros(2), np.zeros(2))
+    seen = tangent.compute_effect_responses([(effect, np.array([1e-3]))])[0][0]
+    off = np.sqrt(np.square(seen - (moved - still)).sum() / np.square(moved - still).sum())
+    assert off < 0.02
+
+
+def test_initial_states_move_a_run_as_their_derivatives_say():
+    simulator, scenario = moving(channels=("q.shoulder", "q.elbow"))
+    size = len(simulator.parameters)
+    about = RunLinearisation(simulator, np.zeros(size), scenario, np.zeros(2), np.zeros(2))
+    derivatives = about.compute_initial_state_responses()
+    small = 1e-4
+    for k, name in enumerate(("q.shoulder", "q.elbow", "qd.shoulder", "qd.elbow")):
+        moved = Scenario(TIMES, {name: small}, scenario.inputs)
+        change = (simulator.simulate(np.zeros((1, size)), moved)[0] - about.observed) / small
+        np.testing.assert_allclose(derivatives[k], change, atol=0.02 * np.abs(change).max())
+
+
+def test_a_command_that_changes_within_a_step_is_neither_early_nor_late():
+    """The sum over steps, and the sum of them times their times, are those of the command."""
+    rng = np.random.default_rng(5)
+    parts = rng.normal(size=(3, 20, 4))
+    seen = np.zeros(21, dtype=bool)
+    seen[::5] = True
+    given = compute_step_inputs(parts, seen)
+    quarters = (np.arange(80) + 0.5) / 4
+    steps = np.arange(20) + 0.5
+    np.testing.assert_allclose(given.sum(axis=1), parts.mean(axis=2).sum(axis=1))
+    wanted = (parts.reshape(3, 80) * quarters).sum(axis=1) / 4
+    np.testing.assert_allclose((given * steps).sum(axis=1), wanted)
+    # And so between any two samples, where nobody looks from one to the next.
+    for begin in range(0, 20, 5):
+        own = slice(begin, begin + 5)
+        np.testing.assert_allclose(given[:, own].sum(1), parts[:, own].mean(axis=2).sum(1))
+
+
+@pytest.mark.parametrize("late", [0.0013, 0.003, 0.0127])
+def test_a_delay_of_a_part_of_a_step_is_right_to_the_third_order(late):
+    """Against a step a hundred times as fine; a mean over the step alone is 20 times as far off."""
+    apart = []
+    for step in (0.002, 0.00002):
+        kind = kind_of(ARM).stepped_by(IntegratorSettings(step, "RK4"))
+        _, scenario = moving()
+        simulator = kind(observe=["qd.elbow"], fixed={"input.delay@m_elbow": late})
+        apart.append(simulator.simulate(np.empty((1, 0)), scenario)[0])
+    size = np.sqrt(np.square(apart[1]).mean())
+    assert np.sqrt(np.square(apart[0] - apart[1]).mean()) < 3e-4 * size

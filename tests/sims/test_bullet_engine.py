@@ -1,0 +1,152 @@
+"""What is Bullet's own: quiet import, the life of its worlds, an interrupted rollout, leaks."""
+
+import gc
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sims.core.simulator import InputError, Scenario
+from sims.engines.adapters import bullet_world
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from sims.systems.servo import Servo
+from sims.systems.slider import Slider
+
+NATIVE = {"native_contact": True}
+KINDS = [(Ball, {}), (Ball, NATIVE), (Pendulum, {}), (Slider, {}), (Servo, {})]
+SCENARIO = Scenario(np.arange(50) / 50)
+
+
+def made(kind, settings):
+    return kind(engine="pybullet", **settings)
+
+
+def theta_for(kind, count=1, seed=0):
+    low, high = np.array([p.bounds for p in kind.parameters]).T
+    return np.random.default_rng(seed).uniform(low, high, size=(count, len(low)))
+
+
+def connected():
+    p = bullet_world.import_pybullet()
+    return [i for i in range(64) if p.getConnectionInfo(i)["isConnected"]]
+
+
+def python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+
+def test_import_is_lazy_and_quiet():
+    lazy = python(
+        "import sys\nfrom sims.systems.ball import Ball\n"
+        "from sims.systems.pendulum import Pendulum\n"
+        "Ball(engine='pybullet'); Pendulum(engine='pybullet'); print('pybullet' in sys.modules)"
+    )
+    assert lazy.stdout == "False\n"
+    used = python(
+        "from sims.engines.adapters import bullet_world\nprint('before', flush=True); bullet_world.engine(); print('after')"
+    )
+    assert (used.stdout, used.stderr) == ("before\nafter\n", "")
+
+
+def test_import_survives_closed_streams():
+    assert (
+        python(
+            "import os; os.close(1); from sims.engines.adapters import bullet_world; bullet_world.engine()"
+        ).returncode
+        == 0
+    )
+
+
+@pytest.mark.parametrize(("kind", "settings"), KINDS)
+@pytest.mark.parametrize("time_step", [0.0, -1.0, np.nan, np.inf, "fast", True])
+def test_impossible_time_steps_are_refused(kind, settings, time_step):
+    with pytest.raises(InputError, match="time_step must be a positive number of seconds"):
+        made(kind, {**settings, "time_step": time_step})
+
+
+@pytest.mark.parametrize(("kind", "settings"), KINDS)
+def test_worlds_are_opened_late_and_closed(kind, settings):
+    gc.collect()
+    before = connected()
+    simulator, theta = made(kind, settings), theta_for(kind)
+    assert connected() == before
+    first = simulator.simulate(theta, SCENARIO)
+    assert len(connected()) == len(before) + 1
+    simulator.close()
+    simulator.close()
+    assert connected() == before
+    np.testing.assert_array_equal(simulator.simulate(theta, SCENARIO), first)
+    del simulator
+    gc.collect()
+    assert connected() == before
+
+
+@pytest.mark.parametrize(("kind", "settings"), KINDS)
+def test_an_interrupted_rollout_leaves_nothing_behind(kind, settings, monkeypatch):
+    simulator, theta = made(kind, settings), theta_for(kind)
+    scenario = Scenario(SCENARIO.times, inputs={c.name: np.ones(50) for c in kind.inputs})
+    step, calls = bullet_world.import_pybullet().stepSimulation, []
+
+    def interrupted(client):
+        calls.append(client)
+        if len(calls) > 20:
+            raise KeyboardInterrupt
+        step(client)
+
+    monkeypatch.setattr(bullet_world.import_pybullet(), "stepSimulation", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        simulator.simulate(theta, scenario)
+    monkeypatch.undo()
+    np.testing.assert_array_equal(
+        simulator.simulate(theta, scenario), made(kind, settings).simulate(theta, scenario)
+    )
+
+
+GROWTH = """
+import gc, numpy as np, psutil
+from sims.core.simulator import Scenario
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from sims.systems.servo import Servo
+from sims.systems.slider import Slider
+simulator, theta, count = {kind}(engine="{engine}", **{settings}), np.array({theta}), {count}
+scenarios = [Scenario(np.arange({samples}) / 50, {initial}, constants=k) for k in {constants}]
+def rollouts(count):
+    for i in range(count):
+        simulator.simulate(theta, scenarios[i % len(scenarios)])
+    gc.collect()
+    return psutil.Process().memory_info().rss
+print(-rollouts(count // 4) + rollouts(count))
+"""
+
+
+def growth(kind, count, samples, constants, engine="pybullet", **settings):
+    """Growth in bytes of the memory of a process of its own over `count` rollouts, after a quarter
+    as many.
+    """
+    values = {
+        "kind": kind.__name__,
+        "engine": engine,
+        "settings": settings,
+        "theta": theta_for(kind).tolist(),
+        "initial": {"z": 0.51} if kind is Ball else {},
+        "constants": constants,
+    }
+    return int(python(GROWTH.format(**values, count=count, samples=samples)).stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "settings"), [KINDS[0], KINDS[2]])
+def test_ten_thousand_rollouts_leak_nothing(kind, settings):
+    assert growth(kind, 10_000, 4, [{}], **settings) < 10_000 * 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "settings"), KINDS[:3:2])
+def test_rebuilding_worlds_leaks_nothing(kind, settings):
+    gravities = [{"gravity": 9.8}, {"gravity": 9.81}]
+    # The allocator may grow once by chance. A leak grows every time.
+    grown = (growth(kind, 800, 2, gravities, **settings) for _ in range(4))
+    assert any(size < 800 * 1000 for size in grown)

@@ -1,0 +1,138 @@
+"""Modules that build systems' worlds fulfil what the engines ask of them; others are refused."""
+
+import inspect
+import sys
+import typing
+from types import ModuleType
+
+import pytest
+
+from sims.core.simulator import InputError
+from sims.engines.external import world_interface
+from sims.system_simulator import SystemSimulator
+from sims.systems.slider import SliderSystem
+from tests.sims.simulation_cases import SIMULATORS
+
+ENGINES = {"pybullet": "bullet_world", "mujoco": "mujoco_world"}
+ASKED = {
+    ("bullet_world", True): (
+        world_interface.BulletWorldModule,
+        world_interface.BulletBallWorldModule,
+    ),
+    ("bullet_world", False): (world_interface.BulletJointWorldModule,),
+    ("mujoco_world", True): (world_interface.MujocoWorldModule,),
+    ("mujoco_world", False): (world_interface.MujocoJointWorldModule,),
+}
+CASES = [
+    (system, name, asked)
+    for system in SIMULATORS
+    for name in ENGINES.values()
+    for asked in ASKED[name, SIMULATORS[system].system.bounces]
+]
+
+
+def types_of(function):
+    """Of its arguments, in order, and of what it returns."""
+    hints = typing.get_type_hints(function)
+    return [
+        hints[name] for name in (*inspect.signature(function).parameters, "return") if name in hints
+    ]
+
+
+def functions_of(protocol):
+    parts = [part for part in protocol.__mro__ if part.__module__ == world_interface.__name__]
+    return {
+        name: function
+        for part in parts
+        for name, function in vars(part).items()
+        if callable(function) and not name.startswith("_")
+    }
+
+
+@pytest.mark.parametrize(("system", "name", "asked"), CASES)
+def test_every_world_module_fulfils_what_its_engine_asks(system, name, asked):
+    module, reason = world_interface.find_world_module(SIMULATORS[system].system, name, asked)
+    assert (module.__name__, reason) == (f"sims.{system}.{name}", "")
+    assert functions_of(asked)
+    for name, function in functions_of(asked).items():
+        assert types_of(getattr(module, name)) == types_of(function)
+
+
+def module_with(**content):
+    module = ModuleType("broken_world")
+    vars(module).update(content)
+    return module
+
+
+WHOLE = {
+    "OPEN_LOOP": True,
+    "gravity": lambda constants: lambda x: 0.0,
+    "build": lambda client, constants: 0,
+    "load": lambda client, body, inertia, constants: True,
+}
+BROKEN = [
+    ({"OPEN_LOOP": None}, "has no OPEN_LOOP = True or False"),
+    ({"gravity": 9.81}, "has no function gravity(constants)"),
+    ({"build": None}, "has no function build(client, constants)"),
+    (
+        {"load": lambda model, inertia, constants: True},
+        "has no function load(client, body, inertia, constants)",
+    ),
+]
+
+
+def test_a_whole_module_lacks_nothing_whatever_its_arguments_are_called():
+    assert not world_interface.describe_missing_members(
+        module_with(**WHOLE), world_interface.BulletJointWorldModule
+    )
+    assert not world_interface.describe_missing_members(
+        module_with(build=lambda a, b: 0), world_interface.BulletWorldModule
+    )
+
+
+@pytest.mark.parametrize(("change", "reason"), BROKEN)
+def test_a_broken_module_is_told_what_it_lacks(change, reason):
+    assert (
+        world_interface.describe_missing_members(
+            module_with(**{**WHOLE, **change}), world_interface.BulletJointWorldModule
+        )
+        == reason
+    )
+
+
+def test_settings_are_given_by_name():
+    whole = module_with(build=WHOLE["build"], build_native=lambda client, constants, settings: 0)
+    assert not world_interface.describe_missing_members(
+        whole, world_interface.BulletBallWorldModule
+    )
+    other = module_with(build=WHOLE["build"], build_native=lambda client, constants, given: 0)
+    expected = "has no function build_native(client, constants, settings)"
+    assert (
+        world_interface.describe_missing_members(other, world_interface.BulletBallWorldModule)
+        == expected
+    )
+
+
+@pytest.mark.parametrize(("engine", "name"), ENGINES.items())
+def test_an_engine_refuses_a_broken_module_by_name(engine, name, tmp_path, monkeypatch):
+    """Before anything is simulated: without a check the first run ends in an AttributeError."""
+    package = tmp_path / "broken_system"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / f"{name}.py").write_text("OPEN_LOOP = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    class Broken(SliderSystem):
+        __module__ = "broken_system.system"
+
+    class Ours(SystemSimulator):
+        system = Broken
+
+    try:
+        with pytest.raises(
+            InputError, match=f"module broken_system.{name} has no function gravity"
+        ):
+            Ours(engine=engine)
+    finally:
+        for loaded in [key for key in sys.modules if key.startswith("broken_system")]:
+            del sys.modules[loaded]

@@ -1,0 +1,123 @@
+"""What is MuJoCo's own: lazy import, contact, the life of its worlds, silence, leaks."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sims.core.simulator import Scenario
+from sims.engines.adapters.mujoco_soft_contact import compute_damping_ratio
+from sims.systems.ball import Ball
+from sims.systems.pendulum import Pendulum
+from sims.systems.servo import Servo
+from sims.systems.slider import Slider
+from tests.sims.test_bullet_engine import growth
+
+KINDS = [Ball, Pendulum, Slider, Servo]
+
+
+def test_import_is_lazy():
+    code = (
+        "import sys\nfrom sims.systems.ball import Ball\nball = Ball(engine='mujoco')\n"
+        "print('mujoco' in sys.modules, sys.modules['sims.engines.adapters.mujoco_engine'].__name__)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "False sims.engines.adapters.mujoco_engine\n"
+
+
+def test_instability_is_silent_and_writes_no_file(tmp_path, monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    heard = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(heard.append)
+    try:
+        pendulum = Pendulum(engine="mujoco", time_step=0.1, fixed={"force.bias": 4e5})
+        assert np.isnan(
+            pendulum.simulate(np.array([[1e-3]]), Scenario(np.arange(1e4) / 10, {"qd": 1e300}))
+        ).all()
+        assert heard == []
+        assert mujoco.get_mju_user_warning() is not None  # the user's own is back
+    finally:
+        mujoco.set_mju_user_warning(before)
+    assert list(Path(tmp_path).iterdir()) == []
+
+
+def test_an_interrupted_rollout_leaves_nothing_behind(monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+    step, calls = mujoco.mj_step, []
+
+    def interrupted(*arguments):
+        calls.append(arguments)
+        if len(calls) > 20:
+            raise KeyboardInterrupt
+        step(*arguments)
+
+    for kind, theta in ((Ball, [[0.7]]), (Servo, [[0.5, 4.0, 2e-3]])):
+        calls.clear()
+        theta, scenario = (
+            np.array(theta),
+            Scenario(np.arange(50) / 50, {"vx": 1.0} if kind is Ball else {"q": 1.0}),
+        )
+        simulator = kind(engine="mujoco", fixed={"drag.linear": 0.01})
+        with monkeypatch.context() as patch:
+            patch.setattr(mujoco, "mj_step", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                simulator.simulate(theta, scenario)
+        fresh = kind(engine="mujoco", fixed={"drag.linear": 0.01})
+        np.testing.assert_array_equal(
+            simulator.simulate(theta, scenario), fresh.simulate(theta, scenario)
+        )
+
+
+@pytest.mark.parametrize("restitution", [0.1, 0.37, 0.7, 0.9, 1.0])
+def test_damping_ratio_against_the_spring_and_damper_itself(restitution):
+    # x'' = -max(0, x + 2 D x') / ..., integrated until the force would pull.
+    ratio, x, v, h = compute_damping_ratio(restitution), 0.0, 1.0, 1e-4
+    while (force := x + 2.0 * ratio * v) >= 0.0:  # depth and its rate
+        v -= h * force
+        x += h * v
+    assert -v == pytest.approx(restitution, abs=5e-4)
+    assert compute_damping_ratio(0.0) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("restitution", "friction"), [(0.8, 0.0), (0.6, 0.1)])
+def test_soft_contact_has_the_restitution_and_friction_asked_for_as_the_step_shrinks(
+    restitution, friction
+):
+    start = Scenario(np.arange(40) / 100, {"z": 0.6, "vz": -2.0, "vx": 3.0})
+    errors = []
+    for step in (4e-4, 1e-4):
+        settings = {"engine": "mujoco", "native_contact": True, "time_step": step}
+        rough = {"contact.friction": friction}
+        ball = Ball({"gravity": 0.0}, ["x", "z"], **settings, fixed=rough)
+        velocity = np.diff(ball.simulate(np.array([[restitution]]), start)[0], axis=0)[-1] * 100
+        errors.append(
+            np.abs(velocity - [3.0 - friction * (1 + restitution) * 2.0, 2.0 * restitution]).max()
+        )
+    assert errors[0] < 0.06
+    assert errors[1] < errors[0] / 3
+
+
+def test_soft_contact_sinks_in_by_weight_over_stiffness():
+    ball = Ball(engine="mujoco", native_contact=True, stiffness=2e4)
+    z, a = ball.simulate(np.array([[0.2]]), Scenario(np.arange(500) / 100, {"z": 0.6}))[0, -1, 2:]
+    assert z == pytest.approx(0.5 - 9.81 / 2e4, rel=1e-3)
+    assert a == 9.81
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Ball, Slider])
+def test_four_thousand_rollouts_leak_nothing(kind):
+    assert growth(kind, 4_000, 4, [{}], engine="mujoco") < 4_000 * 250
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Ball, Pendulum])
+def test_rebuilding_worlds_leaks_nothing(kind):
+    # A world takes half a megabyte; what the allocator keeps comes and goes in a few.
+    assert (
+        growth(kind, 400, 2, [{"gravity": 9.8}, {"gravity": 9.81}], engine="mujoco") < 400 * 50_000
+    )

@@ -1,0 +1,108 @@
+"""The house: which rooms there are, that they stand in layers, and that no import runs in a
+circle.
+"""
+
+import re
+import shutil
+import subprocess
+import sys
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import grimp
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("bench", "methods", "sims")
+ROOMS = {
+    "api", "benchmark", "bounce_shot", "cli", "conformance", "core", "datasets", "diagnosis",
+    "diagnosis_benchmark", "experiments", "figures", "logs", "misspecification", "pages", "schemas",
+    "studies",
+}  # fmt: skip
+
+
+def linted(root):
+    """The verdict on the contracts of pyproject.toml about the code below `root`."""
+    return subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from importlinter.cli import lint_imports_command as c; c(['--no-cache'])",
+        ],
+        cwd=root,
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def circle(imports):
+    """Modules that import each other in a circle, the first of them again at the end; or
+    nothing.
+    """
+    try:
+        tuple(TopologicalSorter(imports).static_order())
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+@pytest.fixture(scope="module")
+def imports():
+    """By module, what it imports, also inside functions, and for type checkers alone."""
+    graph = grimp.build_graph(*PACKAGES, cache_dir=None)
+    return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+
+
+def test_the_rooms_of_the_harness_are_these():
+    there = {p.stem for p in (ROOT / "bench").iterdir() if p.suffix == ".py" or p.is_dir()}
+    assert there - {"__init__", "__pycache__"} == ROOMS
+
+
+def test_imports_run_downwards_and_never_in_a_circle(imports):
+    said = linted(ROOT)
+    assert said.returncode == 0, said.stdout
+    assert "0 broken" in said.stdout
+    assert circle(imports) == []
+    assert circle({**imports, "bench.core.plugin_registries": {"bench.cli.main"}})[:1] != []
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "contract"),
+    [
+        ("bench/benchmark/storage/run_journal.py", "import bench.benchmark.runner.tuner_loop",
+        "the packages of bench form layers"),
+        ("bench/diagnosis/fitting/trajectory_fit.py", "import methods.tuner", "diagnosis runs tuners through the runner alone"),
+        ("bench/diagnosis/fitting/trajectory_fit.py", "import bench.diagnosis.search.effect_search",
+        "the packages of diagnosis form layers"),
+        ("methods/tuners/cma_es.py", "import sims.core.simulator",
+        "tuners import neither the benchmark nor the simulators"),
+        ("sims/core/simulator.py", "import bench.core.plugin_registries",
+        "simulators import neither the benchmark nor the tuners"),
+    ],
+)  # fmt: skip
+def test_an_import_that_climbs_is_found(module, line, contract, tmp_path):
+    for package in PACKAGES:
+        shutil.copytree(
+            ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    path = tmp_path / module
+    path.write_text(path.read_text() + f"\n{line}\n")
+    said = linted(tmp_path)
+    assert said.returncode == 1
+    broken = [title for title in said.stdout.splitlines() if title.endswith("BROKEN")]
+    assert any(contract in title for title in broken), said.stdout
+
+
+GENERIC = re.compile(r"^class \w+\([^)]*\bNamedTuple\b[^)]*\bGeneric\b", re.M)
+"""What Python 3.10 refuses at import, and no checker of later versions sees."""
+
+
+def test_no_named_tuple_is_generic_which_python_3_10_refuses():
+    rooms = [ROOT / name for name in ("bench", "methods", "sims")]
+    files = [path for room in rooms for path in room.rglob("*.py")]
+    assert len(files) > 300
+    assert [path for path in files if GENERIC.search(path.read_text(encoding="utf-8"))] == []
+    assert GENERIC.search("class Added(NamedTuple, Generic[T]):")
