@@ -1,4 +1,4 @@
-"""Identifiability check before a fit: which parameters and causes can a recording identify?"""
+"""Identifiability check before a fit: parameters and causes that a recording can identify."""
 
 from __future__ import annotations
 

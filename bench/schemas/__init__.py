@@ -1,5 +1,6 @@
-"""The published forms of what commands print with ``--json``, and of the files that programs read:
-JSON Schema, draft 2020-12, a file each. A command's schema has its name.
+"""JSON schemas of command output with ``--json`` and of the files that programs read.
+
+Each is one file of JSON Schema, draft 2020-12. The schema of a command has the name of the command.
 
 ``error`` is the form of every command's faults; ``verdict``, ``table`` and ``run-status`` are those
 of verdict.json, and of a row of table.csv and of status.csv.
@@ -41,7 +42,7 @@ def load_schema(name: str) -> dict[str, Any]:
 
 
 def find_violations(document: Any, name: str) -> list[str]:
-    """What in a document is not as the schema says: a line each, with its place.
+    """List the violations of a schema by a document, one line each, with its place.
 
     Raises:
         InputError: there is no schema of that name.

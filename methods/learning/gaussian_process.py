@@ -1,5 +1,4 @@
-"""Gaussian-process regression with a constant mean, its hyper-parameters at their most probable
-values.
+"""Gaussian-process regression with a constant mean and maximum a posteriori hyperparameters.
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, 2006,
 doi:10.7551/mitpress/3206.001.0001; equation numbers are theirs. With K the correlation of the

@@ -1,5 +1,4 @@
-"""What networks are told of a scenario beside what its observation shows, where training scenarios
-differ in it.
+"""Network inputs that describe a scenario, where training scenarios differ in them.
 
 Initial values that no channel shows are inputs as they are. Input signals are not: appended to the
 observation they were measured to be worth next to nothing, since what a sample means depends on all

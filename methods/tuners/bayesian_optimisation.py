@@ -1,5 +1,4 @@
-"""Bayesian optimisation with a Gaussian process and expected improvement, as scikit-optimize has
-it.
+"""Bayesian optimisation with a Gaussian process and expected improvement (scikit-optimize).
 
 Sources: D. R. Jones, M. Schonlau, W. J. Welch, Efficient global optimization of expensive black-box
 functions, Journal of Global Optimization 13, 1998, doi:10.1023/A:1008306431147; T. Head et al.,
@@ -26,7 +25,9 @@ from methods.tuner import Task, Tuner, TunerGenerator
 
 @dataclass(eq=False)
 class BayesianOptimisation(Tuner):
-    """skopt.Optimizer with the process of gp_minimize, asked and told one point at a time;
+    """Bayesian optimisation (scikit-optimize) with a Gaussian process and expected improvement.
+
+    It uses skopt.Optimizer with the Gaussian process of gp_minimize, one point at a time, and
     recommends the lowest loss.
 
     The library's defaults of `candidates`, `polished` and `fits` (10000, 5 and 2) take several

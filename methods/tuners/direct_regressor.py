@@ -15,8 +15,9 @@ from methods.tuner import Proposal, Task, TunerGenerator
 
 @dataclass(eq=False)
 class DirectRegressor(PairTuner):
-    """TuneNet's network on the target alone: its proposed input is zero, its output the parameters
-    themselves.
+    """Direct regression: a network estimates the parameters from the target alone.
+
+    It is TuneNet's network with zero in place of the proposed observation.
 
     It needs no simulation of the target: it recommends its one estimate from the beginning,
     simulates it, and stops.

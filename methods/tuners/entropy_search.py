@@ -1,5 +1,4 @@
-"""Greedy entropy search: simulate where it is most uncertain whether the minimiser of the error
-lies there.
+"""Greedy entropy search: simulate where the minimiser of the error is most uncertain.
 
 Source: S. Zhu, A. Kimmel, K. E. Bekris, A. Boularias, Fast model identification via physics engines
 for data-efficient policy search, IJCAI 2018, doi:10.24963/ijcai.2018/451 (arXiv:1710.08893),
@@ -35,8 +34,9 @@ _REFIT_INTERVAL_THRESHOLD = 20
 
 @dataclass(eq=False)
 class EntropySearch(Tuner):
-    """Greedy entropy search; recommends the lowest loss seen, or as published the candidate of the
-    largest P.
+    """Greedy entropy search over a set of candidate points.
+
+    It recommends the lowest loss so far, or with `published` the candidate with the largest P.
 
     Attributes:
         published: the fixed grid over the cube (the authors of the comparison laid it between their

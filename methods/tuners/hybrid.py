@@ -1,5 +1,4 @@
-"""A learned start and a least-squares finish: TuneNet (arXiv 1907.11200) while it pays, then
-Levenberg-Marquardt.
+"""Hybrid tuner: TuneNet (arXiv 1907.11200) first, then Levenberg-Marquardt.
 
 The network's first steps are worth more than any search's, since it knows the simulator. Its last
 ones are not: outside its training range and under noise its estimate may settle where the
@@ -45,8 +44,7 @@ _MIN_ORTHOGONAL_SHARE = 0.5
 
 @dataclass(eq=False)
 class TuneNetLeastSquares(TuneNet):
-    """TuneNet as long as each step divides the loss; then least squares, which takes over what has
-    been simulated.
+    """TuneNet while each step divides the loss, then least squares from its simulations.
 
     The finish begins at the lowest loss seen, with the secants of the points nearby in place of
     finite differences. It fits all samples first, then with growing horizons, then from new starts

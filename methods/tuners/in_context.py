@@ -123,8 +123,9 @@ class TrainedHistoryNetwork:
 
 @dataclass(eq=False)
 class InContextTransformer(Tuner):
-    """A causal transformer, trained on simulated tuning histories, reads what was tried and seen
-    and proposes the next point; it recommends its newest.
+    """Causal transformer that reads the tuning history and proposes the next point.
+
+    It is trained on simulated tuning histories, and recommends its newest proposal.
 
     The first proposal comes from the target alone. A simulation that failed is left out of the
     history.

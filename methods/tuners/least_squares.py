@@ -1,5 +1,4 @@
-"""Levenberg-Marquardt on the difference between simulated and observed samples: what a practitioner
-tries first.
+"""Levenberg-Marquardt on the difference between simulated and observed samples.
 
 Sources: D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters, SIAM J.
 Appl. Math. 11(2), 1963, doi:10.1137/0111030. J. Nocedal, S. J. Wright, Numerical Optimization, 2nd
@@ -66,8 +65,9 @@ _CANDIDATES = 64
 
 @dataclass(eq=False)
 class LeastSquares(Tuner):
-    """Levenberg-Marquardt with secant updates, a growing horizon and new starts; recommends the
-    lowest loss seen.
+    """Levenberg-Marquardt with secant updates, a growing horizon and restarts.
+
+    It recommends the lowest loss so far.
 
     `LeastSquares(horizons=(1.0,), secant=False, difference=1e-4, restart=False)` is the textbook's.
 

@@ -1,5 +1,4 @@
-"""Neural posterior estimation: a normalising flow learns p(parameters | observation) from
-simulations.
+"""Neural posterior estimation: a normalising flow learns p(parameters | observation).
 
 Sources: G. Papamakarios, I. Murray, Fast ε-free inference of simulation models with Bayesian
 conditional density estimation, NeurIPS 2016, arXiv 1605.06376; D. Greenberg, M. Nonnenmacher, J.
@@ -32,8 +31,9 @@ from methods.tuner import Array, Proposal, Task, TrainingSimulator, Tuner, Tuner
 
 @dataclass(eq=False)
 class NeuralPosteriorEstimation(Tuner):
-    """Recommends the mean of the learned posterior, simulates it, then draws from it and keeps the
-    lowest loss.
+    """Neural posterior estimation; recommends the posterior mean, then the best sample.
+
+    It simulates the mean of the learned posterior, then samples of it, and keeps the lowest loss.
 
     It reads the same numbers of an observation as TuneNet does (`learning.observation_features`),
     of the target alone.

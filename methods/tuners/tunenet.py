@@ -28,8 +28,9 @@ from methods.tuner import Array, Proposal, Task, TunerGenerator
 
 @dataclass(eq=False)
 class TuneNet(PairTuner):
-    """A network trained on pairs of simulations estimates the parameter difference from two
-    observations.
+    """Network that estimates the parameter difference from two observations.
+
+    It is trained on pairs of simulations.
 
     Algorithm 1 adds that estimate to the guess, simulates the new guess, and repeats; it recommends
     its newest guess.
@@ -120,8 +121,7 @@ class TuneNet(PairTuner):
 
 @dataclass(eq=False)
 class TuneNetPublished(PairTuner):
-    """The network, training, data and steps of the authors' released code: TuneNet as it was
-    published.
+    """TuneNet as published: network, training, data and steps of the authors' code.
 
     Attributes:
         points: points to which each run is resampled; L in Algorithm 1.

@@ -1,5 +1,6 @@
-"""TuneNet on vision: simulated heights against what a tracker saw; Allevato et al., CoRL 2019,
-arXiv 1907.11200.
+"""TuneNet on vision: simulated heights against the track of a film.
+
+Source: Allevato et al., CoRL 2019, arXiv 1907.11200.
 """
 
 from __future__ import annotations
@@ -17,8 +18,7 @@ _LAST = 1_000_000
 
 @dataclass(eq=False)
 class TuneNetVision(TuneNet):
-    """TuneNet with another sensor on the target's side: the network itself learns how the two
-    correspond.
+    """TuneNet with another sensor on the side of the target; the network learns the relation.
 
     The proposed side reads the first channel of the simulation, as `z` of simulator ball-filmed;
     the target's side reads the other channels of the target, as the pixel row `v`, and nothing of

@@ -46,8 +46,10 @@ It is small, because simulations are reproducible.
 
 @dataclass(eq=False)
 class TuRBO(Tuner):
-    """A box around the best point that grows with successes and shrinks with failures; recommends
-    the lowest loss.
+    """Trust-region Bayesian optimisation (TuRBO-1); recommends the lowest loss.
+
+    The trust region is a box around the best point. It grows with successes and shrinks with
+    failures.
 
     Where the box has shrunk below its smallest length, it starts again elsewhere with new initial
     points.

@@ -55,7 +55,7 @@ def _of_link(
     training: tuple[float, float],
     says: str,
 ) -> tuple[Parameter, Parameter]:
-    """The same number of both links, told apart by its name."""
+    """Return a parameter of each of the two links, with the link's number in its name."""
 
     def of(link: int) -> Parameter:
         return Parameter(f"{name}{link}", unit, nominal, bounds, training, says=f"{says} {link}")
@@ -118,8 +118,9 @@ class TwoLinkArm(OwnSimulator):
         constants: Mapping[str, float],
         initial: Mapping[str, float],
     ) -> None:
-        """A new arm in an empty world: Bullet has no way to move a centre of mass, and building
-        takes 0.3 ms.
+        """Build the arm again in an empty world.
+
+        Bullet cannot move a centre of mass, and building takes 0.3 ms.
         """
         if "_world" not in self.__dict__:
             self._world = BulletWorld()
@@ -147,7 +148,7 @@ class TwoLinkArm(OwnSimulator):
         self._v = [initial["qd1"], initial["qd2"]]
 
     def _built(self, theta: Mapping[str, float], constants: Mapping[str, float]) -> int:
-        """The two links in the empty world; the body's id."""
+        """Build the two links in the empty world and return the id of the body."""
         p = self._world
         arm: int = p.createMultiBody(
             linkMasses=[theta["mass1"], theta["mass2"]],
@@ -180,8 +181,10 @@ class TwoLinkArm(OwnSimulator):
                 self._heun(torques, seconds / _FRICTION_SUBSTEPS)
 
     def _heun(self, torques: tuple[float, float], seconds: float) -> bool:
-        """The mean of two of Bullet's steps; returns whether a joint that rubs came to rest or
-        turned round.
+        """Take the mean of two of Bullet's steps.
+
+        Returns:
+            Whether a joint with dry friction came to rest or changed its direction.
         """
         self._pace(seconds)
         q = self._q

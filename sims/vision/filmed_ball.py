@@ -21,11 +21,9 @@ FILM_MODES = ("projected", "tracked")
 
 
 class FilmedBall(Simulator):
-    """A ball that falls and bounces on level ground, and its place in the picture of a fixed
-    camera.
+    """A ball that falls and bounces on level ground, seen by a fixed camera.
 
-    The camera has a field of view of 40 degrees and looks at (0, 0, 2) m where nothing else is
-    said, as the published visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released
+    By default, the camera has a field of view of 40 degrees and looks at (0, 0, 2) m, as the published visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released
     code). `v` is the pixel row of the middle of the ball's outline, from the top; it may lie
     outside the picture.
 
@@ -130,8 +128,9 @@ def _camera(constants: Mapping[str, float]) -> PinholeCamera:
 
 
 def _tracked(camera: PinholeCamera, radius: float, places: Array, times: Array) -> Array:
-    """Pixel rows (T,) that the tracker finds in a film of the ball at `places` (T, 3); NaN where it
-    finds none.
+    """Return the pixel rows (T,) that the tracker finds in a film of a ball at `places` (T, 3).
+
+    NaN stands where it finds none.
     """
     from sims.vision.ball_renderer import BallScene
     from sims.vision.ball_tracker import track_ball

@@ -77,8 +77,9 @@ class SamplingConfig:
 
 @dataclass(frozen=True)
 class HeldOutConfig:
-    """Unseen scenarios of a simulated target; initial states and inputs are the experiment's where
-    not given.
+    """Held-out scenarios of a simulated target.
+
+    Initial states and inputs that are not given are those of the experiment.
     """
 
     scenarios: int = 3
@@ -88,8 +89,9 @@ class HeldOutConfig:
 
 @dataclass(frozen=True)
 class RecordingSource:
-    """The recording that an experiment on real data tunes to; `path` is relative to the folder of
-    recordings ($SIMGAP_DATA), to that of `simgap download`, to the experiment's file, or to the
+    """Recording to which an experiment on real data is tuned.
+
+    The `path` is relative to the folder of recordings ($SIMGAP_DATA), to that of `simgap download`, to the experiment's file, or to the
     working directory.
     """
 
@@ -98,8 +100,9 @@ class RecordingSource:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """A recording of the targets' world, with parameters of its own, from which explain extends the
-    simulator that is tuned.
+    """Recording from which explain extends the simulator that is tuned.
+
+    It is made in the system of the targets, with its own parameters.
 
     Attributes:
         runs: in it.

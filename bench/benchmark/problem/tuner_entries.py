@@ -13,8 +13,10 @@ from sims.core.toml_validation import check_entries, get_type_hints_of, make_err
 
 @dataclass(frozen=True)
 class TunerEntry:
-    """One tuner of a comparison: its registered name, options, and seeds or budget where they
-    differ; `randomised` where it trains over the experiment's ``[nuisance]``.
+    """One tuner of a comparison: registered name, options, seeds and budget.
+
+    Seeds and budget are given where they differ from those of the experiment. If `randomised`, the
+    tuner trains with domain randomisation over the experiment's ``[nuisance]``.
     """
 
     label: str

@@ -167,7 +167,7 @@ class ModelSet:
         return None
 
     def on_replaced(self, key: frozenset[str]) -> None:
-        """Called after a model has replaced another one; does nothing here."""
+        """React to the replacement of a model; does nothing here."""
 
     @property
     def parameter_penalty(self) -> float:
