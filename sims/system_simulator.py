@@ -413,7 +413,8 @@ def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) 
     for coefficient, value in zip(effect.on(system), values, strict=False):
         largest = max(map(abs, coefficient.range(system.kind)))
         if abs(value) > MAX_COEFFICIENT_FACTOR * largest:
-            wanted = f"within ±{MAX_COEFFICIENT_FACTOR * largest:g} {coefficient.unit_on(system) or ''}".rstrip()
+            unit = coefficient.unit_on(system) or ""
+            wanted = f"within ±{MAX_COEFFICIENT_FACTOR * largest:g} {unit}".rstrip()
             raise InputError(
                 f"effect {effect.name}: expected {coefficient.name} {wanted}, found {value:g}"
             )

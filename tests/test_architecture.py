@@ -73,7 +73,8 @@ def test_imports_run_downwards_and_never_in_a_circle(imports):
     [
         ("bench/benchmark/storage/run_journal.py", "import bench.benchmark.runner.tuner_loop",
         "the packages of bench form layers"),
-        ("bench/diagnosis/fitting/trajectory_fit.py", "import methods.tuner", "diagnosis runs tuners through the runner alone"),
+        ("bench/diagnosis/fitting/trajectory_fit.py", "import methods.tuner",
+        "diagnosis runs tuners through the runner alone"),
         ("bench/diagnosis/fitting/trajectory_fit.py", "import bench.diagnosis.search.effect_search",
         "the packages of diagnosis form layers"),
         ("methods/tuners/cma_es.py", "import sims.core.simulator",

@@ -138,8 +138,8 @@ class Comparison:
         try:
             if planned is not None and planned != ids:
                 raise InputError(
-                    f"{self.folder / SEGMENTS_FOLDER / PLAN_FILE}: its plan is not the one that its "
-                    "configuration gives; start a new comparison"
+                    f"{self.folder / SEGMENTS_FOLDER / PLAN_FILE}: its plan is not the one that "
+                    "its configuration gives; start a new comparison"
                 )
             self._check_kept(journal, ids)
         except InputError:

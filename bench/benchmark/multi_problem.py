@@ -101,7 +101,8 @@ def compare_across_problems(
     say(f"mean rank over {count} problems (1 is best)\n{means.to_string()}")
     if not together.has_enough_problems:
         say(
-            f"no critical-difference diagram: it needs {MIN_PROBLEMS_FOR_RANKS} problems and {_MIN_TUNERS_FRIEDMAN} tuners"
+            f"no critical-difference diagram: it needs {MIN_PROBLEMS_FOR_RANKS} problems and "
+            f"{_MIN_TUNERS_FRIEDMAN} tuners"
         )
     pictures = {
         name: render_all_formats(figure) for name, figure in together.build_figures().items()
@@ -185,7 +186,7 @@ class ComparisonCollection:
 
     @cached_property
     def rank_tests(self) -> tuple[float, pd.DataFrame]:
-        """Friedman's p-value, and Nemenyi's for each pair of tuners; requires `has_enough_problems`."""
+        """Friedman's p-value, and Nemenyi's for each pair; requires `has_enough_problems`."""
         return compute_nemenyi_p_values(self.mean_ranks)
 
     def build_tables(self) -> dict[str, pd.DataFrame]:
@@ -247,7 +248,7 @@ class ComparisonCollection:
         return frame.assign(trusted=True) if self.has_trusted_runs else frame
 
     def build_figures(self) -> dict[str, Figure]:
-        """Draw the figures runtime-distribution, and critical-difference if `has_enough_problems`."""
+        """Draw runtime-distribution, and critical-difference if `has_enough_problems`."""
         drawn = {"runtime-distribution": self._joint_figure()}
         if self.has_enough_problems:
             friedman, p_values = self.rank_tests

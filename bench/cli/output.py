@@ -32,8 +32,8 @@ EXIT_INTERRUPTED = 130
 """Exit code of a command that was interrupted, by the convention of shells."""
 EXIT_CODES = {
     EXIT_OK: "done",
-    EXIT_PROBLEMS_FOUND: "done, and something failed in it: a run, a check, a claim; or what was asked to make "
-    "it so",
+    EXIT_PROBLEMS_FOUND: "done, and something failed in it: a run, a check, a claim; "
+    "or what was asked to make it so",
     EXIT_ERROR: "a fault of the input, told in one line; nothing was half-written",
     EXIT_INTERRUPTED: "interrupted; what was finished is kept",
 }

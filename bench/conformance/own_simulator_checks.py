@@ -38,10 +38,9 @@ def _step(simulator: OwnSimulator) -> None:
 
 
 def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable | None:
-    """Check the types and shapes of the results of `simulate_toy_problem`, `inertia_repair` and `apply_force`.
+    """Check the types and shapes of the results of `observe`, `inertia` and `apply_force`.
 
-    `simulate_toy_problem` must return a number for every channel, coordinate, rate and level.
-    `inertia_repair` must
+    `observe` must return a number for every channel, coordinate, rate and level. `inertia` must
     return a number or a positive definite matrix (D, D). `apply_force` must accept (D,).
     """
     own = _own(kind)
@@ -181,7 +180,7 @@ def _motion(simulator: OwnSimulator, force: Array | None) -> Array:
 
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
-    """Check that `put` sets a level, which `simulate_toy_problem` returns, and leaves other levels unchanged."""
+    """Check that `set_levels` sets a level that `observe` returns, and no other level."""
     own = _own(kind)
     if own is None:
         return _NOT_OWN

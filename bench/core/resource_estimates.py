@@ -82,7 +82,10 @@ class ResourceNeed:
         if self.files > machine.files:
             return f"{self.files:.3g} files, where there is room for {machine.files:.3g}"
         if self.steps > MAX_STEPS_PER_SIMULATION:
-            return f"{self.steps:.3g} steps in one simulation, where {MAX_STEPS_PER_SIMULATION:g} take hours"
+            return (
+                f"{self.steps:.3g} steps in one simulation, "
+                f"where {MAX_STEPS_PER_SIMULATION:g} take hours"
+            )
         if self.seconds > MAX_TOTAL_SECONDS:
             return f"{_long(self.seconds)}, where {_long(MAX_TOTAL_SECONDS)} are the most"
         return ""

@@ -150,8 +150,8 @@ def _added_noise(channels: Sequence[str]) -> str:
     if not channels:
         return ""
     return (
-        f"no noise is found in {joined(channels)}: white noise of {INTEGRATION_ERROR_SHARE:g} of the range is "
-        "added, the accuracy of a simulation; smaller differences are not explained"
+        f"no noise is found in {joined(channels)}: white noise of {INTEGRATION_ERROR_SHARE:g} of "
+        "the range is added, the accuracy of a simulation; smaller differences are not explained"
     )
 
 

@@ -51,7 +51,7 @@ class Explanation:
 
     @property
     def verdict(self) -> VerdictName:
-        """``adequate``, ``named``, ``ambiguous``, ``partial``, ``make_unknown_name_error``, ``unidentifiable``."""
+        """``adequate``, ``named``, ``ambiguous``, ``partial``, ``unknown``, ``unidentifiable``."""
         return self.answer.verdict
 
     @property

@@ -112,7 +112,8 @@ def write_report(study: ReportableDiagnosisStudy, say: Callable[[str], None]) ->
     hopeless = sum(not one["item"] for one in study.answers.values())
     say(f"{asked} questions of {planned}; of {hopeless} the sensors cannot show what is hidden")
     say(
-        f"written: {study.folder}/ with {ANSWERS_TABLE_FILE}, {', '.join(f'{n}.csv' for n in tables)}"
+        f"written: {study.folder}/ with {ANSWERS_TABLE_FILE}, "
+        f"{', '.join(f'{n}.csv' for n in tables)}"
     )
     say(f"figures: {', '.join(f'{name}.png' for name in sorted(pictures))}")
     say(f"report: {study.folder / REPORT_FILE}")

@@ -125,7 +125,10 @@ def compute_heights_by_scale(
                 "give the ball's diameter"
             )
         factor = fallen
-        how = f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s^2; a drag would be taken for scale)"
+        how = (
+            f"scaled by the fall (gravity {DEFAULT_GRAVITY:g} m/s^2; "
+            "a drag would be taken for scale)"
+        )
         # Without a diameter, assume the radius that a level camera would give.
         ball = diameter / 2 if diameter else factor
     else:

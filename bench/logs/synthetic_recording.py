@@ -379,6 +379,7 @@ def _number(what: str, name: str, value: object) -> float:
         raise InputError(f"{what} {name}: expected a number, found {value!r:.60}")
     if not is_plausible_number(value):
         raise InputError(
-            f"{what} {name} = {truncate_text(str(value))}: expected a finite number within ±{MAX_NUMBER:g}"
+            f"{what} {name} = {truncate_text(str(value))}: "
+            f"expected a finite number within ±{MAX_NUMBER:g}"
         )
     return float(value)

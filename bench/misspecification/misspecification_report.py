@@ -180,7 +180,10 @@ def _table(one: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str
     wide = mine.pivot(index="tuner", columns="column", values="mean")
     order = [f"{head} {model}" for head in heads.values() for model in MODEL_LABELS]
     wide = wide[order].sort_values(order[-1]).rename_axis(index=None, columns=None)
-    title = f"mean error of the parameters [{misspecification_scores.TRAINING_WIDTHS_UNIT}] and RMSE of unseen runs [{one.unit}]"
+    title = (
+        f"mean error of the parameters [{misspecification_scores.TRAINING_WIDTHS_UNIT}] "
+        f"and RMSE of unseen runs [{one.unit}]"
+    )
     return f"{title}\n{wide.to_string(float_format=lambda value: f'{value:.2g}')}"
 
 

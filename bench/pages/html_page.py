@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 _HERE = Path(__file__).parent
 _LIBRARY = _HERE / "vendor" / "uplot"
 _SCRIPTS = (
-    "text_format", "table_data", "view_state", "ticks", "theme", "plot_drawing", "panel", "downloads",
-    "figure", "data_grid", "page",
+    "text_format", "table_data", "view_state", "ticks", "theme", "plot_drawing", "panel",
+    "downloads", "figure", "data_grid", "page",
 )  # fmt: skip
 """Scripts in the order of their dependencies: a later one may use earlier ones."""
 
@@ -142,7 +142,8 @@ class HtmlPage:
                 self._navigation(),
                 '<main id="main">',
                 *self._parts,
-                f'</main>\n<footer class="soft">{html_elements.make_paragraph(self._made)}</footer>',
+                "</main>\n"
+                f'<footer class="soft">{html_elements.make_paragraph(self._made)}</footer>',
                 f'<script type="application/json" id="data">{to_embeddable_json(data)}</script>',
                 f"<script>{script}</script>\n</body>\n</html>\n",
             ]

@@ -251,7 +251,8 @@ class ExplanationDiff:
         yield from format_columns(rows)
         for row in document["heldout"]:
             if row["a"] is not None or row["b"] is not None:
-                yield f"held-out {row['name']}: {format_number(row['a'])} -> {format_number(row['b'])}"
+                change = f"{format_number(row['a'])} -> {format_number(row['b'])}"
+                yield f"held-out {row['name']}: {change}"
         for row in document["candidates"]:
             if row["rank_a"] != row["rank_b"]:
                 ranks = f"{row['rank_a'] or 'none'} -> {row['rank_b'] or 'none'}"

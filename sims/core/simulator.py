@@ -117,7 +117,8 @@ class Parameter:
             )
         if max(-low, high) > MAX_NUMBER:
             raise InputError(
-                f"parameter {self.name}: bounds must lie within ±{MAX_NUMBER:g}, found {self.bounds}"
+                f"parameter {self.name}: bounds must lie within ±{MAX_NUMBER:g}, "
+                f"found {self.bounds}"
             )
         if self.log and low <= 0:
             raise InputError(

@@ -39,7 +39,7 @@ def describe_stepping() -> str:
 
 
 def missing_packages(name: str) -> list[str]:
-    """Return the packages that an engine of `ENGINE_MODULES` requires and that are not installed."""
+    """Return the required packages of an engine of `ENGINE_MODULES` that are not installed."""
     required = import_module(ENGINE_MODULES[name]).REQUIRED_PACKAGES
     return [package for package in required if importlib.util.find_spec(package) is None]
 

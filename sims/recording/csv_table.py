@@ -256,7 +256,8 @@ class Table:
                 self.fault(
                     begin,
                     "run",
-                    f"run {format_value(name)} goes on after another began; expected its rows together",
+                    f"run {format_value(name)} goes on after another began; "
+                    "expected its rows together",
                 )
             part = {c: make_read_only(columns[c][begin:end]) for c in self.wanted[2:]}
             if end - begin < 2:

@@ -127,8 +127,9 @@ def check_switches(
     for switch in switches:
         where = f"{path}: actuators.{switch.actuator}"
         if switch.actuator not in actuators:
+            names = list(actuators) or ["none"]
             raise InputError(
-                f"{where}: {make_unknown_name_error('actuator', switch.actuator, list(actuators) or ['none'])}"
+                f"{where}: {make_unknown_name_error('actuator', switch.actuator, names)}"
             )
         if switch.column in taken:
             raise InputError(

@@ -380,7 +380,7 @@ def _converted(table: Path, part: CsvRun, name: str, scale: UnitScale) -> Array:
 
 
 def _split(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
-    """Divide the runs into runs for fitting and held-out runs, as described for `split_held_out`."""
+    """Divide the runs into runs for fitting and held-out runs; see `split_held_out`."""
     runs = [replace(run, fold=None) for run in runs]
     if any(run.held_out for run in runs):
         if all(run.held_out for run in runs):

@@ -177,8 +177,8 @@ def _belongs_to_nothing(path: Path, name: str, declared: DeclaredSignals) -> Inp
     there += f" and inputs {', '.join(inputs)}" if inputs else " and no inputs"
     near = similar(name, [*channels, *inputs])
     return InputError(
-        f"{path}: column {format_value(name)}: expected a channel or input of {declared.name}, which has "
-        f"{there}{near}; rename the column, drop it, or state what it is with "
+        f"{path}: column {format_value(name)}: expected a channel or input of {declared.name}, "
+        f"which has {there}{near}; rename the column, drop it, or state what it is with "
         f"description={{'extra': {{{name!r}: {{'unit': '1'}}}}}}"
     )
 

@@ -31,5 +31,5 @@ def format_name_list(
 
 
 def format_item_list(things: Sequence[str]) -> str:
-    """Format at most `MAX_LISTED_WITH_NUMBERS` items that contain numbers, with the number of further ones."""
+    """Format at most `MAX_LISTED_WITH_NUMBERS` items with numbers, and count the further ones."""
     return format_name_list(things, MAX_LISTED_WITH_NUMBERS, "; ")

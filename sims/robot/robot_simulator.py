@@ -148,7 +148,7 @@ class RobotSimulator(SystemSimulator):
         return self.engine.largest_step
 
     def _acting(self, theta: Array) -> ActiveEffects:
-        """Return active effects, see `SystemSimulator`: free parameters first, families expanded."""
+        """Return active effects (`SystemSimulator`): free parameters first, families expanded."""
         acting: list[tuple[Effect, Array]] = []
         place = 0
         for effect in self._freed:

@@ -23,9 +23,10 @@ FILM_MODES = ("projected", "tracked")
 class FilmedBall(Simulator):
     """A ball that falls and bounces on level ground, seen by a fixed camera.
 
-    By default, the camera has a field of view of 40 degrees and looks at (0, 0, 2) m, as the published visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released
-    code). `v` is the pixel row of the middle of the ball's outline, from the top; it may lie
-    outside the picture.
+    By default, the camera has a field of view of 40 degrees and looks at (0, 0, 2) m, as the
+    published visual tuner's does (Allevato et al., TuneNet, arXiv 1907.11200, released code). `v`
+    is the pixel row of the middle of the ball's outline, from the top; it may lie outside the
+    picture.
 
     Args:
         constants: values for `make_constant_nodes` other than their defaults.
@@ -86,7 +87,8 @@ class FilmedBall(Simulator):
                 f" {film!r}"
             )
         if film == "tracked":
-            video_packages.check_installed()  # now, with one message, and not in the middle of a training
+            # Fail here with one message, not in the middle of a training.
+            video_packages.check_installed()
         self._tracked = film == "tracked"
         self._ball = Ball(self._of_ball(self.constant_values), ["x", "y", "z"], **settings)
         # with the coefficients of effects that are not fixed

@@ -1,9 +1,9 @@
-"""What the harness costs: an evaluation through `drive_tuner` and `ProposalEvaluator` against a bare loop over
-the same work.
+"""Measure what the harness costs compared with a bare loop over the same work.
 
-Run with `make benchmark`. The bare loop draws the same proposals and calls the same simulator; all
-that is left is harness: budget, checks, unit cube, loss, recommendation, timing, rows. Simulators:
-one that costs nothing, and the spring in closed form.
+An evaluation goes through `drive_tuner` and `ProposalEvaluator`. Run with `make benchmark`. The
+bare loop draws the same proposals and calls the same simulator; all that is left is harness:
+budget, checks, unit cube, loss, recommendation, timing, rows. Simulators: one that costs nothing,
+and the spring in closed form.
 """
 
 from __future__ import annotations
@@ -79,9 +79,8 @@ def measure(problem, name):
         ratios.append(seconds / plain)
         started = perf_counter()
         rmse = evaluator.rmse(trace.proposals, trace.recommendations)
-        build_rows(problem, RunRequest("run", TunerEntry("drawing", "drawing"), 0, target.sealed, EVALUATIONS),
-        target,
-             RunOutcome(trace, rmse, None, 0.0))  # fmt: skip
+        request = RunRequest("run", TunerEntry("drawing", "drawing"), 0, target.sealed, EVALUATIONS)
+        build_rows(problem, request, target, RunOutcome(trace, rmse, None, 0.0))
         scoring.append((perf_counter() - started) / EVALUATIONS * 1e6)
     return {
         "simulator": name,

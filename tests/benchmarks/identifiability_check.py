@@ -1,4 +1,6 @@
-"""Is the word of the check true? ``python -m tests.benchmarks.identifiability_check [--count 200]``.
+"""Measure whether the identifiability check is right.
+
+``python -m tests.benchmarks.identifiability_check [--count 200]``.
 
 Random problems: a pendulum, slider, servo or two-joint arm with numbers of unknown value, driven
 more or less, seen by more or less noise. Of a number that the check calls identifiable the interval

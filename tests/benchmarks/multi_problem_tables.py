@@ -101,7 +101,8 @@ def main():
     folders = sorted((f.parent for f in root.glob("*/identifiability.csv")), key=lambda f: f.name)
     print("# Tables\n\nMade by `make multi`; medians over targets, in range / wide.\n")
     print(
-        f"## What the data identify\n\nStiff: 1 sigma below {STIFF_SIGMA_THRESHOLD:g} of the training width.\n"
+        "## What the data identify\n\n"
+        f"Stiff: 1 sigma below {STIFF_SIGMA_THRESHOLD:g} of the training width.\n"
     )
     print(identified(folders))
     for metric, title in METRICS.items():

@@ -1,5 +1,6 @@
-"""explain on the measured recordings: ``python -m tests.benchmarks.real_recordings [NAME ...] [--thorough]
-[--out DIR]``.
+"""Explain the measured recordings.
+
+``python -m tests.benchmarks.real_recordings [NAME ...] [--thorough] [--out DIR]``.
 
 Writes a folder for each recording (verdict, extended simulator, report; of a thorough search one
 called so) and the table of results/reference/real. What is published of each, and the held-out

@@ -1,5 +1,6 @@
-"""Who is ahead of a tuner, at which number of simulations: ``python -m tests.benchmarks.reference_overlay
-FOLDER [TUNER]``.
+"""Who is ahead of a tuner, at which number of simulations.
+
+``python -m tests.benchmarks.reference_overlay FOLDER [TUNER]``.
 
 Reads a comparison's folder; paired tests over its targets after 1, 2, 3, 5, ... simulations
 (`statistics.paired_tests`: Wilcoxon on the logarithms of errors, Holm's correction over all pairs).

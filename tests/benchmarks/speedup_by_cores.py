@@ -1,5 +1,7 @@
-"""What several cores save of a diagnosis: ``OMP_NUM_THREADS=1 python -m tests.benchmarks.speedup_by_cores
-[RECORDING.csv ...] [--jobs N]``; a pair of causes on each system without a recording.
+"""Measure how much time several cores save in a diagnosis.
+
+``OMP_NUM_THREADS=1 python -m tests.benchmarks.speedup_by_cores [RECORDING.csv ...] [--jobs N]``;
+a pair of causes on each system without a recording.
 
 On a machine that others use the clock tells little, so the critical path stands beside it: the
 processor time of the process that leads, and in each round that is shared that of the worker with

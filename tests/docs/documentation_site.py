@@ -1,5 +1,6 @@
-"""Builds the site: `python -m tests.docs.documentation_site`, which `make docs` calls; site/html/index.html opens
-from the disk, without a server.
+"""Build the site: `python -m tests.docs.documentation_site`, which `make docs` calls.
+
+site/html/index.html opens from the disk, without a server.
 """
 
 import argparse

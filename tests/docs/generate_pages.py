@@ -133,8 +133,8 @@ def experiment_keys():
     parts = [
         "An experiment is a TOML file: one that comes with the project by its name, your own by "
         "its path (`simgap compare my.toml`). The keys are the fields of "
-        "`bench.benchmark.problem.experiment.Experiment`; a comparison's `experiment.toml` has all of them, "
-        "defaults filled in. An unknown key is refused by name. "
+        "`bench.benchmark.problem.experiment.Experiment`; a comparison's `experiment.toml` has "
+        "all of them, defaults filled in. An unknown key is refused by name. "
         "[Patterns](../../bench/experiments), [what they are for](../problems.md).",
         keys(Experiment, ""),
     ]

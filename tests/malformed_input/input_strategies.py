@@ -23,10 +23,12 @@ PIECES = [
     "class Random(Tuner): pass", "class Odd(Tuner):\n    name = 3",
     "class Odd(Tuner):\n    name = 'a b'", "class Odd(Tuner):\n    name = ''",
     "class Odd(Tuner):\n    requires = 5", "raise ValueError('a\\nb')", "raise SystemExit(3)",
-    "1/0", "def f(:", "\tx = 1", "import no_such_thing", "from sims.core.simulator import Simulator",
-    "assert False", "x = (", "class S(Simulator):\n    name = 's'",
-    "class S(Simulator):\n    def simulate(self, a, b): pass", "from sims.core.system import Effect",
-    "class E(Effect):\n    name = 'drag.linear'", "class E(Effect): pass",
+    "1/0", "def f(:", "\tx = 1", "import no_such_thing",
+    "from sims.core.simulator import Simulator", "assert False", "x = (",
+    "class S(Simulator):\n    name = 's'",
+    "class S(Simulator):\n    def simulate(self, a, b): pass",
+    "from sims.core.system import Effect", "class E(Effect):\n    name = 'drag.linear'",
+    "class E(Effect): pass",
     "def recurse(): recurse()\nrecurse()", "exit()", "class Odd(Tuner, metaclass=5): pass",
     "'\\ud800'", "# \x00", "raise KeyboardInterrupt", "raise BaseException('x' * 5000)",
     "class Own(Tuner):\n    name = 'own'\n    def tune(self, task, rng): yield task.start",
@@ -35,7 +37,8 @@ PIECES = [
     "class Own(Tuner):\n    name = 'own'\n    learned = 'x'\n    stochastic = 7",
     "class Own(Tuner):\n    name = 'own'\n    def __init__(self): raise OSError('a\\nb')",
     "raise type('E', (Exception,), {'__str__': lambda s: 1 / 0})()", "print('a\\x1b[31m')",
-    "from sims.core.simulator import Channel, Parameter", "Channel('x', 3)", "Parameter(1, 2, 3, 4, 5)",
+    "from sims.core.simulator import Channel, Parameter", "Channel('x', 3)",
+    "Parameter(1, 2, 3, 4, 5)",
 ]  # fmt: skip
 """Of plugin files."""
 
@@ -63,7 +66,8 @@ def plugins(draw):
         ("compare", "swing.toml", "--tuners", "own"), ("compare", "swing.toml", "--jobs", "0"),
         ("score", "extended.toml", "data.csv"),
     ]))  # fmt: skip
-    files = {"plugin.py": text, "swing.toml": valid_input.toml(valid_input.SWING), **valid_input.recorded("pendulum"),
+    files = {"plugin.py": text, "swing.toml": valid_input.toml(valid_input.SWING),
+             **valid_input.recorded("pendulum"),
              "extended.toml": valid_input.toml(valid_input.model())}  # fmt: skip
     name = draw(
         st.sampled_from(["plugin.py", "plugin.py", "plugin.py", "none.py", ".", "data.csv"])

@@ -392,7 +392,10 @@ def test_failed_simulation_is_no_evidence(one):
 def test_torch_stays_out_until_it_trains(one):
     import subprocess
 
-    code = "import methods.tuners.tunenet, methods.tuners.direct_regressor, sys; print('torch' in sys.modules)"
+    code = (
+        "import methods.tuners.tunenet, methods.tuners.direct_regressor, sys; "
+        "print('torch' in sys.modules)"
+    )
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True

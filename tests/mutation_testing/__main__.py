@@ -1,10 +1,8 @@
-"""Applies the mutants of `mutation_testing.mutant_catalogue` to a copy of the tree, one at a time, and runs
-the tests that must notice.
+"""Apply the mutants of `mutant_catalogue` to a copy of the tree and run the tests that must notice.
 
-`make mutants` runs all. Run `python -m tests.mutation_testing [CONTRACT ...] [--jobs N] [--limit
-S]` for
-some of them. Exit code 1 where one survives, does not fit the code any more, or breaks so much that
-no test is reached.
+Mutants are applied one at a time. `make mutants` runs all. Run `python -m tests.mutation_testing
+[CONTRACT ...] [--jobs N] [--limit S]` for some of them. Exit code 1 where one survives, does not
+fit the code any more, or breaks so much that no test is reached.
 """
 
 from __future__ import annotations

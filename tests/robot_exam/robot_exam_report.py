@@ -233,9 +233,11 @@ KINDS = ("clean", "single", "family", "double", "foreign", "numerics")
 HOWS = ("strict", "few", "fair", "any")
 _WORDS = {None: "", True: "yes", False: "no"}
 INTRODUCTION = """Recordings of robots of 2 to 7 joints, driven by forces or by position servos,
-made by Pinocchio and a solver written for the tests (`tests/robot_exam`; MuJoCo, which explains them,
+made by Pinocchio and a solver written for the tests (`tests/robot_exam`; MuJoCo, which explains \
+them,
 makes none): in each one hidden cause, a family, two, one that the library does not have, a time
 step that is too coarse, or none. `explain` sees the robot's file and the recording. `python -m
-tests.robot_exam` makes all of this again. `strict`: effect and place named alone; `few`: or in a set of
+tests.robot_exam` makes all of this again. `strict`: effect and place named alone; `few`: or in a \
+set of
 at most 4; `fair`: or in a set whose other members, refitted in the world that made the data, do as
 well on the runs held out (error at most 5 % larger); `any`: or in any set."""

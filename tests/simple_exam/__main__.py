@@ -1,5 +1,6 @@
-"""The exam of `simgap explain`: ``python -m tests.simple_exam [--quick] [--out DIR] [--jobs 2] [--only
-KIND/SYSTEM]``.
+"""The exam of `simgap explain`.
+
+``python -m tests.simple_exam [--quick] [--out DIR] [--jobs 2] [--only KIND/SYSTEM]``.
 
 Recordings of independent simulators, in each a hidden cause or none; every answer is marked. One
 row a question is added to items.jsonl as it is answered, so that an exam that was interrupted goes

@@ -1,5 +1,6 @@
-"""Write a batch of recordings: ``python -m tests.simple_exam.make_recordings --kind single --system ball --count 20
---out DIR``.
+"""Write a batch of recordings.
+
+``python -m tests.simple_exam.make_recordings --kind single --system ball --count 20 --out DIR``.
 
 With ``--each`` that many of every effect, else of whatever is drawn. Existing recordings are left
 as they are.

@@ -45,7 +45,8 @@ def test_import_is_lazy_and_quiet():
     )
     assert lazy.stdout == "False\n"
     used = python(
-        "from sims.engines.adapters import bullet_world\nprint('before', flush=True); bullet_world.engine(); print('after')"
+        "from sims.engines.adapters import bullet_world\n"
+        "print('before', flush=True); bullet_world.engine(); print('after')"
     )
     assert (used.stdout, used.stderr) == ("before\nafter\n", "")
 
@@ -53,7 +54,8 @@ def test_import_is_lazy_and_quiet():
 def test_import_survives_closed_streams():
     assert (
         python(
-            "import os; os.close(1); from sims.engines.adapters import bullet_world; bullet_world.engine()"
+            "import os; os.close(1); "
+            "from sims.engines.adapters import bullet_world; bullet_world.engine()"
         ).returncode
         == 0
     )

@@ -61,7 +61,8 @@ def test_an_interrupted_making_leaves_nothing(tmp_path):
 
 def test_a_killed_making_holds_nobody_up_and_one_makes_while_the_others_wait(tmp_path):
     code = (
-        "import os, sys, time; from pathlib import Path; from sims.engines.compiled import code_cache\n"
+        "import os, sys, time; from pathlib import Path; "
+        "from sims.engines.compiled import code_cache\n"
         "path = Path(sys.argv[1])\n"
         "def make():\n"
         "    path.with_name('at-it').touch()\n"

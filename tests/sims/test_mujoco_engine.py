@@ -21,7 +21,8 @@ KINDS = [Ball, Pendulum, Slider, Servo]
 def test_import_is_lazy():
     code = (
         "import sys\nfrom sims.systems.ball import Ball\nball = Ball(engine='mujoco')\n"
-        "print('mujoco' in sys.modules, sys.modules['sims.engines.adapters.mujoco_engine'].__name__)"
+        "print('mujoco' in sys.modules, "
+        "sys.modules['sims.engines.adapters.mujoco_engine'].__name__)"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "False sims.engines.adapters.mujoco_engine\n"

@@ -33,7 +33,11 @@ from bench.benchmark.isolation.process_exit import (
 from methods.tuner import Array
 from sims.engines.compiled import code_cache as compiled
 
-_BOOTSTRAP_CODE = "import sys; sys.path[:] = {path!r}; from bench.benchmark.isolation.fork_server import serve_fork_requests; serve_fork_requests({descriptor})"
+_BOOTSTRAP_CODE = (
+    "import sys; sys.path[:] = {path!r}; "
+    "from bench.benchmark.isolation.fork_server import serve_fork_requests; "
+    "serve_fork_requests({descriptor})"
+)
 _PRELOADED = ("numpy.random", "bench.benchmark.isolation.tuner_server")
 _NUMERICAL = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
 """Prefixes of environment variables that determine how numerical libraries compute."""

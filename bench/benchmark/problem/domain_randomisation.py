@@ -95,7 +95,7 @@ class RandomisedSimulator:
         return np.concatenate([self._simulator.simulate(theta, s) for s in scenarios], axis=1)
 
     def draw_coefficients(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw coefficients uniformly in their ranges; a share of `NO_EFFECT_SHARE` of the rows is zero.
+        """Draw coefficients uniformly; a share of `NO_EFFECT_SHARE` of the rows is zero.
 
         Args:
             rng: random generator.

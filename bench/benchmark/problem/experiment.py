@@ -91,8 +91,8 @@ class HeldOutConfig:
 class RecordingSource:
     """Recording to which an experiment on real data is tuned.
 
-    The `path` is relative to the folder of recordings ($SIMGAP_DATA), to that of `simgap download`, to the experiment's file, or to the
-    working directory.
+    The `path` is relative to the folder of recordings ($SIMGAP_DATA), to that of `simgap download`,
+    to the experiment's file, or to the working directory.
     """
 
     path: str = ""
@@ -298,7 +298,10 @@ class Experiment:
             raise make_error(who, "negligible_error", wanted, self.negligible_error)
         rate = check_finite(who, "sampling.rate", self.sampling.rate)
         if not 0 < rate <= MAX_SAMPLING_RATE_HZ or self.sampling.samples < 1:
-            wanted = f"a rate above 0 Hz and up to {MAX_SAMPLING_RATE_HZ:g} Hz, and at least 1 of samples"
+            wanted = (
+                f"a rate above 0 Hz and up to {MAX_SAMPLING_RATE_HZ:g} Hz, "
+                "and at least 1 of samples"
+            )
             raise make_error(who, "sampling", wanted, asdict(self.sampling))
         for name, sigma in self.noise.items():
             if check_finite(who, f"noise.{name}", sigma) < 0:

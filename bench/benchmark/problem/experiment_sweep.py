@@ -42,8 +42,8 @@ def expand_documents(
     count = prod(len(values) for values in swept.values())
     if count > MAX_EXPERIMENTS:
         raise InputError(
-            f"{path}: sweep: expected at most {MAX_EXPERIMENTS:,} experiments, found {count:.3g} combinations;"
-            " sweep over fewer values, or divide the file"
+            f"{path}: sweep: expected at most {MAX_EXPERIMENTS:,} experiments, "
+            f"found {count:.3g} combinations; sweep over fewer values, or divide the file"
         )
     for key, values in swept.items():
         _check(path, f"sweep.{key}", values)

@@ -44,7 +44,7 @@ class TrainingProblem(Protocol):
 
 
 class RandomisedSimulation(Protocol):
-    """Simulator with effects that the tuned one lacks, as `domain_randomisation.RandomisedSimulator` is."""
+    """Simulator with effects that the tuned one lacks, for example `RandomisedSimulator`."""
 
     def simulate(
         self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]

@@ -195,8 +195,8 @@ def render_runtime_chart(results: ComparisonReportData, page: HtmlPage) -> str:
         across = _simulations(results)
         panels.append(_panel(results, kind, "runtime", "simulations", lines, across, up))
     caption = (
-        f"{safe(format_threshold_caption(results.statistics.spread))} Higher is better; where a line ends "
-        "is what can be solved at all."
+        f"{safe(format_threshold_caption(results.statistics.spread))} Higher is better; "
+        "where a line ends is what can be solved at all."
     )
     still = results.make_static_figure("runtime", "The share of thresholds reached by each tuner.")
     return _shown(
@@ -263,7 +263,8 @@ def render_cost_chart(results: ComparisonReportData, page: HtmlPage) -> str:
     page.add_table("seconds", pd.concat(parts), _DIGITS)
     caption = (
         "Expected simulations times the seconds of one, and the tuner's own seconds as measured; a "
-        f"training is shared by {TARGETS_PER_TRAINING} targets. The strip at the foot names who needs the least. "
+        f"training is shared by {TARGETS_PER_TRAINING} targets. "
+        "The strip at the foot names who needs the least. "
         "A tuner without a line never reached the error."
     )
     still = results.make_static_figure(
@@ -396,7 +397,8 @@ def _panel(
     spans: tuple[AxisSpan, ...] = (),
 ) -> Panel:
     """Build a panel of one range of targets."""
-    title = f"{PANEL_TITLES[kind]} ({results.count_targets(kind)} {'starts' if kind == 'real' else 'targets'})"
+    counted = "starts" if kind == "real" else "targets"
+    title = f"{PANEL_TITLES[kind]} ({results.count_targets(kind)} {counted})"
     return Panel(title, table, x, lines, across, up, {_BESIDE: PANEL_TITLES[kind]}, spans=spans)
 
 

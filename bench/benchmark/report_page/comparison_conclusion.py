@@ -119,8 +119,9 @@ def _reaching(results: ComparisonReportData, kind: str) -> str:
         return ""
     lines = sorted(part.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
     each = [
-        f"{safe(row['tuner'], 40)} {format_number(row['ert'])} ({_ends(row)}; {int(row['successes'])} of "
-        f"{int(row['runs'])} runs{_training(results, row)})"
+        f"{safe(row['tuner'], 40)} {format_number(row['ert'])} "
+        f"({_ends(row)}; {int(row['successes'])} of {int(row['runs'])} runs"
+        f"{_training(results, row)})"
         for row in lines
     ]
     return (

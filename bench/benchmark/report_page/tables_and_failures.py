@@ -175,8 +175,8 @@ def render_identifiability_table(results: ComparisonReportData, page: HtmlPage) 
     if still is None:
         return ""
     caption = (
-        f"Marks above the dashed line ({STIFF_SIGMA_THRESHOLD:g} training widths) are sloppy: no tuner can know "
-        "them from these data. Right: which parameters make up a direction."
+        f"Marks above the dashed line ({STIFF_SIGMA_THRESHOLD:g} training widths) are sloppy: "
+        "no tuner can know them from these data. Right: which parameters make up a direction."
     )
     return "<h3>What the data can know</h3>\n" + page.render_figure("spectra", still, caption)
 

@@ -163,11 +163,11 @@ def hash_class_source(kind: type) -> str:
     """Hash the source of a class and of its base classes.
 
     A class of this project's source folders is represented by its name, because
-    `hash_source_folders` hashes
-    their content. A class of a plugin file is represented by the file, one of an installed plugin
-    by its whole package, and one of a notebook cell or a script by its own text. A class that is
-    made at run time has the attribute ``source_digest``, a text that changes with everything that
-    determines the class. Its attribute ``made_of`` may list further classes that it uses.
+    `hash_source_folders` hashes their content. A class of a plugin file is represented by the file,
+    one of an installed plugin by its whole package, and one of a notebook cell or a script by its
+    own text. A class that is made at run time has the attribute ``source_digest``, a text that
+    changes with everything that determines the class. Its attribute ``made_of`` may list further
+    classes that it uses.
 
     Raises:
         InputError: the source of a class cannot be found.
@@ -220,7 +220,9 @@ def _under_its_name(kind: type) -> bool:
 
 
 def _place(kind: type) -> Any:
-    """Return the representation of a class in a hash: empty if `hash_source_folders` covers it, else its source.
+    """Return the representation of a class in a hash.
+
+    It is empty if `hash_source_folders` covers the class; otherwise it is the source of the class.
 
     Raises:
         InputError: there is no source.

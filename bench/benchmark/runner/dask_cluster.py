@@ -187,7 +187,8 @@ class ClusterPool:
                         losses[place] = losses.get(place, 0) + 1
                         if losses[place] > _MAX_LOST_WORKERS_PER_CALL:
                             raise PoolLostError(
-                                f"cluster {self.address}: lost {_MAX_LOST_WORKERS_PER_CALL} workers on one run"
+                                f"cluster {self.address}: lost {_MAX_LOST_WORKERS_PER_CALL} "
+                                "workers on one run"
                             )
                         again.append(place)
                         continue

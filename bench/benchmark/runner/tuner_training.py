@@ -267,7 +267,9 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
         self._before, self._place = before, 0
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
-        """Simulate points, see `CountedTrainingSimulator.simulate`; check them against the requests before a kill.
+        """Simulate points, and check them against the requests before a kill.
+
+        See `CountedTrainingSimulator.simulate`.
 
         Args:
             rng: random generator.

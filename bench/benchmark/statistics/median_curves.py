@@ -195,7 +195,7 @@ def _median_with_interval(values: Array, tuner: str, place: int) -> tuple[float,
 
 
 def format_bin_labels(table: pd.DataFrame) -> list[str]:
-    """Return the labels of the groups of `compute_medians_by_distance`, with their numbers of targets."""
+    """Return labels of the groups of `compute_medians_by_distance`, with numbers of targets."""
     first = {int(row["bin"]): row for row in table.drop_duplicates("bin").to_dict("records")}
     names = []
     for b in range(max(first, default=0) + 1):

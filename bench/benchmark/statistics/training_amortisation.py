@@ -233,7 +233,7 @@ def build_time_per_target_table(prices: Mapping[str, Mapping[str, TuningCost]]) 
 
 
 def placed_even(table: pd.DataFrame) -> pd.DataFrame:
-    """Map target counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`."""
+    """Map counts of `build_break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`."""
     placed = table.copy()
     for column in ("targets", "low", "high"):
         values = table[column].to_numpy(dtype=np.float64)

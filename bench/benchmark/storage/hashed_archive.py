@@ -189,7 +189,8 @@ def _top(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
         e.filename for e in entries
     }:
         raise InputError(
-            f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} in it"
+            f"{archive}: expected an archive of simgap bundle: one folder with {MANIFEST_FILE} "
+            "in it"
         )
     return top
 

@@ -166,7 +166,8 @@ def read_configuration(folder: Path) -> FolderConfiguration:
     path = folder / CONFIGURATION_FILE
     if not path.is_file():
         raise InputError(
-            f"{folder}: expected the folder of a comparison with {CONFIGURATION_FILE} in it, found none"
+            f"{folder}: expected the folder of a comparison with {CONFIGURATION_FILE} in it, "
+            "found none"
         )
     held = read_environment(folder)
     experiment = parse_experiment(str(held["experiment"]), read_toml(path), path)

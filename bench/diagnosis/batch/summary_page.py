@@ -94,7 +94,10 @@ def render_summary_page(rows: Sequence[LogResult], asked: BatchPageInput) -> str
     """
     logs = summary_tables.build_log_table(rows, asked.folders)
     found = summary_tables.build_number_table(rows)
-    made = f"Made by simgap explain --each; the table is {make_code(LOGS_TABLE_FILE)} in {make_code(safe(asked.out))}."
+    made = (
+        f"Made by simgap explain --each; the table is {make_code(LOGS_TABLE_FILE)} in "
+        f"{make_code(safe(asked.out))}."
+    )
     page = HtmlPage(f"{_counted(len(rows))}, each explained by itself", made)
     page.add_table("each", logs)
     page.add_table("logs", summary_tables.format_log_table(rows))
@@ -171,9 +174,9 @@ def _next(rows: Sequence[LogResult], asked: BatchPageInput) -> Iterator[str]:
         name, _ = commonest[0]
         having = [row.log for row in rows if name in map(format_cause, row.causes)]
         yield make_paragraph(
-            f"{make_strong('Do the numbers differ from log to log by more than chance?')} Explained "
-            f"together, the {len(having)} logs with {make_code(safe(name, 200))} say so, and with what "
-            "a number moves:"
+            f"{make_strong('Do the numbers differ from log to log by more than chance?')} "
+            f"Explained together, the {len(having)} logs with {make_code(safe(name, 200))} say so, "
+            "and with what a number moves:"
         )
         yield render_command("simgap", "explain", *(asked.recordings[log] for log in having))
     if not causes and not failed:
@@ -186,7 +189,9 @@ def _render_log_table() -> DataGrid:
         GridColumn("number", "#", 6),
         GridColumn("verdict"),
         GridColumn("causes"),
-        GridColumn("gap_closed", "gap closed", 3, "share of the held-out error above its noise floor"),
+        GridColumn(
+            "gap_closed", "gap closed", 3, "share of the held-out error above its noise floor"
+        ),
         GridColumn("low", "95 % low", 3),
         GridColumn("high", "95 % high", 3),
         GridColumn("before", "before [floors]", 3, "error on held-out runs, in noise floors"),

@@ -42,7 +42,8 @@ def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> p
             "causes": "; ".join(format_cause(cause) for cause in row.causes),
             "gap_closed": row.gap_closed,
             "low": error.get("low"), "high": error.get("high"),
-            "before": _convert_to_noise_floors(error, "rmse_base"), "after": _convert_to_noise_floors(error, "rmse_extended"),
+            "before": _convert_to_noise_floors(error, "rmse_base"),
+            "after": _convert_to_noise_floors(error, "rmse_extended"),
             "seconds": row.seconds, "error": row.error, "report": report,
         })  # fmt: skip
     frame = pd.DataFrame(lines, columns=["number", *_TEXTS, *_MEASURED])

@@ -109,7 +109,8 @@ def _diagram(built: HtmlPage, diagram: DriveDiagram, drawn: PrintedFigure) -> It
     starts = append_unit(format_number(diagram.breakaway), diagram.unit)
     said = f"At rest it starts without a load at {starts}; "
     if diagram.backdrive < float("inf"):
-        said += f"without power {append_unit(format_number(diagram.backdrive), diagram.unit)} turn it back."
+        backdrive = append_unit(format_number(diagram.backdrive), diagram.unit)
+        said += f"without power {backdrive} turn it back."
     else:
         said += "without power no load turns it."
     laws = joined([make_code(safe(law, 60)) for law in diagram.laws]) or "no friction at rest"
@@ -151,8 +152,8 @@ def _stated(row: SheetRow) -> str:
 def _class(made: MjcfFiles) -> Iterator[str]:
     """Yield the MJCF class and notes on what MJCF cannot express."""
     if CLASS_FILE in made.contents:
-        said = f"{make_code(CLASS_FILE)} holds it as a default class: include the file, and give the joint "
-        yield make_paragraph(said + "and its actuator the class.")
+        said = f"{make_code(CLASS_FILE)} holds it as a default class: include the file, "
+        yield make_paragraph(said + "and give the joint and its actuator the class.")
         yield f'<pre class="copied" tabindex="0">{escape(made.contents[CLASS_FILE])}</pre>'
     if made.notes:
         yield make_list(safe(line) for line in made.notes)

@@ -32,12 +32,12 @@ MAX_CORRECTED_ERROR_FAR_FIT = 0.7
 The rest of the error is corrected after the fit (`bench.diagnosis.fitting.linearised_runs`).
 """
 MIN_ERROR_REDUCTION = 4.0
-"""Minimum factor by which a setting with an error above `MAX_CORRECTED_ERROR` must reduce the error.
+"""Minimum factor by which a setting must reduce an error above `MAX_CORRECTED_ERROR`.
 
 The reference is the error of the step of the model file.
 """
 MAX_ERROR_TO_RESIDUAL_RATIO = 0.05
-"""Maximum error of a setting above `MAX_CORRECTED_ERROR`, as a share of the residual of the model."""
+"""Maximum error of a setting above `MAX_CORRECTED_ERROR`, as a share of the model's residual."""
 CONVERGENCE_TOLERANCE = 0.03
 """Maximum RMS change by halving the step, in units of the noise, of a reference scheme."""
 MAX_STEP_DIVISIONS = 10

@@ -31,8 +31,9 @@ The remainder due to rounding to six digits is smaller.
 
 
 def add_least_noise(recording: Recording, channels: Sequence[str]) -> tuple[Recording, list[str]]:
-    """Add white noise of `INTEGRATION_ERROR_SHARE` of a channel's range to each channel without noise.
+    """Add white noise to each channel without noise.
 
+    Its standard deviation is the fraction `INTEGRATION_ERROR_SHARE` of the channel's range.
     Channels that never change are not modified.
 
     Args:

@@ -30,7 +30,7 @@ MIN_SAMPLES = 40
 REST_RATE = 0.05
 """Rate of a coordinate, in its unit per second, below which a run began at rest."""
 REST_STATE = 0.05
-"""Minimum magnitude of an initial coordinate to which the factors of `INITIAL_STATE_FACTORS` apply."""
+"""Minimum magnitude of an initial coordinate to which `INITIAL_STATE_FACTORS` apply."""
 RELEASE_SHARE = 0.2
 """Share of a run after which a pushed system is released."""
 HOLD_LEVEL_COUNT = 6

@@ -37,8 +37,9 @@ distinguish them.
 INITIAL_STATE_FACTORS = (0.3, 2.0, -1.0)
 """Factors of an initial state that are tried."""
 REST_STATE = 0.05
-"""Minimum magnitude of an initial state to which the factors of `INITIAL_STATE_FACTORS` apply. A smaller state is
-replaced by the numbers in `INITIAL_STATE_FACTORS` themselves.
+"""Minimum magnitude of an initial state to which the factors of `INITIAL_STATE_FACTORS` apply.
+
+A smaller state is replaced by the numbers in `INITIAL_STATE_FACTORS` themselves.
 """
 MIN_DROP_HEIGHT = 1.0
 """Minimum initial height in metres of a system that bounces."""

@@ -30,7 +30,7 @@ SEGMENTS_PER_RUN = 4
 MIN_MEAN_SEGMENT_SAMPLES = 20
 """Minimum number of samples per segment, on average over the segments of a run."""
 MAX_MISSING_FACTOR = 2
-"""Factor by which a single segment may have fewer samples than `MIN_MEAN_SEGMENT_SAMPLES`, due to missing samples."""
+"""Factor by which a segment may fall below `MIN_MEAN_SEGMENT_SAMPLES` due to missing samples."""
 RUN_END_SHARE = 0.1
 """Share of a run, at its end, in which the influence of the initial state is measured."""
 MAX_STATE_INFLUENCE = 0.1

@@ -194,8 +194,10 @@ class PredictionErrorSearch(EffectSearch):
         return p_value_of_gain(gain, len(places), count)
 
     def score_missing_effects(
-        self, model: FittedModel, against: Array | None = None
-    ) -> CandidateScores:  # noqa: ARG002
+        self,
+        model: FittedModel,
+        against: Array | None = None,  # noqa: ARG002
+    ) -> CandidateScores:
         """Score every effect that the model lacks by the innovations.
 
         Args:

@@ -161,7 +161,8 @@ def is_overstated(cause: Cause) -> bool:
 def _share(what: str) -> Callable[[str, Sequence[FittedValue]], str]:
     def say(where: str, values: Sequence[FittedValue]) -> str:
         c = values[0].value
-        return f"the {what} {where} is {format_percent(abs(c))} {_MORE[c > 0]} than the model file says"
+        percent = format_percent(abs(c))
+        return f"the {what} {where} is {percent} {_MORE[c > 0]} than the model file says"
 
     return say
 

@@ -211,7 +211,7 @@ def _drawn(one: ParameterConsistency) -> str:
 
 
 def build_consistency_rows(story: DiagnosisReportData) -> list[tuple[object, ...]]:
-    """Build the rows of `AGREEMENT_COLUMNS`: joint fit and groups of each parameter, with 95 % intervals."""
+    """Build the rows of `AGREEMENT_COLUMNS`: joint fit and groups, with 95 % intervals."""
     found: list[tuple[object, ...]] = []
     models = [("base", story.consistency.before)]
     if story.verdict.causes:

@@ -72,7 +72,8 @@ def _numbers(story: DiagnosisReportData) -> Iterator[str]:
     if not story.verdict.causes:
         return
     found = [
-        f"{safe(format_sentence(format_effect(cause.effect))[:-1], 200)}: {safe(format_coefficients(cause), 1000)}"
+        f"{safe(format_sentence(format_effect(cause.effect))[:-1], 200)}: "
+        f"{safe(format_coefficients(cause), 1000)}"
         for cause in story.verdict.causes
     ]
     trust = [safe(text, 1000) for text in format_consistency(story)]

@@ -155,7 +155,10 @@ def format_headline(story: DiagnosisReportData) -> str:
         end = f"the {END[first.at_bound or 'high']} bound of its range"
         value = append_unit(format_number(first.value), first.unit)
         why = f"parameter {sanitise(name, 60)} ends at {end}, {value}"
-        return f"The simulation {format_lacking(causes)}, but {why}: the cause may stand for a value beyond it."
+        return (
+            f"The simulation {format_lacking(causes)}, but {why}: "
+            "the cause may stand for a value beyond it."
+        )
     if verdict == "partial":
         more = "something else that no known cause explains"
         if len(causes) == 1 and (said := format_number_error(causes[0])):

@@ -119,7 +119,7 @@ def compute_explained_squares(
 
 
 def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
-    """Solve for the best of all subsets of columns; arguments and result as in `compute_explained_squares`."""
+    """Solve for the best subset of columns; see `compute_explained_squares` for the arguments."""
     number, count, samples = cross.shape
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))

@@ -88,7 +88,7 @@ def _max_input_rate(world: RunEvaluator, track: RunData, effect: Effect) -> floa
 
 
 def _max_input_acceleration(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
-    """Return the acceleration that moves the input over its range to rest within `MIN_PROFILE_SECONDS`."""
+    """Return the acceleration that crosses the input's range to rest in `MIN_PROFILE_SECONDS`."""
     return 4.0 * float(np.ptp(_command(track, effect))) / MIN_PROFILE_SECONDS**2
 
 

@@ -189,7 +189,7 @@ def is_indistinguishable(behind: float) -> bool:
 
 
 def convert_excess_ratio(ratios: Sequence[float]) -> float:
-    """Return the distance between two models on the scale of `is_indistinguishable`, from their excesses.
+    """Return the distance of two models on the scale of `is_indistinguishable`, from excesses.
 
     A ratio of excesses of `INDISTINGUISHABLE_EXCESS_RATIO` is equivalent to
     `INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO`:

@@ -24,8 +24,9 @@ from sims.core.simulator import Array
 HORIZON_STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
 """Stages of the fit of initial states: fraction of each run, and maximum number of steps."""
 FOLLOWED = ((1.0, 6),)
-"""Stages of the fit of initial states, as in `HORIZON_STAGES`, for a robot whose runs are filtered. These
-runs begin near their best states.
+"""Stages of the fit of initial states, as in `HORIZON_STAGES`, for a robot with filtered runs.
+
+These runs begin near their best states.
 """
 FAR = 1.5
 """Minimum mean square residual of the nearest model, in noise variances, for which models that

@@ -229,7 +229,7 @@ def _find_trend_covariate(
 
 
 def _compute_residual_mean_square(parts: Sequence[GroupEstimate], numbers: Array) -> float:
-    """Compute the weighted mean square about the line of `_fit_trend`; at least 1, its expectation."""
+    """Compute the weighted mean square about the line of `_fit_trend`; at least 1 (expectation)."""
     values = np.array([part.value for part in parts])
     weights = np.array([part.error for part in parts]) ** -2.0
     rest = values - np.polyval(np.polyfit(numbers, values, 1, w=np.sqrt(weights)), numbers)

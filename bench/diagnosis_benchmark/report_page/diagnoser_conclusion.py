@@ -50,7 +50,10 @@ def _own_failures(shown: DiagnoserReportData) -> Iterator[str]:
         of = int((own["kind"] == kind).sum())
         if of:
             parts.append(f"{int((wrong['kind'] == kind).sum())} {says.format(of=of)}")
-    said = f"{make_strong(REFERENCE_DIAGNOSER)} fails on {len(wrong)} of {len(own)} questions: {', '.join(parts)}."
+    said = (
+        f"{make_strong(REFERENCE_DIAGNOSER)} fails on {len(wrong)} of {len(own)} questions: "
+        f"{', '.join(parts)}."
+    )
     yield f'{said} <a href="#failures">They are listed first</a>.' if len(wrong) else said
 
 
@@ -124,8 +127,8 @@ def write_warnings(shown: DiagnoserReportData) -> Iterator[str]:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
     if shown.case_count < shown.planned:
         yield (
-            f"{shown.case_count} of {shown.planned} questions: those that everybody has been asked. "
-            "Questions are asked in an order of chance, so these are a fair sample."
+            f"{shown.case_count} of {shown.planned} questions: those that everybody has been "
+            "asked. Questions are asked in an order of chance, so these are a fair sample."
         )
     failed = shown.rows[shown.rows["status"] != "done"]
     if len(failed):

@@ -242,7 +242,7 @@ class MujocoBall(MujocoMover):
 
     @property
     def exported_state(self) -> tuple[bool, int, Any]:
-        """State to continue as another ball: `held` of `load_state`, disable flags, `before` of `load_state`."""
+        """State to continue as another ball: `held`, disable flags, `before` (`load_state`)."""
         return self._held, self._model.opt.disableflags, self._data.qacc_warmstart
 
     def get_resting_solref(self, step: float) -> tuple[float, float]:

@@ -87,7 +87,8 @@ def make_engine(
     step = resolve_time_step(time_step, system)
     if not (isinstance(threads, int) and 1 <= threads <= _MOST_THREADS):
         raise InputError(
-            f"threads must be a whole number from 1 to {_MOST_THREADS}, found {truncate_text(str(threads))}"
+            f"threads must be a whole number from 1 to {_MOST_THREADS}, "
+            f"found {truncate_text(str(threads))}"
         )
     if not native_contact:
         if stiffness is not None:

@@ -73,7 +73,8 @@ class BatchEngine:
         for name, value in (("turn", turn), ("patience", patience)):
             if value != np.inf and not (is_plausible_number(value) and value > 0):
                 raise InputError(
-                    f"engine batch: {name} must be a positive number, found {truncate_text(str(value))}"
+                    f"engine batch: {name} must be a positive number, "
+                    f"found {truncate_text(str(value))}"
                 )
         if not (isinstance(jobs, int) and jobs >= 1):
             raise InputError(

@@ -60,8 +60,8 @@ class CompiledKernel:
         self._function = function
 
     def choose_step_divisions(
-        self, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int, spans: FloatArray, turn: float,
-        parts: FloatArray,
+        self, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int,
+        spans: FloatArray, turn: float, parts: FloatArray,
     ) -> None:  # fmt: skip
         """Choose the number of parts of each step; see `sims.engines.compiled.step_size`.
 
@@ -138,8 +138,8 @@ class CompiledKernel:
         return run
 
     def _call(
-        self, what: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int, spans: FloatArray,
-        turn: float, parts: FloatArray,
+        self, what: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int,
+        spans: FloatArray, turn: float, parts: FloatArray,
     ) -> None:  # fmt: skip
         # The compiled code does not check array bounds.
         check_array_layout(program, work, block, w, spans, parts)

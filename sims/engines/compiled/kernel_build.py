@@ -50,7 +50,10 @@ _WRITTEN_OUT = frozenset(
     }
 )
 """Functions that are inlined, because a call costs more than their body."""
-_START = "import sys; sys.path[:] = {path!r}; from sims.engines.compiled.kernel_build import main; main()"
+_START = (
+    "import sys; sys.path[:] = {path!r}; "
+    "from sims.engines.compiled.kernel_build import main; main()"
+)
 
 
 def build_kernel() -> bytes:

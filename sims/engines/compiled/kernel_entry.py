@@ -54,9 +54,10 @@ def kernel_entry(
     spans_at: Any,
     parts_at: Any,
 ) -> None:
-    """Run `choose_step_divisions`, `step_block`, `step_in_lockstep` or `run_instructions` with arrays given by their addresses.
+    """Run a function of the kernel with arrays given by their addresses.
 
-    The first integer selects the function: 0, 1, 2 or 3.
+    The first integer selects the function: `choose_step_divisions` (0), `step_block` (1),
+    `step_in_lockstep` (2) or `run_instructions` (3).
     """
     sizes = carray(sizes_at, (SIZE_ARGUMENT_COUNT,))
     if sizes[0] == 3:

@@ -96,7 +96,7 @@ class BallWithImpacts(BallBody, Protocol):
         ...
 
     def set_resting_contact(self) -> None:
-        """Set contact that only supports the resting ball; `set_state` must be called afterwards."""
+        """Set contact that only supports the resting ball; `set_state` must be called next."""
         ...
 
 

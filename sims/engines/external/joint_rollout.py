@@ -256,7 +256,9 @@ def to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step: 
 
 
 def to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
-    """Return the engine's velocity, half a step before the position; inverse of `to_full_step_velocity`.
+    """Return the engine's velocity, half a step before the position.
+
+    This is the inverse of `to_full_step_velocity`.
 
     Args:
         v: velocity at the time of the position.

@@ -89,7 +89,7 @@ class ResistanceBatch:
 
 
 def make_resistance_batch(lanes: Sequence[ElementWork]) -> ResistanceBatch:
-    """Return the closed-form laws of batch elements, for none of which `make_resistance` is None."""
+    """Return the laws of batch elements; `make_resistance` must not return None for any of them."""
     found = [make_resistance(lane) for lane in lanes]
     limits = np.array([one.limit if one else 0.0 for one in found])
     laws = []

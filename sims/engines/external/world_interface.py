@@ -68,7 +68,7 @@ class BulletJointWorldModule(BulletWorldModule, JointWorldModule, Protocol):
 
 
 class BulletBallWorldModule(BulletWorldModule, Protocol):
-    """Module ``pendulum_bullet_world`` of a bouncing ball, required for the setting `native_contact`."""
+    """Module ``pendulum_bullet_world`` of a bouncing ball, required for `native_contact`."""
 
     def build_native(self, client: int, constants: Constants, /, settings: Constants) -> int:
         """Build the world with Bullet's native contact.

@@ -160,7 +160,7 @@ def _by_kinds(passed: ActiveEffects, n: int) -> Iterator[tuple[Places, ActiveEff
 
 
 def _groups(asked: Sequence[_InputRequest]) -> Iterator[list[_InputRequest]]:
-    """Group requests with equal sequences of effect types, of at most `MAX_BATCH_SIZE` batch elements.
+    """Group requests with equal sequences of effect types, at most `MAX_BATCH_SIZE` elements each.
 
     Effects with a state are integrated step by step, and a step costs about the same for few and
     for many batch elements.

@@ -329,7 +329,7 @@ class MujocoBatch:
         ranges.restore()
 
     def force_ranges(self) -> ForceRanges:
-        """Return the force ranges of the batch, to switch actuators off until the next `write_effects`."""
+        """Return the force ranges, to switch actuators off until the next `write_effects`."""
         self._changed.update(FORCE_FIELDS)
         return ForceRanges(self.fields)
 

@@ -99,9 +99,8 @@ def _check(spec: Any, source: str, where: str, name: str, table: Mapping[str, An
         )
     joints = [joint.name for joint in spec.joints if _single(joint)]
     if table["joint"] not in joints:
-        raise InputError(
-            f"{source}: {where}: {make_unknown_name_error('joint', table['joint'], joints or ['none'])}"
-        )
+        error = make_unknown_name_error("joint", table["joint"], joints or ["none"])
+        raise InputError(f"{source}: {where}: {error}")
     if name in [actuator.name for actuator in spec.actuators]:
         raise InputError(
             f"{source}: {where}: the model has an actuator {truncate_text(name)} already"

@@ -55,7 +55,8 @@ def exclude_spurious_contacts(spec: Any, model: Any) -> list[str]:
         names[0] = "the base"
         pairs = [f"{names[one]} and {names[other]}" for one, other in sorted(inside)]
         notes.append(
-            f"no contacts between parts that overlap at the zero position: {format_name_list(pairs)}"
+            "no contacts between parts that overlap at the zero position: "
+            f"{format_name_list(pairs)}"
         )
     return notes
 

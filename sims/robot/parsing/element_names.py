@@ -21,7 +21,7 @@ FREE_TEXT_ATTRIBUTES = ("file", "class", "childclass", "filename")
 
 
 def rename_invalid_names(root: Element) -> list[str]:
-    """Rename elements whose names contain `RESERVED_CHARACTERS` characters, and all references to them.
+    """Rename elements whose names contain `RESERVED_CHARACTERS`, and all references to them.
 
     Args:
         root: root element of the model file; it is changed in place.

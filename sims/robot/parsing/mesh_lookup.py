@@ -88,7 +88,8 @@ class MeshLookup:
     def notes(self) -> list[str]:
         """One note for each reason why shapes were omitted."""
         return [
-            f"shapes left out, and their contacts, since their mesh {why}: {format_name_list(names)}"
+            f"shapes left out, and their contacts, since their mesh {why}: "
+            f"{format_name_list(names)}"
             for why, names in self.left.items()
         ]
 

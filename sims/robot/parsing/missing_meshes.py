@@ -41,8 +41,9 @@ class OmittedShapes:
         body = geom.parent
         if determines_mass(spec, geom, body):
             raise InputError(
-                f"{self.source}: mesh {truncate_text(label)} {why}, and the mass of body {truncate_text(body.name)} "
-                "would follow from it; mend the mesh, or state the body's <inertial>"
+                f"{self.source}: mesh {truncate_text(label)} {why}, and the mass of body "
+                f"{truncate_text(body.name)} would follow from it; "
+                "mend the mesh, or state the body's <inertial>"
             )
         group = self.touching if geom.contype or geom.conaffinity else self.seen
         group.setdefault(why, []).append(label)
@@ -52,7 +53,8 @@ class OmittedShapes:
     def notes(self) -> list[str]:
         """Notes, one for each reason."""
         notes = [
-            f"shapes left out, and their contacts, since their file {why}: {format_name_list(labels)}"
+            f"shapes left out, and their contacts, since their file {why}: "
+            f"{format_name_list(labels)}"
             for why, labels in self.touching.items()
         ]
         for why, labels in self.seen.items():

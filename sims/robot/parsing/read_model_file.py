@@ -1,4 +1,4 @@
-"""Read an MJCF or URDF model file into a `RobotModel`, with safe repairs that are listed in notes."""
+"""Read an MJCF or URDF model file into a `RobotModel`; notes list the safe repairs."""
 
 from __future__ import annotations
 
@@ -141,8 +141,8 @@ def _check(files: ModelFileReader, model: Any) -> None:
             joint = model.dof_jntid[row] if kind == "dof" else row
             name = (model.body(row) if kind == "body" else model.joint(joint)).name
             raise InputError(
-                f"{files.path}: {what} of {truncate_text(name)}: expected numbers within ±{MAX_NUMBER:g}, "
-                f"found {values[tuple(faults[0])]:g}"
+                f"{files.path}: {what} of {truncate_text(name)}: "
+                f"expected numbers within ±{MAX_NUMBER:g}, found {values[tuple(faults[0])]:g}"
             )
 
 

@@ -155,8 +155,8 @@ def _kept(
         if not stated:
             raise files.make_error(
                 mesh,
-                f"mesh {truncate_text(file)} {why}, and the mass of link {truncate_text(name)} would follow from it; "
-                "put it there, or state the link's <inertial>",
+                f"mesh {truncate_text(file)} {why}, and the mass of link {truncate_text(name)} "
+                "would follow from it; put it there, or state the link's <inertial>",
             )
         meshes.leave_out(file, why)
         return False

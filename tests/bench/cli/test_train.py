@@ -103,9 +103,11 @@ def test_trains_what_compare_then_finds(experiment, tmp_path, cache, capsys):
 
 def test_hybrid_starts_from_the_same_network_as_tunenet(experiment):
     settings = load_experiment(str(experiment))
-    one, two = (dict(np.load(train_or_load(settings, TrainingRequest(TunerEntry("x", name, TUNER["options"]),
-    1)).path)) for name in
-                ("tunenet", "hybrid"))  # fmt: skip
+    requests = [
+        TrainingRequest(TunerEntry("x", name, TUNER["options"]), 1)
+        for name in ("tunenet", "hybrid")
+    ]
+    one, two = (dict(np.load(train_or_load(settings, request).path)) for request in requests)
     arrays = [name for name in one if "." in name]
     assert len(arrays) > 6
     for name in arrays:

@@ -303,7 +303,10 @@ def test_a_recording_is_not_changed(tmp_path):
 
 
 def test_what_only_tables_need_is_not_loaded():
-    code = "import sys, bench.diagnosis.explain; print('pandas' in sys.modules, 'scipy' in sys.modules)"
+    code = (
+        "import sys, bench.diagnosis.explain; "
+        "print('pandas' in sys.modules, 'scipy' in sys.modules)"
+    )
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert printed.stdout.split() == ["False", "False"], printed.stderr
 

@@ -15,7 +15,8 @@ pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 
 @pytest.fixture(autouse=True)
 def no_process_is_left():
-    sandboxed_tuner.close_isolated_processes()  # tests of other files may have left processes that wait for further runs
+    # Tests of other files may have left processes that wait for further runs.
+    sandboxed_tuner.close_isolated_processes()
     yield
     sandboxed_tuner.close_isolated_processes()
     assert not below([psutil.Process()], "tuner")

@@ -136,7 +136,8 @@ def test_no_worker_outlives_its_parent(tmp_path):
     import subprocess
 
     code = (
-        "from bench.benchmark.runner.worker_pools import LocalPool\nfrom tests.bench.runner.test_worker_pools import hang\n"
+        "from bench.benchmark.runner.worker_pools import LocalPool\n"
+        "from tests.bench.runner.test_worker_pools import hang\n"
         "if __name__ == '__main__':\n"
         "    pool = LocalPool(1)\n"
         f"    list(pool.results([(hang, ({str(tmp_path / 'pid')!r},))], 100.0))\n"

@@ -26,7 +26,8 @@ REGISTER = Path(__file__).with_name("once.toml")
 COMMAND = re.compile(r"python -m (tests\.[\w.]+)")
 """A program of the repository that is named."""
 HEAD = """# Numbers on pages below docs/ that no table backs, by page and section: how they came
-# about, and what they are. `python -m tests.docs.page_numbers.stated_once` writes it; `from` is yours.
+# about, and what they are. `python -m tests.docs.page_numbers.stated_once` writes it; `from` \
+is yours.
 
 """
 WIDTH = 120

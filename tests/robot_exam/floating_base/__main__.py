@@ -1,4 +1,6 @@
-"""Causes hidden in robots that float: ``python -m tests.robot_exam.floating_base --out DIR [--only TEXT]``.
+"""Causes hidden in robots that float.
+
+``python -m tests.robot_exam.floating_base --out DIR [--only TEXT]``.
 
 One row a question is added to items.jsonl as it is answered; what is there is not asked again.
 A table of the answers, items.csv, is made from it at the end.

@@ -1,4 +1,4 @@
-"""One run of a robot that floats: the world of `robot_exam.reference_world`, with a pose and its velocity
+"""One run of a robot that floats: the world of `reference_world`, with a pose and its velocity
 behind the hinges' coordinates.
 
 Positions of all coordinates are q = (hinges, pose), speeds v = (hinges, velocity in the body's

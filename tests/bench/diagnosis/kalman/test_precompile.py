@@ -6,7 +6,9 @@ import pytest
 
 SIGNATURES = """
 from bench.diagnosis_benchmark.kalman.precompile import precompile
-from bench.diagnosis_benchmark.kalman.compiled_recursions import filter_recursion, smoother_recursion
+from bench.diagnosis_benchmark.kalman.compiled_recursions import (
+    filter_recursion, smoother_recursion
+)
 precompile()
 before = [set(f.signatures) for f in (filter_recursion, smoother_recursion)]
 assert all(before), before

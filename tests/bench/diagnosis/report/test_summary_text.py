@@ -222,7 +222,8 @@ def test_a_terminal_obeys_nothing_in_the_data():
 
 
 def test_numbers_read_well():
-    assert [format_number(v) for v in (0.0, 0.0333333, 2.2e-4, 1234.5, 1.5e9, -0.5, np.nan, None)] == [
+    numbers = (0.0, 0.0333333, 2.2e-4, 1234.5, 1.5e9, -0.5, np.nan, None)
+    assert [format_number(v) for v in numbers] == [
         "0", "0.0333", "2.2×10⁻⁴", "1230", "1.5×10⁹", "−0.5", "–", "–"
     ]  # fmt: skip
     assert format_number(0.00099996) == "0.001"
