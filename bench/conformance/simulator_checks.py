@@ -251,7 +251,7 @@ def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
 
 
 def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotApplicable | None:
-    """Check that `simulate_toy_problem` selects and orders columns without changing their values."""
+    """Check that `observe` selects and orders columns without changing their values."""
     everything = kind()
     names = [c.name for c in everything.channels][::-1]
     if len(names) == 1:

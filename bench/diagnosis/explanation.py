@@ -51,7 +51,7 @@ class Explanation:
 
     @property
     def verdict(self) -> VerdictName:
-        """``adequate``, ``named``, ``ambiguous``, ``partial``, ``make_unknown_name_error``, ``unidentifiable``."""
+        """``adequate``, ``named``, ``ambiguous``, ``partial``, ``unknown``, ``unidentifiable``."""
         return self.answer.verdict
 
     @property
@@ -90,8 +90,7 @@ class Explanation:
         Args:
             folder: Folder to write to.
             pdf: Also write each figure as PDF, in addition to PNG.
-            ranges: Also write the ranges for domain randomisation (`list_present_ranges`), if there
-                are any:
+            ranges: Also write the ranges for domain randomisation (`ranges`), if there are any:
                 ranges.toml, ranges.csv, ranges_isaac_lab.py and ranges_mujoco_playground.py.
 
         Returns:

@@ -77,7 +77,7 @@ NOTHING = LackOfFitResult(0.3, "", np.ones(1), ())
 
 
 def judged(fitted, held_out, left=NOTHING, base_error=1.0):
-    """The verdict on an `make_unknown_name_error` finding without causes: merits of models with one effect on the
+    """The verdict on an `unknown` finding without causes: merits of models with one effect on the
     fitted and on the held-out runs, next to 100 of the base model.
     """
     base = SimpleNamespace(names=(), penalised_log_likelihood=100.0)

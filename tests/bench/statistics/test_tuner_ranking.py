@@ -17,7 +17,7 @@ FLOOR = 1e-3
 
 
 def curves_of(errors, failed=(), kind="in"):
-    """Curves of {tuner: (targets, K + 1) errors}, one seed; all runs of `make_failed_trajectory` failed."""
+    """Curves of {tuner: (targets, K + 1) errors}, one seed; all runs of `failed` failed."""
     rows = [
         ("e", tuner, kind, f"{kind}-{i:03d}", tuner in failed, line)
         for tuner, lines in errors.items()
