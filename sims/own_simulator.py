@@ -1,9 +1,8 @@
 """Base class of user-defined simulators in PyBullet, MuJoCo or any other engine.
 
-Subclass `OwnSimulator`, declare its attributes, and implement `reset`, `step` and
-`simulate_toy_problem`; see
+Subclass `OwnSimulator`, declare its attributes, and implement `reset`, `step` and `observe`; see
 docs/own-simulator.md. Effects on inputs and sensors are then supported as for any simulator; forces
-and dry friction are supported if it implements `apply_force` and `inertia_repair`.
+and dry friction are supported if it implements `apply_force` and `inertia`.
 """
 
 from __future__ import annotations
@@ -52,27 +51,27 @@ class OwnSimulatorSystem(System):
     simulator: ClassVar[type[OwnSimulator]]
 
     @classmethod
-    def expand_to_places(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+    def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
         """Return an effect on levels once for each level, and any other effect unchanged."""
         if issubclass(effect, Level) and not effect.misses(cls):
             return make_level_effects(effect, cls)
-        return super().expand_to_places(effect)
+        return super().placed(effect)
 
     @classmethod
-    def find_effect(cls, name: str) -> type[Effect] | None:
+    def effect(cls, name: str) -> type[Effect] | None:
         """Return the effect with a name such as ``state.overflow@upper``; None if there is none."""
         return find_level_effect(name, cls)
 
     @classmethod
-    def find_unsupported_reason(cls, effect: type[Effect]) -> str:
+    def refuses(cls, effect: type[Effect]) -> str:
         """Return why the simulator cannot have an effect; empty if it can.
 
-        Forces need the method `apply_force`, dry friction also needs `inertia_repair`, levels need
-        `put`; effects on impacts and hidden-state effects are not possible.
+        Forces need the method `apply_force`, dry friction also needs `inertia`, levels need `put`;
+        effects on impacts and hidden-state effects are not possible.
         """
         if issubclass(effect, Contact):
             return "an own simulator does not say when it strikes something"
-        if issubclass(effect, Level) and cls.simulator.set_levels is OwnSimulator.set_levels:
+        if issubclass(effect, Level) and cls.simulator.put is OwnSimulator.put:
             return "its levels cannot be set (it has no method put)"
         if issubclass(effect, HiddenStateEffect):
             return "an own simulator takes forces and no states beside its own"
@@ -88,7 +87,7 @@ class OwnSimulatorSystem(System):
             return str(reason)
         return ""
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Raise an error, because the mass is unknown outside the simulator."""
         raise _NotDeclaredError("it does not say its mass")
 
@@ -133,7 +132,7 @@ class OwnSimulator(SystemSimulator):
 
     Declare the attributes of `Simulator` (name, says, parameters, channels, constants, inputs,
     states, requires), then those below where they apply, and implement `reset`, `step` and
-    `simulate_toy_problem`.
+    `observe`.
 
     Attributes:
         time_step: Maximum step, s; `step` is called with this or less, so that each sample time is
@@ -238,7 +237,7 @@ class OwnSimulator(SystemSimulator):
         """
         raise NotImplementedError
 
-    def set_levels(self, levels: Mapping[str, float]) -> None:
+    def put(self, levels: Mapping[str, float]) -> None:
         """Set some levels to new values and continue from there; other states stay (optional)."""
         raise NotImplementedError
 

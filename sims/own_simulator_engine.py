@@ -59,7 +59,7 @@ class SteppableSimulator(Protocol):
 
     def inertia(self) -> float | Array: ...
 
-    def set_levels(self, levels: Mapping[str, float]) -> None: ...
+    def put(self, levels: Mapping[str, float]) -> None: ...
 
 
 class OwnSimulatorEngine:
@@ -160,11 +160,11 @@ def _fault(world: SteppableSimulator, error: Exception) -> InputError:
 
 
 def observed(world: SteppableSimulator, seen: Mapping[str, float], name: str) -> float:
-    """Return one value of the result of `simulate_toy_problem`.
+    """Return one value of the result of `observe`.
 
     Args:
         world: Simulator.
-        seen: Result of its `simulate_toy_problem`.
+        seen: Result of its `observe`.
         name: Name of a channel, coordinate, rate or level.
 
     Raises:
@@ -189,7 +189,7 @@ def observed(world: SteppableSimulator, seen: Mapping[str, float], name: str) ->
 
 
 def _unobserved(world: SteppableSimulator, seen: object, name: str) -> InputError:
-    """Make the error for a value that `simulate_toy_problem` did not return."""
+    """Make the error for a value that `observe` did not return."""
     if not isinstance(seen, Mapping):
         found = type(seen).__name__
         return InputError(
@@ -207,7 +207,7 @@ def inertia_of(world: SteppableSimulator) -> float | Array:
         A number, which applies to every coordinate, or a matrix (D, D).
 
     Raises:
-        InputError: `inertia_repair` returned neither.
+        InputError: `inertia` returned neither.
     """
     given = world.inertia()
     if isinstance(given, float):
@@ -246,9 +246,9 @@ class _LevelLimits:
         seen = self.world.observe()
         for effect, c, name in self.acting:
             level = np.array([[observed(self.world, seen, name)]])
-            kept = float(effect.limit_level(c, level)[0, 0])
+            kept = float(effect.keep(c, level)[0, 0])
             if kept != level[0, 0]:
-                self.world.set_levels({name: kept})
+                self.world.put({name: kept})
 
 
 class _Forces:

@@ -48,7 +48,7 @@ class SystemSimulator(Simulator):
     """Base class of the simulators of declared systems; a subclass sets `system`.
 
     Args:
-        constants: Values of `make_constant_nodes` that differ from their defaults.
+        constants: Values of `constants` that differ from their defaults.
         observe: Channels to return, in order (default: all).
         engine: Name of the engine: pybullet, mujoco or batch.
         effects: Effects whose coefficients are parameters after the system's own, in the order in

@@ -87,19 +87,16 @@ def _format_discrimination(found: NextRunDesign) -> list[str]:
     lines = []
     if found.distinguished_effects:
         sizes = [
-            f"{name} ({math.sqrt(found.discrimination_by_effect[name]):.3g})"
-            for name in found.distinguished_effects
+            f"{name} ({math.sqrt(found.told[name]):.3g})" for name in found.distinguished_effects
         ]
         lines.append(
             f"it tells {found.effect} from {', '.join(sizes)}: by so many noises, once every "
             "number is fitted again, whichever is true"
         )
-    stays = [
-        name for name in found.discrimination_by_effect if name not in found.distinguished_effects
-    ]
+    stays = [name for name in found.told if name not in found.distinguished_effects]
     if stays:
         lines.append(f"no run of this kind tells it from {', '.join(stays)}")
-    best = max((found.discrimination_by_effect[name] for name in stays), default=0.0)
+    best = max((found.told[name] for name in stays), default=0.0)
     if best > 0 and (times := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
         lines.append(f"recorded {times} times it would tell it from one more of these")
     if found.settles_all:

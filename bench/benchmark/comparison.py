@@ -49,8 +49,8 @@ class Comparison:
     """Comparison of tuners x targets x seeds in a result folder; implements `study.Study`.
 
     Args:
-        folder: result folder of a comparison, for status and report. Use `begin` or `resume_study`
-            for a comparison that can be run.
+        folder: result folder of a comparison, for status and report. Use `begin` or `resume` for a
+            comparison that can be run.
 
     Attributes:
         folder: result folder.

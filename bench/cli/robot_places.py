@@ -95,6 +95,6 @@ def list_effects_by_place_kind(system: type[RobotSystem]) -> dict[str, list[str]
     found: dict[str, list[str]] = {}
     for name in effects.list_names():
         effect = effects.get_effect(name)
-        if system.expand_to_places(effect):
+        if system.placed(effect):
             found.setdefault(effect.at, []).append(name)
     return found

@@ -168,13 +168,13 @@ def _contributions(
             (acting.friction(c) + np.zeros((2, 1)), np.zeros((2, 1))),
         ]
     if isinstance(acting, Input):
-        return [(acting.times(c, times), times), (acting.apply(c, signal), values)]
+        return [(acting.times(c, times), times), (acting.feel(c, signal), values)]
     if isinstance(acting, HiddenStateEffect):
         return []  # engines do not call it if its first coefficient is zero
     if isinstance(acting, Sensor):
         return [(acting.times(c, times), times), (acting.read(c, signal), values)]
     if isinstance(acting, Level):
-        return [(acting.limit_level(c, e), e)]
+        return [(acting.keep(c, e), e)]
     raise CheckError(
         f"expected one of the hook classes; found {type(acting).__mro__}; see sims.core.system"
     )

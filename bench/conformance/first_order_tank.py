@@ -49,6 +49,6 @@ class FirstOrderTank(OwnSimulator):
         """Return the level."""
         return {"level": self.level}
 
-    def set_levels(self, levels: Mapping[str, float]) -> None:
+    def put(self, levels: Mapping[str, float]) -> None:
         """Set the level."""
         self.level = levels["level"]

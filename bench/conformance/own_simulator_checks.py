@@ -180,11 +180,11 @@ def _motion(simulator: OwnSimulator, force: Array | None) -> Array:
 
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
-    """Check that `set_levels` sets a level that `observe` returns, and no other level."""
+    """Check that `put` sets a level, which `observe` returns, and leaves other levels unchanged."""
     own = _own(kind)
     if own is None:
         return _NOT_OWN
-    if own.set_levels is OwnSimulator.set_levels or not own.levels:
+    if own.put is OwnSimulator.put or not own.levels:
         return NotApplicable("its levels cannot be set (it has no method put)")
     simulator, look = own(), f"{own.__name__}.put"
     for name in own.levels:
@@ -192,7 +192,7 @@ def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
         _step(simulator)
         before = {level: float(simulator.observe()[level]) for level in own.levels}
         wanted = {**before, name: 0.9 * before[name] + 0.01}
-        simulator.set_levels({name: wanted[name]})
+        simulator.put({name: wanted[name]})
         found = {level: float(simulator.observe()[level]) for level in own.levels}
         same = np.allclose(list(found.values()), list(wanted.values()), rtol=1e-9, atol=1e-12)
         check(same, f"levels {wanted} after put({name})", found, look)

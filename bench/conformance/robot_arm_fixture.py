@@ -79,7 +79,7 @@ def list_effect_places(effect: type[Effect]) -> tuple[type[Effect], ...]:
         return ()
     if effect.name not in registry.names():
         registry.register(effect)
-    return tuple(make_arm_simulator(effect).system.expand_to_places(effect))
+    return tuple(make_arm_simulator(effect).system.placed(effect))
 
 
 def make_scenario() -> Scenario:

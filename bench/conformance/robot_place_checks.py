@@ -54,7 +54,7 @@ def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
 
 def _refuses(effect: type[Effect], places: Sequence[str]) -> None:
     try:
-        make_arm_simulator(effect).system.find_effect(f"{effect.name}@nowhere")
+        make_arm_simulator(effect).system.effect(f"{effect.name}@nowhere")
     except InputError as error:
         listed = all(place in str(error) for place in places)
         check(listed, f"a message that lists {', '.join(places)}", error, effect.__name__)
@@ -252,9 +252,7 @@ def _find_forced_coordinates(
     if isinstance(effect, Friction):
         return (effect.coordinate,) if np.any(effect.limit(c, moment)) else ()
     if isinstance(effect, HiddenStateEffect):
-        force, _ = effect.compute_force_and_rate(
-            c, moment, HiddenState(np.full((2, 1), 0.1), np.full((2, 1), 0.5))
-        )
+        force, _ = effect.act(c, moment, HiddenState(np.full((2, 1), 0.1), np.full((2, 1), 0.5)))
     else:
         force = effect.force(c, moment)
     return tuple(int(joint) for joint in np.unique(np.nonzero(force)[1]))

@@ -90,8 +90,7 @@ class Explanation:
         Args:
             folder: Folder to write to.
             pdf: Also write each figure as PDF, in addition to PNG.
-            ranges: Also write the ranges for domain randomisation (`list_present_ranges`), if there
-                are any:
+            ranges: Also write the ranges for domain randomisation (`ranges`), if there are any:
                 ranges.toml, ranges.csv, ranges_isaac_lab.py and ranges_mujoco_playground.py.
 
         Returns:

@@ -180,7 +180,7 @@ class LeastSquares(Tuner):
             trusted = self.ahead and model.trusted and chosen.all()
             hopeful = proposal if trusted else None
             (residual,) = yield from run.simulate(proposal[None], hopeful)
-            # The error is NaN if the simulation failed, and then `select_better_fit` is False.
+            # The error is NaN if the simulation failed, and then `better` is False.
             after = float(residual[chosen] @ residual[chosen])
             better = after < before
             # A step that increased the error still gives information about the slope along it.

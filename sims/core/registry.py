@@ -2,7 +2,7 @@
 
 Installed parts come from an entry-point group and are imported only when requested. Parts that
 cannot be imported are listed as skipped, with the reason. Files and notebooks add parts with
-`register_effect`.
+`register`.
 """
 
 from __future__ import annotations

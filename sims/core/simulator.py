@@ -343,10 +343,10 @@ class Simulator(ABC):
         """Set the constants and select the observed channels.
 
         Args:
-            constants: Values of `make_constant_nodes` that differ from their defaults.
+            constants: Values of `constants` that differ from their defaults.
             observe: Names of the channels to return, in this order (default: all of the system).
-                `render_channels` then contains these, and `columns` their positions among the
-                system's channels.
+                `channels` then contains these, and `columns` their positions among the system's
+                channels.
 
         Raises:
             InputError: A constant or channel does not exist, or a value is impossible.

@@ -88,14 +88,14 @@ class StateSnapshot:
         return self.system.push(self, axis)
 
     @property
-    def transmission_load(self) -> Array:
+    def load(self) -> Array:
         """Load (L, 1) of the transmission: magnitude of drive force plus passive force."""
         carried = self.system.drive(self) + self.system.passive(self)
         load: Array = np.abs(carried).sum(axis=1, keepdims=True)
         return load
 
     @property
-    def transmission_sides(self) -> tuple[Array, Array]:
+    def sides(self) -> tuple[Array, Array]:
         """Drive force and passive force of the primary coordinate, each (L, 1).
 
         With equal signs, they press on the transmission from both sides.
@@ -104,18 +104,18 @@ class StateSnapshot:
         return self.system.drive(self)[:, place], self.system.passive(self)[:, place]
 
     @property
-    def supply_load(self) -> Array:
+    def drawn(self) -> Array:
         """Sum of the force magnitudes (L, 1) of all drives that share a power supply."""
-        drawn: Array = np.abs(self.transmission_sides[0])
+        drawn: Array = np.abs(self.sides[0])
         return drawn
 
     @property
-    def servo_error(self) -> Array:
+    def error(self) -> Array:
         """Error of the servo (L, 1): set point minus position."""
         error: Array = self.inputs[self.system.servo] - self.primary
         return error
 
-    def compute_set_point_force(self, shift: Array) -> Array:
+    def aimed(self, shift: Array) -> Array:
         """Return the change of the drive's force (L, D) if the servo's set point is shifted.
 
         Args:
@@ -129,7 +129,7 @@ class StateSnapshot:
     @property
     def inertia(self) -> Array:
         """Generalised inertia (L, 1)."""
-        return self.system.inertia(self.theta, self.constants)
+        return self.system.mass(self.theta, self.constants)
 
     @property
     def primary(self) -> Array:
@@ -217,7 +217,7 @@ class System(ABC):
         constants: Known numbers with their defaults.
         inputs: Input signals; effects on the input act on the first.
         channels: Signals that its sensors can measure; effects on a sensor's value act on the first
-            observed one of `apply_sensor_effects`.
+            observed one of `sensed`.
         coordinates: Names of the states that are the generalised position, in order.
         rates: Names of the states that are the generalised velocity, in order.
         states: Default values of both.
@@ -273,7 +273,7 @@ class System(ABC):
         return next((name for name in cls.sensed if name in observed), observed[0])
 
     @classmethod
-    def render_model_file(cls, numbers: Mapping[str, float]) -> RenderedModelFile | None:  # noqa: ARG003
+    def model_file(cls, numbers: Mapping[str, float]) -> RenderedModelFile | None:  # noqa: ARG003
         """Return the system as a robot's model file; None if that is not possible.
 
         Args:
@@ -282,12 +282,12 @@ class System(ABC):
         return None
 
     @classmethod
-    def get_gear_ratio(cls, coordinate: int) -> float:  # noqa: ARG003
+    def gear(cls, coordinate: int) -> float:  # noqa: ARG003
         """Return the gear ratio: the servo's travel per unit of a coordinate."""
         return 1.0
 
     @classmethod
-    def expand_to_places(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+    def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
         """Return the forms of a registered effect that this system can have; empty if none.
 
         This is the effect itself in a system with one place, and a class for each place and family
@@ -296,7 +296,7 @@ class System(ABC):
         return (effect,) if effect.fits(cls) else ()
 
     @classmethod
-    def find_effect(cls, name: str) -> type[Effect] | None:  # noqa: ARG003
+    def effect(cls, name: str) -> type[Effect] | None:  # noqa: ARG003
         """Return the effect with a name that only this system defines, such as those of its places.
 
         The result is None for registered effects.
@@ -304,7 +304,7 @@ class System(ABC):
         return None
 
     @classmethod
-    def find_unsupported_reason(cls, effect: type[Effect]) -> str:  # noqa: ARG003
+    def refuses(cls, effect: type[Effect]) -> str:  # noqa: ARG003
         """Return why the system cannot have an effect although it has all that the effect `needs`.
 
         The result is empty if it can.
@@ -312,7 +312,7 @@ class System(ABC):
         return ""
 
     @abstractmethod
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the generalised inertia (L, 1); 1 for a system that counts force per unit mass.
 
         Args:
@@ -409,8 +409,7 @@ class Coefficient:
             does not exist.
         plausible: Plausible ranges, in the same order.
         of: Quantity whose unit it has, if `units` are only the default ones: ``input`` the first
-            input, ``error`` likewise for values compared with a servo's error,
-            ``render_reading_guide`` the
+            input, ``error`` likewise for values compared with a servo's error, ``reading`` the
             channel on which it acts, ``input/s`` and ``reading/s`` per second, ``input/s^2`` per
             second squared, ``level`` the stored quantity. Other values state a meaning: ``stop`` is
             the stiffness of a stop at the position given by coefficient ``place``; ``drive`` is a
@@ -554,7 +553,7 @@ class Effect(ABC):
             "level": "" if declared.levels else "it names no level that could spill over",
         }[cls.needs]
         undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
-        return lacks or undefined or system.find_unsupported_reason(cls)
+        return lacks or undefined or system.refuses(cls)
 
     @classmethod
     def on(cls, system: System | type[System]) -> tuple[Coefficient, ...]:
@@ -656,15 +655,15 @@ class HiddenStateEffect(Effect):
     Only for an element in series between a drive and its load.
     """
 
-    def make_series_element(self, c: Array) -> SeriesElement:
+    def element(self, c: Array) -> SeriesElement:
         """Return the series element with these values (K, L) of the coefficients `between`."""
         raise NotImplementedError
 
-    def get_inertia_share(self, c: Array) -> Array:
+    def behind(self, c: Array) -> Array:
         """Return the share (L, 1) of the joint's inertia on the hidden coordinate, below 1."""
         return np.zeros_like(c[0])
 
-    def get_initial_state(self, c: Array, moment: StateSnapshot) -> HiddenState:  # noqa: ARG002
+    def begin(self, c: Array, moment: StateSnapshot) -> HiddenState:  # noqa: ARG002
         """Return the hidden state at the beginning of the run.
 
         Args:
@@ -674,9 +673,7 @@ class HiddenStateEffect(Effect):
         return HiddenState(np.zeros_like(c[0]), np.zeros_like(c[0]))
 
     @abstractmethod
-    def compute_force_and_rate(
-        self, c: Array, moment: StateSnapshot, state: HiddenState
-    ) -> tuple[Array, Array]:
+    def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the generalised force and the rate of the hidden state.
 
         Args:
@@ -707,7 +704,7 @@ class Level(Effect):
     needs = "level"
 
     @abstractmethod
-    def limit_level(self, c: Array, level: Array) -> Array:
+    def keep(self, c: Array, level: Array) -> Array:
         """Return the bounded level (L, 1).
 
         Args:
@@ -785,7 +782,7 @@ class Input(Effect):
         """
         return t
 
-    def apply(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
+    def feel(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
         """Return the applied values (L, S) over the steps.
 
         Args:

@@ -23,7 +23,7 @@ def list_effects_for(system: type[System]) -> dict[str, type[Effect]]:
             PartUnavailableError
         ):  # the list of effects shows the reason; explain works without it
             continue
-        for placed in system.expand_to_places(effect):
+        for placed in system.placed(effect):
             usable[placed.name] = placed
     return usable
 
@@ -38,4 +38,4 @@ def find_effect(name: str, system: type[System]) -> type[Effect]:
     Raises:
         InputError: no such effect exists.
     """
-    return system.find_effect(name) or registry.get(name)
+    return system.effect(name) or registry.get(name)

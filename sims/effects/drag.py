@@ -95,5 +95,5 @@ def _air(c: Array, moment: StateSnapshot) -> Array:
     """Return the velocity (L, D) of the air along the system's coordinates."""
     # `push` is the force of 1 m/s^2 of acceleration: divided by the mass, it gives the direction of
     # the axis
-    mass = moment.system.inertia(moment.theta, moment.constants)
+    mass = moment.system.mass(moment.theta, moment.constants)
     return (c[1] * moment.push("x") + c[2] * moment.push("y")) / mass

@@ -134,7 +134,7 @@ class LoadFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        return np.maximum(c[0], 0.0) * moment.transmission_load  # (3)
+        return np.maximum(c[0], 0.0) * moment.load  # (3)
 
 
 class DirectionalLoadFriction(Friction):
@@ -156,7 +156,7 @@ class DirectionalLoadFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        drive, against = moment.transmission_sides
+        drive, against = moment.sides
         return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * against)  # (4)
 
 
@@ -176,8 +176,8 @@ class QuadraticLoadFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        through = _transmitted(*moment.transmission_sides)
-        return np.maximum(c[0] * moment.transmission_load + c[1] * through**2, 0.0)  # (5)
+        through = _transmitted(*moment.sides)
+        return np.maximum(c[0] * moment.load + c[1] * through**2, 0.0)  # (5)
 
 
 class PositionFriction(Friction):

@@ -41,9 +41,7 @@ class FrictionHysteresis(HiddenStateEffect):
     needs, contains = "joint", ("friction.coulomb",)
     coefficients = _DAHL
 
-    def compute_force_and_rate(
-        self, c: Array, moment: StateSnapshot, state: HiddenState
-    ) -> tuple[Array, Array]:
+    def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the force (L, D), and the rate (L, 1) of the hidden state.
 
         Args:

@@ -79,7 +79,7 @@ class InputGain(Input):
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _PURE, _SHARE),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the scaled input (L, S).
 
         Args:
@@ -98,7 +98,7 @@ class InputBias(Input):
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _FORCE_UNITS, _OFFSET, of="input"),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the shifted input (L, S).
 
         Args:
@@ -136,7 +136,7 @@ class InputLag(Input):
     source = _FEEDBACK
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.5), (0, 0.5), (0, 0.5))),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the lagged input over each step.
 
         Args:
@@ -156,7 +156,7 @@ class InputDeadBand(Input):
     source = _NONLINEAR
     coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH, of="input"),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the excess (L, S) over the half width.
 
         Args:
@@ -178,7 +178,7 @@ class InputSaturation(Input):
     source = _NONLINEAR
     coefficients = (Coefficient("coefficient", _FORCE_UNITS, _LIMIT, of="input"),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the limited input (L, S).
 
         Args:
@@ -200,7 +200,7 @@ class InputBacklash(Input):
     source = _PLAY
     coefficients = (Coefficient("coefficient", _FORCE_UNITS, _WIDTH, of="input"),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) on the load side of the backlash.
 
         Args:
@@ -221,7 +221,7 @@ class InputPower(Input):
     needs, contains = "input", ("input.gain",)
     coefficients = (Coefficient("gain", _PURE, _SCALE), Coefficient("power", _PURE, _EXPONENT))
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the input (L, S) to a power; an input of one unit changes only by the gain.
 
         Args:
@@ -242,7 +242,7 @@ class InputRateLimit(Input):
     source = _NONLINEAR
     coefficients = (Coefficient("coefficient", _PER_SECOND, _SLEW, of="input/s"),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the rate-limited input over each step.
 
         Args:

@@ -54,8 +54,8 @@ class SupplySag(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        drive, _ = moment.transmission_sides
-        lost = np.maximum(c[0], 0.0) * moment.supply_load
+        drive, _ = moment.sides
+        lost = np.maximum(c[0], 0.0) * moment.drawn
         return moment.along_primary(-drive * lost / (1.0 + lost))  # (1), (2)
 
 
@@ -77,6 +77,6 @@ class SupplyBrakingLoss(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of L batch elements.
         """
-        drive, _ = moment.transmission_sides
+        drive, _ = moment.sides
         against = np.where(drive * moment.primary_rate < 0.0, drive, 0.0)
         return moment.along_primary(-np.clip(c[0], 0.0, 1.0) * against)  # (3)

@@ -52,7 +52,7 @@ class ServoDeadBand(Force):
             moment: state snapshot of L batch elements.
         """
         width = np.maximum(c[0], 0.0)
-        return moment.compute_set_point_force(-np.clip(moment.servo_error, -width, width))  # (1)
+        return moment.aimed(-np.clip(moment.error, -width, width))  # (1)
 
 
 class ServoDerivativeAction(Input):
@@ -65,7 +65,7 @@ class ServoDerivativeAction(Input):
     needs = "servo"
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the set point (L, S) plus its change in the last c seconds.
 
         Args:
@@ -88,7 +88,7 @@ class ServoMotionProfile(Input):
     needs = "servo"
     coefficients = (Coefficient("coefficient", _ACCELERATION, _REACHED, of="input/s^2"),)
 
-    def apply(self, c: Array, signal: Signal) -> Array:
+    def feel(self, c: Array, signal: Signal) -> Array:
         """Return the mean (L, S) of the limited set point over each step.
 
         Args:

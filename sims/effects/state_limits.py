@@ -51,7 +51,7 @@ class LevelOverflow(Level):
     source = "M. Schoukens, J. P. Noel, IFAC-PapersOnLine 50(1), 446 (2017)"
     coefficients = (Coefficient("coefficient", _LEVEL, _TYPICAL, of="level"),)
 
-    def limit_level(self, c: Array, level: Array) -> Array:
+    def keep(self, c: Array, level: Array) -> Array:
         """Return the level (L, 1), limited by the rim.
 
         Args:

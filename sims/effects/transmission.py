@@ -104,11 +104,11 @@ class DrivenLoad(HiddenStateEffect):
 
     share: ClassVar[int] = 0
 
-    def get_inertia_share(self, c: Array) -> Array:
+    def behind(self, c: Array) -> Array:
         """Return the load's share of the inertia (L, 1), limited to its maximum."""
         return np.clip(c[self.share], 0.0, _MOST)
 
-    def make_series_element(self, c: Array) -> SeriesElement:
+    def element(self, c: Array) -> SeriesElement:
         """Return the series element: a spring with damper for a compliance, else backlash."""
         numbers = {one.name: values for one, values in zip(self.between, c, strict=True)}
         none = np.zeros_like(c[0])
@@ -118,7 +118,7 @@ class DrivenLoad(HiddenStateEffect):
         gap = np.maximum(numbers.get("gap", none), 0.0)
         return SeriesElement(stiffness, numbers.get("damping", none), gap, numbers["rotor"])
 
-    def get_initial_state(self, c: Array, moment: StateSnapshot) -> HiddenState:
+    def begin(self, c: Array, moment: StateSnapshot) -> HiddenState:
         """Return the initial state: moving with the drive, at the static deflection.
 
         Args:
@@ -128,9 +128,7 @@ class DrivenLoad(HiddenStateEffect):
         away = self.compute_static_deflection(c, _fall(moment, moment.primary))
         return HiddenState(moment.primary + away, moment.v[:, :1])
 
-    def compute_force_and_rate(
-        self, c: Array, moment: StateSnapshot, state: HiddenState
-    ) -> tuple[Array, Array]:
+    def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
         """Return the force (L, D) on the drive side and the acceleration (L, 1) of the load.
 
         Args:
@@ -138,7 +136,7 @@ class DrivenLoad(HiddenStateEffect):
             moment: state snapshot of L batch elements.
             state: position and velocity of the load.
         """
-        pull, share = self.compute_coupling_force(c, moment, state), self.get_inertia_share(c)
+        pull, share = self.compute_coupling_force(c, moment, state), self.behind(c)
         # The load carries its share of the weight.
         near = -share * moment.inertia * (pull + _fall(moment, moment.primary))  # (1)
         return moment.along_primary(near), pull + _fall(moment, state.x)  # (2)
@@ -222,7 +220,7 @@ class JointBacklash(DrivenLoad):
         beyond = apart - np.clip(apart, -0.5 * c[0], 0.5 * c[0])
         pressed = np.abs(beyond) / (np.abs(beyond) + CONTACT_DAMPING_DEPTH * c[0])
         push = CONTACT_FREQUENCY * beyond + 4.0 * pressed * (moment.v[:, :1] - state.v)
-        pull = (1.0 - self.get_inertia_share(c)) * CONTACT_FREQUENCY * push  # (4)
+        pull = (1.0 - self.behind(c)) * CONTACT_FREQUENCY * push  # (4)
         return np.where(beyond > 0, np.maximum(pull, 0.0), np.minimum(pull, 0.0))
 
 

@@ -67,18 +67,18 @@ class AugmentedSystem(System):
             place += count
         return found
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the inertia (L, 1) of the system's own coordinates.
 
         Args:
             theta: (L, p) parameters of the augmented system.
             constants: (L, 1) constants by name.
         """
-        whole = self.base_system.inertia(theta[:, : len(self.base_system.parameters)], constants)
+        whole = self.base_system.mass(theta[:, : len(self.base_system.parameters)], constants)
         pairs = zip(self.effects, self.split_coefficients(theta), strict=True)
         left = np.ones_like(whole)
         for effect, c in pairs:
-            left = left - effect.get_inertia_share(c)
+            left = left - effect.behind(c)
         return whole * left  # (1)
 
     def weight(self, moment: StateSnapshot) -> Array:
@@ -90,12 +90,12 @@ class AugmentedSystem(System):
         plain = self.get_base_snapshot(moment)
         own = len(self.base_system.coordinates)
         total = self.base_system.force(plain)
-        inertia = self.inertia(moment.theta, moment.constants)
+        inertia = self.mass(moment.theta, moment.constants)
         rates = []
         for k, c in enumerate(self.split_coefficients(moment.theta)):
             place = slice(own + k, own + k + 1)
             state = HiddenState(moment.x[:, place], moment.v[:, place])
-            force, rate = self.effects[k].compute_force_and_rate(c, plain, state)
+            force, rate = self.effects[k].act(c, plain, state)
             total = total + force
             rates.append(inertia * rate)
         return np.concatenate([total, *rates], axis=1)
@@ -186,7 +186,7 @@ def _enlarged(
     inputs = {name: values[:, :1] for name, values in lanes.inputs.items()}
     start = np.zeros((len(lanes.x), 1))
     at = StateSnapshot(lanes.system, lanes.theta, lanes.constants, start, lanes.x, lanes.v, inputs)
-    states = [effect.get_initial_state(c, at) for effect, c in effects]
+    states = [effect.begin(c, at) for effect, c in effects]
     return replace(
         lanes,
         system=system,

@@ -397,9 +397,9 @@ def _apply_input_effects(
         own, begin = c[:, lanes], start[lanes]
         nothing = np.zeros_like(begin)
         signal = Signal(values[lanes], steps[lanes], begin, ends[lanes])
-        passed = effect.apply(own, signal)
+        passed = effect.feel(own, signal)
         values[lanes] = np.take_along_axis(passed, lasting[lanes], axis=1)
-        start[lanes] = effect.apply(own, Signal(begin, nothing, begin, nothing))
+        start[lanes] = effect.feel(own, Signal(begin, nothing, begin, nothing))
     return values
 
 

@@ -76,12 +76,12 @@ class RobotSystem(System):
         cls.traced, cls._placed, cls.left_out = {}, {}, {}
 
     @classmethod
-    def get_gear_ratio(cls, coordinate: int) -> float:
+    def gear(cls, coordinate: int) -> float:
         """Return the gear of a coordinate's position servo, see `System`."""
         return cls.gears.get(coordinate, 1.0)
 
     @classmethod
-    def expand_to_places(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+    def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
         """Return the effect at each of its places, without effects that are free parameters."""
         if effect.name not in cls._placed:
             found = effect_places.make_effect_classes(
@@ -116,7 +116,7 @@ class RobotSystem(System):
         )
 
     @classmethod
-    def find_effect(cls, name: str) -> type[Effect] | None:
+    def effect(cls, name: str) -> type[Effect] | None:
         """Find the effect with a name such as ``friction.coulomb@elbow``.
 
         Raises:
@@ -128,7 +128,7 @@ class RobotSystem(System):
             registered = library.get_effect(base)
         except PartUnavailableError:
             raise
-        cls.expand_to_places(registered)
+        cls.placed(registered)
         if name in cls.left_out:
             raise InputError(f"effect {name} of robot {cls.name}: {cls.left_out[name]}")
         known = {one.name: one for one in cls._placed[base]}
@@ -142,7 +142,7 @@ class RobotSystem(System):
                 + ", ".join(sorted(known))
             )
         if registered.at == "body" and place in (cls.robot.aliases or {}):
-            return cls.find_effect(f"{base}@{cls.robot.body(place).name}")
+            return cls.effect(f"{base}@{cls.robot.body(place).name}")
         there = [one.place for one in known.values() if one.place]
         if place == ALL_PLACES and len(there) == 1:
             # If there is one place only, the family is this place.
@@ -167,7 +167,7 @@ class RobotSystem(System):
                 *(other for other in library.list_names() if cls._has(other)),
             ]
             raise make_unknown_name_error(f"number of robot {cls.name}", base, there)
-        found = cls.find_effect(f"{name}@{place}" if place else name)
+        found = cls.effect(f"{name}@{place}" if place else name)
         assert found is not None
         # Shared effects, such as delays, have one number for all places.
         members = (
@@ -186,11 +186,11 @@ class RobotSystem(System):
     def _has(cls, name: str) -> bool:
         """Return whether the robot can have a registered effect at any place."""
         try:
-            return bool(cls.expand_to_places(library.get_effect(name)))
+            return bool(cls.placed(library.get_effect(name)))
         except PartUnavailableError:
             return False
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Raise an error: only the engine computes the pose-dependent inertia matrix."""
         raise NotImplementedError
 

@@ -24,7 +24,7 @@ class SingleJointSystem(System):
     states: ClassVar[dict[str, float]] = {}
     sensed = ()
 
-    def inertia(self, theta: Array, constants: Any) -> Array:
+    def mass(self, theta: Array, constants: Any) -> Array:
         """Raise an error: the inertia is not known for one joint alone."""
         raise NotImplementedError
 
@@ -63,27 +63,27 @@ class JointSnapshot(StateSnapshot):
     shared: Array | None = None
 
     @property
-    def supply_load(self) -> Array:
+    def drawn(self) -> Array:
         """Load of the power supply, see `StateSnapshot`."""
-        return super().supply_load if self.shared is None else self.shared
+        return super().drawn if self.shared is None else self.shared
 
     @property
-    def transmission_load(self) -> Array:
+    def load(self) -> Array:
         """Absolute load of the transmission, (L, 1)."""
         load: Array = np.abs(self.carried[0] + self.carried[1])
         return load
 
     @property
-    def transmission_sides(self) -> tuple[Array, Array]:
+    def sides(self) -> tuple[Array, Array]:
         """Forces on both sides of the transmission, see `StateSnapshot`."""
         return self.carried[0], self.carried[1]
 
     @property
-    def servo_error(self) -> Array:
+    def error(self) -> Array:
         """Error of the position servo, see `StateSnapshot`."""
         return self.goal - self.gear * self.x
 
-    def compute_set_point_force(self, shift: Array) -> Array:
+    def aimed(self, shift: Array) -> Array:
         """Return the additional drive force for a shifted set point, see `StateSnapshot`.
 
         It does not include force limits of the actuator.
@@ -143,5 +143,5 @@ class RobotSnapshot(StateSnapshot):
             self.carried[:, :, one],
             self.inputs[servo] if followed and servo else np.full_like(self.t, np.nan),
             self.stiffness[:, one] if followed else np.zeros_like(self.t),
-            self.system.get_gear_ratio(joint),
+            self.system.gear(joint),
         )

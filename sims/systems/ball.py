@@ -64,7 +64,7 @@ class BallSystem(System):
     bounces = True
     uniform = True
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return one (L, 1): forces are per unit mass.
 
         Args:

@@ -105,12 +105,12 @@ class ShotSystem(System):
     uniform = True
 
     @classmethod
-    def find_unsupported_reason(cls, effect: type[Effect]) -> str:
+    def refuses(cls, effect: type[Effect]) -> str:
         """Refuse effects along the vertical coordinate, which this frame does not have."""
         tilted = "it acts along the vertical, and the incline is tilted"
         return tilted if effect.name in _LEVEL_ONLY else ""
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return one, because force is counted per unit mass."""
         return np.ones((len(theta), 1))
 

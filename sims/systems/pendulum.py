@@ -56,7 +56,7 @@ class PendulumSystem(System):
     sensed = ("q", "qd")
     usual_recording = DefaultRecording(initial={"q": (0.5, 1.5)})
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the inertia (L, 1) about the hinge in kg m^2.
 
         Args:

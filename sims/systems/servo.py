@@ -135,12 +135,12 @@ class ServoSystem(System):
     )
 
     @classmethod
-    def find_unsupported_reason(cls, effect: type[Effect]) -> str:
+    def refuses(cls, effect: type[Effect]) -> str:
         """Return why the servo cannot have an effect; see `System`."""
         return "its input is a set point, not a force" if effect.name == "input.power" else ""
 
     @classmethod
-    def render_model_file(cls, numbers: Mapping[str, float]) -> RenderedModelFile:
+    def model_file(cls, numbers: Mapping[str, float]) -> RenderedModelFile:
         """Return the servo as a model file; see `System`.
 
         The duty is limited before the back electromotive force is subtracted. Therefore the latter
@@ -148,7 +148,7 @@ class ServoSystem(System):
         """
         return render_model_file(numbers)
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the inertia (L, 1) about the joint in kg m^2.
 
         Args:

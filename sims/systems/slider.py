@@ -38,7 +38,7 @@ class SliderSystem(System):
     usual_recording = DefaultRecording(inputs={"u": "steps:2:0.5"})
 
     @classmethod
-    def find_unsupported_reason(cls, effect: type[Effect]) -> str:
+    def refuses(cls, effect: type[Effect]) -> str:
         """Return why the slider cannot have an effect; see `System`.
 
         Without a load, the effects of `LOAD_DEPENDENT_EFFECTS` would be equivalent to
@@ -46,7 +46,7 @@ class SliderSystem(System):
         """
         return "nothing works against its drive" if effect.name in LOAD_DEPENDENT_EFFECTS else ""
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the mass (L, 1) in kg.
 
         Args:

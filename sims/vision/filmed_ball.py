@@ -29,7 +29,7 @@ class FilmedBall(Simulator):
     picture.
 
     Args:
-        constants: values for `make_constant_nodes` other than their defaults.
+        constants: values for `constants` other than their defaults.
         observe: channels to return, in order (default: both).
         film: "projected" computes `v` through the camera. "tracked" renders a film of each run, its
             light, colours and compression drawn from the run's own numbers, and lets the tracker

@@ -314,7 +314,7 @@ class Cart(OwnSimulator):
     def inertia(self):
         return np.eye(2)
 
-    def set_levels(self, levels):
+    def put(self, levels):
         self.now |= levels
 
 
@@ -415,7 +415,7 @@ class KeepsForces(Cart):
 class IgnoresPut(Cart):
     name = "ignores_put"
 
-    def set_levels(self, levels):
+    def put(self, levels):
         pass
 
 

@@ -10,7 +10,7 @@ from tests.robot_exam.reference_plant import Binding, Cogging, Heated
 
 
 def drawn(cause, joint, setting, rng):
-    """What is hidden, by strength: keyword arguments for `compute_detectable_gap` of a question.
+    """What is hidden, by strength: keyword arguments for `hidden` of a question.
 
     Args:
         cause: of `causes.FOREIGN`.

@@ -187,7 +187,7 @@ class Puck(System):
     parameters = (Parameter("unused", "1", 0.5, (0, 1)),)
     coordinates, rates, sensed = ("x", "y"), ("vx", "vy"), ("x",)
 
-    def inertia(self, theta, constants):
+    def mass(self, theta, constants):
         return np.ones((len(theta), 1))
 
     def weight(self, moment):

@@ -36,7 +36,7 @@ class Pair(FirstOrderTank):
     def observe(self):
         return self.both
 
-    def set_levels(self, levels):
+    def put(self, levels):
         self.both |= levels
 
 
@@ -80,7 +80,7 @@ def test_each_level_has_its_own_rim_in_its_own_unit_and_size():
 def test_rims_that_cannot_be_say_why():
     class Fixed(Pair):
         name = "fixed"
-        put = OwnSimulator.set_levels
+        put = OwnSimulator.put
 
     assert {"state.overflow@left", "state.overflow@right"} <= set(
         effects.list_effects_for(Pair.system)

@@ -305,7 +305,7 @@ class IsolatedProcess:
             return NOTHING_WRITTEN
 
     def send(self, kind: bytes, *parts: bytes | Array, deadline: float, **head: int) -> None:
-        """Send a message to the process; raises the errors of `receive_message`.
+        """Send a message to the process; raises the errors of `receive`.
 
         Args:
             kind: kind of the message, one byte.

@@ -21,7 +21,7 @@ def chi_squared_tail(freedom: int, statistic: float) -> float:
         statistic: x.
 
     Raises:
-        ValueError: `count_identified_states` is below 1.
+        ValueError: `freedom` is below 1.
     """
     if freedom < 1:
         raise ValueError(f"expected at least 1 degree of freedom, found {freedom}")

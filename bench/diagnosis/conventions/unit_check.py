@@ -143,7 +143,7 @@ class Signal:
 
     Attributes:
         name: Name of the column.
-        kind: Table of the signal in the description, ``render_channels`` or ``inputs``.
+        kind: Table of the signal in the description, ``channels`` or ``inputs``.
         si: SI unit that the simulator uses.
         stated: Unit that the description specifies.
         gain: Factor from the values of the column to SI units.
@@ -547,8 +547,8 @@ def _distinction(
         samples: Number of samples.
 
     Returns:
-        ``sharp`` if no nearby factor fits as well; ``has_absorbed_gap`` if parameters absorb the
-        scale of an input, but its unit can be recognised; ``none`` otherwise.
+        ``sharp`` if no nearby factor fits as well; ``absorbed`` if parameters absorb the scale of
+        an input, but its unit can be recognised; ``none`` otherwise.
     """
 
     def left(step: float) -> float:

@@ -60,7 +60,7 @@ class _StaticJoint(System):
     states: ClassVar[Mapping[str, float]] = {}
     sensed = ()
 
-    def inertia(self, theta: Array, constants: Mapping[str, Array]) -> Array:
+    def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Raise an error, because the joint does not move."""
         raise NotImplementedError
 

@@ -104,7 +104,7 @@ def _of_system(facts: SheetContent, folder: Path) -> MjcfFiles:
 
 def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
     try:
-        return facts.subject.kind.system.render_model_file(setting.numbers)
+        return facts.subject.kind.system.model_file(setting.numbers)
     except ZeroDivisionError:
         # The file may contain a value that was edited by hand.
         return None

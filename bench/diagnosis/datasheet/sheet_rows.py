@@ -30,8 +30,8 @@ class SheetRow:
         name: Name of the effect here, with its coefficient if it has several; or of the parameter.
         says: Name in words.
         part: ``joint``, ``actuator``, ``channel``, or ``system`` for a parameter of a system.
-        state: ``found`` for a cause, ``fitted`` for a parameter, ``get_central_jacobian`` for a
-            number that follows from others, or ``not shown``.
+        state: ``found`` for a cause, ``fitted`` for a parameter, ``derived`` for a number that
+            follows from others, or ``not shown``.
         unit: Unit of the number.
         number: Value with its 95 % interval; None if it is not shown.
         stated: Value in the model file; None if the file has none.

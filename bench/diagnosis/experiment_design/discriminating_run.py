@@ -59,19 +59,18 @@ class DiscriminatingRun:
         says: Proposal as a sentence.
         change: By name, the differences from the first fitted run: seconds, an initial state, or
             the factor of an input; None if no run is proposed.
-        discrimination_sigmas: RMS difference of the two models in units of the noise; None if no
-            run is proposed.
+        apart: RMS difference of the two models in units of the noise; None if no run is proposed.
     """
 
     says: str
     change: Mapping[str, float] | None = None
-    discrimination_sigmas: float | None = None
+    apart: float | None = None
 
     def to_document(self) -> dict[str, Any]:
         """Return the proposal as in verdict.json."""
-        if self.change is None or self.discrimination_sigmas is None:
+        if self.change is None or self.apart is None:
             return {"says": self.says}
-        return {"says": self.says, "change": dict(self.change), "apart": self.discrimination_sigmas}
+        return {"says": self.says, "change": dict(self.change), "apart": self.apart}
 
 
 class _Run(NamedTuple):

@@ -39,10 +39,9 @@ class NextRunDesign:
         says: Commands in words.
         by: Criterion: ``T`` if the run distinguishes models, ``D`` if it narrows parameters.
         gain: For ``D``, (2) of `rig.worth`, the logarithm of the factor by which the volume of the
-            confidence region shrinks; for ``T``, the smallest value of `discrimination_by_effect`.
+            confidence region shrinks; for ``T``, the smallest value of `told`.
         effect: Effect of the present model that is to be distinguished; empty for ``D``.
-        discrimination_by_effect: Discrimination, (1) of `rig.worth`, from each alternative effect;
-            empty for ``D``.
+        told: Discrimination, (1) of `rig.worth`, from each alternative effect; empty for ``D``.
         times: (T,) sample times in seconds.
         inputs: (T,) values by input, each held until the next sample.
         initial: Initial states by name.
@@ -54,7 +53,7 @@ class NextRunDesign:
     by: Literal["T", "D"]
     gain: float
     effect: str
-    discrimination_by_effect: Mapping[str, float]
+    told: Mapping[str, float]
     times: Array
     inputs: Mapping[str, Array]
     initial: Mapping[str, float]
@@ -64,16 +63,12 @@ class NextRunDesign:
     @property
     def distinguished_effects(self) -> tuple[str, ...]:
         """Alternative effects that the run would distinguish from the present effect."""
-        return tuple(
-            name
-            for name, value in self.discrimination_by_effect.items()
-            if value > DISCRIMINATION_THRESHOLD
-        )
+        return tuple(name for name, value in self.told.items() if value > DISCRIMINATION_THRESHOLD)
 
     @property
     def settles_all(self) -> bool:
         """Return whether the run would distinguish all effects, whichever is true."""
-        return len(self.groups) == len(self.discrimination_by_effect) + 1
+        return len(self.groups) == len(self.told) + 1
 
     def to_document(self) -> dict[str, Any]:
         """Return the design as JSON data; the command signals are written as a table instead."""
@@ -82,7 +77,7 @@ class NextRunDesign:
             "by": self.by,
             "gain": self.gain,
             "effect": self.effect,
-            "told": dict(self.discrimination_by_effect),
+            "told": dict(self.told),
             "split": self.distinguished_effects,
             "settles": self.settles_all,
             "seconds": float(self.times[-1]),
@@ -190,7 +185,7 @@ def _made(
         by="T" if rivals else "D",
         gain=gain,
         effect=effect,
-        discrimination_by_effect=told,
+        told=told,
         times=run.scenario.times,
         inputs=dict(run.scenario.inputs),
         initial=dict(zip(models.world.states, run.states.tolist(), strict=True)),

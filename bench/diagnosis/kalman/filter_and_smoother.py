@@ -104,7 +104,7 @@ class LinearRuns:
         return self._mapped(lambda values: values[chosen])
 
     def segments(self, length: int) -> LinearRuns:
-        """Split the runs into segments of `compute_norm` samples, each with the prior of a run."""
+        """Split the runs into segments of `length` samples, each with the prior of a run."""
         number, samples, _ = self.residuals.shape
         count = -(-samples // length)
 

@@ -136,7 +136,7 @@ def offset_from_command(world: RunEvaluator, noise: NoiseModel, joint: int) -> f
         return 0.0
     column = world.channels.index(channel)
     differences = [
-        track.observed[:, column] - system.get_gear_ratio(joint) * track.scenario.inputs[servo]
+        track.observed[:, column] - system.gear(joint) * track.scenario.inputs[servo]
         for track in world.tracks
         if servo in track.scenario.inputs
     ]

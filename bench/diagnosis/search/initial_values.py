@@ -111,7 +111,7 @@ def _max_servo_error(world: RunEvaluator, track: RunData, effect: Effect) -> flo
     name = system.coordinates[place]
     if name not in world.channels:
         return 0.0
-    turned = system.get_gear_ratio(place) * track.observed[:, world.channels.index(name)]
+    turned = system.gear(place) * track.observed[:, world.channels.index(name)]
     apart = _command(track, effect) - turned
     return float(np.nanmax(np.abs(apart), initial=0.0))
 

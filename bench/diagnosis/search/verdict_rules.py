@@ -75,7 +75,7 @@ BORDERING: str = (
 )
 """Meaning of `partial` if a base parameter is at a bound of its range."""
 FAULTY: str = "the recording states a unit or a sign wrongly; correct it before causes are searched"
-"""Meaning of `make_unknown_name_error` for a recording with a wrong unit or sign."""
+"""Meaning of `unknown` for a recording with a wrong unit or sign."""
 REQUIRED_QUESTIONS: Collection[str] = frozenset({"structure", "alternatives"})
 """Questions that need not be answered for a cause to be accepted."""
 

@@ -180,7 +180,7 @@ def _accelerations(recording: Recording, run: Run, system: System) -> Array:
     inputs |= {name: signal[:, None] for name, signal in run.inputs.items()}
     moment = StateSnapshot(system, theta, constants, nothing, x, np.zeros_like(x), inputs)
     with np.errstate(all="ignore"):
-        accelerations: Array = system.force(moment) / system.inertia(theta, constants)
+        accelerations: Array = system.force(moment) / system.mass(theta, constants)
     return accelerations
 
 

@@ -96,7 +96,7 @@ class ForceField:
         self._moment = StateSnapshot(
             lanes.system, lanes.theta, lanes.constants, start_time, lanes.x, lanes.v
         )
-        self.mass = lanes.system.inertia(lanes.theta, lanes.constants)
+        self.mass = lanes.system.mass(lanes.theta, lanes.constants)
         self.guided = lanes.system.guided or lanes.x.shape[1]
         self._none = np.zeros_like(self.mass)
         shares = _shares(lanes)

@@ -55,7 +55,7 @@ class _Job:
         self._spans = self._steps.max(axis=1, initial=0.0) * ones
         self._planned = np.count_nonzero(self._steps, axis=1) * ones
         self._inputs = _stacked(list(lanes.inputs.values()), self._steps.shape[1])
-        self._mass = _column(lanes.system.inertia(lanes.theta, lanes.constants), count)
+        self._mass = _column(lanes.system.mass(lanes.theta, lanes.constants), count)
         self._ground = _ground(lanes)
         records = self._steps.shape[1] // lanes.steps_per_sample + 1
         self._kept = np.empty((count, records, 3 * dimensions))

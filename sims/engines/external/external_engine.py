@@ -131,7 +131,7 @@ integration failed.
 def integrate_batch(
     lanes: IntegrationBatch, rollouts: RolloutFunction, discard: Callable[[], None]
 ) -> Trajectories:
-    """Integrate all batch elements with `integrate_grouped`.
+    """Integrate all batch elements with `rollouts`.
 
     Args:
         lanes: batch to integrate.

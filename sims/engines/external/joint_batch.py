@@ -366,6 +366,4 @@ class _StepwiseRun:
 
 
 def _inertia(lanes: Sequence[ElementWork]) -> Array:
-    return np.array(
-        [float(lane.system.inertia(lane.theta, lane.constants)[0, 0]) for lane in lanes]
-    )
+    return np.array([float(lane.system.mass(lane.theta, lane.constants)[0, 0]) for lane in lanes])

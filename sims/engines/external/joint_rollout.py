@@ -116,7 +116,7 @@ def integrate_joint(joint: JointBody, lane: ElementWork) -> Trajectory:
         The trajectory; NaN if the engine cannot represent the element.
     """
     joint.reset_world(lane.plain_constants)
-    inertia = float(lane.system.inertia(lane.theta, lane.constants)[0, 0])
+    inertia = float(lane.system.mass(lane.theta, lane.constants)[0, 0])
     way = choose_integration_mode(lane, joint.open_loop)
     if way.damping is not None:
         return _integrate_open_loop(joint, lane, inertia, way.damping)

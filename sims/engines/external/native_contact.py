@@ -59,7 +59,7 @@ def integrate_native_ball(ball: NativeContactBall, lane: ElementWork) -> Traject
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
     """
-    # Unlike in `ball_rollout`, velocity and contact of the engine are used without correction.
+    # Unlike in `flight`, velocity and contact of the engine are used without correction.
     contact = ImpactParameters(lane)
     felt = EffectForce(lane)
     floor = float(lane.system.floor(lane.constants)[0, 0])

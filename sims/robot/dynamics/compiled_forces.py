@@ -237,7 +237,7 @@ class CompiledForces:
             r[self._past] = self._of.step if k else 0.5 * self._of.step
         if hidden and not k:
             moment = self._of.make_step_snapshot(0, look)
-            states = [effect.get_initial_state(c, moment) for effect, c in hidden]
+            states = [effect.begin(c, moment) for effect, c in hidden]
             begun = [part for state in states for part in (state.x, state.v)]
             r[self._states] = np.concatenate(begun, axis=1).T
         self._run()

@@ -166,7 +166,7 @@ class EffectForces:
         force = compute_effect_forces(self.forces, moment)
         if self.hidden:
             begun = self.make_step_snapshot(k, look)
-            self._states = self._states or [e.get_initial_state(c, begun) for e, c in self.hidden]
+            self._states = self._states or [e.begin(c, begun) for e, c in self.hidden]
             # Hidden states advance from the middle of the previous step to the middle of this one.
             step = self.step if k else 0.5 * self.step
             more, self._states = compute_hidden_state_forces(
@@ -246,7 +246,7 @@ def compute_hidden_state_forces(
     later = []
     for (effect, c), state in zip(hidden, states, strict=True):
         after = advance_state(effect, c, between, state, step)
-        force, _ = effect.compute_force_and_rate(c, end, after)
+        force, _ = effect.act(c, end, after)
         total = total + np.where(c[0] > 0, force, 0.0)
         later.append(after)
     return total, later

@@ -37,8 +37,8 @@ def advance_state(
     Returns:
         The hidden state at the end of the step, (L, 1).
     """
-    _, rate = effect.compute_force_and_rate(c, moment, state)
-    _, nudged = effect.compute_force_and_rate(c, moment, HiddenState(state.x, state.v + STATE_STEP))
+    _, rate = effect.act(c, moment, state)
+    _, nudged = effect.act(c, moment, HiddenState(state.x, state.v + STATE_STEP))
     z = step * (nudged - rate) / STATE_STEP
     near = np.abs(z) < 1e-6
     phi = np.where(near, 1.0 + 0.5 * z, np.expm1(z) / np.where(near, 1.0, z))
@@ -61,12 +61,12 @@ def integrate_state(
         Hidden states (S + 1, 1): at the beginning of each step, and at the end of the motion.
     """
     steps = len(moment.x)
-    state = effect.get_initial_state(c, moment.select_element(0))
+    state = effect.begin(c, moment.select_element(0))
     own = np.repeat(c, steps, axis=1)
     zero = np.zeros((steps, 1))
 
     def rate(w: float, x: float) -> Array:
-        return effect.compute_force_and_rate(own, moment, HiddenState(zero + x, zero + w))[1]
+        return effect.act(own, moment, HiddenState(zero + x, zero + w))[1]
 
     none, whole, half = rate(0.0, 0.0), rate(1.0, 0.0), rate(0.5, 1.0)
     if np.allclose(half, 0.5 * (none + whole), rtol=1e-9, atol=0.0):

@@ -294,7 +294,7 @@ class LinearisationPoints:
                 state = HiddenState(known.x[at], known.v[at] + remembered.get(k, 0.0))
                 ahead = advance_state(effect, own, moment, state, 0.5 * motion.step)
                 self._after[k] = advance_state(effect, own, moment, state, motion.step)
-                force, _ = effect.compute_force_and_rate(own, moment, ahead)
+                force, _ = effect.act(own, moment, ahead)
                 bind("qfrc_applied")[:n, places.velocities] += force
             elif isinstance(effect, Friction):
                 assert effect.coordinate is not None
@@ -401,7 +401,7 @@ class LinearisationPoints:
         if isinstance(effect, HiddenStateEffect):
             state = self.integrate_hidden_state(effect, c)
             ahead = HiddenState(*(0.5 * (u[1:] + u[:-1]) for u in (state.x, state.v)))
-            return effect.compute_force_and_rate(own, self.snapshot, ahead)[0]
+            return effect.act(own, self.snapshot, ahead)[0]
         if isinstance(effect, Force):
             return effect.force(own, self.snapshot)
         assert isinstance(effect, Friction)

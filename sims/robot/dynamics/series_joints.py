@@ -238,7 +238,7 @@ def make_series_element(kind: type[Effect], numbers: Mapping[str, Array]) -> Ser
     assert issubclass(kind, HiddenStateEffect)
     first = next(iter(numbers.values()))
     values = [numbers.get(one.name, np.zeros_like(first)) for one in kind.between]
-    return kind().make_series_element(np.stack(values))
+    return kind().element(np.stack(values))
 
 
 def combine_elements(elements: Sequence[SeriesElement]) -> SeriesElement:

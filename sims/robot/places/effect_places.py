@@ -199,7 +199,7 @@ def _act_of(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Array, Array
         joint = cast(int, self.coordinate)
         alone = cast(RobotSnapshot, moment).get_joint_snapshot(joint)
         result = np.zeros_like(moment.x)
-        force, rate = effect.compute_force_and_rate(self, c, alone, state)
+        force, rate = effect.act(self, c, alone, state)
         result[:, joint] = force[:, 0]
         return result, rate
 
@@ -347,9 +347,7 @@ def _for_one(effect: type[Effect]) -> bool:
     alone = effect.needs in ("", "guide", "input", "servo")
     if issubclass(effect, HiddenStateEffect):
         # An effect with a share of the joint's inertia must declare what it connects.
-        return (
-            bool(effect.between) or effect.get_inertia_share is HiddenStateEffect.get_inertia_share
-        )
+        return bool(effect.between) or effect.behind is HiddenStateEffect.behind
     return alone and issubclass(effect, Force | Friction)
 
 

@@ -231,6 +231,6 @@ def evil():
         places=tuple(replace(p, label=EVIL + "$\\alpha{$") for p in base.places),
         profiles=tuple(replace(p, channel=EVIL, variable=EVIL, unit=EVIL) for p in base.profiles),
         parameters=tuple(replace(p, name=EVIL, unit=EVIL) for p in base.parameters),
-        remains=(EVIL,),
+        lack_of_fit=(EVIL,),
         why=(EVIL,),
     )

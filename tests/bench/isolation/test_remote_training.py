@@ -32,7 +32,7 @@ def experiment():
 
 
 class Learned(Tuner):
-    """As `train_remotely` of the plugin, here."""
+    """As `school` of the plugin, here."""
 
     name = source_digest = "learned"
     learned = True

@@ -201,14 +201,12 @@ def test_zero_gives_nothing_and_shapes_are_those_of_the_lanes(name, system, coun
         assert np.array_equal(effect.restitution(off, e, speed), e)
         assert effect.restitution(on, e, speed).shape == effect.friction(on).shape == (count, 1)
     elif isinstance(effect, HiddenStateEffect):  # where it is off no engine asks it
-        state = effect.get_initial_state(on, now)
-        force, rate = effect.compute_force_and_rate(on, now, state)
+        state = effect.begin(on, now)
+        force, rate = effect.act(on, now, state)
         assert force.shape == (count, size)
-        assert {a.shape for a in (rate, state.x, state.v, effect.get_inertia_share(on))} == {
-            (count, 1)
-        }
+        assert {a.shape for a in (rate, state.x, state.v, effect.behind(on))} == {(count, 1)}
     else:
-        change = effect.apply if isinstance(effect, Input) else effect.read
+        change = effect.feel if isinstance(effect, Input) else effect.read
         assert np.array_equal(change(off, signal), signal.values)
         assert np.array_equal(effect.times(off, signal.times), signal.times)
         assert change(on, signal).shape == effect.times(on, signal.times).shape == (count, 6)

@@ -128,14 +128,14 @@ def test_inertia_is_what_is_left_to_the_drives_side():
 
     system = make_augmented_system(SliderSystem, (JointFlexibility, FrictionHysteresis))()
     theta = np.array([[2.0, 0.25, 30.0, 0.1, 0.5, 0.01]])
-    assert system.inertia(theta, {})[0, 0] == pytest.approx(1.5)
+    assert system.mass(theta, {})[0, 0] == pytest.approx(1.5)
     assert system.coordinates == ("x", "joint.flexibility", "friction.hysteresis")
 
 
 def test_a_share_beyond_all_leaves_something_to_either_side():
     from sims.effects.transmission import JointFlexibility
 
-    assert JointFlexibility().get_inertia_share(lanes(5.0, 30.0, 0.1))[0, 0] == pytest.approx(0.98)
+    assert JointFlexibility().behind(lanes(5.0, 30.0, 0.1))[0, 0] == pytest.approx(0.98)
     at = moment("slider", [[0.1]], [[0.2]], theta=[[2.0]])
     assert at.inertia[0, 0] == 2.0
 

@@ -130,7 +130,7 @@ def test_ranges_take_away_what_the_file_states_and_no_more(arm):
 
 def test_a_file_may_state_less_than_nothing():
     pushes = make_robot_system(made(ARM.replace('damping="0.1"', 'damping="-0.5"')))
-    (_, _, (low, high), least) = numbers(pushes.find_effect("drag.linear@elbow"))[0]
+    (_, _, (low, high), least) = numbers(pushes.effect("drag.linear@elbow"))[0]
     assert (low, least, high) == (0.0, 0.0, 1.0), "there is nothing to take away"
 
 
@@ -162,7 +162,7 @@ def test_what_is_free_is_no_cause(word, names):
     there = effects.list_effects_for(kind.system)
     assert not there.keys() & {*names, f"{names[0].partition('@')[0]}@*"}
     # Though a file may name it: the extended simulator of one where it was not free.
-    assert kind.system.find_effect(names[0]).name == names[0]
+    assert kind.system.effect(names[0]).name == names[0]
 
 
 def test_a_family_contains_its_members_and_what_they_contain(arm):
@@ -192,8 +192,8 @@ def test_an_effect_sees_its_joint_alone(rail):
     hinge = moment.get_joint_snapshot(1)
     np.testing.assert_array_equal(hinge.primary, [[0.2], [0.4]])
     np.testing.assert_array_equal(hinge.speed, [[2.0], [4.0]])
-    np.testing.assert_allclose(hinge.transmission_load, [[0.2], [0.4]])
-    np.testing.assert_allclose(hinge.transmission_sides, [[[-0.6], [-1.2]], [[0.4], [0.8]]])
+    np.testing.assert_allclose(hinge.load, [[0.2], [0.4]])
+    np.testing.assert_allclose(hinge.sides, [[[-0.6], [-1.2]], [[0.4], [0.8]]])
     assert set(hinge.inputs) == {"u.hold"}
     assert (hinge.system.kind, moment.get_joint_snapshot(0).system.kind) == ("rotary", "linear")
     np.testing.assert_array_equal(hinge.along_primary(np.array([[5.0], [6.0]])), [[5.0], [6.0]])

@@ -131,7 +131,7 @@ def test_a_link_without_inertia_does_not_shrink_the_ranges_of_its_joint(yaw, tmp
         coefficient_scales(light).inertia[:2], compute_joint_scales(light).inertia[:2]
     )
     system = make_robot_simulator(yaw).system
-    ((low, high),) = system.find_effect("inertia.armature@roll").coefficients[0].plausible[:1]
+    ((low, high),) = system.effect("inertia.armature@roll").coefficients[0].plausible[:1]
     assert (low, high > 1e-4) == (0.0, True)
     # Set free, too: within 1e-8 kg m^2 it could only end at a bound.
     (free,) = make_robot_simulator(yaw, ["armature@roll"]).system.parameters

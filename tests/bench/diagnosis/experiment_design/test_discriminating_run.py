@@ -42,12 +42,12 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
     made = small_swing(effects=["drag.quadratic=2e-4"])
     search, model, rival = rivals(made, [0.003, 0.02], effects, free=free)
     found = propose_discriminating_run(search, model, rival)
-    assert found.discrimination_sigmas > MIN_DISCRIMINATION_SIGMAS
+    assert found.apart > MIN_DISCRIMINATION_SIGMAS
     assert found.change
     said = re.fullmatch(
         r"(.*): there drag.linear and drag.quadratic differ by (.*) times the noise", found.says
     )
-    assert float(said[2]) == pytest.approx(found.discrimination_sigmas, rel=0.01)
+    assert float(said[2]) == pytest.approx(found.apart, rel=0.01)
     if free:
         return
     track = search.world.tracks[0]
@@ -65,14 +65,14 @@ def test_the_run_that_differs_most_is_proposed_and_does_tell_them_apart(free):
         for name, m in zip(effects, (model, rival), strict=True)
     ]
     apart = np.sqrt(np.square((seen[0] - seen[1]) / [0.003, 0.02]).mean())
-    assert apart == pytest.approx(found.discrimination_sigmas, rel=0.05)
+    assert apart == pytest.approx(found.apart, rel=0.05)
 
 
 def test_equal_models_are_not_told_apart_by_any_run():
     made = small_swing()
     search, model, _ = rivals(made, [0.003, 0.02], ("drag.linear", "drag.quadratic"))
     found = propose_discriminating_run(search, model, model)
-    assert found.discrimination_sigmas == 0
+    assert found.apart == 0
     assert found.change == {}
     assert found.says.startswith("No run of this kind would tell")
     assert found.says.endswith("measure one of the causes directly")
@@ -91,7 +91,7 @@ def test_an_input_is_made_smaller_or_larger():
     search, model, rival = rivals(made, 0.003, ("input.deadband", "friction.coulomb"))
     before = search.world.simulations
     found = propose_discriminating_run(search, model, rival)
-    assert np.isfinite(found.discrimination_sigmas)
+    assert np.isfinite(found.apart)
     assert search.world.simulations - before == 2 * (1 + 6 + 2), (
         "twice as long, each state three ways, the input two"
     )

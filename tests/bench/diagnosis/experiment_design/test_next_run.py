@@ -81,7 +81,7 @@ def test_the_proposed_run_splits_the_set(tmp_path):
     assert {"input.lag", "input.delay"} <= ambiguous
     design = proposed.design
     assert design.by == "T"
-    assert {design.effect, *design.discrimination_by_effect} == ambiguous
+    assert {design.effect, *design.told} == ambiguous
     assert design.distinguished_effects
     assert design.times[-1] <= 4.0
     after = write(tmp_path, "after", drawn(design), lag=0.04, seed=1)

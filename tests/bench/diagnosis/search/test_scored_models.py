@@ -21,7 +21,7 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     assert search.scan(base) is search.scanned[frozenset()].scores
 
     shifted = replace(base.fit, simulated=base.fit.simulated + moved * 0.01, cost=0.0)
-    search.models[frozenset()] = replace(base, merit=-np.inf)
+    search.models[frozenset()] = replace(base, penalised_log_likelihood=-np.inf)
     again = search.enter(shifted)
     scores = search.scan(again)
     assert (search.world.simulations > once) is anew
@@ -39,7 +39,7 @@ def test_what_was_scored_about_the_base_model_is_told_when_a_better_fit_has_take
     assert search.about_base is None
     scores = search.scan(base)
     assert search.about_base is scores
-    search.models[frozenset()] = replace(base, merit=-np.inf)
+    search.models[frozenset()] = replace(base, penalised_log_likelihood=-np.inf)
     search.enter(base.fit)
     assert frozenset() not in search.scored
     assert search.about_base is scores
