@@ -80,7 +80,7 @@ def with_solver_parameters(world: RunEvaluator, name: str, says: str) -> str:
     robot: Any = world.kind
     effect = type(world.available_effects[name])
     members = members_of(effect)
-    joints = [joint for joint in robot.robot.joints if joint.single]
+    joints = [joint for joint in robot.robot.joints if joint.has_one_coordinate]
     places = [member.coordinate for member in members if member.coordinate is not None]
     dofs = [joints[place].velocity for place in places]
     parameters = {tuple(robot.robot.compiled.dof_solref[dof].tolist()) for dof in dofs}

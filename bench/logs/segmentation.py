@@ -108,7 +108,7 @@ def _budget(kind: type[Simulator]) -> float:
     """Return the seconds of a robot's motion that cost `MAX_RECORDING_COST`."""
     robot: Any = kind
     step, integrator = robot.numerics
-    joints = sum(joint.single for joint in robot.robot.joints)
+    joints = sum(joint.has_one_coordinate for joint in robot.robot.joints)
     return float(
         MAX_RECORDING_COST * step / (joints + 3) / STEP_COST_BY_INTEGRATOR.get(integrator, 1.0)
     )

@@ -39,13 +39,13 @@ def test_what_was_tried_before_changes_what_is_proposed(fitted):
     rng = np.random.default_rng(1)
     target, *shown = rng.normal(size=(3, network.design.seen))
     points = [np.array([0.4]), np.array([0.6])]
-    alone = network.following(target, shown[1:], points[1:])
-    assert not np.allclose(network.following(target, shown, points), alone, atol=1e-6)
+    alone = network.propose_next(target, shown[1:], points[1:])
+    assert not np.allclose(network.propose_next(target, shown, points), alone, atol=1e-6)
     # beyond the window nothing is heard
     long = [shown[0]] * network.design.window
     for before in (shown[1:], shown[:1] * 3):
-        found = network.following(target, before + long, [points[0]] * (len(before) + len(long)))
-        assert np.array_equal(found, network.following(target, long, [points[0]] * len(long)))
+        found = network.propose_next(target, before + long, [points[0]] * (len(before) + len(long)))
+        assert np.array_equal(found, network.propose_next(target, long, [points[0]] * len(long)))
 
 
 def test_a_simulation_that_shows_the_target_is_where_it_stays(fitted):
@@ -58,7 +58,7 @@ def test_a_simulation_that_shows_the_target_is_where_it_stays(fitted):
     far = network.apply_weights(
         network.input_features(toy.observe(truth[None] - 0.2, scenario), (60,), toy.scene)
     )
-    found = network.following(row, [*far, row], [truth - 0.2, truth])
+    found = network.propose_next(row, [*far, row], [truth - 0.2, truth])
     assert found == pytest.approx(truth, abs=1e-7)
 
 

@@ -152,9 +152,9 @@ def test_a_noisy_target_is_left_to_the_network_that_knows_noise(one):
     task = Task(
         1, np.zeros(1), swing(np.full((1, 1), 0.9), 1.5)[0], np.ones(2), TRAINING[1], 9, (60,)
     )
-    assert one._fitted.suited(task) is one._fitted.clean
+    assert one._fitted.select_for(task) is one._fitted.clean
     spoil(task.observed)
-    assert one._fitted.suited(task) is one._fitted.noisy
+    assert one._fitted.select_for(task) is one._fitted.noisy
 
 
 def test_roughness_is_the_noise_and_sees_no_motion():

@@ -67,7 +67,7 @@ def test_gaps_are_bridged_by_the_proposed_model(tuner):
         )
         return abs(
             tuner.get_trained_network()
-            .suited(task)
+            .select_for(task)
             .make_estimator(task)(toy.observe(np.array([[0.55]]), scenario))[0]
         )
 
@@ -93,7 +93,7 @@ def test_sides_read_their_own_channels(tuner):
             toy.lengths,
             toy.known(scenario),
         )
-        return tuner.get_trained_network().suited(task).make_estimator(task)(shown)[0]
+        return tuner.get_trained_network().select_for(task).make_estimator(task)(shown)[0]
 
     blind, deaf = target.copy(), proposed.copy()
     blind[..., 0], deaf[..., 1] = 7.0, -7.0

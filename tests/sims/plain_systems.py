@@ -17,5 +17,5 @@ def lanes_of(simulator, theta, scenarios, monkeypatch):
     engine = simulator.engine
     whole = engine.integrate
     monkeypatch.setattr(engine, "integrate", lambda lanes: seen.append(lanes) or whole(lanes))
-    simulator.simulate_lanes(theta, scenarios)
+    simulator.simulate_batch(theta, scenarios)
     return seen[0]

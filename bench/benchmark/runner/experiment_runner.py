@@ -375,7 +375,7 @@ class _LazyCalls(Sequence[Call]):
 
     def __getitem__(self, i: Any) -> Any:
         results = self._results
-        order = results.plan[self._places[i]].order
+        order = results.plan[self._places[i]].request
         order = replace(
             order, tuned=results.tuned.get(order.entry.label), hidden=results.hidden_paths
         )

@@ -341,5 +341,5 @@ def _work(
         except Exception as raised:
             error, trace = raised, traceback.format_exc()
         count = world.simulations - before
-        if not _sent(pipe, _Answer(result, error, trace, count, world.watch.left())):
+        if not _sent(pipe, _Answer(result, error, trace, count, world.watch.has_abandoned_fits())):
             return

@@ -55,7 +55,7 @@ def stated_limits(world: RunEvaluator) -> StatedLimits:
         return StatedLimits()
     kind: Any = world.kind
     robot = kind.robot
-    joints = {joint.name: joint for joint in robot.joints if joint.single}
+    joints = {joint.name: joint for joint in robot.joints if joint.has_one_coordinate}
     forces = {}
     for name, joint in joints.items():
         drives = [actuator for actuator in robot.actuators if actuator.joint == name]

@@ -86,7 +86,7 @@ class RigLimits:
     @property
     def _joints(self) -> list[Any]:
         robot: Any = self.world.kind
-        return [joint for joint in robot.robot.joints if joint.single]
+        return [joint for joint in robot.robot.joints if joint.has_one_coordinate]
 
     def _seen(
         self, model: FittedModel, scenarios: Sequence[Scenario], states: Array

@@ -315,7 +315,7 @@ class _BestScores:
         result = []
         for i in chosen:
             group = self._groups[i]
-            result.append((group, self._coefficients[i, : len(group.columns)].copy()))
+            result.append((group, self._coefficients[i, : len(group.column_indices)].copy()))
         return tuple(result)
 
 

@@ -511,7 +511,7 @@ def simulate_joint(world: TrueSystem, scenario: Scenario, number: int, instants:
     joint, until = JointDynamics(world, number), float(instants[-1])
     names = ("q", "qd") if world.system == "pendulum" else ("x", "v")
     state = np.array([scenario.initial[name] for name in names])
-    hidden = [value for part in joint.behind for value in part.begin(*state)]
+    hidden = [value for part in joint.behind for value in part.get_initial_state(*state)]
     state = np.concatenate([state, hidden])
     out = np.empty((instants.size, 2))
     out[instants <= 0] = state[:2]

@@ -55,7 +55,7 @@ def check_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly
         return
     robot: Any = kind
     for joint in robot.robot.joints:
-        if joint.single:
+        if joint.has_one_coordinate:
             yield from _beyond(recording, joint)
     yield from _servos(recording, robot.robot)
 
@@ -111,7 +111,7 @@ def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
     robot = kind.robot  # type: ignore[attr-defined]
     model = robot.compiled
     data = mujoco.MjData(model)
-    joints = [joint for joint in robot.joints if joint.single]
+    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     found = []
     with capture_mujoco_warnings():
         for row in np.unique(np.linspace(0, run.times.size - 1, CHECKED_INSTANTS).astype(np.intp)):
@@ -150,7 +150,7 @@ def find_contacts(
             mujoco.mj_resetData(model, data)
             for joint in robot.joints:
                 values = positions.get(f"q.{joint.name}")
-                if joint.single and values is not None and np.isfinite(values[row]):
+                if joint.has_one_coordinate and values is not None and np.isfinite(values[row]):
                     data.qpos[joint.position] = values[row]
             mujoco.mj_forward(model, data)
             found |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}

@@ -40,14 +40,14 @@ def test_without_a_base_model_nothing_is_said(swing):
     found = until(swing, "base fit")
     assert found.verdict == "unknown"
     assert not found.causes
-    assert found.answer.cut.not_asked[0] == "base_fit"
+    assert found.answer.cut.skipped_questions[0] == "base_fit"
     assert found.answer.parameters["inertia"].value > 0
 
 
 def test_fits_leave_off_where_they_are(swing):
     found = until(swing, "refit of")
     assert found.verdict == "unknown"
-    assert found.answer.cut.not_asked[0] == "search"
+    assert found.answer.cut.skipped_questions[0] == "search"
     assert found.answer.candidates, "the scores were there already"
 
 
@@ -55,7 +55,7 @@ def test_what_the_search_came_upon_is_listed_and_not_believed(swing):
     found = until(swing, "scores of the library about drag.linear")
     assert found.verdict == "unknown"
     assert [cause.effect for cause in found.causes] == ["drag.linear"]
-    assert found.answer.cut.not_asked == ("rivals", "held_out", "structure", "alternatives")
+    assert found.answer.cut.skipped_questions == ("rivals", "held_out", "structure", "alternatives")
     assert found.answer.heldout is None
     assert found.answer.next_experiment is None
     assert "drag.linear" in repr(found)
@@ -65,7 +65,7 @@ def test_what_the_search_came_upon_is_listed_and_not_believed(swing):
 def test_a_cause_that_stood_is_real_and_never_the_whole_answer(swing, tmp_path):
     found = until(swing, "whether a force of any shape")
     assert found.verdict == "partial"
-    assert set(found.answer.cut.not_asked) <= {"structure", "alternatives"}
+    assert set(found.answer.cut.skipped_questions) <= {"structure", "alternatives"}
     (cause,) = found.causes
     assert cause.effect == "drag.linear"
     assert cause.coefficients["coefficient"].value == pytest.approx(1e-3, rel=0.05)

@@ -174,7 +174,7 @@ def test_a_free_swing_does_not_fix_gravity_and_length_besides(tmp_path):
     path = table(tmp_path, swings(), noise=NOISE)
     found = explained(path, free=("gravity", "length"))
     assert found.verdict == "unidentifiable"
-    assert set(found.story.vague) >= {"gravity", "length"}
+    assert set(found.story.unidentified_parameters) >= {"gravity", "length"}
     says = found.answer.next_experiment.says
     assert says.startswith("Measure ")
     assert says.endswith("apart, or record runs in which they act differently from each other")
@@ -182,7 +182,7 @@ def test_a_free_swing_does_not_fix_gravity_and_length_besides(tmp_path):
         assert found.answer.parameters[name].low is None
     one = explained(path, free=("gravity",))
     assert one.verdict == "unidentifiable", "only the ratio to the inertia shows"
-    assert one.story.vague == ("inertia", "gravity")
+    assert one.story.unidentified_parameters == ("inertia", "gravity")
     assert one.answer.parameters["gravity"].low is None
 
 

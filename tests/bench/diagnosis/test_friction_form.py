@@ -102,9 +102,9 @@ def test_the_form_that_was_planted_fits_better(tmp_path, form):
     soft = choose_friction_form(models, stiff, other, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     assert (soft is not None) == (form == "soft")
     best, world = (stiff, models.world) if soft is None else (soft, other)
-    assert best.names == (name,)
-    assert best.fit.theta[world.places(name)[0]] == pytest.approx(PLANTED, rel=0.03)
-    assert abs(models.excess(best)) < 0.1
+    assert best.effects == (name,)
+    assert best.fit.theta[world.get_coefficient_indices(name)[0]] == pytest.approx(PLANTED, rel=0.03)
+    assert abs(models.compute_excess(best)) < 0.1
     assert form_of(world, name) == ("soft" if form == "soft" else None)
     assert form_of(other, "drag.linear@elbow") is None
 
@@ -115,7 +115,7 @@ def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):
     soft = choose_friction_form(models, hysteresis, other, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     assert soft is not None
     assert soft.effects == ("friction.coulomb@elbow",)
-    assert soft.fit.theta[other.places(soft.effects[0])[0]] == pytest.approx(PLANTED, rel=0.03)
+    assert soft.fit.theta[other.get_coefficient_indices(soft.effects[0])[0]] == pytest.approx(PLANTED, rel=0.03)
     assert has_dry_friction(models.world, ["friction.hysteresis@elbow"])
     assert not has_dry_friction(models.world, ["drag.linear@elbow"])
 

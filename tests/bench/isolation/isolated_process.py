@@ -77,7 +77,7 @@ def experiment(name, **changes):
 def outcome(made, seed=0, target=0):
     """One run of it."""
     (entry,) = made.tuners
-    sealed = get_problem(made).draw_targets()[target].sealed
+    sealed = get_problem(made).draw_targets()[target].blinded
     order = RunRequest("run", entry, seed, sealed, made.budget)
     return execute_run(made, replace(order, tuned=sandboxed_tuner.make_tuner_spec(entry)))
 

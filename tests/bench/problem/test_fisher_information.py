@@ -181,12 +181,12 @@ def folder(tmp_path_factory):
 def test_errors_along_directions_and_of_prediction_are_recorded(folder):
     folder, results = folder
     runs, problem = read_comparison(folder).runs, results.problem
-    targets = {job.target.sealed.name: job.target for job in results.plan}
+    targets = {job.target.blinded.name: job.target for job in results.plan}
     for row in runs.iloc[:: max(len(runs) // 12, 1)].to_dict("records"):
         target, found = targets[row["target"]], results.spectra[row["target"]]
         delivered = np.array([row["recommendation_rate"], row["recommendation_decay"]])
         away = (delivered - target.truth) / [2.0, 0.4]
-        for metric, mask in (("stiff_error", found.stiff), ("sloppy_error", ~found.stiff)):
+        for metric, mask in (("stiff_error", found.is_stiff), ("sloppy_error", ~found.is_stiff)):
             expected = (
                 np.sqrt(np.mean((found.vectors[:, mask].T @ away) ** 2)) if mask.any() else np.nan
             )
@@ -198,7 +198,7 @@ def test_errors_along_directions_and_of_prediction_are_recorded(folder):
 
         error = np.sqrt(np.mean((swing(delivered) - swing(target.truth)) ** 2))
         assert row["heldout_error"] == pytest.approx(error, rel=1e-9, abs=1e-12)
-    assert problem.identifiable
+    assert problem.has_several_parameters
 
 
 @pytest.mark.slow

@@ -19,10 +19,10 @@ NARROW = 1e-6
 
 def everything(target):
     """All numbers of a target, one after another."""
-    sides = target.sealed.fitting, target.sealed.held_out
+    sides = target.blinded.fitting, target.blinded.held_out
     starts = [list(s.initial.values()) for side in sides for s in side.scenarios]
     observed = [side.observed.ravel() for side in sides]
-    return np.concatenate([target.truth, target.sealed.start, *starts, *observed])
+    return np.concatenate([target.truth, target.blinded.start, *starts, *observed])
 
 
 def test_targets_of_another_experiment_are_met_whole(spring):

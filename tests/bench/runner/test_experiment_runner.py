@@ -32,7 +32,7 @@ def compared(experiment, jobs=2) -> ExperimentRun:
 
 
 def frame(results):
-    columns = results.kept.columns
+    columns = results.run_sink.columns
     return pd.concat([pd.DataFrame(columns[i]) for i in sorted(columns)], ignore_index=True)
 
 
@@ -85,7 +85,7 @@ def test_other_tuners_in_the_comparison_change_nothing(two_workers):
 
 
 def test_every_end_has_its_status_and_keeps_its_rows(two_workers):
-    statuses = pd.DataFrame([vars(s) for s in two_workers.kept.statuses.values()])
+    statuses = pd.DataFrame([vars(s) for s in two_workers.run_sink.statuses.values()])
     kinds = {tuner: set(group["status"]) for tuner, group in statuses.groupby("tuner")}
     assert kinds["crashing"] == kinds["dying"] == {"crashed"}
     assert kinds["nan_proposing"] == {"diverged"}
@@ -133,11 +133,11 @@ def test_errors_are_those_of_the_recommendation(two_workers):
 def test_obs_error_is_the_rmse_of_the_recommended_simulation(two_workers):
     rows = frame(two_workers).query("tuner == 'cma_es' and target == 'in-001' and seed == 1")
     problem = two_workers.problem
-    target = next(t for t in problem.targets() if t.sealed.name == "in-001")
+    target = next(t for t in problem.draw_targets() if t.blinded.name == "in-001")
     for _, row in rows.iterrows():
         theta = np.array([[row["recommendation_rate"], row["recommendation_decay"]]])
-        simulated = problem.simulator.simulate(theta, target.sealed.fitting.scenarios[0])[0]
-        rmse = np.sqrt(np.mean((simulated - target.sealed.fitting.observed) ** 2))
+        simulated = problem.simulator.simulate(theta, target.blinded.fitting.scenarios[0])[0]
+        rmse = np.sqrt(np.mean((simulated - target.blinded.fitting.observed) ** 2))
         assert row["obs_error"] == pytest.approx(rmse, rel=1e-9)
 
 

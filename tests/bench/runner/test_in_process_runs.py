@@ -95,14 +95,14 @@ def test_table_is_the_same_without_workers_and_with_one_or_two(tmp_path, monkeyp
 def test_prints_show_and_the_tuner_is_in_this_process(monkeypatch, capsys):
     in_a_cell(monkeypatch, "return str(__import__('os').getpid())")
     results = here(small(tuners={"mine": {}}))
-    (status,) = results.kept.statuses.values()
+    (status,) = results.run_sink.statuses.values()
     assert (status.status, status.reason) == ("converged", str(os.getpid()))
     assert capsys.readouterr().out == "looked at 12\n"
 
 
 def test_a_crash_is_a_status_with_the_cells_own_line_and_said_when_it_happens(monkeypatch, capsys):
     in_a_cell(monkeypatch, "raise ValueError('oh')  # here")
-    (status,) = here(small(tuners={"mine": {}})).kept.statuses.values()
+    (status,) = here(small(tuners={"mine": {}})).run_sink.statuses.values()
     assert status.status == "crashed"
     assert status.simulations == 1
     for text in (status.reason, capsys.readouterr().err):
@@ -112,7 +112,7 @@ def test_a_crash_is_a_status_with_the_cells_own_line_and_said_when_it_happens(mo
 
 def test_soft_time_limit_holds(monkeypatch):
     in_a_cell(monkeypatch, "while True: yield task.start")
-    (status,) = here(small(tuners={"mine": {}}, budget=10**6, timeout=0.2)).kept.statuses.values()
+    (status,) = here(small(tuners={"mine": {}}, budget=10**6, timeout=0.2)).run_sink.statuses.values()
     assert status.status == "timeout"
     assert 1 <= status.simulations < 10**6
 
@@ -190,7 +190,7 @@ def test_simulator_of_a_notebook_is_refused_too_and_a_redefined_one_is_not_remem
     for times in (1, 3):
         defined(times)
         results = here(small(simulator="mine", tuners={"same": {}}))
-        reasons += [status.reason for status in results.kept.statuses.values()]
+        reasons += [status.reason for status in results.run_sink.statuses.values()]
     assert reasons[0] == reasons[1], "targets and tuner meet the same simulator, the new one"
     with pytest.raises(InputError, match="simulator mine: class Mine is defined in"):
         run_experiment(results, PLUGIN_FILES, jobs=1)

@@ -25,7 +25,7 @@ def test_loss_of_one_proposal_is_that_in_a_batch():
     expected = np.sqrt(((simulated - side.observed) ** 2).mean(axis=(1, 2))) / 0.1
     np.testing.assert_allclose(alone, expected, rtol=1e-12)
     np.testing.assert_allclose(
-        one.rmse(points, points[::-1])[:, 0], expected[::-1] * 0.1, rtol=1e-12
+        one.compute_rmse(points, points[::-1])[:, 0], expected[::-1] * 0.1, rtol=1e-12
     )
 
 

@@ -204,7 +204,7 @@ def test_who_wins_changes_where_the_costs_cross():
 
 def test_tuner_seconds_are_those_up_to_the_threshold():
     rows = curves_of({"a": {(0, 0): [1, 0.5, 0.05, 0.05, 0.05], (1, 0): [1, 1, 1]}}, seconds=0.25)
-    spent = rows.spent("tuner_seconds")
+    spent = rows.build_cumulative_seconds("tuner_seconds")
     assert spent[0].tolist() == [0, 0.25, 0.5, 0.75, 1.0]
     held = compute_tuning_costs(
         rows.build_curves("param_error"), 0.1, 4, spent, spent * 2, {"a": (7.0, 3.0)}

@@ -112,7 +112,7 @@ def test_commands_before_a_run_set_its_first_activation():
 def test_lanes_of_one_command_keep_their_own_activations():
     kind = simulator(POSITION)
     scenarios = [Scenario(TIMES, {"act.m": a}, {"u.m": COMMAND}) for a in (0.0, 0.5)]
-    lanes = kind(observe=["q.hinge"]).simulate_lanes(np.empty((2, 0)), scenarios)
+    lanes = kind(observe=["q.hinge"]).simulate_batch(np.empty((2, 0)), scenarios)
     for row, activation in zip(lanes[:, :, 0], (0.0, 0.5), strict=True):
         assert row == pytest.approx(plain(kind, activation)[0], abs=1e-12)
 

@@ -85,7 +85,7 @@ def test_lanes_of_runs_switch_at_their_own_times_and_forget_it_afterwards():
     masks = [OFF, TIMES > 0.3, np.zeros_like(OFF)]
     scenarios = [Scenario(TIMES, {}, COMMANDS, off={"m": mask}) for mask in masks]
     made = kind(observe=["q.shoulder", "q.elbow"])
-    lanes = made.simulate_lanes(np.empty((3, 0)), scenarios)
+    lanes = made.simulate_batch(np.empty((3, 0)), scenarios)
     for row, mask in zip(lanes, masks, strict=True):
         assert row == pytest.approx(plain(kind, off=mask)[0], abs=1e-12)
     again = made.simulate(np.empty((1, 0)), Scenario(TIMES, {}, COMMANDS))[0]

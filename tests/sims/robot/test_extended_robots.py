@@ -134,9 +134,9 @@ def test_moved_together_they_find_each_other_and_apart_it_says_where(model, path
 
 
 def test_without_a_tree_in_common_the_model_file_is_named_as_it_is(model):
-    document = model.robot.document(model.robot.path.parents[-2].parent / "nowhere" / "at" / "all")
+    document = model.robot.to_document(model.robot.path.parents[-2].parent / "nowhere" / "at" / "all")
     assert document["model"] == str(model.robot.path)
-    assert model.robot.document(None)["model"] == "arm.xml"
+    assert model.robot.to_document(None)["model"] == "arm.xml"
 
 
 def test_a_model_file_that_has_changed_is_one_line(model, path):

@@ -69,8 +69,8 @@ CASES = {
 def test_the_tangent_goes_through_what_floats(name):
     simulator, scenario = moving(*CASES[name])
     added, thetas = probes(simulator)
-    still = simulator.simulate_lanes(np.zeros((1, thetas.shape[1])), [scenario])[0]
-    changed = simulator.simulate_lanes(thetas, [scenario] * len(thetas)) - still
+    still = simulator.simulate_batch(np.zeros((1, thetas.shape[1])), [scenario])[0]
+    changed = simulator.simulate_batch(thetas, [scenario] * len(thetas)) - still
     about = RunLinearisation(
         simulator, np.zeros(thetas.shape[1]), scenario, np.zeros(1), np.zeros(1)
     )

@@ -274,9 +274,9 @@ def test_lanes_give_the_same_bits_in_any_order_and_company():
     lanes *= rng.uniform(size=lanes.shape) < 0.3
     short = Scenario(np.array([0.0, 0.0131, 0.2, 0.2004]), {"q.elbow": 1.0}, {})
     runs = [short if i % 3 else ARM_RUN for i in range(24)]
-    together = simulator.simulate_lanes(lanes, runs)
+    together = simulator.simulate_batch(lanes, runs)
     order = rng.permutation(24)
-    turned = simulator.simulate_lanes(lanes[order], [runs[i] for i in order])
+    turned = simulator.simulate_batch(lanes[order], [runs[i] for i in order])
     np.testing.assert_array_equal(turned, together[order])
     for i in range(24):
         alone = simulator.simulate(lanes[i : i + 1], runs[i])[0]

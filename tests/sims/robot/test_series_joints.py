@@ -231,7 +231,7 @@ def test_the_tangent_about_such_a_motion_is_that_of_the_simulation(effect, c):
     others = {"force.bias@elbow": 1e-4, "drag.linear@shoulder": 1e-4}
     simulator, theta, linear = about(kind, [effect, *others], [*c, 0.0, 0.0])
     added = [(simulator.effects[1 + k], np.array([d])) for k, d in enumerate(others.values())]
-    found, _ = linear.responses(added)
+    found, _ = linear.compute_effect_responses(added)
     lanes = np.tile(theta, (3, 1))
     for k, size in enumerate(others.values()):
         lanes[1 + k, len(c) + k] = size
@@ -240,7 +240,7 @@ def test_the_tangent_about_such_a_motion_is_that_of_the_simulation(effect, c):
         exact = other - seen[0]
         error = np.abs(response - exact).max(axis=0) / np.abs(exact).max()
         assert error.max() < 0.05, effect
-    begun = linear.begun()
+    begun = linear.compute_initial_state_responses()
     nudged = Scenario(SWUNG.times, {**SWUNG.initial, "q.elbow": 0.3 + 1e-5}, SWUNG.inputs)
     exact = (simulator.simulate(theta[None], nudged)[0] - seen[0]) / 1e-5
     # How links hang when a run begins changes with its pose, which is left out of it.
@@ -252,7 +252,7 @@ def test_what_such_effects_change_is_what_the_simulation_shows():
     effects = ["joint.flexibility@elbow", "joint.backlash@shoulder", "friction.hysteresis@elbow"]
     sizes = [np.array([0.02, 0.1, 0.3]), np.array([0.01]), np.array([1e-4, 0.05])]
     simulator, theta, linear = about(kind, effects, np.zeros(6))
-    found, _ = linear.responses(list(zip(simulator.effects, sizes, strict=True)))
+    found, _ = linear.compute_effect_responses(list(zip(simulator.effects, sizes, strict=True)))
     begin = 0
     for k, c in enumerate(sizes):
         lanes = np.tile(theta, (2, 1))

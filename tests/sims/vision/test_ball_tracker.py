@@ -42,13 +42,13 @@ def upright(z):
 def test_centres_are_within_half_a_pixel_of_the_truth_after_compression(seed, tmp_path):
     camera, scene = stage(seed)
     points = upright(fall())
-    write_video(tmp_path / "drop.mp4", scene.film(points), TIMES, scene.look.crf)
+    write_video(tmp_path / "drop.mp4", scene.render_frames(points), TIMES, scene.look.crf)
     found = track_ball(VideoFile(tmp_path / "drop.mp4"))
     apart = np.linalg.norm(np.stack([found.u, found.v], axis=1) - camera.project(points), axis=1)
     assert np.isfinite(apart).mean() > 0.9
     assert np.sqrt(np.nanmean(apart**2)) < 0.5
     np.testing.assert_allclose(
-        np.nanmedian(found.radius / camera.apparent_radius(points, 0.5)), 1, atol=0.06
+        np.nanmedian(found.radius / camera.compute_apparent_radius(points, 0.5)), 1, atol=0.06
     )
 
 
@@ -71,9 +71,9 @@ def test_a_ball_that_comes_to_rest_is_seen_to_the_end(seed, tmp_path):
     times = np.arange(240) / 60
     camera, scene = stage(seed)
     points = upright(bouncing(times))
-    write_video(tmp_path / "rest.mp4", scene.film(points), times, scene.look.crf)
+    write_video(tmp_path / "rest.mp4", scene.render_frames(points), times, scene.look.crf)
     found = track_ball(VideoFile(tmp_path / "rest.mp4"))
-    true = camera.outline(points, 0.5)[0]
+    true = camera.project_sphere(points, 0.5)[0]
     apart = np.linalg.norm(np.stack([found.u, found.v], axis=1) - true, axis=1)
     seen = (true[:, 1] > 0) & (true[:, 1] < 99)
     assert np.isfinite(apart[seen]).mean() > 0.93
@@ -84,7 +84,7 @@ def test_a_ball_that_comes_to_rest_is_seen_to_the_end(seed, tmp_path):
 def test_the_same_frames_make_the_same_file(tmp_path):
     """Whatever the memory held before: with x264's own choices one file in twenty differs."""
     _, scene = stage(5)
-    frames, made = list(scene.film(upright(fall()))), set()
+    frames, made = list(scene.render_frames(upright(fall()))), set()
     rng = np.random.default_rng(0)
     for i in range(25):
         junk = [np.ones(rng.integers(1, 20_000)) for _ in range(4)]
@@ -102,15 +102,15 @@ def test_the_picture_is_where_the_camera_model_says():
         np.abs(scene.render_frame(point).astype(float) - scene.render_frame(away)).max(axis=2) > 60
     )
     v, u = np.nonzero(apart)
-    np.testing.assert_allclose([u.mean(), v.mean()], camera.outline(point, 0.5)[0], atol=0.35)
+    np.testing.assert_allclose([u.mean(), v.mean()], camera.project_sphere(point, 0.5)[0], atol=0.35)
     np.testing.assert_allclose(
-        np.sqrt(apart.sum() / np.pi), camera.apparent_radius(point, 0.5), rtol=0.06
+        np.sqrt(apart.sum() / np.pi), camera.compute_apparent_radius(point, 0.5), rtol=0.06
     )
 
 
 def test_a_short_film_is_decoded_once_and_a_long_one_each_time_with_the_same_track(monkeypatch):
     _, scene = stage(12)
-    frames = list(zip(TIMES, scene.film(upright(fall())), strict=True))
+    frames = list(zip(TIMES, scene.render_frames(upright(fall())), strict=True))
 
     class Source:
         passes = 0
@@ -143,7 +143,7 @@ def test_frames_without_the_ball_stay_missing():
     hidden = np.zeros(60, bool)
     hidden[20:30] = hidden[50:] = True
     points[hidden, 2] = -50
-    found = track_ball([(t, f) for t, f in zip(TIMES, scene.film(points), strict=True)])
+    found = track_ball([(t, f) for t, f in zip(TIMES, scene.render_frames(points), strict=True)])
     assert not np.isfinite(found.u[hidden]).any()
     assert np.isfinite(found.u[~hidden]).sum() >= 35
     assert any("show no ball" in note for note in found.notes)
@@ -153,14 +153,14 @@ def test_a_film_without_a_ball_is_one_line():
     _, scene = stage(4)
     with pytest.raises(InputError, match="no ball found"):
         track_ball(
-            [(t, f) for t, f in zip(TIMES, scene.film(upright(np.full(60, -50.0))), strict=True)]
+            [(t, f) for t, f in zip(TIMES, scene.render_frames(upright(np.full(60, -50.0))), strict=True)]
         )
 
 
 def test_a_cut_leaves_the_longest_part():
     (_, first), (_, second) = stage(12), stage(3)
     points = upright(fall())
-    frames = [*first.film(points[:45]), *second.film(points[45:])]
+    frames = [*first.render_frames(points[:45]), *second.render_frames(points[45:])]
     found = track_ball(list(zip(TIMES, frames, strict=True)))
     assert found.times.size == 45
     assert "cut" in found.notes[0]
@@ -168,8 +168,8 @@ def test_a_cut_leaves_the_longest_part():
 
 def test_two_balls_give_a_warning():
     _, scene = stage(12)
-    empty = scene.frame(np.array([0, 0, -50.0])).astype(int)
-    frames = list(scene.film(upright(fall())))
+    empty = scene.render_frame(np.array([0, 0, -50.0])).astype(int)
+    frames = list(scene.render_frames(upright(fall())))
     doubled = []
     for frame in frames:
         ball = np.abs(frame.astype(int) - empty).max(axis=2) > 25
@@ -183,7 +183,7 @@ def test_uneven_time_stamps_come_back(tmp_path):
     _, scene = stage(1)
     times = np.cumsum(np.random.default_rng(0).uniform(0.005, 0.05, 60)).round(3)
     times -= times[0]
-    write_video(tmp_path / "uneven.mp4", scene.film(upright(fall())), times)
+    write_video(tmp_path / "uneven.mp4", scene.render_frames(upright(fall())), times)
     read = [t for t, _ in VideoFile(tmp_path / "uneven.mp4")]
     np.testing.assert_allclose(read, times, atol=1e-5)
     np.testing.assert_allclose(
@@ -193,7 +193,7 @@ def test_uneven_time_stamps_come_back(tmp_path):
 
 def test_a_truncated_film_is_read_as_far_as_it_goes(tmp_path):
     _, scene = stage(1)
-    write_video(tmp_path / "whole.mp4", scene.film(upright(fall())), TIMES)
+    write_video(tmp_path / "whole.mp4", scene.render_frames(upright(fall())), TIMES)
     data = (tmp_path / "whole.mp4").read_bytes()
     (tmp_path / "half.mp4").write_bytes(data[: len(data) * 6 // 10])
     film = VideoFile(tmp_path / "half.mp4")

@@ -54,13 +54,13 @@ def test_the_middle_of_the_picture_is_the_target_and_its_edge_the_field_of_view(
 
 def test_outline_of_a_sphere_by_hand_and_by_its_surface():
     camera = level()
-    centre, axes = camera.outline([0.0, 0.0, 2.0], 0.5)
+    centre, axes = camera.project_sphere([0.0, 0.0, 2.0], 0.5)
     radius = (
         camera.focal * 0.5 / math.sqrt(25 - 0.25)
     )  # straight ahead: a circle, tangents from the camera
     np.testing.assert_allclose(centre, [100, 50], atol=1e-12)
     np.testing.assert_allclose(axes, [radius, radius], rtol=1e-12)
-    assert camera.apparent_radius([0.0, 0.0, 2.0], 0.5) == pytest.approx(radius, rel=1e-12)
+    assert camera.compute_apparent_radius([0.0, 0.0, 2.0], 0.5) == pytest.approx(radius, rel=1e-12)
     camera = PinholeCamera(0.3, 5.5, 7.5, size=(400, 400))
     ball = np.array([0.6, 0.4, 4.6])
     rng = np.random.default_rng(1)

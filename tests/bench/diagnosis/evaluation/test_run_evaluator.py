@@ -68,7 +68,7 @@ def test_lanes_are_what_the_simulator_gives():
     np.testing.assert_allclose(part[:, :20], seen[:, :20], atol=1e-3)
     assert np.isnan(part[0, 20:]).all()
     assert np.isnan(part[1:, 45:]).all()
-    np.testing.assert_array_equal(there.counted(0.5).sum(axis=(1, 2)), [40, 90])
+    np.testing.assert_array_equal(there.get_sample_mask(0.5).sum(axis=(1, 2)), [40, 90])
 
 
 def test_a_later_clock_changes_nothing():

@@ -56,7 +56,7 @@ def fails(there, number):
 
 
 def waits(there, number):
-    while not there.watch.leaves(0.0):
+    while not there.watch.should_abandon_fit(0.0):
         time.sleep(0.01)
     return number
 

@@ -105,13 +105,13 @@ def servo():
 
 def test_loads_that_were_there_can_be_had_again(servo):
     plan = RunPlan(("goal",), "slow sine")
-    loads = {dict(one.constants)["mass"] for one in servo.variants(plan) if one.constants}
+    loads = {dict(one.constants)["mass"] for one in servo.list_variants(plan) if one.constants}
     assert loads == {0.1, 0.3}
     other = servo.make_run(RunPlan(("goal",), "slow sine", constants=(("mass", 0.3),)))
     assert other.scenario.constants["mass"] == 0.3
     assert other.says.endswith("with mass = 0.3")
     # What was the same all the time is no knob: torque is on, and stays on.
-    assert {name for one in servo.basic() for name in one.driven_inputs} == {"goal"}
+    assert {name for one in servo.list_basic_plans() for name in one.driven_inputs} == {"goal"}
     assert (other.scenario.inputs["torque_enable"] == 1.0).all()
 
 

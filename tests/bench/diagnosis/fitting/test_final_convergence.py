@@ -48,9 +48,9 @@ def off(search, model, best):
 def test_it_is_where_generalised_least_squares_ends(there, phi):
     search = search_of(there, phi)
     begun = entered(search, [1.1, 0.1], 2)
-    told = search.to_the_end(begun)
+    told = search.fit_to_convergence(begun)
     assert told.likelihood.phi[0] == pytest.approx(phi, abs=0.12)
-    noise = white(there, told.likelihood.sigma[0]).coloured(told.likelihood.phi)
+    noise = white(there, told.likelihood.sigma[0]).with_correlation(told.likelihood.phi)
     start = FitStart((NAME,), np.array([1.1, 0.1]), there.guess)
     best = search._of(TrajectoryFitter(there, noise, exact=True).fit_models([start], 60)[0])
     assert off(search, told, best) < 0.05
@@ -64,20 +64,20 @@ def test_it_is_where_generalised_least_squares_ends(there, phi):
 def test_what_is_there_already_stays_and_keeps_its_scores(there):
     search = search_of(there, 0.0)
     model = entered(search, [MASS, DRAG], 60, exact=True)
-    search.scored[frozenset({NAME})] = "scores"
-    assert off(search, search.to_the_end(model), model) < 0.05
-    assert search.scored[frozenset({NAME})] == "scores"
+    search.scores_by_effects[frozenset({NAME})] = "scores"
+    assert off(search, search.fit_to_convergence(model), model) < 0.05
+    assert search.scores_by_effects[frozenset({NAME})] == "scores"
     far = entered(search_of(there, 0.0, seed=1), [0.9, 0.0], 0)
     search.models[frozenset({NAME})] = far
-    search.to_the_end(far)
-    assert frozenset({NAME}) not in search.scored, "of another place they tell nothing"
+    search.fit_to_convergence(far)
+    assert frozenset({NAME}) not in search.scores_by_effects, "of another place they tell nothing"
 
 
 def test_a_model_that_cannot_be_simulated_stays_as_it_is(there):
     search = search_of(there, 0.0)
     model = entered(search, [MASS, DRAG], 20)
     lost = replace(model, fit=replace(model.fit, cost=np.inf))
-    assert search.to_the_end(lost) is lost
+    assert search.fit_to_convergence(lost) is lost
 
 
 def test_what_is_left_over_and_is_no_noise_does_not_pull_it_away(there):
@@ -88,11 +88,11 @@ def test_what_is_left_over_and_is_no_noise_does_not_pull_it_away(there):
     times = np.arange(there.observed.shape[1]) / 60
     there.observed[...] += 0.5 * (times / times[-1])[None, :, None] ** 3
     begun = entered(search, [MASS, DRAG], 60, exact=True)
-    noise = white(there, begun.likelihood.sigma[0]).coloured(begun.likelihood.phi)
+    noise = white(there, begun.likelihood.sigma[0]).with_correlation(begun.likelihood.phi)
     (fit,) = TrajectoryFitter(there, noise, exact=True).fit_models([begun.fit.make_start()], 60)
     pulled = search._of(replace(fit, cost=TrajectoryFitter(there, search.noise).compute_cost(fit)))
-    assert pulled.merit > begun.merit
+    assert pulled.penalised_log_likelihood > begun.penalised_log_likelihood
     assert pulled.fit.cost > 2.0 * begun.fit.cost
     assert pulled.fit.theta[1] == 0.0
-    told = search.to_the_end(begun)
+    told = search.fit_to_convergence(begun)
     assert told.fit.cost < 1.2 * begun.fit.cost

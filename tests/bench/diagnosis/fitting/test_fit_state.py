@@ -38,7 +38,7 @@ def moved(theta, states):
 def test_derivatives_agree_with_the_step_that_they_have_learnt_from():
     wrong = TRUE + RNG.normal(size=TRUE.shape)
     theta, states = RNG.normal(size=SHARED), RNG.normal(size=(RUNS, STATES))
-    learnt = problem(wrong).learnt(at(theta, states, wrong))
+    learnt = problem(wrong).update_jacobian(at(theta, states, wrong))
     step = moved(theta, states)
     np.testing.assert_allclose(np.einsum("rtcq,rq->rtc", learnt, step), linear(theta, states))
     across = RNG.normal(size=step.shape)
@@ -54,14 +54,14 @@ def test_as_many_steps_as_unknowns_make_derivatives_right():
     for k in range(SHARED + STATES):
         unit = steps * (np.arange(SHARED + STATES) == k)
         theta, states = unit[:SHARED], np.tile(unit[SHARED:], (RUNS, 1))
-        jacobian = problem(jacobian, steps).learnt(at(theta, states, jacobian))
+        jacobian = problem(jacobian, steps).update_jacobian(at(theta, states, jacobian))
     np.testing.assert_allclose(jacobian, TRUE, rtol=1e-9)
 
 
 def test_a_run_that_nothing_moved_teaches_nothing():
     wrong = TRUE + 1.0
     states = np.array([[0.0, 0.0], [0.3, -0.1]])
-    learnt = problem(wrong).learnt(at(np.zeros(SHARED), states, wrong))
+    learnt = problem(wrong).update_jacobian(at(np.zeros(SHARED), states, wrong))
     assert np.array_equal(learnt[0], wrong[0])
     assert not np.allclose(learnt[1], wrong[1])
 
@@ -70,7 +70,7 @@ def test_what_has_converged_with_derivatives_of_another_point_is_not_believed():
     there = problem(TRUE)
     there.here = False
     there.mark_converged()
-    assert (there.done, there.is_jacobian_stale, there.is_waiting) == (False, True, True)
+    assert (there.is_finished, there.is_jacobian_stale, there.is_waiting) == (False, True, True)
     there.here = True
     there.finish()
     assert there.done

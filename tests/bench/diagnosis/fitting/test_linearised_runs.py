@@ -59,7 +59,7 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
 ):
     there = world(tmp_path, text)
     noise = NoiseModel(np.array([1e-3]), np.zeros(1))
-    by_states = compute_state_jacobian(there, there.nominal(), there.guess)
+    by_states = compute_state_jacobian(there, there.get_nominal_theta(), there.guess)
     assert forgets_initial_state(there, noise, by_states) is expected
     known = np.zeros_like(by_states)
     assert not forgets_initial_state(there, noise, known), (
@@ -69,7 +69,7 @@ def test_what_is_held_or_damped_forgets_and_what_swings_or_creeps_does_not(
 
 def test_a_lane_that_was_simulated_is_not_simulated_again(tmp_path):
     there = world(tmp_path, ARM.format(damping=0.4, drive=SERVO))
-    theta = np.tile(there.nominal(), (3, 1))
+    theta = np.tile(there.get_nominal_theta(), (3, 1))
     runs = np.array([0, 1, 0])
     states = there.guess[runs] + np.array([[0.0], [0.0], [0.1]])
     first = there.simulate(theta, runs, states)

@@ -107,7 +107,7 @@ def test_a_search_goes_over_pieces_unless_the_motion_forgets_how_it_began(
     starts = [({"q": angle}, inputs) for angle in (0.4, -0.2)]
     swung = recorded(Servo(), [0.5, 4.0, 2e-3], starts, times, noise=1e-3)
     looking, _ = searched(swung, 1e-3, candidates=["drag.quadratic"])
-    looking.from_pieces(1)
+    looking.refit_from_segments(1)
     assert bool(asked) is cuts
 
 

@@ -30,7 +30,7 @@ def world():
 
 
 def theta_of(world, name, c):
-    theta = world.nominal()
+    theta = world.get_nominal_theta()
     theta[world.slots[name]] = c
     return theta
 
@@ -43,13 +43,13 @@ def motion_with(world, theta):
     x, v, _ = simulated.trajectory
     nothing = FloatingState(np.zeros((len(x), 0)), np.zeros((len(x), 0)))
     motion = Trajectory(x, v, nothing)
-    return MeasuredLinear(world.simulator, world.nominal(), world.tracks[0].scenario, start, motion)
+    return MeasuredLinear(world.simulator, world.get_nominal_theta(), world.tracks[0].scenario, start, motion)
 
 
 def added(linear, world, name, c):
     """What an effect adds about the motion, with no deviation from it."""
     size = 2 * (len(world.states) // 2)
-    return linear.added([(world.effects[name], c)], np.zeros((linear.knots.size, size)))
+    return linear.added([(world.available_effects[name], c)], np.zeros((linear.knots.size, size)))
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -68,12 +68,12 @@ def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(world, name):
 
 
 def test_without_an_effect_nothing_is_missed(world):
-    maps = motion_with(world, world.nominal()).interval_maps()
+    maps = motion_with(world, world.get_nominal_theta()).interval_maps()
     assert np.abs(maps.defects).max() < 1e-9
 
 
 def test_a_sensor_effect_changes_readings_alone(world):
-    linear = motion_with(world, world.nominal())
+    linear = motion_with(world, world.get_nominal_theta())
     pushed, readings = added(linear, world, "sensor.bias@q.elbow", np.array([0.01]))
     column = world.channels.index("q.elbow")
     np.testing.assert_allclose(readings[:, column, 0], 0.01, atol=1e-7)
@@ -82,11 +82,11 @@ def test_a_sensor_effect_changes_readings_alone(world):
 
 def test_a_gain_of_a_sensor_acts_on_what_is_predicted(world):
     """Not on the reading itself, whose noise it would explain."""
-    linear = motion_with(world, world.nominal())
+    linear = motion_with(world, world.get_nominal_theta())
     predicted = np.zeros((linear.knots.size, 2 * (len(world.states) // 2)))
     elbow = world.channels.index("q.elbow")
     predicted[:, world.simulator.system.coordinates.index("q.elbow")] = 0.2
-    _, readings = linear.added([(world.effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted)
+    _, readings = linear.added([(world.available_effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted)
     wanted = 0.5 * (linear.observed[:, elbow] + 0.2)
     np.testing.assert_allclose(readings[:, elbow, 0], wanted, atol=1e-6)
 
@@ -100,7 +100,7 @@ def test_jacobians_of_other_commands_are_not_used_again(world):
             values[sample:] += 0.06
     scenario = replace(scenario, inputs=steps)
     start = world.guess[0, :half], world.guess[0, half:]
-    nominal = MeasuredLinear(world.simulator, world.nominal(), scenario, start)
+    nominal = MeasuredLinear(world.simulator, world.get_nominal_theta(), scenario, start)
     delayed = theta_of(world, "input.delay@m_shoulder", (0.013,))
     given = delayed, scenario, start, nominal.trajectory
     anew = MeasuredLinear(world.simulator, *given)
@@ -112,17 +112,17 @@ def test_jacobians_of_other_commands_are_not_used_again(world):
 
 def test_maps_carry_a_deviation_as_the_simulator_does(world):
     """A states' deviation at a sample, mapped to the next one, against two simulations."""
-    linear = motion_with(world, world.nominal())
+    linear = motion_with(world, world.get_nominal_theta())
     maps = linear.interval_maps()
     half = len(world.states) // 2
     moved = 1e-5
     scenario = world.tracks[0].scenario
     start = world.guess[0, :half].copy(), world.guess[0, half:].copy()
-    base = MeasuredLinear(world.simulator, world.nominal(), scenario, start)
+    base = MeasuredLinear(world.simulator, world.get_nominal_theta(), scenario, start)
     for column in range(half):
         other = start[0].copy()
         other[column] += moved
-        changed = MeasuredLinear(world.simulator, world.nominal(), scenario, (other, start[1]))
+        changed = MeasuredLinear(world.simulator, world.get_nominal_theta(), scenario, (other, start[1]))
         for sample in (1, 4):
             step = base.knots[sample]
             x = (changed.trajectory.x[step] - base.trajectory.x[step]) / moved

@@ -238,7 +238,7 @@ def test_stops_are_tried_at_both_ends_of_where_it_has_been():
     there = world(recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"]))
     x = there.observed[..., there.channels.index("x")]
     low, high = float(np.nanmin(x)), float(np.nanmax(x))
-    assert there.ends_of("state.limit") == (low, high)
+    assert there.get_coordinate_range("state.limit") == (low, high)
     found = compute_directions(there, fitted(there), ["state.limit"])
     tried = [found.candidates[i].coefficients for i in of(found, "state.limit")]
     assert {np.sign(c[0]) for c in tried} == {-1.0, 1.0}
@@ -256,7 +256,7 @@ def test_stops_are_tried_at_both_ends_of_where_it_has_been():
 def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later():
     there = world(recording("slider", runs=2, seconds=1, rate=60, noise=["0.003"], inputs=["u=1"]))
     fit = fitted(there)
-    _, high = there.ends_of("state.limit")
+    _, high = there.get_coordinate_range("state.limit")
     theta = fit.theta.copy()
     theta[there.slots["state.limit"]] = [40.0, 0.5 * high, 0.1]
     starts = list(

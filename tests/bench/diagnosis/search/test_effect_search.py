@@ -112,12 +112,12 @@ def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
     """A sketch that was begun for fewer effects may have no model of so many."""
     recorded = recording("pendulum", noise=["0.01"], observe=["q"], runs=2, seconds=4.0, rate=50.0)
     made, _ = searched(recorded, 0.01, candidates=["friction.coulomb", "gravity.tilt"])
-    made.from_pieces(1)
+    made.refit_from_segments(1)
     known = set(made.models)
     assert {len(names) for names in known} == {0, 1}, "the pieces are searched"
 
     monkeypatch.setattr(EffectSearch, "refit_extensions", lambda *args: None)
-    made.from_pieces(2)
+    made.refit_from_segments(2)
     assert set(made.models) == known
 
 

@@ -55,11 +55,11 @@ SWINGS = [{"q": 0.8}, {"q": -1.1}, {"q": 0.4, "qd": 2.0}]
 @pytest.mark.parametrize("stated", [True, False])
 def test_a_gust_is_caught(stated):
     found = left(Pendulum, Gust, 0.02, SWINGS, stated=stated)
-    assert found.structure
+    assert found.has_structure
     assert found.p_value < STRUCTURE_P_VALUE_THRESHOLD
     assert found.where == "time, along q"
     assert (found.excess > 2).all()
-    assert found.loud == ("q", "qd")
+    assert found.channels_above_noise == ("q", "qd")
     assert (found.excess > MAX_AUTOCORRELATED_NOISE_RATIO).all(), (
         "so much that even an estimated noise is exceeded"
     )
@@ -75,8 +75,8 @@ def test_clean_recordings_are_quiet():
     p, excess = [], []
     for seed in range(12):
         found = left(Pendulum, None, 0.0, SWINGS, seed=seed)
-        assert not found.structure
-        assert found.loud == ()
+        assert not found.has_structure
+        assert found.channels_above_noise == ()
         p.append(found.p_value)
         excess.append(found.excess)
     assert np.median(p) > 0.15

@@ -46,7 +46,7 @@ def test_the_richer_law_stands_where_it_comes_nearer(truth, richer, kept):
     made = search({**truth, "force.bias": 0.4})
     values = {"friction.stribeck": (0.5, 0.5, 0.2), "friction.direction": (0.5, 0.4)}
     model = fitted(made, ("force.bias", richer), {**values, "force.bias": 0.3})
-    plainer = made.plainer(model)
+    plainer = made.simplify_laws(model)
     assert set(plainer.effects) == {"force.bias", kept}
     if kept != richer:
         place = made.world.slots[kept].start
@@ -65,7 +65,7 @@ def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts
     """In 4 s friction that falls over 300 s does not fall: it is dry and viscous friction."""
     made = search({**truth, "force.bias": 0.4})
     values = {"friction.warming": (0.7, 0.6, 2.0 if len(kept) == 1 else 300.0), "force.bias": 0.3}
-    plainer = made.plainer(fitted(made, ("force.bias", "friction.warming"), values))
+    plainer = made.simplify_laws(fitted(made, ("force.bias", "friction.warming"), values))
     assert set(plainer.effects) == {"force.bias", *kept}
     for name in truth:
         c = plainer.fit.theta[made.world.slots[name]]
@@ -89,9 +89,9 @@ def test_a_simpler_law_that_is_known_and_caught_is_fitted_from_the_richer_one():
     made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
     values = {"friction.coulomb": 0.5, "friction.stribeck": (0.7, 0.0, 0.2), "force.bias": 0.4}
     part = fitted(made, ("force.bias", "friction.coulomb"), values)
-    caught = type(part)(part.fit, part.likelihood, part.merit - 50.0)
+    caught = type(part)(part.fit, part.likelihood, part.penalised_log_likelihood - 50.0)
     made.models[frozenset(part.effects)] = caught
     richer = fitted(made, ("force.bias", "friction.stribeck"), values)
-    plainer = made.plainer(richer)
+    plainer = made.simplify_laws(richer)
     assert set(plainer.effects) == {"force.bias", "friction.coulomb"}
-    assert plainer.merit > caught.merit + 45.0
+    assert plainer.penalised_log_likelihood > caught.penalised_log_likelihood + 45.0

@@ -16,9 +16,9 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     """A fit a little to the side, by so many sigmas RMS, takes the place of the base model."""
     recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
     search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
-    search.scan(base)
+    search.score_missing_effects(base)
     once = search.world.simulations
-    assert search.scan(base) is search.scanned[frozenset()].scores
+    assert search.score_missing_effects(base) is search.cached_scans[frozenset()].scores
 
     shifted = replace(base.fit, simulated=base.fit.simulated + moved * 0.01, cost=0.0)
     search.models[frozenset()] = replace(base, penalised_log_likelihood=-np.inf)
@@ -36,9 +36,9 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
 def test_what_was_scored_about_the_base_model_is_told_when_a_better_fit_has_taken_its_place():
     recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
     search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
-    assert search.about_base is None
-    scores = search.scan(base)
-    assert search.about_base is scores
+    assert search.base_scores is None
+    scores = search.score_missing_effects(base)
+    assert search.base_scores is scores
     search.models[frozenset()] = replace(base, penalised_log_likelihood=-np.inf)
     search.enter(base.fit)
     assert frozenset() not in search.scored
@@ -59,9 +59,9 @@ def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
         larger = search.models[frozenset(["drag.linear"])]
         models = [base, larger] if first else [larger, base]
         for model in models:
-            search.scan(model)
+            search.score_missing_effects(model)
             assess_lack_of_fit(search, model)
-        chances.append([*search.scan(base).chance, *search.scan(larger).chance])
+        chances.append([*search.score_missing_effects(base).null_quantiles, *search.score_missing_effects(larger).null_quantiles])
         chances[-1].append(assess_lack_of_fit(search, larger).p_value)
     assert chances[0] == chances[1]
 
@@ -72,26 +72,26 @@ def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkey
     )
     names = ["drag.linear", "spring.linear"]
     search, base = searched(recorded, 0.01, candidates=["friction.coulomb", *names])
-    search.refit([replace(base.fit.start(), effects=(name,)) for name in names])
+    search.refit_models([replace(base.fit.make_start(), effects=(name,)) for name in names])
     first, second = (search.models[frozenset([name])] for name in names)
-    search.scan(base)
-    before = search.scan(first)
-    held = {frozenset(), frozenset(first.names)}
-    assert set(search.scanned) == held
+    search.score_missing_effects(base)
+    before = search.score_missing_effects(first)
+    held = {frozenset(), frozenset(first.effects)}
+    assert set(search.cached_scans) == held
 
     # Room for one of them beside the base model's.
-    size = search.scanned[frozenset(first.names)].directions.values.nbytes
+    size = search.cached_scans[frozenset(first.effects)].directions.responses.nbytes
     monkeypatch.setattr("bench.diagnosis.search.scored_models.DIRECTION_CACHE_BYTES", 1.5 * size)
-    search.scan(second)
-    assert set(search.scanned) == {frozenset(), frozenset(second.names)}
+    search.score_missing_effects(second)
+    assert set(search.cached_scans) == {frozenset(), frozenset(second.effects)}
     once = search.world.simulations
-    assert search.scan(first) is before
+    assert search.score_missing_effects(first) is before
     assert search.world.simulations == once
 
     # Who extends both has both, the one that was gone among them.
-    search.extend([first, second], 3)
-    assert search.scored[frozenset(first.names)] is before
-    known = {frozenset([*one, "friction.coulomb"]) for one in (first.names, second.names)}
+    search.refit_extensions([first, second], 3)
+    assert search.scores_by_effects[frozenset(first.effects)] is before
+    known = {frozenset([*one, "friction.coulomb"]) for one in (first.effects, second.effects)}
     assert known <= set(search.models)
 
 
@@ -111,8 +111,8 @@ def test_a_survey_of_several_models_reports_each_of_them():
     candidates = ["friction.coulomb", "spring.linear", "drag.linear"]
     search, _ = searched(recorded, 0.01, candidates=candidates)
     names = [("friction.coulomb",), ("spring.linear",)]
-    search.refit([replace(search.base.fit.start(), effects=one) for one in names])
+    search.refit_models([replace(search.base_model.fit.make_start(), effects=one) for one in names])
     heard = Events()
     search.world.watch = SearchControl(listener=heard)
-    search.extend([search.models[frozenset(one)] for one in names], 0)
+    search.refit_extensions([search.models[frozenset(one)] for one in names], 0)
     assert heard.finished["testing 2 effects beside 2 models", 2] == 2

@@ -61,7 +61,7 @@ def test_where_all_samples_show_more_the_search_is_made_on_all(search, monkeypat
     monkeypatch.setattr(EffectSearch, "run", counted)
     assert search_with_subsampling(search).effects == ("friction.coulomb",)
     assert asked == [150, 600]
-    assert search.settled is None
+    assert search.settled_effects is None
 
 
 def test_what_shows_nothing_is_not_searched_with_fewer_samples(monkeypatch):
@@ -88,6 +88,6 @@ def test_a_search_that_has_to_end_tells_what_few_samples_support(search, monkeyp
     search.world.watch = ended
     with pytest.raises(SearchStoppedError):
         search_with_subsampling(search)
-    assert search.supported is not None
-    assert np.isfinite(search.supported.merit)
-    assert search.so_far() is search.supported
+    assert search.best_supported_model is not None
+    assert np.isfinite(search.best_supported_model.penalised_log_likelihood)
+    assert search.get_best_so_far() is search.best_supported_model

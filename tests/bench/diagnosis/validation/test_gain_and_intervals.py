@@ -142,7 +142,7 @@ def test_intervals_cover_the_truth(phi):
         Slider(fixed={"drag.linear": 0.4}, observe=["x"]), [1.3], [({}, {"u": push})], times
     )
     there = world(made, candidates=["drag.linear"])
-    clean, noise = there.observed.copy(), white(there, 0.004).coloured(phi)
+    clean, noise = there.observed.copy(), white(there, 0.004).with_correlation(phi)
     theta = np.array([1.3, 0.4])
     for _ in range(60):
         there.observed[...] = clean + correlated(rng, phi, 0.004, clean.shape)
@@ -165,7 +165,7 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
     assert np.allclose(model.likelihood.phi, 0, atol=0.3)
     flat = NoiseModel(sigma, np.zeros(2))
     model = type(model)(
-        model.fit, type(model.likelihood)(model.likelihood.value, sigma, flat.phi), model.merit
+        model.fit, type(model.likelihood)(model.likelihood.value, sigma, flat.phi), model.penalised_log_likelihood
     )
     jacobian = (
         compute_central_jacobian(search.world, model.fit, search.noise).jacobian / sigma[:, None]

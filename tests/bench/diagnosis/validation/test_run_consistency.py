@@ -56,12 +56,12 @@ def test_logs_of_one_world_agree(tmp_path):
     found = explain(paths)
     assert found.verdict == "adequate"
     mass = by(found.story.consistency.after, "mass", "log")
-    assert mass.agree
-    assert [part.group for part in mass.parts] == ["log0", "log1", "log2"]
-    assert all(abs(part.value - 2.0) < 4 * part.error for part in mass.parts)
+    assert mass.is_consistent
+    assert [part.group for part in mass.group_estimates] == ["log0", "log1", "log2"]
+    assert all(abs(part.value - 2.0) < 4 * part.error for part in mass.group_estimates)
     assert mass.value == pytest.approx(2.0, abs=3 * mass.error)
     # Three logs of the same length: each knows it to root three times what all know.
-    assert np.mean([part.error for part in mass.parts]) == pytest.approx(
+    assert np.mean([part.error for part in mass.group_estimates]) == pytest.approx(
         mass.error * 3**0.5, rel=0.1
     )
 
@@ -69,7 +69,7 @@ def test_logs_of_one_world_agree(tmp_path):
 def test_what_each_log_says_is_what_it_says_alone(tmp_path):
     paths = [write(tmp_path, f"log{i}", mass=m, seed=i) for i, m in enumerate((2.0, 2.05))]
     found = explain(paths)
-    parts = by(found.story.consistency.before, "mass", "log").parts
+    parts = by(found.story.consistency.before, "mass", "log").group_estimates
     for path, part in zip(paths, parts, strict=True):
         alone = explain(path).answer.parameters["mass"]
         assert part.value == pytest.approx(alone.value, abs=0.5 * part.error + 0.002)
@@ -80,14 +80,14 @@ def test_a_mass_that_grows_from_day_to_day(tmp_path):
     paths = [write(tmp_path, f"day{i}", mass=m, seed=i) for i, m in enumerate(masses)]
     found = explain(paths)
     mass = by(found.story.consistency.before, "mass", "log")
-    assert not mass.agree
+    assert not mass.is_consistent
     assert mass.trend.slope == pytest.approx(0.01, abs=3 * mass.trend.error)
-    assert mass.trend.chance < 1e-3
-    assert mass.mover.kind == "time"
-    assert name_missing_physics("mass", "time", mass.mover.name, True, ()) == "a load that changes"
+    assert mass.trend.p_value < 1e-3
+    assert mass.trend_covariate.kind == "time"
+    assert name_missing_physics("mass", "time", mass.trend_covariate.name, True, ()) == "a load that changes"
     assert mass.scatter == pytest.approx(np.std(masses, ddof=1), rel=0.3)
     # For a day not yet recorded the truth is within it; by curvature alone it is not.
-    assert abs(mass.value - 2.03) < 2.5 * mass.total
+    assert abs(mass.value - 2.03) < 2.5 * mass.prediction_sigma
     assert abs(mass.value - 2.03) > 3 * mass.error
 
 
