@@ -1,8 +1,4 @@
-"""Complete user-defined simulator: two tanks, one above the other.
-
-A pump fills the upper tank, which drains into the lower one, which drains away. The system is of
-first order: it has levels and no velocities.
-"""
+"""Complete user-defined simulator of first order: two tanks with levels and no velocities."""
 
 import math
 

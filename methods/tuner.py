@@ -162,11 +162,11 @@ class TrainingCallback(Protocol):
     """Callback that observes the training of a learned tuner, without any effect on its result."""
 
     @property
-    def evaluation_simulator(self) -> TrainingSimulator:
+    def ground(self) -> TrainingSimulator:
         """Simulator of the training range for evaluation; the training budget does not count it."""
         ...
 
-    def on_epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+    def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         """Report one pass over the training data of one stage.
 
         Args:

@@ -179,11 +179,11 @@ class LossRecorder:
         self._title, self._seed, self._stage = title, seed, ""
 
     @property
-    def evaluation_simulator(self) -> TrainingSimulator:
+    def ground(self) -> TrainingSimulator:
         """Counted simulator for evaluating the held-out loss."""
         return TuningProblem(self.experiment).make_training_simulator(_HELD_OUT_SIMULATIONS)
 
-    def on_epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+    def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         """Record one pass over the training data.
 
         Args:

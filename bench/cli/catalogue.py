@@ -15,13 +15,13 @@ from bench.cli.output import EXIT_CODES, JsonDocument
 
 _TYPES = {
     "_StoreTrueAction": "flag",
-    "positive": "whole number",
-    "natural": "whole number",
+    "parse_positive_int": "whole number",
+    "parse_non_negative_int": "whole number",
     "int": "whole number",
     "float": "number",
-    "seconds": "number",
-    "place": "path",
-    "file": "path",
+    "parse_seconds": "number",
+    "parse_path": "path",
+    "parse_file_name": "path",
 }
 """Type of an option's value, by the function that parses it or the class of argparse's action."""
 

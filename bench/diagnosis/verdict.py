@@ -220,9 +220,9 @@ class Verdict:
         cut: Early stop of the search, with the questions it skipped; None if the search was
             complete.
         recording_faults: Wrong units or signs of the recording, because of which no cause was
-            searched; not in verdict.json if empty.
+            searched; left out where it is empty.
         recording_notes: Notes on samples of the recording, such as those with drives switched off;
-            not in verdict.json if empty.
+            left out where it is empty.
     """
 
     verdict: VerdictName

@@ -236,7 +236,7 @@ class PairTuner(Tuner):
         watch = self.watch
         apart = None
         if watch is not None:
-            ground = watch.evaluation_simulator
+            ground = watch.ground
             # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
             apart = generate_training_data(ground, stream, ground.budget, scenarios, max(each, 2))
@@ -258,7 +258,7 @@ class PairTuner(Tuner):
             look = None
             if watch is not None and apart is not None:
                 look = TrainingMonitor(
-                    add_noise_to_held_out(apart, noise), partial(watch.on_epoch, stage)
+                    add_noise_to_held_out(apart, noise), partial(watch.epoch, stage)
                 )
             return TrainedPairNetwork.train(
                 self.make_network_design(),

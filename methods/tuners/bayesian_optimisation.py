@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -42,6 +42,7 @@ class BayesianOptimisation(Tuner):
         noise: variance of the losses' noise, or "gaussian" to fit it: a jagged loss looks noisy.
     """
 
+    name: ClassVar[str] = "bayes"
     requires = ("skopt",)
 
     initial: int = 5

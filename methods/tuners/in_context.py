@@ -210,7 +210,7 @@ class InContextTransformer(Tuner):
         watch = self.watch
         apart = None
         if watch is not None:
-            ground = watch.evaluation_simulator
+            ground = watch.ground
             # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
             apart = generate_training_data(
@@ -223,7 +223,7 @@ class InContextTransformer(Tuner):
             watched = None
             if watch is not None and apart is not None:
                 material = _build_training_histories(read, add_noise_to_held_out(apart, noise), box)
-                watched = HistoryValidationMonitor(material, partial(watch.on_epoch, stage))
+                watched = HistoryValidationMonitor(material, partial(watch.epoch, stage))
             design = self.make_network_design()
             material = _build_training_histories(read, shown, box)
             weights = train_history_transformer(

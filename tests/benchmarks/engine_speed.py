@@ -64,7 +64,7 @@ def recording(cls, effects):
     ]
     theta = np.array(middle) * rng.uniform(0.95, 1.05, (256, len(middle)))
     lanes = [runs[k % 4] for k in range(256)]
-    return min(once(lambda: simulator.simulate_lanes(theta, lanes)) for _ in range(REPEATS))
+    return min(once(lambda: simulator.simulate_batch(theta, lanes)) for _ in range(REPEATS))
 
 
 CASES = [

@@ -82,7 +82,7 @@ def seconds(cls, effects, lanes, repeats=REPEATS):
         for k, engine in enumerate(engines):
             simulator.engine, engine.seconds = engine, 0.0
             started = process_time()
-            simulator.simulate_lanes(theta, scenarios)
+            simulator.simulate_batch(theta, scenarios)
             found = engine.seconds, process_time() - started
             if repeat:  # the first loads and traces
                 best[k] = np.minimum(best[k], found)

@@ -12,11 +12,11 @@ GROUPS = {
     ),
     "What they give back": (
         "Results, with tables as frames and figures as matplotlib figures.",
-        "Compared Explanation NextRecording DataSheet Extended Recording Run Experiment",
+        "ComparisonResult Explanation NextRecording DataSheet ExtendedSimulator Recording Run Experiment",
     ),
     "For tuners": (
         "The contract of a [tuner](../add-a-tuner.md).",
-        "Tuner Task Ask Evaluation Practice Scene from_callback BudgetExceededError",
+        "Tuner Task Proposal Evaluation TrainingSimulator ScenarioInfo from_callback BudgetExceededError",
     ),
     "For simulators": (
         "The contract of a simulator, and of [one's own](../own-simulator.md).",
@@ -24,18 +24,24 @@ GROUPS = {
     ),
     "For effects": (
         "The contract of an [effect](../../sims/effects/README.md), by hook.",
-        "Effect Coefficient Force Friction Contact Input Sensor Level Hidden State Moment Signal",
+        "Effect Coefficient Force Friction Contact Input Sensor Level HiddenStateEffect HiddenState StateSnapshot Signal",
     ),
     "For diagnosers": (
         "The contract of a [diagnoser](../diagnosers.md).",
-        "Diagnoser Case Answer Named Lesson",
+        "Diagnoser DiagnosisCase Answer NamedCause DiagnoserTrainingTask",
     ),
     "Faults": ("What is the user's to mend.", "InputError"),
 }
 """Headings of the page: a sentence, and the names below it."""
-UNDOCUMENTED = {"Array", "Steps", "__version__", "main", "tuners", "simulators", "effects"} | {
-    "diagnosers"
-}
+UNDOCUMENTED = {
+    "Array",
+    "TunerGenerator",
+    "__version__",
+    "main",
+    "tuners",
+    "simulators",
+    "effects",
+} | {"diagnosers"}
 """Aliases and objects, which docs/python.md has in its tables."""
 
 

@@ -278,12 +278,21 @@ def verdict_keys():
     return page("verdict.json", *parts)
 
 
+OF_JSON = {
+    ("EarlyStop", "reason"): "by",
+    ("EarlyStop", "during_question"): "during",
+    ("EarlyStop", "skipped_questions"): "not_asked",
+}
+"""Keys of JSON objects that differ from the names of the fields."""
+
+
 def json_keys(cls, says):
     """A dataclass's fields as keys of a JSON object."""
     rows = [("key", "type", "what")]
     for field in dataclasses.fields(cls):
         what = says[field.name].replace("``", "`").replace("None", "null").removesuffix(".")
-        rows.append((f"`{field.name}`", of_json(hints(cls)[field.name]), what))
+        key = OF_JSON.get((cls.__name__, field.name), field.name)
+        rows.append((f"`{key}`", of_json(hints(cls)[field.name]), what))
     return table(*rows)
 
 

@@ -54,7 +54,7 @@ def told(heading, below=PAGE):
 
 
 def told_always(heading, below=PAGE):
-    """The names of `told`, without the keys that are left out where they do not apply."""
+    """The names of `told`, without the keys that are not written where they do not apply."""
     rows = tables(section(below, heading))[0][1:]
     return [name for row in rows if "left out where" not in row[-1] for name in quoted(row[0])]
 
@@ -145,7 +145,7 @@ def test_several_comparisons(folder, tmp_path, capsys):
     names = written_out(told("### `ranks.csv`"), TUNER=TUNERS)
     assert set(columns(tmp_path / "all" / "ranks.csv")) == set(names)
     assert {*PAIR_COLUMNS, "trusted"} == set(columns(tmp_path / "all" / "pairs.csv"))
-    assert {*BREAK_EVEN_COLUMNS, "trusted"} == set(told("### `compute_break_even_targets.csv`"))
+    assert {*BREAK_EVEN_COLUMNS, "trusted"} == set(told("### `break_even.csv`"))
 
 
 def test_the_tables_of_the_bounce_shot():

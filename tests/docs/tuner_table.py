@@ -89,7 +89,13 @@ SET = {
 }
 """By what stands in a docstring: the same in LaTeX."""
 EQUATION = re.compile(r"\(([\d.]+)\)  (.*)", re.S)
-SHARED = ("pair_network", "pair_inputs", "circumstances", "bridging", "gaussian_process")
+SHARED = (
+    "pair_network",
+    "observation_features",
+    "scenario_features",
+    "gap_filling",
+    "gaussian_process",
+)
 """Modules below methods/learning that several tuners are made of."""
 LINKS = {
     r"\barXiv[: ](\d{4}\.\d{5})": r"[arXiv:\1](https://arxiv.org/abs/\1)",

@@ -92,7 +92,16 @@ class Behind(School):
     def fit(self, simulator, rng, budget):
         from bench.benchmark.runner import worker_tasks
 
-        held = [one for one in gc.get_objects() if type(one).__name__ in ("Practice", "Problem")]
+        held = [
+            one
+            for one in gc.get_objects()
+            if type(one).__name__
+            in (
+                "TrainingSimulator",
+                "CountedTrainingSimulator",
+                "TuningProblem",
+            )
+        ]
         frame = sys._getframe()
         while frame is not None:
             held += [value for value in frame.f_locals.values() if hasattr(value, "cube")]
@@ -117,7 +126,7 @@ class Huge(School):
     ends = "crashed"
 
     def fit(self, simulator, rng, budget):
-        (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "Channel")
+        (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "MessageChannel")
         os.write(channel._writing, struct.pack("<cBxxIQ", b"L", 0, 0, 1 << 40))
 
 
@@ -153,7 +162,7 @@ class Pickles(School):
 
 def say(kind, body, flags=0, size=0):
     """Tell the harness something, past the code that speaks for tuners."""
-    (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "Channel")
+    (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "MessageChannel")
     with contextlib.suppress(OSError):
         channel.send(kind, body, flags=flags, size=size)
     return channel

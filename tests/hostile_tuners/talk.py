@@ -24,7 +24,7 @@ def message(kind, body=b"", flags=0, size=0, length=None):
 
 def writing():
     """The end of the pipe that leads to the harness."""
-    (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "Channel")
+    (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "MessageChannel")
     return channel._writing
 
 

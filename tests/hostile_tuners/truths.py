@@ -262,7 +262,7 @@ class Garbage(Cheat):
     name = "garbage"
 
     def find(self, task):
-        known = [thing for thing in gc.get_objects() if type(thing).__name__ == "Evaluator"]
+        known = [thing for thing in gc.get_objects() if type(thing).__name__ == "ProposalEvaluator"]
         found = [best_of(evaluator, task.dim)[0] for evaluator in known[-1:]]
         targets = [thing for thing in gc.get_objects() if type(thing).__name__ == "Target"]
         return found + matching(targets, task)

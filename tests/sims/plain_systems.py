@@ -6,7 +6,7 @@ from sims.engines.compiled import element_stepping, lockstep_stepping, step_size
 
 PLAIN = SimpleNamespace(
     choose_step_divisions=step_size.choose_step_divisions,
-    advance=element_stepping.step_block,
+    step_block=element_stepping.step_block,
     step_in_lockstep=lockstep_stepping.step_in_lockstep,
 )
 

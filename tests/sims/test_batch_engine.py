@@ -417,7 +417,9 @@ def test_a_lane_given_up_holds_nobody_up():
     """Its clock has ended at once: one that an impact without speed had set back ran on for
     minutes.
     """
-    lanes = SimpleNamespace(steps=np.full((2, 3), 0.1), inputs={}, every=1, x=np.zeros((2, 1)))
+    lanes = SimpleNamespace(
+        steps=np.full((2, 3), 0.1), inputs={}, steps_per_sample=1, x=np.zeros((2, 1))
+    )
     clock, state = ElementClocks(lanes), np.ones((3, 2))
     clock.shift_time(np.array([0]), np.array([[-50.0]]))
     assert clock.left[:, 0] == pytest.approx([50.1, 0.1])

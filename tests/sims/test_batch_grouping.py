@@ -42,7 +42,7 @@ def split(monkeypatch):
     def choose(fewest):
         for engine in (mujoco_joint_batch, mujoco_ball_batch, bullet_joints):
             for kind, count in fewest.items():
-                monkeypatch.setitem(engine.FEWEST, kind, count)
+                monkeypatch.setitem(engine.MIN_BATCH_SIZE, kind, count)
 
     return choose
 
@@ -84,11 +84,11 @@ def lanes(name, chosen, per_run=2, engine="mujoco"):
 def test_together_is_one_by_one_to_the_bit(name, case, engine, split):
     simulator, theta, scenarios = lanes(name, EFFECTS[case], engine=engine)
     split(NEVER)
-    alone = simulator.simulate_lanes(theta, scenarios)
+    alone = simulator.simulate_batch(theta, scenarios)
     split(ALWAYS)
     assert np.isfinite(alone[:, 0]).all()
     for _ in range(2):  # made anew, and used
-        np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), alone)
+        np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), alone)
 
 
 @pytest.mark.parametrize("case", ["none", "known", "asked"])
@@ -97,9 +97,9 @@ def test_constants_that_differ_and_other_numbers_of_lanes(case, split):
     split(ALWAYS)
     heavy = [Scenario(s.times, s.initial, s.inputs, {"mass": 0.7}) for s in scenarios]
     mixed = [pair[k % 2] for k, pair in enumerate(zip(scenarios, heavy, strict=True))]
-    found = simulator.simulate_lanes(theta, mixed)
+    found = simulator.simulate_batch(theta, mixed)
     for i in range(len(theta)):
-        own = simulator.simulate_lanes(theta[i : i + 1], mixed[i : i + 1])[0]
+        own = simulator.simulate_batch(theta[i : i + 1], mixed[i : i + 1])[0]
         np.testing.assert_array_equal(found[i, : len(own)], own)
 
 
@@ -111,18 +111,18 @@ def test_a_lane_that_fails_is_nan_silently_and_harms_no_other(
     monkeypatch.chdir(tmp_path)
     simulator, theta, scenarios = lanes("pendulum", EFFECTS[case], engine=engine)
     split(ALWAYS)
-    healthy = simulator.simulate_lanes(theta, scenarios)
+    healthy = simulator.simulate_batch(theta, scenarios)
     wild, light = 1, 3
     broken = scenarios.copy()
     broken[wild] = Scenario(scenarios[wild].times, {"q": 0.3, "qd": 1e300}, scenarios[wild].inputs)
     theta = theta.copy()
     theta[light, 0] = 1e-9  # less than MuJoCo can represent
-    found = simulator.simulate_lanes(theta, broken)
+    found = simulator.simulate_batch(theta, broken)
     assert np.isnan(found[[wild, light]]).all()
     others = [0, 2, 4, 5]
     np.testing.assert_array_equal(found[others], healthy[others])
     split(NEVER)
-    np.testing.assert_array_equal(found, simulator.simulate_lanes(theta, broken))
+    np.testing.assert_array_equal(found, simulator.simulate_batch(theta, broken))
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
 
@@ -181,7 +181,7 @@ def test_an_interrupt_leaves_nothing_behind(case, called, split, monkeypatch):
 
     split(ALWAYS)
     simulator, theta, scenarios = lanes("servo" if case == "asked" else "slider", EFFECTS[case])
-    expected = simulator.simulate_lanes(theta, scenarios)
+    expected = simulator.simulate_batch(theta, scenarios)
     real, calls = getattr(batch.Batch, called), []
 
     def interrupted(*arguments, **more):
@@ -193,25 +193,25 @@ def test_an_interrupt_leaves_nothing_behind(case, called, split, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(batch.Batch, called, interrupted)
         with pytest.raises(KeyboardInterrupt):
-            simulator.simulate_lanes(theta, scenarios)
-    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+            simulator.simulate_batch(theta, scenarios)
+    np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), expected)
 
 
 def test_a_long_stretch_is_handed_over_in_parts(split, monkeypatch):
     split(ALWAYS)
     simulator, theta, scenarios = lanes("slider", {})
-    expected = simulator.simulate_lanes(theta, scenarios)
+    expected = simulator.simulate_batch(theta, scenarios)
     monkeypatch.setattr(mujoco_joint_batch, "_UNINTERRUPTED", 20)  # three steps of six lanes
-    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+    np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), expected)
     monkeypatch.setattr(batch_grouping, "_MAX_BATCH_STEPS", 400)  # lanes in parts
-    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+    np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), expected)
 
 
 @pytest.mark.parametrize("case", ["none", "asked"])
 def test_threads_and_a_mujoco_without_batches_change_no_bit(case, split, monkeypatch):
     split(ALWAYS)
     simulator, theta, scenarios = lanes("slider", EFFECTS[case])
-    expected = simulator.simulate_lanes(theta, scenarios)
+    expected = simulator.simulate_batch(theta, scenarios)
     kind = SIMULATORS["slider"]
     threaded = kind(engine="mujoco", effects=list(EFFECTS[case]), threads=2)
     np.testing.assert_array_equal(threaded.simulate_batch(theta, scenarios), expected)
@@ -236,7 +236,7 @@ def test_a_world_that_writes_what_lanes_share_is_stepped_one_by_one(split, monke
     monkeypatch.setattr(pendulum_mujoco_world, "load", shared)
     simulator, theta, scenarios = lanes("pendulum", {})
     split(NEVER)
-    expected = simulator.simulate_lanes(theta, scenarios)
+    expected = simulator.simulate_batch(theta, scenarios)
     split(ALWAYS)
     real = joint_batch.JointBatchIntegrator.integrate
     monkeypatch.setattr(
@@ -244,7 +244,7 @@ def test_a_world_that_writes_what_lanes_share_is_stepped_one_by_one(split, monke
         "integrate",
         lambda *given: tried.append(1) or real(*given),
     )
-    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+    np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), expected)
     assert tried
 
 
@@ -260,7 +260,7 @@ def test_a_bullet_world_whose_bodies_may_meet_is_stepped_one_by_one(split, monke
 
     simulator, theta, scenarios = lanes("pendulum", EFFECTS["asked"], engine="pybullet")
     split(NEVER)
-    expected = simulator.simulate_lanes(theta, scenarios)
+    expected = simulator.simulate_batch(theta, scenarios)
     simulator.close()
     monkeypatch.setattr(pendulum_bullet_world, "build", shaped)
     crowded = SIMULATORS["pendulum"](engine="pybullet", effects=list(EFFECTS["asked"]))
@@ -281,9 +281,9 @@ def test_all_that_a_world_writes_reaches_its_lane(split, monkeypatch):
     monkeypatch.setattr(pendulum_mujoco_world, "load", more)
     simulator, theta, scenarios = lanes("pendulum", EFFECTS["known"])
     split(NEVER)
-    expected = simulator.simulate_lanes(theta, scenarios)
+    expected = simulator.simulate_batch(theta, scenarios)
     split(ALWAYS)
-    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), expected)
+    np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), expected)
 
 
 # ---------------------------------------------------------------------- balls
@@ -322,15 +322,15 @@ def balls(case, count=8):
 def test_balls_together_are_balls_one_by_one_to_the_bit(case, split):
     simulator, theta, scenarios = balls(case)
     split(NEVER)
-    alone = simulator.simulate_lanes(theta, scenarios)
+    alone = simulator.simulate_batch(theta, scenarios)
     split(ALWAYS)
     for _ in range(2):  # made anew, and used
-        np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), alone)
+        np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), alone)
 
 
 def test_the_cases_of_balls_are_what_they_say(split):
     split(ALWAYS)
-    _, _, z, *_ = balls("lifting")[0].simulate_lanes(*balls("lifting")[1:]).T
+    _, _, z, *_ = balls("lifting")[0].simulate_batch(*balls("lifting")[1:]).T
     height = z[:, 2]  # of a run that begins on the ground
     on = height <= height[0] + 1e-6
     assert on[0]
@@ -353,14 +353,14 @@ def test_a_ball_that_fails_is_nan_silently_and_harms_no_other(split, tmp_path, m
     monkeypatch.chdir(tmp_path)
     simulator, theta, scenarios = balls("asked")
     split(ALWAYS)
-    healthy = simulator.simulate_lanes(theta, scenarios)
+    healthy = simulator.simulate_batch(theta, scenarios)
     broken = scenarios.copy()
     broken[1] = Scenario(scenarios[1].times, {"z": 1.0, "vz": 1e300})
-    found = simulator.simulate_lanes(theta, broken)
+    found = simulator.simulate_batch(theta, broken)
     assert np.isnan(found[1]).all()
     others = [0, *range(2, len(theta))]
     np.testing.assert_array_equal(found[others], healthy[others])
-    np.testing.assert_array_equal(simulator.simulate_lanes(theta, scenarios), healthy)
+    np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), healthy)
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
 

@@ -46,7 +46,7 @@ def test_import_is_lazy_and_quiet():
     assert lazy.stdout == "False\n"
     used = python(
         "from sims.engines.adapters import bullet_world\n"
-        "print('before', flush=True); bullet_world.engine(); print('after')"
+        "print('before', flush=True); bullet_world.import_pybullet(); print('after')"
     )
     assert (used.stdout, used.stderr) == ("before\nafter\n", "")
 
@@ -55,7 +55,7 @@ def test_import_survives_closed_streams():
     assert (
         python(
             "import os; os.close(1); "
-            "from sims.engines.adapters import bullet_world; bullet_world.engine()"
+            "from sims.engines.adapters import bullet_world; bullet_world.import_pybullet()"
         ).returncode
         == 0
     )

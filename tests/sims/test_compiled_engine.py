@@ -83,7 +83,9 @@ def test_how_long_steps_may_be_depends_on_the_lane_alone(monkeypatch):
         longest.extend(work.longest[work.order])
 
     plain = SimpleNamespace(
-        choose_step_divisions=step_size.choose_step_divisions, advance=noted, step_in_lockstep=noted
+        choose_step_divisions=step_size.choose_step_divisions,
+        step_block=noted,
+        step_in_lockstep=noted,
     )
     step_batch(lanes, simulator.engine._turn, np.inf, plain)
     assert len(set(longest)) == 1
@@ -107,14 +109,14 @@ def test_lanes_in_lockstep_do_what_they_do_apart(shared, monkeypatch):
     def noted(way, name):
         return lambda *given: ways.extend([name] * len(given[1].order)) or way(*given)
 
-    machine_of = {k: noted(v, k) for k, v in vars(PLAIN).items() if k != "divide"}
+    machine_of = {k: noted(v, k) for k, v in vars(PLAIN).items() if k != "choose_step_divisions"}
     found = [
         step_batch(lanes, 0.07, np.inf, SimpleNamespace(**{**vars(PLAIN), **machine_of, **other}))[
             0
         ]
-        for other in ({}, {"march": element_stepping.step_block})
+        for other in ({}, {"step_in_lockstep": element_stepping.step_block})
     ]
-    assert ways.count("march") > 10
+    assert ways.count("step_in_lockstep") > 10
     assert found[0].x.tobytes() == found[1].x.tobytes()
     assert found[0].a.tobytes() == found[1].a.tobytes()
 
@@ -169,7 +171,7 @@ def spoilt(lanes, rng):
     yield replace(lanes, steps=np.where(rng.random(lanes.steps.shape) < 0.4, 0.0, lanes.steps))
     yield replace(lanes, steps=np.where(rng.random(lanes.steps.shape) < 0.4, 1e-15, lanes.steps))
     yield replace(lanes, steps=0.0 * lanes.steps)
-    yield replace(lanes, every=10**6)
+    yield replace(lanes, steps_per_sample=10**6)
 
 
 @needs_compiler

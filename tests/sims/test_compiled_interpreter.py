@@ -68,7 +68,7 @@ def test_a_killed_making_holds_nobody_up_and_one_makes_while_the_others_wait(tmp
         "    path.with_name('at-it').touch()\n"
         "    time.sleep(float(sys.argv[2]))\n"
         "    return str(os.getpid()).encode()\n"
-        "print(code_cache.made_once(path, make, lambda: print('waits')).decode())\n"
+        "print(code_cache.make_cached(path, make, lambda: print('waits')).decode())\n"
     )
 
     def begun(seconds):
@@ -138,7 +138,7 @@ def test_code_that_calls_what_is_not_there_is_not_loaded():
 @needs_compiler
 def test_stepping_imports_no_translator():
     code = (
-        "import sys; from sims.engines.compiled import kernel; assert kernel.machine();"
+        "import sys; from sims.engines.compiled import kernel; assert kernel.get_kernel();"
         "sys.exit('numba' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

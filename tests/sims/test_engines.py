@@ -247,8 +247,8 @@ def test_plain_numbers_are_what_the_effects_say(system, engine, elsewhere):
 def test_only_the_librarys_own_laws_are_taken_for_known():
     class Lane:
         effects = (
-            (effects.get("drag.linear")(), np.full((1, 1, 1), 0.2)),
-            (effects.get("friction.coulomb")(), np.ones((1, 1, 1))),
+            (effects.get_effect("drag.linear")(), np.full((1, 1, 1), 0.2)),
+            (effects.get_effect("friction.coulomb")(), np.ones((1, 1, 1))),
         )
 
     found = make_resistance(Lane)

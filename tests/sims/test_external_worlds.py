@@ -52,7 +52,7 @@ def functions_of(protocol):
 @pytest.mark.parametrize(("system", "name", "asked"), CASES)
 def test_every_world_module_fulfils_what_its_engine_asks(system, name, asked):
     module, reason = world_interface.find_world_module(SIMULATORS[system].system, name, asked)
-    assert (module.__name__, reason) == (f"sims.{system}.{name}", "")
+    assert (module.__name__, reason) == (f"sims.systems.{system}_{name}", "")
     assert functions_of(asked)
     for name, function in functions_of(asked).items():
         assert types_of(getattr(module, name)) == types_of(function)

@@ -283,10 +283,10 @@ class _RemoteTrainingCallback:
         self._channel = channel
 
     @property
-    def evaluation_simulator(self) -> TrainingSimulator:
+    def ground(self) -> TrainingSimulator:
         return _RemoteTrainingSimulator(self._channel, 1)
 
-    def on_epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
+    def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
         self._channel.send_document(b"W", [stage, epoch, epochs, float(loss), float(held_out)])
         self._channel.receive(_LIMIT)
 

@@ -31,6 +31,7 @@ PROJECT_ROOT = Path(__file__).resolve().parents[3]
 COMPARISON_SOURCE_FOLDERS = (
     "methods",
     "sims",
+    "bench/core",
     "bench/benchmark/problem",
     "bench/benchmark/runner",
     "bench/benchmark/isolation",

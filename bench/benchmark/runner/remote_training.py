@@ -74,14 +74,14 @@ def _serve(
         FoulError: the message is not valid here.
     """
     if message.kind == b"W" and watch is not None:
-        watch.on_epoch(*_parse_progress(message.to_document()))
+        watch.epoch(*_parse_progress(message.to_document()))
         child.send(b"K", deadline=_NO_DEADLINE)
     elif (
         message.kind == b"P" and message.flags < 4 and (watch is not None or not message.flags & 1)
     ):
         # The second simulator is for evaluation only, and exists only if there is a callback.
         if message.flags & 1 and watch is not None and len(grounds) == 1:
-            grounds.append(watch.evaluation_simulator)
+            grounds.append(watch.ground)
         _serve_simulation(child, message, grounds[message.flags & 1])
     else:
         raise ProtocolError("it sent what nobody asked for")

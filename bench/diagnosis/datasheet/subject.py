@@ -144,7 +144,7 @@ class SheetSubject:
         return ModelFileValue(value, unit.format(force=force, length=length), share)
 
     def _spots(self) -> Mapping[str, Any]:
-        spots: Mapping[str, Any] = getattr(self.kind.system, "spots", {})
+        spots: Mapping[str, Any] = getattr(self.kind.system, "places", {})
         return spots
 
     def _on(self, spot: Any) -> bool:
@@ -166,7 +166,7 @@ def make_subject(kind: type[SystemSimulator], joint: str | None) -> SheetSubject
         if joint is not None:
             raise InputError(f"--joint: expected none, as {kind.name} is no robot; found {joint}")
         return SheetSubject(kind, "", frozenset())
-    spots: Mapping[str, Any] = vars(kind.system)["spots"]
+    spots: Mapping[str, Any] = vars(kind.system)["places"]
     joints = [spot.name for spot in spots["joint"]]
     if joint is None and len(joints) > 1:
         raise InputError(f"robot {kind.name}: expected --joint, one of {', '.join(joints)}")

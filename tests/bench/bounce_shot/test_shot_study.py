@@ -359,8 +359,8 @@ def explained(_):
 def crashing(tmp_path, monkeypatch, fresh_registries):
     """An experiment with a tuner that fails, and its options; explain and pictures cost nothing."""
     monkeypatch.setattr(shot_planning, "_explained", explained)
-    monkeypatch.setattr("bench.bounce_shot.shot_report.draw", lambda *_: {})
-    monkeypatch.setattr("bench.bounce_shot.shot_report.animate", lambda *_: "animation")
+    monkeypatch.setattr("bench.bounce_shot.shot_report.draw_figures", lambda *_: {})
+    monkeypatch.setattr("bench.bounce_shot.shot_report.write_animation", lambda *_: "animation")
     path = tmp_path / "mine.toml"
     path.write_text(
         SMALL.replace("least_squares = {}", "least_squares = {}, crashing = {}") + DROPS
@@ -472,7 +472,7 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
     assert resumed("--budget", "5") == 2
     assert "leave out budget" in capsys.readouterr().err
     with monkeypatch.context() as patch:
-        patch.setattr("bench.benchmark.runner.run_ids.rooms", lambda *_: "0123456789")
+        patch.setattr("bench.benchmark.runner.run_ids.hash_source_folders", lambda *_: "0123456789")
         assert resumed() == 2
     assert "its code changed since it was begun" in capsys.readouterr().err
     for registry in REGISTRIES:
@@ -491,10 +491,10 @@ def test_what_is_lost_on_the_way_is_said_and_no_untrained_tuner_is_shot_with(
         def __init__(self, fault):
             self._fault = fault
 
-        def load(self, plugins):
+        def load_plugins(self, plugins):
             pass
 
-        def results(self, calls, seconds):
+        def iterate_results(self, calls, seconds):
             if isinstance(self._fault, PoolLostError):
                 raise self._fault
             yield 0, self._fault

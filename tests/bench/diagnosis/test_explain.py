@@ -152,7 +152,7 @@ def test_what_does_not_fit_the_system_at_all_is_unknown(tmp_path):
     runs = [(TIMES[:60], walk, 0.3 * rng.standard_normal(60)) for walk in walks]
     found = explained(table(tmp_path, runs, noise=NOISE))
     assert found.verdict == "unknown"
-    assert any("channel q still misses by" in line for line in found.story.remains)
+    assert any("channel q still misses by" in line for line in found.story.lack_of_fit)
     assert found.answer.candidates, "what comes nearest is told all the more"
     assert found.answer.heldout.rmse_extended > 10 * 0.003
 
@@ -330,7 +330,7 @@ def test_a_mass_beyond_its_declared_range_is_fitted_and_told(tmp_path):
     mass = found.answer.parameters["mass"]
     assert mass.value == pytest.approx(95.0, rel=5e-3)
     assert mass.low < mass.value < mass.high
-    (said,) = found.story.remains
+    (said,) = found.story.lack_of_fit
     assert "lies outside its usual range, " in said
     assert "to 10 kg" in said
 

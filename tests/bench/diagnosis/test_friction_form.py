@@ -103,7 +103,9 @@ def test_the_form_that_was_planted_fits_better(tmp_path, form):
     assert (soft is not None) == (form == "soft")
     best, world = (stiff, models.world) if soft is None else (soft, other)
     assert best.effects == (name,)
-    assert best.fit.theta[world.get_coefficient_indices(name)[0]] == pytest.approx(PLANTED, rel=0.03)
+    assert best.fit.theta[world.get_coefficient_indices(name)[0]] == pytest.approx(
+        PLANTED, rel=0.03
+    )
     assert abs(models.compute_excess(best)) < 0.1
     assert form_of(world, name) == ("soft" if form == "soft" else None)
     assert form_of(other, "drag.linear@elbow") is None
@@ -115,7 +117,9 @@ def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):
     soft = choose_friction_form(models, hysteresis, other, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     assert soft is not None
     assert soft.effects == ("friction.coulomb@elbow",)
-    assert soft.fit.theta[other.get_coefficient_indices(soft.effects[0])[0]] == pytest.approx(PLANTED, rel=0.03)
+    assert soft.fit.theta[other.get_coefficient_indices(soft.effects[0])[0]] == pytest.approx(
+        PLANTED, rel=0.03
+    )
     assert has_dry_friction(models.world, ["friction.hysteresis@elbow"])
     assert not has_dry_friction(models.world, ["drag.linear@elbow"])
 
@@ -123,11 +127,11 @@ def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):
 def names_friction_alone(search, held_out):
     """What the search finds, without the time that it takes: the effect that was planted."""
     effect = "friction.coulomb@elbow"
-    base = search.base
-    search.refit([replace(base.fit.start(), effects=(effect,))], race=False)
+    base = search.base_model
+    search.refit_models([replace(base.fit.make_start(), effects=(effect,))], race=False)
     model = search.models[frozenset([effect])]
     thetas = [base.fit.theta, model.fit.theta]
-    measured = dict(zip([(), (effect,)], held_out.measure(thetas), strict=True))
+    measured = dict(zip([(), (effect,)], held_out.fit_initial_states(thetas), strict=True))
     gain = model.likelihood.value - base.likelihood.value
     causes = (CauseEvidence(effect, (), 0.0, gain),)
     return DiagnosisResult(
@@ -164,7 +168,11 @@ def test_the_form_of_friction_that_is_free_is_chosen_too(tmp_path, monkeypatch):
 
     def names_nothing(search, _):
         return DiagnosisResult(
-            "adequate", search.base, search.base, (), assess_lack_of_fit(search, search.base)
+            "adequate",
+            search.base_model,
+            search.base_model,
+            (),
+            assess_lack_of_fit(search, search.base_model),
         )
 
     monkeypatch.setattr(explaining, "diagnose", names_nothing)

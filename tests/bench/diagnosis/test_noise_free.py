@@ -80,12 +80,12 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     """The verdict on an `unknown` finding without causes: merits of models with one effect on the
     fitted and on the held-out runs, next to 100 of the base model.
     """
-    base = SimpleNamespace(names=(), penalised_log_likelihood=100.0)
+    base = SimpleNamespace(effects=(), penalised_log_likelihood=100.0)
     models = {
-        (name,): SimpleNamespace(names=(name,), penalised_log_likelihood=m)
+        (name,): SimpleNamespace(effects=(name,), penalised_log_likelihood=m)
         for name, m in fitted.items()
     }
-    search = SimpleNamespace(base=base, models={(): base, **models})
+    search = SimpleNamespace(base_model=base, models={(): base, **models})
     simulated = np.full((1, 4, 1), base_error)
     measured = {(): SimpleNamespace(simulated=simulated, penalised_log_likelihood=100.0)}
     measured |= {

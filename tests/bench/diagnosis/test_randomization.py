@@ -274,7 +274,7 @@ def randomized(code, model):
     jax.Array = np.ndarray
     jax.tree_util = SimpleNamespace(tree_map=lambda _f, model: _Model(model._model))
     jax.random = SimpleNamespace(
-        distinguished_effects=lambda key: (key, key),
+        split=lambda key: (key, key),
         uniform=lambda key, minval, maxval: (minval, maxval)[key],
     )
     jax.vmap = lambda f: (

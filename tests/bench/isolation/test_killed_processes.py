@@ -142,7 +142,7 @@ def test_a_look_at_the_seals_is_begun_again_as_often_as_a_run(monkeypatch, kills
 ALONE = """
 import sys, time
 from bench.benchmark.runner import sandboxed_tuner
-sandboxed_tuner.nursery()
+sandboxed_tuner.get_fork_server()
 print("there", flush=True)
 time.sleep(60)
 """

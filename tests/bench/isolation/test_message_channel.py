@@ -127,10 +127,10 @@ class Nobody:
     def __init__(self):
         self.ended = []
 
-    def end(self, keeper, kill):
+    def end_process(self, keeper, kill):
         self.ended.append((keeper, kill))
 
-    def empty(self):
+    def empty_shared_folder(self):
         pass
 
 

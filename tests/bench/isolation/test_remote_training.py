@@ -65,11 +65,11 @@ class Watch:
         self.problem, self.told, self.asked = problem, [], 0
 
     @property
-    def evaluation_simulator(self):
+    def ground(self):
         self.asked += 1
-        return self.problem.practice(10)
+        return self.problem.make_training_simulator(10)
 
-    def on_epoch(self, *told):
+    def epoch(self, *told):
         self.told.append(told)
 
 
@@ -181,7 +181,7 @@ def test_a_training_that_is_made_again_after_a_kill_must_ask_for_the_same(experi
     asked.clear()
     drawn = iter(range(10))
     monkeypatch.setattr(
-        "bench.benchmark.runner.tuner_training.digest", lambda *_, **__: str(next(drawn))
+        "bench.benchmark.runner.tuner_training.compute_digest", lambda *_, **__: str(next(drawn))
     )
     with pytest.raises(RunEndedError, match="asked for other simulations"):
         train_or_load(experiment, lesson("school"), anew=True)

@@ -230,7 +230,9 @@ def test_the_cursor_shows_the_last_medians(opened, shown):
     tip = opened.page.locator("#error .tip").first
     tip.wait_for()
     text = tip.inner_text().replace("\n", " ")
-    medians = shown.statistics.compute_median_curves("param_abs_error", "in").groupby("tuner").last()
+    medians = (
+        shown.statistics.compute_median_curves("param_abs_error", "in").groupby("tuner").last()
+    )
     for tuner, line in medians.iterrows():
         ends = f"{format_number(line['low'])} to {format_number(line['high'])}"
         assert f"{tuner} {format_number(line['median'])} ({ends})" in text
@@ -252,7 +254,9 @@ def test_errors_to_be_reached_are_chosen(opened, shown):
     reached = [v for v in prices if not build_time_per_target_table(prices[v]).empty]
     levels = [f"{format_number(v)} [training widths]" for v in reached]
     assert sorted(pick.locator("option").all_inner_texts()) == sorted(levels)
-    assert pick.input_value() == f"{format_number(shown.statistics.reference_level)} [training widths]"
+    assert (
+        pick.input_value() == f"{format_number(shown.statistics.reference_level)} [training widths]"
+    )
     pick.select_option(levels[0] if levels[0] != pick.input_value() else levels[1])
     assert opened.page.locator("#cost canvas").first.screenshot() != before
 

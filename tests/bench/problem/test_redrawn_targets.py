@@ -116,7 +116,9 @@ class Lossy(Simulator):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -3e12])
 def test_what_is_not_finite_or_beyond_the_limit_counts_as_diverged(value, monkeypatch):
     monkeypatch.setattr(Lossy, "value", value)
-    monkeypatch.setattr("bench.benchmark.problem.tuning_problem.kind_of", lambda _: Lossy)
+    monkeypatch.setattr(
+        "bench.benchmark.problem.tuning_problem.get_simulator_class", lambda _: Lossy
+    )
     experiment = spring_experiment(ranges=["in"], targets=30, observe=[], initial={})
     drawn = TuningProblem(experiment, "salt").draw_targets()
     assert max(float(target.truth[0]) for target in drawn) <= 0.5
@@ -132,7 +134,9 @@ def test_what_is_not_finite_or_beyond_the_limit_counts_as_diverged(value, monkey
 def test_a_simulator_that_always_diverges_has_no_target(monkeypatch):
     monkeypatch.setattr(Lossy, "value", np.inf)
     monkeypatch.setattr(Lossy, "parameters", (Parameter("p", "1", 0.8, (0.6, 1.0), (0.6, 1.0)),))
-    monkeypatch.setattr("bench.benchmark.problem.tuning_problem.kind_of", lambda _: Lossy)
+    monkeypatch.setattr(
+        "bench.benchmark.problem.tuning_problem.get_simulator_class", lambda _: Lossy
+    )
     experiment = spring_experiment(ranges=["in"], observe=[], initial={})
     with pytest.raises(InputError, match="200 of 200 targets drawn diverges"):
         TuningProblem(experiment).draw_target("in", 0)

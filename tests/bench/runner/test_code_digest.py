@@ -226,7 +226,7 @@ def test_what_explains_a_drop_makes_its_shot_and_no_run_of_a_comparison(tmp_path
             compute_fingerprint(load_experiment(name), [])["code"]
             for name in ("bounce-shot", "ball-drop")
         ]
-        (tmp_path / "bench" / "gap" / "explain.py").write_text("changed")
+        (tmp_path / "bench" / "diagnosis" / "explain.py").write_text("changed")
         code_digest.hash_source_folders.cache_clear()
         after = [
             compute_fingerprint(load_experiment(name), [])["code"]
@@ -353,14 +353,15 @@ CHANGES = {
 }
 """A change to every key of an experiment that determines a run or a training."""
 NO_MATTER = {
-    "identity": {"training_budget"},
-    "training": {"error_channel", "world", "timeout", "memory", "isolation"},
+    "run_ids": {"training_budget"},
+    "tuner_training": {"error_channel", "world", "timeout", "memory", "isolation"},
 }
 """Those of them that determine the other of the two alone."""
 
 
 @pytest.mark.parametrize(
-    ("module", "but"), [("identity", "NOT_OF_A_RUN"), ("training", "NOT_OF_A_TRAINING")]
+    ("module", "but"),
+    [("run_ids", "RUN_IRRELEVANT_KEYS"), ("tuner_training", "TRAINING_IRRELEVANT_KEYS")],
 )
 def test_every_key_of_an_experiment_matters_or_has_its_reason(module, but):
     """A new key that nobody gives a reason for must stand in CHANGES, and is seen to matter."""

@@ -112,7 +112,9 @@ def test_a_crash_is_a_status_with_the_cells_own_line_and_said_when_it_happens(mo
 
 def test_soft_time_limit_holds(monkeypatch):
     in_a_cell(monkeypatch, "while True: yield task.start")
-    (status,) = here(small(tuners={"mine": {}}, budget=10**6, timeout=0.2)).run_sink.statuses.values()
+    (status,) = here(
+        small(tuners={"mine": {}}, budget=10**6, timeout=0.2)
+    ).run_sink.statuses.values()
     assert status.status == "timeout"
     assert 1 <= status.simulations < 10**6
 

@@ -151,7 +151,8 @@ def folder(tmp_path, spring):
 
 
 @pytest.mark.parametrize(
-    ("function", "what"), [("rooms", "code"), ("versions", "package versions")]
+    ("function", "what"),
+    [("hash_source_folders", "code"), ("hash_package_versions", "package versions")],
 )
 def test_changed_code_and_other_packages_are_refused(folder, monkeypatch, function, what):
     monkeypatch.setattr(f"bench.benchmark.runner.run_ids.{function}", lambda *_: "0123456789")

@@ -140,7 +140,7 @@ def test_no_worker_outlives_its_parent(tmp_path):
         "from tests.bench.runner.test_worker_pools import hang\n"
         "if __name__ == '__main__':\n"
         "    pool = LocalPool(1)\n"
-        f"    list(pool.results([(hang, ({str(tmp_path / 'pid')!r},))], 100.0))\n"
+        f"    list(pool.iterate_results([(hang, ({str(tmp_path / 'pid')!r},))], 100.0))\n"
     )
     script = tmp_path / "parent.py"
     script.write_text(code)

@@ -241,7 +241,9 @@ def test_what_would_leave_the_folder_or_stand_for_something_else_is_refused(
     assert not list(tmp_path.rglob("evil*"))
 
 
-@pytest.mark.parametrize(("limit", "at"), [("DENSEST", 3), ("LARGEST", 1 << 20)])
+@pytest.mark.parametrize(
+    ("limit", "at"), [("MAX_COMPRESSION_RATIO", 3), ("MAX_UNPACKED_BYTES", 1 << 20)]
+)
 def test_a_bomb_is_refused_before_it_is_unpacked(
     compared, tmp_path, capsys, monkeypatch, limit, at
 ):

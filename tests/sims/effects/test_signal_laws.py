@@ -18,7 +18,7 @@ def signal(values, step=0.1, start=None):
 
 def through(name, c, *args, **kwargs):
     effect, given = effects.get_effect(name)(), signal(*args, **kwargs)
-    change = effect.apply if effect.hook == "input" else effect.read
+    change = effect.feel if effect.hook == "input" else effect.read
     return change(lanes(c, count=len(given.values)), given)[0]
 
 
@@ -131,7 +131,7 @@ def test_lags_stand_still_while_a_lane_waits(name):
 def test_lanes_that_are_off_keep_every_bit_beside_lanes_that_are_on(name):
     effect = effects.get_effect(name)()
     given = signal(np.random.default_rng(5).normal(size=(3, 40)))
-    change = effect.apply if effect.hook == "input" else effect.read
+    change = effect.feel if effect.hook == "input" else effect.read
     felt = change(np.array([[[0.0], [0.3], [0.0]]]), given)
     assert np.array_equal(felt[::2], given.values[::2])
     assert np.abs(felt[1] - given.values[1]).max() > 0.1

@@ -251,9 +251,9 @@ def test_unspoilt_it_is_sound(folder):
 @SETTINGS
 @given(data=spoilt_tables())
 def test_spoilt_tables(folder, monkeypatch, data):
-    monkeypatch.setattr("sims.recording.csv_table.WORTHWHILE", 1 << 20)
+    monkeypatch.setattr("sims.recording.csv_table.MIN_FAST_PARSE_BYTES", 1 << 20)
     slow = outcome(folder, data, GOOD_TOML)
-    monkeypatch.setattr("sims.recording.csv_table.WORTHWHILE", 0)
+    monkeypatch.setattr("sims.recording.csv_table.MIN_FAST_PARSE_BYTES", 0)
     assert outcome(folder, data, GOOD_TOML) == slow, "the fast reader differs"
     seen["sound" if slow.startswith("('swing'") else "refused"] += 1
 

@@ -311,7 +311,7 @@ def test_large_tables_are_read_fast_and_the_same(tmp_path, monkeypatch):
         ]
     path = written(tmp_path, "\n".join(rows) + "\n")
     slow = read_recording(path, Cart)
-    monkeypatch.setattr("sims.recording.csv_table.WORTHWHILE", 0)
+    monkeypatch.setattr("sims.recording.csv_table.MIN_FAST_PARSE_BYTES", 0)
     assert read_csv_fast(path, rows[0].split(","), ["t", "u", "x"], ["x"]) is not None
     fast = read_recording(path, Cart)
     for a, b in zip(slow.runs, fast.runs, strict=True):

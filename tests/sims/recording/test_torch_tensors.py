@@ -59,7 +59,7 @@ def test_a_log_of_tensors_is_imported_without_torch(tmp_path):
     np.testing.assert_allclose(recording.runs[0].channels["q.hip"], Q[:, 0])
     code = f"""import sys
 from sims.recording.log_formats.log_files import read_log
-assert read_log({str(tmp_path / "log.pt")!r}).names() == ["time", "q.knee", "q.hip"]
+assert read_log({str(tmp_path / "log.pt")!r}).list_columns() == ["time", "q.knee", "q.hip"]
 assert "torch" not in sys.modules and "h5py" not in sys.modules"""
     subprocess.run([sys.executable, "-c", code], check=True)
 

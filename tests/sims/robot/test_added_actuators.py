@@ -54,7 +54,12 @@ def test_a_velocity_servo(write):
 def test_a_pid_whose_damping_acts_on_the_joint(write):
     robot = added(write, kind="pid", kp=20, ki=5, kv=3)
     actuator = robot.actuator("m")
-    assert (actuator.kind, actuator.control, actuator.controls, robot.rate_controlled_actuators) == ("pid", 1, 1, ())
+    assert (
+        actuator.kind,
+        actuator.control,
+        actuator.controls,
+        robot.rate_controlled_actuators,
+    ) == ("pid", 1, 1, ())
     assert force(robot) == pytest.approx(20 * (U - Q) - 3 * V + 5 * STATE)
 
 

@@ -112,7 +112,7 @@ class Changing(Plain):
 def test_what_does_not_trace_is_told_once_and_asked_by_numpy(
     arm, effect, says, capsys, monkeypatch
 ):
-    elbow = next(spot for spot in arm.system.spots["joint"] if spot.name == "elbow")
+    elbow = next(spot for spot in arm.system.places["joint"] if spot.name == "elbow")
     made = arm(effects=[make_placed_effect(effect, elbow)])
     theta = np.array([[0.2], [0.0]])
     first = made.simulate(theta, SCENARIO)

@@ -134,7 +134,9 @@ def test_moved_together_they_find_each_other_and_apart_it_says_where(model, path
 
 
 def test_without_a_tree_in_common_the_model_file_is_named_as_it_is(model):
-    document = model.robot.to_document(model.robot.path.parents[-2].parent / "nowhere" / "at" / "all")
+    document = model.robot.to_document(
+        model.robot.path.parents[-2].parent / "nowhere" / "at" / "all"
+    )
     assert document["model"] == str(model.robot.path)
     assert model.robot.to_document(None)["model"] == "arm.xml"
 
@@ -189,7 +191,7 @@ def test_it_conforms_as_a_plugin_does(model, path):
 def test_a_step_that_was_found_is_kept(model, path, kind, tmp_path):
     """As explain hands it over: the robot is the file's, the step another."""
     finer = IntegratorSettings(0.002, "implicitfast")
-    found = kind.stepped_by(finer)
+    found = kind.with_integrator_settings(finer)
     fitted = replace(model, engine="mujoco", kind=found, robot=get_robot_reference(found))
     assert fitted.robot.digest == model.robot.digest
     write_extended(fitted, path)

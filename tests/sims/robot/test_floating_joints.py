@@ -98,7 +98,7 @@ def test_a_free_body_that_a_sensor_shows_keeps_the_spin_it_was_given():
     sensor = "<sensor><framequat name='att' objtype='body' objname='hull'/></sensor>"
     text = SATELLITE.replace("</actuator>", f"</actuator>{sensor}")
     text = text.replace('diaginertia="0.2 0.25 0.3"', 'diaginertia="2e3 2e3 2e3"')
-    kind = kind_of(text).stepped_by(IntegratorSettings(0.002, "RK4"))
+    kind = kind_of(text).with_integrator_settings(IntegratorSettings(0.002, "RK4"))
     names = [f"s.att.{axis}" for axis in "wxyz"]
     simulator = kind(observe=names)
     begins = {"qd.base.wx": 0.4, "qd.base.wz": -0.3, "q.base.qw": 0.8, "q.base.qy": 0.6}

@@ -289,7 +289,7 @@ def test_another_step_is_that_of_a_file_that_states_it():
     other = kind_of(ARM.replace('timestep="0.001"', 'timestep="0.0004" integrator="RK4"'))
     effects = {"friction__coulomb_at_elbow": 0.2, "mass__scale_at_fore": 0.3}
     expected = one(other, ARM_RUN, JOINTS, **effects)
-    found = arm().stepped_by(finer)
+    found = arm().with_integrator_settings(finer)
     assert (found.numerics, read_integrator_settings(found.robot)) == (
         finer,
         IntegratorSettings(0.001, "Euler"),

@@ -49,7 +49,7 @@ ALIKE = {
 
 def moving(integrator="implicitfast", step=0.002, channels=("q.shoulder", "q.elbow", "tau.elbow")):
     """An arm on its way, its simulator with all effects at hand."""
-    kind = kind_of(ARM).stepped_by(IntegratorSettings(step, integrator))
+    kind = kind_of(ARM).with_integrator_settings(IntegratorSettings(step, integrator))
     effects = list(library.list_effects_for(kind.system).values())
     simulator = kind(observe=list(channels), effects=effects)
     rng = np.random.default_rng(3)
@@ -86,8 +86,8 @@ def probes(simulator):
 def test_the_tangent_is_what_each_small_change_makes(integrator):
     simulator, scenario = moving(integrator)
     added, thetas = probes(simulator)
-    still = simulator.simulate_lanes(np.zeros((1, thetas.shape[1])), [scenario])[0]
-    changed = simulator.simulate_lanes(thetas, [scenario] * len(thetas)) - still
+    still = simulator.simulate_batch(np.zeros((1, thetas.shape[1])), [scenario])[0]
+    changed = simulator.simulate_batch(thetas, [scenario] * len(thetas)) - still
     about = RunLinearisation(
         simulator, np.zeros(thetas.shape[1]), scenario, np.zeros(2), np.zeros(2)
     )
@@ -115,7 +115,7 @@ def test_what_hangs_on_the_drive_moves_with_the_servo(name):
     about[names.index(name)] = 0.1
     pushed = about.copy()
     pushed[names.index("force.bias@elbow")] = 1e-3
-    still, moved = simulator.simulate_lanes(np.stack([about, pushed]), [scenario] * 2)
+    still, moved = simulator.simulate_batch(np.stack([about, pushed]), [scenario] * 2)
     effect = next(e for e in simulator.effects if e.name == "force.bias@elbow")
     tangent = RunLinearisation(simulator, about, scenario, np.zeros(2), np.zeros(2))
     seen = tangent.compute_effect_responses([(effect, np.array([1e-3]))])[0][0]
@@ -135,7 +135,7 @@ def test_frictions_at_one_joint_add_up(frictions):
     about[[names.index(name) for name in frictions]] = 1.0, 0.1
     pushed = about.copy()
     pushed[names.index("force.bias@elbow")] = 1e-3
-    still, moved = simulator.simulate_lanes(np.stack([about, pushed]), [scenario] * 2)
+    still, moved = simulator.simulate_batch(np.stack([about, pushed]), [scenario] * 2)
     effect = next(e for e in simulator.effects if e.name == "force.bias@elbow")
     tangent = RunLinearisation(simulator, about, scenario, np.zeros(2), np.zeros(2))
     seen = tangent.compute_effect_responses([(effect, np.array([1e-3]))])[0][0]
@@ -178,7 +178,7 @@ def test_a_delay_of_a_part_of_a_step_is_right_to_the_third_order(late):
     """Against a step a hundred times as fine; a mean over the step alone is 20 times as far off."""
     apart = []
     for step in (0.002, 0.00002):
-        kind = kind_of(ARM).stepped_by(IntegratorSettings(step, "RK4"))
+        kind = kind_of(ARM).with_integrator_settings(IntegratorSettings(step, "RK4"))
         _, scenario = moving()
         simulator = kind(observe=["qd.elbow"], fixed={"input.delay@m_elbow": late})
         apart.append(simulator.simulate(np.empty((1, 0)), scenario)[0])

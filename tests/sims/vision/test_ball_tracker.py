@@ -102,7 +102,9 @@ def test_the_picture_is_where_the_camera_model_says():
         np.abs(scene.render_frame(point).astype(float) - scene.render_frame(away)).max(axis=2) > 60
     )
     v, u = np.nonzero(apart)
-    np.testing.assert_allclose([u.mean(), v.mean()], camera.project_sphere(point, 0.5)[0], atol=0.35)
+    np.testing.assert_allclose(
+        [u.mean(), v.mean()], camera.project_sphere(point, 0.5)[0], atol=0.35
+    )
     np.testing.assert_allclose(
         np.sqrt(apart.sum() / np.pi), camera.compute_apparent_radius(point, 0.5), rtol=0.06
     )
@@ -153,7 +155,12 @@ def test_a_film_without_a_ball_is_one_line():
     _, scene = stage(4)
     with pytest.raises(InputError, match="no ball found"):
         track_ball(
-            [(t, f) for t, f in zip(TIMES, scene.render_frames(upright(np.full(60, -50.0))), strict=True)]
+            [
+                (t, f)
+                for t, f in zip(
+                    TIMES, scene.render_frames(upright(np.full(60, -50.0))), strict=True
+                )
+            ]
         )
 
 

@@ -156,14 +156,14 @@ def test_workers_end_with_a_parent_that_is_killed():
     code = textwrap.dedent(r"""
         import os, time
         from types import SimpleNamespace
-        from bench.diagnosis_benchmark.evaluation import worker_pool
-        from bench.diagnosis_benchmark.evaluation.search_control import SearchControl
+        from bench.diagnosis.evaluation import worker_pool
+        from bench.diagnosis.evaluation.search_control import SearchControl
         def task(world, number):
             os.write(1, f"{os.getpid()}\n".encode())
             time.sleep(60)
-        worker_pool.PAYS = 0.0
+        worker_pool.PARALLEL_THRESHOLD_SECONDS = 0.0
         world = SimpleNamespace(simulations=0, watch=SearchControl(), crew=None)
-        worker_pool.Crew(2).map(world, task, [(1,), (2,)])
+        worker_pool.ForkedWorkerPool(2).map(world, task, [(1,), (2,)])
     """)
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as parent:
         try:

@@ -65,7 +65,7 @@ def world_of(kind, command, begin=0.0):
         kind, Recording("x.csv", kind.name, "", {}, {}, (run,)), (run,), None, candidates=()
     )
     fit = SimpleNamespace(theta=recording.get_nominal_theta(), states=recording.guess)
-    return recording, SimpleNamespace(fit=fit, names=())
+    return recording, SimpleNamespace(fit=fit, effects=())
 
 
 def log(folder, kind, effect, coefficient, size, noise):

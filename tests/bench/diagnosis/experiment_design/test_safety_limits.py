@@ -48,13 +48,13 @@ def arm(tmp_path_factory):
         recording = Recording(Path("x.csv"), kind.name, "", {}, {}, (run,))
         world = RunEvaluator(kind, recording, (run,), None, candidates=())
         fit = SimpleNamespace(theta=world.get_nominal_theta(), states=world.guess)
-        return world, SimpleNamespace(fit=fit, names=())
+        return world, SimpleNamespace(fit=fit, effects=())
 
     return made
 
 
 def pushes(rig, size):
-    return rig.run(RunPlan(("u.m",), "slow sine", size))
+    return rig.make_run(RunPlan(("u.m",), "slow sine", size))
 
 
 def test_a_speed_that_the_file_states_is_kept_though_nobody_recorded_it(arm):

@@ -68,12 +68,12 @@ def test_a_run_that_nothing_moved_teaches_nothing():
 
 def test_what_has_converged_with_derivatives_of_another_point_is_not_believed():
     there = problem(TRUE)
-    there.here = False
+    there.has_own_jacobian = False
     there.mark_converged()
     assert (there.is_finished, there.is_jacobian_stale, there.is_waiting) == (False, True, True)
-    there.here = True
-    there.finish()
-    assert there.done
+    there.has_own_jacobian = True
+    there.mark_converged()
+    assert there.is_finished
 
 
 def test_known_derivatives_follow_the_parameters_that_they_are_by():

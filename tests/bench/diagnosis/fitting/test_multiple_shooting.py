@@ -113,7 +113,7 @@ def test_a_search_goes_over_pieces_unless_the_motion_forgets_how_it_began(
 
 def test_rivals_that_were_not_nominated_are_asked_before_a_cause_is_named(monkeypatch):
     for module in (effect_search, model_moves):
-        monkeypatch.setattr(module, "NOMINATED", 1)
+        monkeypatch.setattr(module, "MAX_REFITTED_CANDIDATES", 1)
     dragged = Pendulum(effects=["drag.quadratic"])
     starts = [*STARTS, {"q": 2.0}]
     data = recorded(dragged, [0.0035, 4e-7], starts, TIMES[:250], SIGMA)

@@ -227,7 +227,9 @@ def test_least_squares_with_coloured_noise_is_generalised():
         start = FitStart((), there.get_nominal_theta(), there.guess)
         plain = white(there, 0.02)
         # the same noise, once taken for white and once for what it is
-        fitters = [TrajectoryFitter(there, noise) for noise in (plain, plain.with_correlation(0.95))]
+        fitters = [
+            TrajectoryFitter(there, noise) for noise in (plain, plain.with_correlation(0.95))
+        ]
         fits = [fitter.fit_models([start], 20)[0] for fitter in fitters]
         errors.append([fit.theta[0] / TRUTH - 1 for fit in fits])
     ordinary, generalised = np.sqrt(np.square(errors).mean(axis=0))

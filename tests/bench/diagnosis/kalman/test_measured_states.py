@@ -43,7 +43,9 @@ def motion_with(world, theta):
     x, v, _ = simulated.trajectory
     nothing = FloatingState(np.zeros((len(x), 0)), np.zeros((len(x), 0)))
     motion = Trajectory(x, v, nothing)
-    return MeasuredLinear(world.simulator, world.get_nominal_theta(), world.tracks[0].scenario, start, motion)
+    return MeasuredLinear(
+        world.simulator, world.get_nominal_theta(), world.tracks[0].scenario, start, motion
+    )
 
 
 def added(linear, world, name, c):
@@ -86,7 +88,9 @@ def test_a_gain_of_a_sensor_acts_on_what_is_predicted(world):
     predicted = np.zeros((linear.knots.size, 2 * (len(world.states) // 2)))
     elbow = world.channels.index("q.elbow")
     predicted[:, world.simulator.system.coordinates.index("q.elbow")] = 0.2
-    _, readings = linear.added([(world.available_effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted)
+    _, readings = linear.added(
+        [(world.available_effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted
+    )
     wanted = 0.5 * (linear.observed[:, elbow] + 0.2)
     np.testing.assert_allclose(readings[:, elbow, 0], wanted, atol=1e-6)
 
@@ -122,7 +126,9 @@ def test_maps_carry_a_deviation_as_the_simulator_does(world):
     for column in range(half):
         other = start[0].copy()
         other[column] += moved
-        changed = MeasuredLinear(world.simulator, world.get_nominal_theta(), scenario, (other, start[1]))
+        changed = MeasuredLinear(
+            world.simulator, world.get_nominal_theta(), scenario, (other, start[1])
+        )
         for sample in (1, 4):
             step = base.knots[sample]
             x = (changed.trajectory.x[step] - base.trajectory.x[step]) / moved

@@ -212,7 +212,7 @@ def test_it_says_what_remains(figures):
         "The noise of qd is estimated from the data, not stated."
         in Reader(render_report(story(), figures)).text
     )
-    text = Reader(render_report(story(remains=()), figures)).text
+    text = Reader(render_report(story(lack_of_fit=()), figures)).text
     assert re.search(r"the residual of the held-out runs is 1 times the noise", text)
 
 
@@ -223,7 +223,7 @@ def test_what_is_open_is_not_called_settled(figures):
     )
     assert (
         "Structure that no known cause"
-        in Reader(render_report(story("partial", remains=()), figures)).text
+        in Reader(render_report(story("partial", lack_of_fit=()), figures)).text
     )
     assert "Nothing that stands out" in Reader(render_report(story("adequate"), figures)).text
 
@@ -316,7 +316,7 @@ def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
             "sensor.drift", False, "1", np.inf, 0.0, 1.0, "not identifiable", ()
         ),
     )
-    text = render_report(story("named", fixable=numbers), figures)
+    text = render_report(story("named", identifiability=numbers), figures)
     said = Reader(text).text.partition("How to read this ")[2]
     assert "Of 3 causes, each by itself, this recording can determine 1 well, 1 roughly and" in said
     assert "All 3 causes with their intervals" in said
@@ -336,7 +336,7 @@ def test_what_can_be_fixed_does_not_contradict_the_headline(figures, verdict):
         ParameterIdentifiability(n, False, "1", np.inf, 0.0, 1.0, "not identifiable", ())
         for n in names
     ]
-    told = story(verdict, fixable=tuple(numbers))
+    told = story(verdict, identifiability=tuple(numbers))
     text = render_report(told, figures)
     said = Reader(text).text.partition("Of 3 causes, ")[2].partition("Where the gap is")[0]
     lost = "not to be seen, whether it acts or not"
@@ -359,7 +359,7 @@ def test_causes_at_places_are_a_matrix_of_effects_by_places(figures):
         ParameterIdentifiability(n, False, "N", 0.1, 0.0, 1.0, word, ()) for n, word in pairs
     )
     cause = {**DRAG, "effect": "friction.coulomb@b"}
-    text = render_report(story("named", fixable=numbers, causes=[cause]), figures)
+    text = render_report(story("named", identifiability=numbers, causes=[cause]), figures)
     signs = {
         row[0]: [re.sub("<[^>]*>", "", cell) for cell in row[1:]]
         for row in (

@@ -153,7 +153,7 @@ def test_many_candidates_are_one_row_an_effect_at_first():
 
 def test_the_lines_of_the_model_file_to_change():
     html = render_report(
-        robot_story(changes=(CHANGE,), unwritten=("a delay has no place in MJCF",)), {}
+        robot_story(changes=(CHANGE,), unwritable_causes=("a delay has no place in MJCF",)), {}
     )
     reader = Reader(html)
     assert "What to change in the model file" in reader.text
@@ -165,7 +165,7 @@ def test_the_lines_of_the_model_file_to_change():
 
 def test_texts_of_the_model_file_are_escaped():
     evil = replace(CHANGE, element=EVIL, before=EVIL, after=EVIL, comment=EVIL)
-    html = render_report(robot_story(changes=(evil,), unwritten=(EVIL,)), {})
+    html = render_report(robot_story(changes=(evil,), unwritable_causes=(EVIL,)), {})
     assert html.count("<script") == 2
     assert html.count("&lt;script&gt;") == 5
 

@@ -96,9 +96,9 @@ def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
 
 
 def test_unidentifiable_says_which_parameters_the_analysis_found_vague():
-    assert format_headline(story("unidentifiable", vague=("mass", "inertia"))).startswith(
-        "These data cannot fix mass and inertia:"
-    )
+    assert format_headline(
+        story("unidentifiable", unidentified_parameters=("mass", "inertia"))
+    ).startswith("These data cannot fix mass and inertia:")
 
 
 def test_the_gain_is_told_with_its_interval_and_units():

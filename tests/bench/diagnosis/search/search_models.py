@@ -24,8 +24,8 @@ def search_of(*models, excess=None):
     return SimpleNamespace(
         models=table,
         settled_effects=None,
-        excess=lambda m: excesses.get(m.names, 0.0),
-        without=lambda m, name: table[frozenset(m.names) - {name}],
+        compute_excess=lambda m: excesses.get(m.effects, 0.0),
+        remove_effect=lambda m, name: table[frozenset(m.effects) - {name}],
     )
 
 

@@ -22,14 +22,14 @@ def evidence(
     **excess,
 ):  # fmt: skip
     scores = SimpleNamespace(
-        effects=("a", "b", "c"), chance=np.full(3, luck), null_scores=np.zeros((3, 40))
+        effects=("a", "b", "c"), null_quantiles=np.full(3, luck), null_scores=np.zeros((3, 40))
     )
     search = search_of(model(), BEST, ALIKE, BEHIND, excess={(n,): e for n, e in excess.items()})
-    search.scored = {frozenset(): scores}
-    search.tests = {frozenset(): best}
+    search.scores_by_effects = {frozenset(): scores}
+    search.best_p_values = {frozenset(): best}
     slots = {name: slice(0, size) for name, size in zip("abc", sizes, strict=True)}
     effects = {name: placed() for name in "abc"}
-    search.world = SimpleNamespace(effects=effects, slots=slots, linear=False)
+    search.world = SimpleNamespace(available_effects=effects, slots=slots, has_linearisation=False)
     monkeypatch.setattr(
         AlternativeFinder, "_is_plausible", lambda self, effect: effect in plausible
     )
@@ -98,7 +98,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     """The plain one is; a family whose place is far behind stays in the set."""
     search = search_of(model(), BEST, ALIKE, BEHIND)
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
-    search.world = SimpleNamespace(effects=effects, linear=False)
+    search.world = SimpleNamespace(available_effects=effects, has_linearisation=False)
     monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
     monkeypatch.setattr(AlternativeFinder, "_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)
@@ -115,12 +115,12 @@ def test_what_one_of_two_signs_gains_by_chance_is_no_reason_about_a_robot(
         model(), BEST, model("b", merit=100.0 - 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     )
     search.world = SimpleNamespace(
-        effects={"a": placed(), "b": placed()},
-        linear=True,
+        available_effects={"a": placed(), "b": placed()},
+        has_linearisation=True,
         parameters=[SimpleNamespace(bounds=(least, 1.0))] * 2,
         slots={"a": slice(0, 1), "b": slice(1, 2)},
     )
-    search.chance_of = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get
+    search.get_effect_penalty = {"a": 0.0, "b": 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO}.get
     monkeypatch.setattr(AlternativeFinder, "_is_plausible", lambda self, effect: True)
     monkeypatch.setattr(AlternativeFinder, "_p_value", lambda self, rest, effect, gain: 0.0)
     (found,) = AlternativeFinder(search, None, structure=False).collect_evidence(BEST)

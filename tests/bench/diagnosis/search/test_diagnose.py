@@ -23,11 +23,11 @@ def share(before, after, structure=True, own=np.nan):
         return np.where(seen, left, 77.0)
 
     search = SimpleNamespace(
-        base=SimpleNamespace(fit=before), noise=SimpleNamespace(sigma=np.array([SIGMA])),
-        residual=residual, seen=seen,
+        base_model=SimpleNamespace(fit=before), noise=SimpleNamespace(sigma=np.array([SIGMA])),
+        compute_residual=residual, observed_mask=seen,
     )  # fmt: skip
     model = SimpleNamespace(fit=after, likelihood=SimpleNamespace(sigma=np.array([own])))
-    return compute_gap_closed(search, model, SimpleNamespace(structure=structure))
+    return compute_gap_closed(search, model, SimpleNamespace(has_structure=structure))
 
 
 def test_the_gap_is_what_lies_above_the_noise():
@@ -78,9 +78,9 @@ def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
     inquiry._model = found
     if held_out:
         inquiry._trial = SimpleNamespace(
-            find_better_extension=lambda search, model: fuller, measure=measured.extend
+            find_better_extension=lambda search, model: fuller, evaluate_models=measured.extend
         )
-    taken = inquiry._fuller(SimpleNamespace(structure=structure))
+    taken = inquiry._fuller(SimpleNamespace(has_structure=structure))
     assert inquiry._model is stands
     assert taken is (stands is PLAINER)
     assert measured == ([PLAINER] if taken else [])

@@ -30,8 +30,9 @@ def search(monkeypatch, **answers):
 def test_an_effect_is_taken_that_has_merit_and_is_no_chance(monkeypatch, merit, chance, taken):
     larger = model("a", merit=merit)
     made = search(
-        monkeypatch, plain=lambda self, best, doubt: best is not BASE, missing=chance,
-        _larger=lambda self, best, size: larger, excess=0.1, quiet=False,
+        monkeypatch, is_complete=lambda self, best, doubt: best is not BASE,
+        compute_missing_effect_p_value=chance,
+        _larger=lambda self, best, size: larger, compute_excess=0.1, is_noise_like=False,
         without_step_errors=lambda self, model: model,
     )  # fmt: skip
     assert made.run() is (larger if taken else BASE)
@@ -48,7 +49,10 @@ def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
         sizes.append(size)
         return LARGER
 
-    asked = {"plain": plain, "_larger": grown, "missing": 0.0, "excess": 0.1, "quiet": False}
+    asked = {
+        "is_complete": plain, "_larger": grown, "compute_missing_effect_p_value": 0.0,
+        "compute_excess": 0.1, "is_noise_like": False,
+    }  # fmt: skip
     asked["without_step_errors"] = lambda self, model: model
     assert search(monkeypatch, **asked).run() is LARGER
     assert (doubts, sizes) == ([0.1, 0.015], [1]), "a second effect needs stronger evidence"
@@ -61,15 +65,20 @@ def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
 def test_a_model_is_plain_that_neither_scores_nor_loudness_doubt(
     monkeypatch, p_value, quiet, plain
 ):
-    made = search(monkeypatch, scan=SimpleNamespace(p_value=p_value), quiet=quiet)
-    assert made.plain(BASE, 0.1) is plain
+    made = search(
+        monkeypatch, score_missing_effects=SimpleNamespace(p_value=p_value), is_noise_like=quiet
+    )
+    assert made.is_complete(BASE, 0.1) is plain
 
 
 def scores(p_value, lucky):
     """Of two effects; a hundred surrogates whose best gains 0, 1, ... 99 less its chance."""
     drawn = np.vstack([np.arange(100.0), np.full(100, -50.0)])
     return SimpleNamespace(
-        effects=("a", "b"), chance=np.array([lucky, 0.0]), null_scores=drawn, p_value=p_value
+        effects=("a", "b"),
+        null_quantiles=np.array([lucky, 0.0]),
+        null_scores=drawn,
+        p_value=p_value,
     )
 
 
@@ -77,14 +86,16 @@ def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
     """The model gains 20: beside a luck of 12 beaten by 92 of 100 surrogates, else by 80."""
     about = {None: scores(0.9, 5.0), "larger": scores(0.95, 0.0)}
     made = search(
-        monkeypatch, scan=lambda self, m, against=None: about["larger" if against else None],
-        residual="what the larger model leaves",
+        monkeypatch, score_missing_effects=lambda self, m, against=None: about["larger" if against else None],
+        compute_residual="what the larger model leaves",
     )  # fmt: skip
-    assert made.missing(BASE, LARGER) == pytest.approx(81 / 101)
+    assert made.compute_missing_effect_p_value(BASE, LARGER) == pytest.approx(81 / 101)
     about["larger"] = scores(0.02, 0.0)
-    assert made.missing(BASE, LARGER) == pytest.approx(0.02), "the best score may see more"
+    assert made.compute_missing_effect_p_value(BASE, LARGER) == pytest.approx(0.02), (
+        "the best score may see more"
+    )
     about["larger"] = scores(0.9, 12.0)
-    assert made.missing(BASE, LARGER) == pytest.approx(0.9)
+    assert made.compute_missing_effect_p_value(BASE, LARGER) == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize(
@@ -99,13 +110,15 @@ def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
 def test_what_is_left_may_be_noise_up_to_the_floor_or_if_it_forgets(
     monkeypatch, sigma, stated, chance, quiet
 ):
-    monkeypatch.setattr("bench.diagnosis.search.scored_models.forgets", lambda *_: chance)
-    made = search(monkeypatch, residual=np.zeros((1, 1, 1)))
+    monkeypatch.setattr(
+        "bench.diagnosis.search.scored_models.compute_portmanteau_p_value", lambda *_: chance
+    )
+    made = search(monkeypatch, compute_residual=np.zeros((1, 1, 1)))
     made.world = SimpleNamespace(observed=np.zeros((1, 1, 1)))
     made.noise = SimpleNamespace(sigma=np.array([2.0]))
     made.stated = np.array([stated])
     asked = SimpleNamespace(fit=None, likelihood=Likelihood(0.0, 2.0 * np.array([sigma]), None))
-    assert made.quiet(asked) is quiet
+    assert made.is_noise_like(asked) is quiet
 
 
 def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
@@ -132,5 +145,5 @@ def test_a_thorough_search_goes_on_where_the_nearest_models_come_nearer(
     left = {(): 20.0, ("a",): 5.0, ("a", "b"): 4.9, ("c", "d"): nearest}
     models = [model(*names) for names in left]
     asked = search_of(*models, excess=left)
-    asked.base, asked.thorough = models[0], thorough
+    asked.base_model, asked.thorough = models[0], thorough
     assert is_hopeless(asked, models[2]) is hopeless

@@ -56,7 +56,7 @@ def test_what_is_left_is_noise_where_it_has_no_structure(structure, missed):
     trial = HeldOutValidation(*held_out({(): 9.0, ("a",): 2.0}))
     loud = model("a")
     loud.likelihood.sigma[:] = 2.0
-    assert trial.has_unexplained_gap(loud, SimpleNamespace(structure=structure)) is missed
+    assert trial.has_unexplained_gap(loud, SimpleNamespace(has_structure=structure)) is missed
 
 
 A_B, A_C, A_B_C, B_C = model("a", "b"), model("a", "c"), model("a", "b", "c"), model("b", "c")

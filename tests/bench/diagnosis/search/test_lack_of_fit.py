@@ -105,7 +105,7 @@ def test_noise_that_is_louder_than_stated_is_structure():
 @pytest.mark.parametrize(("phi", "samples"), [(0.0, 1.0), (0.6, 0.64 / 1.36), (-0.6, 0.64 / 1.36)])
 def test_noise_that_remembers_is_known_less_well(phi, samples):
     """As if there were so many times fewer samples; Bartlett's formula."""
-    models = SimpleNamespace(seen=np.ones((2, 100, 1), dtype=bool))
+    models = SimpleNamespace(observed_mask=np.ones((2, 100, 1), dtype=bool))
     model = SimpleNamespace(likelihood=SimpleNamespace(phi=np.array([phi])))
     assert _sigma_standard_error(models, model, 0) == pytest.approx(
         1 / np.sqrt(2 * 200 * samples), rel=1e-12

@@ -79,9 +79,9 @@ def test_what_is_far_from_the_data_is_told_by_the_shorter_account(monkeypatch):
     part = fitted(made, ("friction.coulomb",), {"friction.coulomb": 0.5})
     for share, names in ((0.94, model.effects), (0.96, part.effects)):
         excess = {model.effects: share, part.effects: 1.0}
-        monkeypatch.setattr(made, "excess", lambda m, excess=excess: excess[m.names])
-        better = type(model)(model.fit, model.likelihood, part.merit + 5.0)
-        assert made.plainer(better).names == names
+        monkeypatch.setattr(made, "compute_excess", lambda m, excess=excess: excess[m.effects])
+        better = type(model)(model.fit, model.likelihood, part.penalised_log_likelihood + 5.0)
+        assert made.simplify_laws(better).effects == names
 
 
 def test_a_simpler_law_that_is_known_and_caught_is_fitted_from_the_richer_one():

@@ -43,10 +43,12 @@ def test_a_rival_that_is_better_fitted_to_the_end_stands_unless_structure_is_lef
         refits.append(([start.effects for start in starts], noise))
         search.models[frozenset("b")] = model("b", merit=110.0)
 
-    search.refit, search.extend = refit, lambda models, most: None
+    search.refit_models, search.refit_extensions = refit, lambda models, most: None
     monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda world, fit: [])
     monkeypatch.setattr(
-        settling, "assess_lack_of_fit", lambda search, model: SimpleNamespace(structure=structure)
+        settling,
+        "assess_lack_of_fit",
+        lambda search, model: SimpleNamespace(has_structure=structure),
     )
     assert refine_best_model(search, best).effects == (stands,)
     ((effects, noise),) = refits
@@ -69,9 +71,12 @@ def test_a_rival_of_a_pair_is_fitted_from_what_the_pair_shares_with_it_as_well(m
     slots = {"a": slice(1, 2), "b": slice(2, 3), "c": slice(3, 4)}
     search.world = SimpleNamespace(library=["a", "b", "c"], slots=slots)
     begun = []
-    search.refit, search.extend = lambda s, noise: begun.extend(s), lambda models, most: None
+    search.refit_models, search.refit_extensions = (
+        lambda s, noise: begun.extend(s),
+        lambda models, most: None,
+    )
     monkeypatch.setattr(settling, "generate_frequency_neighbours", lambda world, fit: [])
-    left = SimpleNamespace(structure=False)
+    left = SimpleNamespace(has_structure=False)
     monkeypatch.setattr(settling, "assess_lack_of_fit", lambda search, model: left)
     refine_best_model(search, best)
     of_rival = [s.theta.tolist() for s in begun if s.effects == ("a", "c")]

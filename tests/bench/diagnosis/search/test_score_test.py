@@ -282,7 +282,7 @@ def test_a_cause_has_a_small_p_value():
 def test_a_chance_near_those_that_decide_is_found_from_more_surrogates(first, drawn):
     asked = []
     chances = iter([first, 0.3])
-    test = SimpleNamespace(scores=lambda *given: SimpleNamespace(p_value=next(chances)))
+    test = SimpleNamespace(compute_scores=lambda *given: SimpleNamespace(p_value=next(chances)))
     found = compute_calibrated_scores(test, np.zeros((1, 9, 1)), asked.append, 100)
     assert asked == drawn
     assert found.p_value == (first if len(drawn) == 1 else 0.3)

@@ -22,14 +22,14 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
 
     shifted = replace(base.fit, simulated=base.fit.simulated + moved * 0.01, cost=0.0)
     search.models[frozenset()] = replace(base, penalised_log_likelihood=-np.inf)
-    again = search.enter(shifted)
-    scores = search.scan(again)
+    again = search.add_fit(shifted)
+    scores = search.score_missing_effects(again)
     assert (search.world.simulations > once) is anew
     # The residual is the new one's, whatever it is compared with.
-    assert scores is not search.former.get(frozenset())
+    assert scores is not search.superseded_scans.get(frozenset())
     assert set(scores.effects) == {"friction.coulomb", "spring.linear"}
     np.testing.assert_array_equal(
-        search.scanned[frozenset()].at.simulated, (shifted if anew else base.fit).simulated
+        search.cached_scans[frozenset()].at.simulated, (shifted if anew else base.fit).simulated
     )
 
 
@@ -40,9 +40,9 @@ def test_what_was_scored_about_the_base_model_is_told_when_a_better_fit_has_take
     scores = search.score_missing_effects(base)
     assert search.base_scores is scores
     search.models[frozenset()] = replace(base, penalised_log_likelihood=-np.inf)
-    search.enter(base.fit)
-    assert frozenset() not in search.scored
-    assert search.about_base is scores
+    search.add_fit(base.fit)
+    assert frozenset() not in search.scores_by_effects
+    assert search.base_scores is scores
 
 
 def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
@@ -61,7 +61,12 @@ def test_scores_of_a_model_do_not_hang_on_what_was_scored_before():
         for model in models:
             search.score_missing_effects(model)
             assess_lack_of_fit(search, model)
-        chances.append([*search.score_missing_effects(base).null_quantiles, *search.score_missing_effects(larger).null_quantiles])
+        chances.append(
+            [
+                *search.score_missing_effects(base).null_quantiles,
+                *search.score_missing_effects(larger).null_quantiles,
+            ]
+        )
         chances[-1].append(assess_lack_of_fit(search, larger).p_value)
     assert chances[0] == chances[1]
 

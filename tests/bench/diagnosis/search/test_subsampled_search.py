@@ -37,12 +37,12 @@ def test_what_few_samples_show_is_fitted_to_all_of_them(search, log, monkeypatch
     found = refine_best_model(search, search_with_subsampling(search))
     assert found.effects == ("friction.coulomb",)
     assert found.fit.simulated.shape == search.world.observed.shape
-    assert search.settled == {"friction.coulomb"}
+    assert search.settled_effects == {"friction.coulomb"}
     monkeypatch.setattr(run_thinning, "MIN_SAMPLES_TO_THIN", 10_000)
     usual = searched(log, SIGMA)[0]
     same = refine_best_model(usual, search_with_subsampling(usual))
     assert same.effects == found.effects
-    (place,) = search.world.places("friction.coulomb")
+    (place,) = search.world.get_coefficient_indices("friction.coulomb")
     assert found.fit.theta[place] == pytest.approx(same.fit.theta[place], rel=1e-3)
     assert len(search.models) < len(usual.models), "few of them are fitted to all samples"
 

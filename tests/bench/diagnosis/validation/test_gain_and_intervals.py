@@ -165,7 +165,9 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
     assert np.allclose(model.likelihood.phi, 0, atol=0.3)
     flat = NoiseModel(sigma, np.zeros(2))
     model = type(model)(
-        model.fit, type(model.likelihood)(model.likelihood.value, sigma, flat.phi), model.penalised_log_likelihood
+        model.fit,
+        type(model.likelihood)(model.likelihood.value, sigma, flat.phi),
+        model.penalised_log_likelihood,
     )
     jacobian = (
         compute_central_jacobian(search.world, model.fit, search.noise).jacobian / sigma[:, None]

@@ -84,7 +84,10 @@ def test_a_mass_that_grows_from_day_to_day(tmp_path):
     assert mass.trend.slope == pytest.approx(0.01, abs=3 * mass.trend.error)
     assert mass.trend.p_value < 1e-3
     assert mass.trend_covariate.kind == "time"
-    assert name_missing_physics("mass", "time", mass.trend_covariate.name, True, ()) == "a load that changes"
+    assert (
+        name_missing_physics("mass", "time", mass.trend_covariate.name, True, ())
+        == "a load that changes"
+    )
     assert mass.scatter == pytest.approx(np.std(masses, ddof=1), rel=0.3)
     # For a day not yet recorded the truth is within it; by curvature alone it is not.
     assert abs(mass.value - 2.03) < 2.5 * mass.prediction_sigma
@@ -97,7 +100,7 @@ def test_the_groups_disagree_by_chance_as_often_as_they_say(tmp_path):
     for seed in range(12):
         found = explain(write(tmp_path, "log", seed=100 + seed, runs=4))
         if found.verdict == "adequate":
-            chances.append(by(found.story.consistency.after, "mass", "run").chance)
+            chances.append(by(found.story.consistency.after, "mass", "run").p_value)
     assert len(chances) >= 11
     assert np.mean(np.array(chances) < 0.05) <= 0.25
     assert 0.2 < np.median(chances) < 0.85
@@ -199,8 +202,8 @@ def test_what_a_number_moves_with_says_what_is_missing(tmp_path):
     heat = np.array([3, 0, 7, 5, 1, 8, 2, 6, 4])
     found = explain(warm(tmp_path, 2.0 - 0.08 * heat, 20.0 + 5.0 * heat))
     drag = by(found.story.consistency.after, "drag.linear", "run")
-    assert (drag.mover.kind, drag.mover.name) == ("other", "temperature")
-    assert drag.mover.trend.slope == pytest.approx(-0.08 / 5.0, rel=0.1)
+    assert (drag.trend_covariate.kind, drag.trend_covariate.name) == ("other", "temperature")
+    assert drag.trend_covariate.trend.slope == pytest.approx(-0.08 / 5.0, rel=0.1)
     said = " ".join(format_consistency(found.story))
     assert "it falls with temperature: what is missing is friction that depends on temp" in said
 
