@@ -34,7 +34,7 @@ class Cause:
         coefficients: Fitted coefficients with their 95 % intervals, by name.
         p_value: Probability of such a gain if the effect were absent.
         form: ``soft`` if dry friction has the solver parameters of the robot's model file, or
-            MuJoCo's defaults; None for stiff friction and for all other causes.
+            MuJoCo's defaults; left out where it is stiff, and for all other causes.
     """
 
     effect: str

@@ -12,11 +12,13 @@ GROUPS = {
     ),
     "What they give back": (
         "Results, with tables as frames and figures as matplotlib figures.",
-        "ComparisonResult Explanation NextRecording DataSheet ExtendedSimulator Recording Run Experiment",
+        "ComparisonResult Explanation NextRecording DataSheet ExtendedSimulator Recording Run "
+        "Experiment",
     ),
     "For tuners": (
         "The contract of a [tuner](../add-a-tuner.md).",
-        "Tuner Task Proposal Evaluation TrainingSimulator ScenarioInfo from_callback BudgetExceededError",
+        "Tuner Task Proposal Evaluation TrainingSimulator ScenarioInfo from_callback "
+        "BudgetExceededError",
     ),
     "For simulators": (
         "The contract of a simulator, and of [one's own](../own-simulator.md).",
@@ -24,7 +26,8 @@ GROUPS = {
     ),
     "For effects": (
         "The contract of an [effect](../../sims/effects/README.md), by hook.",
-        "Effect Coefficient Force Friction Contact Input Sensor Level HiddenStateEffect HiddenState StateSnapshot Signal",
+        "Effect Coefficient Force Friction Contact Input Sensor Level HiddenStateEffect "
+        "HiddenState StateSnapshot Signal",
     ),
     "For diagnosers": (
         "The contract of a [diagnoser](../diagnosers.md).",

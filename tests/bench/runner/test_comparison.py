@@ -302,7 +302,7 @@ def test_one_function_tells_which_study_an_experiment_or_a_folder_is(tmp_path, s
     assert get_study_class(load_experiment("bounce-shot")) is BounceShotStudy
     assert get_study_class(load_experiment("ball-drop")) is Comparison
     begun = begin_study(spring_experiment(), [SPRING_PLUGIN], tmp_path / "out")
-    begun.results.kept.close()
+    begun.results.run_sink.close()
     there = open_study(tmp_path / "out")
     assert isinstance(there, Comparison)
     standing = there.status()

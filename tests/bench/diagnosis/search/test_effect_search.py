@@ -86,7 +86,8 @@ def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
     """The model gains 20: beside a luck of 12 beaten by 92 of 100 surrogates, else by 80."""
     about = {None: scores(0.9, 5.0), "larger": scores(0.95, 0.0)}
     made = search(
-        monkeypatch, score_missing_effects=lambda self, m, against=None: about["larger" if against else None],
+        monkeypatch,
+        score_missing_effects=lambda self, m, against=None: about["larger" if against else None],
         compute_residual="what the larger model leaves",
     )  # fmt: skip
     assert made.compute_missing_effect_p_value(BASE, LARGER) == pytest.approx(81 / 101)
