@@ -38,7 +38,7 @@ def outcome(job, rng, budget):
     points = np.clip(0.5 + rng.normal(size=(budget, 2)) / steps[:, None], 0, 1)
     trace = RunTrace(
         "done", "", points, rng.exponential(size=budget) / steps,
-        np.vstack([job.target.sealed.start, points]),
+        np.vstack([job.target.blinded.start, points]),
         np.full(budget, 1e-4), np.full(budget, 1e-3),
     )  # fmt: skip
     return RunOutcome(trace, rng.exponential(size=(budget + 1, 1)), None, 0.1)
@@ -62,8 +62,8 @@ def measure(targets, budget, figures):
             end = outcome(job, rng, budget)
             results.run_sink.add(
                 i,
-                build_rows(results.problem, job.order, job.target, end),
-                make_status(results.problem, job.order, end),
+                build_rows(results.problem, job.request, job.target, end),
+                make_status(results.problem, job.request, end),
             )
         kept = perf_counter() - started
         segments = sum(f.stat().st_size for f in (folder / "segments").iterdir())

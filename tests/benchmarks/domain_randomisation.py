@@ -45,7 +45,7 @@ def halves(errors, covered=COVERED):
 def rehearsed(problem, randomised, index):
     """A target from where the tuner trains, and its truth (dim,) in the unit cube."""
     rng = make_rng("randomised", problem.experiment.name, index)
-    scenarios = problem.scenarios(rng)
+    scenarios = problem.draw_scenarios(rng)
     low, high = problem.cube.training
     point = rng.uniform(low, high)
     simulate = problem.simulate
@@ -57,11 +57,11 @@ def rehearsed(problem, randomised, index):
 
     seen = simulate(point[None], scenarios)[0]
     seen = seen + problem.noise * rng.standard_normal(seen.shape)
-    like = problem.target("in", 0).sealed
+    like = problem.draw_target("in", 0).blinded
     nothing = ObservedRuns((), np.empty((0, seen.shape[1])))
     fitting = ObservedRuns(scenarios, seen)
     sealed = replace(like, name=f"in-{index:03d}", fitting=fitting, held_out=nothing)
-    return sealed, problem.cube.physical(point)
+    return sealed, problem.cube.to_physical(point)
 
 
 def measured(name):

@@ -37,15 +37,15 @@ simgap.explain(sys.argv[1], jobs=1)
 end("diagnosis again, everything loaded")
 import matplotlib.figure, matplotlib.backends.backend_agg
 end("import Matplotlib")
-from bench.diagnosis_benchmark.diagnoser_report import explanation_figures
-from bench.diagnosis_benchmark.diagnoser_report.explanation_page import render_report
-drawn = explanation_figures.printed(found.story)
+from bench.diagnosis.report import explanation_figures
+from bench.diagnosis.report.explanation_page import render_report
+drawn = explanation_figures.render_figures(found.story)
 end("figures as PNG")
 render_report(found.story, drawn)
 end("report page")
 from bench.figures.figure_files import pdf_figures
 with pdf_figures():
-    explanation_figures.printed(found.story)
+    explanation_figures.render_figures(found.story)
 end("figures as PNG, PDF and SVG")
 print(json.dumps({b[0]: b[1] - a[1] for a, b in zip([("", 0.0), *ends], ends)}))
 """

@@ -69,17 +69,17 @@ def harnessed(points, problem, sealed):
 
 
 def measure(problem, name):
-    target = problem.targets()[0]
+    target = problem.draw_targets()[0]
     points = np.random.default_rng(0).uniform(size=(EVALUATIONS, problem.cube.dim))
     costs, ratios, scoring = [], [], []
     for _ in range(REPEATS):
-        plain = bare(points, problem, target.sealed.fitting.scenarios[0])
-        seconds, trace, evaluator = harnessed(points, problem, target.sealed)
+        plain = bare(points, problem, target.blinded.fitting.scenarios[0])
+        seconds, trace, evaluator = harnessed(points, problem, target.blinded)
         costs.append((seconds - plain) / EVALUATIONS * 1e6)
         ratios.append(seconds / plain)
         started = perf_counter()
-        rmse = evaluator.rmse(trace.proposals, trace.recommendations)
-        request = RunRequest("run", TunerEntry("drawing", "drawing"), 0, target.sealed, EVALUATIONS)
+        rmse = evaluator.compute_rmse(trace.proposals, trace.recommendations)
+        request = RunRequest("run", TunerEntry("drawing", "drawing"), 0, target.blinded, EVALUATIONS)
         build_rows(problem, request, target, RunOutcome(trace, rmse, None, 0.0))
         scoring.append((perf_counter() - started) / EVALUATIONS * 1e6)
     return {

@@ -64,7 +64,7 @@ def tuners_process():
 
 def timed(tuner, task, problem, target, child):
     """Wall seconds of a run, processor seconds of this side and of the tuner's process."""
-    evaluator = ProposalEvaluator(problem, target.sealed.fitting)
+    evaluator = ProposalEvaluator(problem, target.blinded.fitting)
     there = spent(child)
     started, used = perf_counter(), process_time()
     trace = drive_tuner(tuner, task, evaluator, make_rng(*NAMES))
@@ -75,8 +75,8 @@ def timed(tuner, task, problem, target, child):
 
 def evaluation(problem, name):
     """Microseconds an evaluation, of random search."""
-    target = problem.targets()[0]
-    sealed = target.sealed
+    target = problem.draw_targets()[0]
+    sealed = target.blinded
     points = np.random.default_rng(0).uniform(size=(EVALUATIONS, problem.cube.dim))
     task = Task(
         problem.cube.dim, sealed.start, sealed.fitting.observed, problem.scale,

@@ -152,7 +152,7 @@ class Study:
 
     def train(self, variant, seed):
         begin = time.perf_counter()
-        variant.learn(
+        variant.train_on(
             self.data(variant.spread, seed), make_rng("tunenet study", variant.says, seed)
         )
         return time.perf_counter() - begin
@@ -245,20 +245,20 @@ def ensemble(study):
     rows += study.rows(f"{together.says} ({MEMBERS})", [together])
     spread = []
     for target in study.targets:
-        side = target.sealed.fitting
-        truth = study.problem.cube.inverse(target.truth)
-        task = Task(1, target.sealed.start, side.observed, study.problem.scale,
+        side = target.blinded.fitting
+        truth = study.problem.cube.to_unit_cube(target.truth)
+        task = Task(1, target.blinded.start, side.observed, study.problem.scale,
         study.problem.cube.training, 1,
                     (len(side.observed),))  # fmt: skip
-        seen = study.problem.simulate(target.sealed.start[None], side.scenarios)
+        seen = study.problem.simulate(target.blinded.start[None], side.scenarios)
         h = np.array(
             [
                 m.get_trained_network().select_for(task).make_estimator(task)(seen)[0]
                 for m in members
             ]
         )
-        off = abs(h.mean() - (truth[0] - target.sealed.start[0]))
-        spread.append((target.sealed.range, h.std(ddof=1), off))
+        off = abs(h.mean() - (truth[0] - target.blinded.start[0]))
+        spread.append((target.blinded.range, h.std(ddof=1), off))
     return pd.DataFrame(rows), pd.DataFrame(spread, columns=["range", "spread", "error"])
 
 
@@ -269,7 +269,7 @@ def cost(study):
     rows = []
     for tuner in (TuneNet(), TuneNetPublished()):
         begin = time.perf_counter()
-        tuner.fit(study.problem.practice(1600), make_rng("cost"), 1600)
+        tuner.fit(study.problem.make_training_simulator(1600), make_rng("cost"), 1600)
         seconds = time.perf_counter() - begin
         each = study.errors(tuner)[1]
         rows.append((tuner.name, seconds, 1e3 * np.median(each), 1e3 * np.percentile(each, 95)))
@@ -315,13 +315,13 @@ def differences_figure(study, kept):
     }
     rng, low, high = make_rng("differences"), *study.problem.cube.training[:, 0]
     points = rng.uniform(size=(400, 2))
-    (scenario,) = study.problem.scenarios(rng)
+    (scenario,) = study.problem.draw_scenarios(rng)
     seen = study.problem.simulate(points.reshape(-1, 1), (scenario,)).reshape(400, 2, -1, 1)
     inside = ((points > low) & (points < high)).all(axis=1)
     for ax, (key, title) in zip(axes, names.items(), strict=True):
-        network = kept[key].fitted().clean
+        network = kept[key].get_trained_network().clean
         pairs = [network.read(seen[:, i], (seen.shape[2],), EMPTY_SCENE) for i in (0, 1)]
-        h, true = network.difference(*pairs)[:, 0], points[:, 1] - points[:, 0]
+        h, true = network.predict_difference(*pairs)[:, 0], points[:, 1] - points[:, 0]
         ax.plot([-1, 1], [-1, 1], color=CONNECTOR_GREY, lw=1)
         ax.plot(
             true[~inside],

@@ -5,14 +5,14 @@ import sys
 import pytest
 
 SIGNATURES = """
-from bench.diagnosis_benchmark.kalman.precompile import precompile
-from bench.diagnosis_benchmark.kalman.compiled_recursions import (
+from bench.diagnosis.kalman.precompile import precompile
+from bench.diagnosis.kalman.compiled_recursions import (
     filter_recursion, smoother_recursion
 )
 precompile()
 before = [set(f.signatures) for f in (filter_recursion, smoother_recursion)]
 assert all(before), before
-from bench.diagnosis_benchmark.explain import explain
+from bench.diagnosis.explain import explain
 explain("examples/robot/log.csv")
 assert before == [set(f.signatures) for f in (filter_recursion, smoother_recursion)]
 """
