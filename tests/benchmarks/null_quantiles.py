@@ -41,11 +41,11 @@ def chances(test, seen, memory, count):
     found = []
     for _ in range(count):
         noise = correlated(rng, memory, SIGMA, seen.shape)
-        residual = test.left(noise[None])[0]
+        residual = test.project_out(noise[None])[0]
         drawn = (
-            draw_surrogates(residual, seen, SURROGATES, rng, left=f) for f in (test.left, None)
+            draw_surrogates(residual, seen, SURROGATES, rng, left=f) for f in (test.project_out, None)
         )
-        found.append([test.scores(residual, some).p_value for some in drawn])
+        found.append([test.compute_scores(residual, some).p_value for some in drawn])
     return np.array(found).T
 
 
