@@ -1,7 +1,8 @@
 """World of the pendulum in MuJoCo.
 
 A body on a short arm gives the torque of gravity, and the armature of the joint the inertia. As in
-Bullet (`systems.pendulum_bullet_world`) the inertia may be anything above mass length^2 / 1000.
+Bullet (`sims.systems.pendulum_bullet_world`) the inertia may be anything above
+mass length^2 / 1000.
 """
 
 from __future__ import annotations

@@ -79,7 +79,9 @@ def measure(problem, name):
         ratios.append(seconds / plain)
         started = perf_counter()
         rmse = evaluator.compute_rmse(trace.proposals, trace.recommendations)
-        request = RunRequest("run", TunerEntry("drawing", "drawing"), 0, target.blinded, EVALUATIONS)
+        request = RunRequest(
+            "run", TunerEntry("drawing", "drawing"), 0, target.blinded, EVALUATIONS
+        )
         build_rows(problem, request, target, RunOutcome(trace, rmse, None, 0.0))
         scoring.append((perf_counter() - started) / EVALUATIONS * 1e6)
     return {

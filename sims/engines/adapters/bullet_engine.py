@@ -1,6 +1,6 @@
 """PyBullet engine: forces through Bullet's force and torque interfaces, impacts by its solver.
 
-The module ``pendulum_bullet_world`` in the system's package builds the world of a system; its
+The module ``<system>_bullet_world`` in the system's package builds the world of a system; its
 interface is specified in `sims.engines.external.world_interface`.
 """
 

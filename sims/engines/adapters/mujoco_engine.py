@@ -1,6 +1,6 @@
 """MuJoCo engine: forces through ``qfrc_applied``, impacts through its contact solver.
 
-The module ``pendulum_mujoco_world`` in the system's package writes the world of a system; its
+The module ``<system>_mujoco_world`` in the system's package writes the world of a system; its
 interface is specified in `sims.engines.external.world_interface`.
 """
 

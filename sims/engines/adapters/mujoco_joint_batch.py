@@ -49,7 +49,7 @@ class MujocoJointBatch:
 
     Args:
         world: world whose model the elements share.
-        module: module ``pendulum_mujoco_world`` of the system.
+        module: module ``<system>_mujoco_world`` of the system.
         threads: number of threads; the results do not depend on it.
     """
 

@@ -1,12 +1,10 @@
 """Interface of the world modules that build a system in PyBullet or MuJoCo.
 
-A system that PyBullet can simulate has a module ``pendulum_bullet_world`` in its package, one that
-MuJoCo
-can simulate a module ``pendulum_mujoco_world``. The required members depend on the system: a body
-on a hinge
-or guide needs a function that sets its inertia, a bouncing ball does not. The protocols below
-specify them. A module that does not fulfil its protocol is rejected with the name of the missing
-member before any simulation.
+A system that PyBullet can simulate has a module ``<system>_bullet_world`` in its package, one that
+MuJoCo can simulate a module ``<system>_mujoco_world``. The required members depend on the system: a
+body on a hinge or guide needs a function that sets its inertia, a bouncing ball does not. The
+protocols below specify them. A module that does not fulfil its protocol is rejected with the name
+of the missing member before any simulation.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ class JointWorldModule(Protocol):
 
 
 class BulletWorldModule(Protocol):
-    """Module ``pendulum_bullet_world`` of a system."""
+    """Module ``<system>_bullet_world`` of a system."""
 
     def build(self, client: int, constants: Constants, /) -> int:
         """Build the world in an empty client; return the id of the moving body."""
@@ -50,7 +48,7 @@ class BulletWorldModule(Protocol):
 
 
 class BulletJointWorldModule(BulletWorldModule, JointWorldModule, Protocol):
-    """Module ``pendulum_bullet_world`` of a one-coordinate system."""
+    """Module ``<system>_bullet_world`` of a one-coordinate system."""
 
     def load(self, client: int, body: int, inertia: float, constants: Constants, /) -> bool:
         """Set the generalised inertia of the body.
@@ -68,7 +66,7 @@ class BulletJointWorldModule(BulletWorldModule, JointWorldModule, Protocol):
 
 
 class BulletBallWorldModule(BulletWorldModule, Protocol):
-    """Module ``pendulum_bullet_world`` of a bouncing ball, required for `native_contact`."""
+    """Module ``<system>_bullet_world`` of a bouncing ball, required for `native_contact`."""
 
     def build_native(self, client: int, constants: Constants, /, settings: Constants) -> int:
         """Build the world with Bullet's native contact.
@@ -85,7 +83,7 @@ class BulletBallWorldModule(BulletWorldModule, Protocol):
 
 
 class MujocoWorldModule(Protocol):
-    """Module ``pendulum_mujoco_world`` of a system."""
+    """Module ``<system>_mujoco_world`` of a system."""
 
     def model(self, constants: Constants, /) -> str:
         """Return the world as MJCF."""
@@ -93,7 +91,7 @@ class MujocoWorldModule(Protocol):
 
 
 class MujocoJointWorldModule(MujocoWorldModule, JointWorldModule, Protocol):
-    """Module ``pendulum_mujoco_world`` of a one-coordinate system."""
+    """Module ``<system>_mujoco_world`` of a one-coordinate system."""
 
     def load(self, model: Any, inertia: float, constants: Constants, /) -> bool:
         """Set the generalised inertia in a compiled model.
