@@ -60,7 +60,7 @@ def measure(targets, budget, figures):
         started = perf_counter()
         for i, job in enumerate(results.plan):
             end = outcome(job, rng, budget)
-            results.run_sink.add(
+            results.run_sink.append(
                 i,
                 build_rows(results.problem, job.request, job.target, end),
                 make_status(results.problem, job.request, end),
