@@ -40,7 +40,7 @@ class Explanation:
     """Result of `explain`.
 
     Attributes:
-        answer: Verdict with its numbers; ``answer.document()`` is the content of verdict.json.
+        answer: Verdict with its numbers; ``answer.to_document()`` is the content of verdict.json.
         story: Data from which text, figures and page of the report are rendered.
         extended: Extended simulator.
     """

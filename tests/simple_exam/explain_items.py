@@ -25,7 +25,7 @@ def explained(written, explain=EXPLAIN, **settings):
         begin, busy = time.perf_counter(), time.process_time()
         try:
             asked = getattr(importlib.import_module(module), function)
-            document = asked(path, **settings).answer.document()
+            document = asked(path, **settings).answer.to_document()
             row["verdict"] = {key: v for key, v in document.items() if key != "candidates"}
         except Exception:
             row["error"] = traceback.format_exc(limit=-4)
