@@ -9,7 +9,7 @@ _CODE = f"""
 import sys
 sys.path.append({str(ROOT)!r})
 from tests.without_drawing import undrawn
-from bench.cli.main.main import main
+from bench.cli.main import main
 with undrawn():
     sys.exit(main())
 """

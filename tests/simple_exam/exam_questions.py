@@ -123,15 +123,15 @@ def digest():
     """Of the code that draws; items drawn by the same code need not be drawn again."""
     here, text = Path(reference_simulation.__file__).parent, hashlib.sha256()
     for module in (
-        "base",
-        "items",
-        "settings",
-        "shapes",
-        "sizing",
-        "rivals",
-        "joints",
-        "flights",
-        "world",
+        "true_system",
+        "case_sampling",
+        "recording_conditions",
+        "effect_coefficients",
+        "effect_sizing",
+        "competing_effects",
+        "joint_reference",
+        "ball_reference",
+        "reference_simulation",
     ):
         text.update((here / f"{module}.py").read_bytes())
     return text.hexdigest()[:16]

@@ -60,7 +60,7 @@ def test_sound_plugin_tuner_passes_every_check(tmp_path, capsys):
         ("chaos_raise", "found crashed: Traceback"),
         (
             "chaos_exit",
-            "expected to survive; found DeathError: the worker process exited with code 7",
+            "expected to survive; found WorkerDiedError: the worker process exited with code 7",
         ),
         ("chaos_hang", "expected an end within 2 s; found none"),
         ("chaos_nan", "found diverged: the tuner gave proposals that are not finite"),

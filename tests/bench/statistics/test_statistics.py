@@ -234,7 +234,7 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
         targets=200, seeds=5, budget=99, ranges=["in"], tuners=entries, noise={"x": 0.1}
     )
     comparison = Comparison.begin(experiment, [], folder)
-    comparison.results.run_sink.discard()
+    comparison.results.run_sink.delete_segments()
     runs, k = 10_000, np.arange(100)
     tuners = np.repeat(labels, 1000)
     targets = np.tile([f"in-{i:03d}" for i in range(200)], 50)
