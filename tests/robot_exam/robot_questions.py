@@ -97,8 +97,10 @@ def digest():
     """Of the code that draws; items drawn by the same code need not be drawn again."""
     here, text = Path(__file__).parent, hashlib.sha256()
     for module in (
-        "friction_laws", "reference_plant", "exam_robots", "excitation_signals", "reference_integration", "reference_world", "robot_models", "command_signals",
-        "sensor_models", "exam_settings", "planted_effects", "causes_outside_library", "cause_sizing", "robot_items", "exam_recording",
+        "friction_laws", "reference_plant", "exam_robots", "excitation_signals",
+        "reference_integration", "reference_world", "robot_models", "command_signals",
+        "sensor_models", "exam_settings", "planted_effects", "causes_outside_library",
+        "cause_sizing", "robot_items", "exam_recording",
     ):  # fmt: skip
         text.update((here / f"{module}.py").read_bytes())
     return text.hexdigest()[:16]
