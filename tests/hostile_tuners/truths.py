@@ -53,7 +53,7 @@ class Cheat(RandomSearch):
 
 
 def matching(targets, task):
-    return [cube(t.truth) for t in targets if np.array_equal(t.sealed.start, task.start)]
+    return [cube(t.truth) for t in targets if np.array_equal(t.blinded.start, task.start)]
 
 
 class ProblemOfWorker(Cheat):
