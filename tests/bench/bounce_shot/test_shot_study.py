@@ -1,6 +1,4 @@
-"""Bounce-shot studies: Wilson's interval, what goes over from a drop to a shot, who hits, and the
-command.
-"""
+"""Tests of bounce-shot studies: Wilson interval, restitution from a filmed drop, shots, command."""
 
 import importlib.util
 import json
@@ -121,7 +119,7 @@ def test_deals_do_not_depend_on_methods_or_numbers(experiment):
 @vision
 @pytest.mark.parametrize("kind", ["squash", "golf"])
 def test_a_filmed_drop_is_tracked_to_millimetres(experiment, tmp_path, kind):
-    """A squash ball meets its shadow at the bounce, which then goes on as the ball went before."""
+    """The camera also sees the shadow, which touches a squash ball at the bounce."""
     settings, path = read_shot_config(experiment), tmp_path / "drop.csv"
     dealt = draw_shot(experiment, settings, kind, 0)
     record_drop(experiment, dealt, settings, path)
@@ -147,7 +145,7 @@ def test_recorded_drop_reads_as_any_recording_of_a_ball(experiment, tmp_path):
     experiment = replace(experiment, noise={"z": 0.01})
     dealt = draw_shot(experiment, settings, "tennis", 0)
     record_drop(experiment, dealt, settings, path)
-    record_drop(experiment, dealt, settings, path)  # what is there stays
+    record_drop(experiment, dealt, settings, path)  # an existing recording is kept
     recording = read_recording(path, Ball, whole=True)
     z = recording.runs[0].channels["z"]
     assert len(z) == 150
@@ -187,7 +185,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         seen = build_pixel_runs(read_recording(path, Ball, whole=True), watching, dealt.ball.radius)
         assert not [name for s in seen.scenarios for name in s.constants if "camera" in name]
         assert np.isnan(seen.observed[:, 0]).all()
-        # the ball lies on the ground at the end, lower in the picture than where it was let go
+        # The ball ends on the ground, lower in the image than at its release.
         assert np.isfinite(seen.observed[:, 1]).mean() > 0.9
         assert (
             np.nanmax(seen.observed[:, 1]) - seen.observed[np.isfinite(seen.observed[:, 1])][0, 1]
@@ -206,13 +204,13 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         found[kind] = by_rows.restitution
         for left in ("drop.csv", "drop.toml", "drop.png"):
             (tmp_path / left).unlink()
-    assert found["golf"] - found["squash"] > 0.2  # 0.86 and 0.54 by the tables
+    assert found["golf"] - found["squash"] > 0.2  # the tables give 0.86 and 0.54
 
 
 @pytest.mark.slow
 @vision
 def test_a_drop_that_cannot_be_tracked_is_a_row_and_not_the_end(experiment, tmp_path, capsys):
-    """A film of 16 pixels' height shows a golf ball on a fifth of a pixel."""
+    """In a film with a height of 16 pixels, a golf ball covers a fifth of a pixel."""
     text = f"""{SMALL}
 budget = 2
 sampling = {{ rate = 60.0, samples = 60 }}
@@ -239,7 +237,7 @@ def test_methods_get_the_recording_and_the_scene_and_not_the_ball():
 
 
 def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp_path, monkeypatch):
-    """And a failure of explain is a row, not the end."""
+    """A failure of explain becomes a row of the table and does not stop the study."""
 
     def broken(_):
         return TunedModel("explain", 0.5, {}, 0, 0.0, "crashed", "no"), {}
@@ -357,7 +355,7 @@ def explained(_):
 
 @pytest.fixture
 def crashing(tmp_path, monkeypatch, fresh_registries):
-    """An experiment with a tuner that fails, and its options; explain and pictures cost nothing."""
+    """Return the arguments of a study with a failing tuner; explain and figures are stubs."""
     monkeypatch.setattr(shot_planning, "_explained", explained)
     monkeypatch.setattr("bench.bounce_shot.shot_report.draw_figures", lambda *_: {})
     monkeypatch.setattr("bench.bounce_shot.shot_report.write_animation", lambda *_: "animation")
@@ -485,7 +483,7 @@ def test_interrupted_it_is_resumed_with_its_own_plugins_and_what_changed_is_refu
 def test_what_is_lost_on_the_way_is_said_and_no_untrained_tuner_is_shot_with(
     tmp_path, monkeypatch, fresh_registries
 ):
-    """A pool that is gone leaves a folder to resume; a training that fails ends the study."""
+    """A lost pool leaves a folder to resume; a failed training ends the study."""
 
     class Gone:
         def __init__(self, fault):

@@ -1,6 +1,7 @@
-"""A model file of a two-link arm with position servos, for logs that tests make.
+"""Model file of a two-link arm with position servos, for logs that tests make.
 
-No motion in the tests of `steps` reaches the range of the shoulder, so it must change no answer.
+No motion in the tests of discretisation errors reaches the range limit of the shoulder, so the
+limit must not change any result.
 """
 
 ARM = """<mujoco>

@@ -1,4 +1,4 @@
-"""Small recordings, worlds and made-up fits for the tests of explain."""
+"""Small recordings, run evaluators and constructed fits for the tests of explain."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +18,12 @@ from tests.simulation_arguments import Wish
 
 
 def recording(system="pendulum", **wish):
-    """A simulated recording, nothing written."""
+    """Simulate a recording without writing a file."""
     return simulate_recording(Wish(system, **wish)).recording
 
 
 def recorded(simulator, theta, starts, times, noise=0.0, seed=0, stated=True):
-    """Runs of any simulator as a recording: an initial state each, or (initial state, inputs)."""
+    """Simulate runs with any simulator; a start is an initial state or (initial state, inputs)."""
     rng, runs = np.random.default_rng(seed), []
     names = [c.name for c in simulator.channels]
     sigma = np.broadcast_to(np.asarray(noise, dtype=float), (len(names),))
@@ -41,37 +41,37 @@ def recorded(simulator, theta, starts, times, noise=0.0, seed=0, stated=True):
 
 
 def changed(run, **changes):
-    """The run with samples of channels replaced: name=function of the old ones."""
+    """Return the run with changed channels: name=function of the recorded values."""
     channels = {n: changes.get(n, lambda v: v)(v.copy()) for n, v in run.channels.items()}
     return replace(run, channels=channels)
 
 
 def with_runs(recorded, runs):
-    """The recording with other runs, named in order."""
+    """Return the recording with these runs, renamed 1, 2, ..."""
     return replace(
         recorded, runs=tuple(replace(run, name=str(i)) for i, run in enumerate(runs, start=1))
     )
 
 
 def world(recorded, **options):
-    """All runs of a recording as the fit meets them."""
+    """Return the run evaluator of all runs of a recording."""
     return RunEvaluator(simulators.get(recorded.system), recorded, recorded.runs, **options)
 
 
 def white(world, sigma):
-    """White noise of every channel, or of each its own."""
+    """Return a white noise model with one sigma for all channels or one per channel."""
     return NoiseModel(
         np.broadcast_to(np.asarray(sigma, dtype=float), (len(world.channels),)).copy(), np.zeros(1)
     ).with_correlation(0.0)
 
 
 def marked(world, stated):
-    """(C,) whether the noise of each channel is stated: of all, or of each its own."""
+    """Return a (C,) mask of the channels with specified noise, from one value or C values."""
     return np.broadcast_to(np.asarray(stated, dtype=bool), (len(world.channels),)).copy()
 
 
 def searched(recorded, sigma, seed=0, stated=True, **options):
-    """A search with the fitted base model entered, and that model."""
+    """Return a search that contains the fitted base model, and that model."""
     there = world(recorded, **options)
     noise = white(there, sigma)
     base = fit_base_model(there, noise)
@@ -86,7 +86,7 @@ def searched(recorded, sigma, seed=0, stated=True, **options):
 
 
 def linear_fit(jacobian, q, free=None):
-    """A fit whose Jacobian (R, T, C, q + s) is given, for what needs nothing else of it."""
+    """Return a fit with this Jacobian (R, T, C, q + s); all other values are zero."""
     runs, samples, channels, size = jacobian.shape
     places = np.arange(q) if free is None else np.asarray(free)
     return TrajectoryFit(
@@ -101,7 +101,7 @@ def linear_fit(jacobian, q, free=None):
 
 
 def correlated(rng, phi, sigma, shape):
-    """(R, T, C) stationary first-order autoregressions, sigma and phi a number or (C,)."""
+    """Return stationary AR(1) noise (R, T, C); sigma and phi are numbers or arrays (C,)."""
     made = rng.standard_normal(shape)
     for t in range(1, shape[1]):
         made[:, t] = phi * made[:, t - 1] + np.sqrt(1 - np.square(phi)) * made[:, t]
@@ -109,8 +109,9 @@ def correlated(rng, phi, sigma, shape):
 
 
 def covariance_of(seen, phi):
-    """(n, n) correlations of the seen samples of one channel (R, T): each unbroken stretch is an
-    autoregression.
+    """Return the (n, n) AR(1) correlations of the samples present in one channel (R, T).
+
+    Samples on different sides of a hole are uncorrelated.
     """
     stretch = np.cumsum(~(seen & np.pad(seen, ((0, 0), (1, 0)))[:, :-1]).ravel())[seen.ravel()]
     time = np.tile(np.arange(seen.shape[1]), len(seen))[seen.ravel()]
@@ -123,17 +124,17 @@ def covariance_of(seen, phi):
 
 
 def everything(values):
-    """A mask of samples that are all there."""
+    """Return an observed mask without missing samples."""
     return np.ones(values.shape, dtype=bool)
 
 
 def holes(shape, share, seed):
-    """A mask of which so large a share is missing."""
+    """Return an observed mask in which this fraction of samples is missing."""
     return np.random.default_rng(seed).random(shape) > share
 
 
 def autocorrelation(values, lag):
-    """Of values (..., T, C), those so many samples apart."""
+    """Return the autocorrelation of values (..., T, C) at this lag in samples."""
     length = values.shape[-2]
     here, later = values[..., : length - lag, :], values[..., lag:, :]
     return float((here * later).mean() / np.square(values).mean())

@@ -1,4 +1,4 @@
-"""A two-joint arm for tests of comparisons: its file, in which little takes long."""
+"""Model file of a two-joint arm that is fast to simulate, for tests of comparisons."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SWINGING = """
 
 
 def written(folder: Path, text: str = SWINGING, name: str = "swinging.xml") -> Path:
-    """The file in a folder."""
+    """Write the model file to a folder; return its path."""
     path = folder / name
     path.write_text(text)
     return path

@@ -1,12 +1,10 @@
-"""Recordings on disk, made of columns."""
+"""Recordings on disk, made from columns."""
 
 import numpy as np
 
 
 def table(folder, runs, channels=("q", "qd"), system="pendulum", noise=None, inputs=(), more=""):
-    """Write odd.csv and odd.toml; each run is its times and one column a channel, then a column an
-    input.
-    """
+    """Write odd.csv and odd.toml; a run is its times, a column per channel and one per input."""
     units = {
         "q": "rad",
         "qd": "rad/s",
@@ -34,7 +32,7 @@ def table(folder, runs, channels=("q", "qd"), system="pendulum", noise=None, inp
 
 
 def swing(times, angle=0.8, pulse=8.17, decay=0.0, rng=None, sigma=(0.003, 0.02)):
-    """Times, angle and rate of a small free swing in closed form, with noise of `rng`."""
+    """Return times, angle and rate of a small free swing in closed form, with noise of `rng`."""
     envelope = angle * np.exp(-decay * times)
     q, qd = envelope * np.cos(pulse * times), -pulse * envelope * np.sin(pulse * times)
     if rng is not None:

@@ -1,4 +1,4 @@
-"""Invented stories of an arm of six joints: what a report tells of causes at places."""
+"""Constructed report data of a six-joint arm with causes at its places."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ EVERYWHERE = cause("friction.coulomb@*", {f"coefficient@{joint}": number(0.3) fo
 
 
 def candidates(joints=ARM6, best="friction.coulomb@elbow"):
-    """The library at the places of an arm, families among them."""
+    """Return candidates for the effect library at the places of an arm, including families."""
     names = [f"{effect}@{joint}" for effect in FORCE for joint in joints]
     names += [f"{effect}@m_{joint}" for effect in INPUT for joint in joints]
     names += [f"{effect}@q.{joint}" for effect in SENSOR for joint in joints]
@@ -59,7 +59,7 @@ def candidates(joints=ARM6, best="friction.coulomb@elbow"):
     rng = np.random.default_rng(3)
     scores = np.sort(rng.exponential(60.0, len(names)))[::-1]
     place = best.partition("@")[2]
-    # What stands at the place of the cause comes closest to it.
+    # Candidates at the place of the cause have the next highest scores.
     names.sort(key=lambda name: (name != best, place not in name, name))
     return [
         {
@@ -73,7 +73,7 @@ def candidates(joints=ARM6, best="friction.coulomb@elbow"):
 
 
 def motion(joints, runs, seed, at):
-    """Runs (R, T, C) of positions and torques: measured, before and after."""
+    """Return runs (R, T, C) of positions and torques: measured, before and after."""
     rng = np.random.default_rng(seed)
     t = np.arange(400) / 100.0
     quantities = [(kind, joint) for kind in NOISE for joint in joints]
@@ -93,7 +93,7 @@ def motion(joints, runs, seed, at):
 
 
 def robot_story(verdict="named", causes=(RUB,), joints=ARM6, at="elbow", **changes):
-    """A story of an arm; `changes` replace entries of the verdict or fields of the story."""
+    """Return report data of an arm; `changes` replace entries of the verdict or of the data."""
     robot = arm6() if len(joints) == 6 else arm2()
     fitting = DataSplit(*motion(joints, 3, 1, at))
     names, *rest = motion(joints, 1, 2, at)

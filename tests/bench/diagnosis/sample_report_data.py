@@ -1,6 +1,4 @@
-"""Invented stories: a damped swing that a frictionless pendulum cannot follow, with every verdict
-about it.
-"""
+"""Constructed report data of a damped swing and a frictionless pendulum, for every verdict."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -123,7 +121,7 @@ CAUSES = {"named": [DRAG], "ambiguous": [EITHER], "partial": [DRAG]}
 
 
 def answer(verdict="named", **changes):
-    """What verdict.json says with this verdict; `changes` replace its entries."""
+    """Return a verdict.json document with this verdict; `changes` replace its entries."""
     causes = CAUSES.get(verdict, [])
     found = {
         "verdict": verdict,
@@ -158,9 +156,7 @@ def answer(verdict="named", **changes):
 
 
 def story(verdict="named", **changes):
-    """A story with this verdict; `changes` replace entries of the verdict or fields of the
-    story.
-    """
+    """Return report data with this verdict; `changes` replace entries of the verdict or data."""
     gap = verdict not in ("adequate", "unidentifiable")
     fitting, held_out = sides(gap)
     causes = CAUSES.get(verdict, [])
@@ -202,7 +198,7 @@ def story(verdict="named", **changes):
 
 
 def evil():
-    """A story in which every text that comes from a file or plugin is an attack."""
+    """Return report data in which every text from a file or plugin is an injection attack."""
     cause = {
         **DRAG,
         "effect": EVIL,

@@ -1,4 +1,4 @@
-"""A search that is ended early says what it has, and claims no more."""
+"""Tests that a search stopped early reports its results and claims no more."""
 
 import json
 
@@ -20,7 +20,7 @@ def swing():
 
 
 def until(swing, text):
-    """What explain finds if somebody wants an end as soon as it looks at this."""
+    """Return the result of explain if the user stops it at the step with this text."""
     seen = []
     found = explain(
         swing,

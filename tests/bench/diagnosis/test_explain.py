@@ -1,4 +1,4 @@
-"""Odd recordings: a verdict or one clear line, never a traceback, never a confident wrong name."""
+"""Tests of anomalous recordings: a verdict or a one-line error, no traceback, no wrong cause."""
 
 import json
 import subprocess
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("fresh_registries")
 
 
 def explained(path, **options):
-    """What explain finds, its verdict checked against the design's form."""
+    """Return the result of explain after checking its verdict against the schema."""
     found = explain(path, **options)
     document = found.answer.to_document()
     verdict_schema.check(json.dumps(document, allow_nan=False))
@@ -50,7 +50,7 @@ def noisy(seed=0, sigma=(0.003, 0.02)):
 
 
 def swings(times=TIMES, count=3, effects=None, seed=0):
-    """Real free swings with noise, as columns."""
+    """Return simulated free swings with noise, as columns."""
     rng, runs = np.random.default_rng(seed), []
     for angle in np.linspace(0.4, 1.2, count):
         seen = Pendulum(fixed=effects).simulate(
@@ -146,7 +146,7 @@ def test_values_that_cannot_be_are_one_line(tmp_path):
 
 
 def test_what_does_not_fit_the_system_at_all_is_unknown(tmp_path):
-    """A random walk, told to be a pendulum's angle."""
+    """The recording is a random walk that is described as a pendulum's angle."""
     rng = np.random.default_rng(1)
     walks = [np.cumsum(0.05 * rng.standard_normal(60)) for _ in range(2)]
     runs = [(TIMES[:60], walk, 0.3 * rng.standard_normal(60)) for walk in walks]
@@ -312,7 +312,7 @@ def test_what_only_tables_need_is_not_loaded():
 
 
 def test_a_mass_beyond_its_declared_range_is_fitted_and_told(tmp_path):
-    """A slide of 95 kg, where the system's own range ends at 10 kg: no gain stands in for it."""
+    """The slide has 95 kg, above the system's limit of 10 kg; no gain must replace the mass."""
     rng, mass, step = np.random.default_rng(0), 95.0, 0.01
     times, lines = step * np.arange(200), ["run,t,u,x"]
     for run in range(2):

@@ -1,4 +1,4 @@
-"""The result of explain as a notebook's user meets it: shown, asked, drawn and written."""
+"""Tests of the result of explain in a notebook: display, queries, figures and files."""
 
 import json
 import re
@@ -84,7 +84,7 @@ def test_shown_in_a_notebook_it_is_the_report_in_a_frame(named):
 def test_its_report_is_that_of_the_folder_but_for_the_files_beside_it(named, tmp_path):
     page = unescape(re.search('srcdoc="([^"]*)"', named._repr_html_())[1])
     written = named.write(tmp_path)[-1].read_text(encoding="utf-8")
-    # A command that names a file of the folder is in the folder's page alone.
+    # Only the page in the folder contains a command that names a file of the folder.
     command = r'<p>How far [^<]*</p>\n<pre class="copied" tabindex="0">simgap score [^<]*</pre>\n'
     assert len(re.findall(command, written)) == 1
     assert re.sub(command, "", written) == page

@@ -1,4 +1,4 @@
-"""What was found in a robot stands in its own file, beside extended.toml, and can be scored."""
+"""Tests of the model file written next to extended.toml for a robot, and of its score."""
 
 from dataclasses import replace
 from html import escape

@@ -1,6 +1,6 @@
-"""Explain takes a servo with a filter for a servo, whatever its filter holds when a run begins.
+"""Tests of explain on servos with a filter, for any filter state at the start of a run.
 
-The motion is that of plain MuJoCo, from a model file with another damping at the elbow.
+Plain MuJoCo makes the motion, from a model file with another damping at the elbow.
 """
 
 import os
@@ -51,12 +51,12 @@ CASE = SHARED / "cases" / "filtered_servo" / "log.csv"
 
 
 def recorded(folder, begun, seconds=2.5):
-    """The path of a log of three runs.
+    """Write a log of three runs; return its path.
 
     Args:
-        folder: where it is written, with the model file as it is known.
-        begun: ``zero`` where activations begin as MuJoCo resets them; ``moving`` where the log is
-            cut out of a motion.
+        folder: folder of the log and of the known model file.
+        begun: ``zero`` for activations as MuJoCo resets them; ``moving`` for a log that is cut out
+            of a motion.
     """
     rng = np.random.default_rng(5)
     model = mujoco.MjModel.from_xml_string(ARM.format(damping=PLANTED, actuators=SERVOS))
@@ -90,7 +90,7 @@ def test_a_planted_damping_is_found_behind_filtered_servos(tmp_path, begun):
     (cause,) = found.causes
     assert {cause.effect, *cause.alternatives} == {"drag.linear@elbow", "actuator.damping@s2"}
     (number,) = cause.coefficients.values()
-    # A servo's damping acts on the joint by the square of its gear.
+    # The servo's damping acts on the joint multiplied by the square of its gear.
     change = (PLANTED - STATED) / (1.0 if cause.effect.startswith("drag") else 0.4 * 2.0**2)
     assert number.value == pytest.approx(change, rel=0.03)
     (line,) = [line for line in lines if "are left out" in line]

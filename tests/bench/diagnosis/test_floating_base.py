@@ -1,4 +1,4 @@
-"""Recordings of a robot that floats."""
+"""Tests of recordings of a robot with a floating base."""
 
 from itertools import pairwise
 
@@ -18,11 +18,11 @@ from tests.sims.robot.test_robot_motion import kind_of
 
 MODEL = SATELLITE.replace('axis="0 0.6 0.8"', 'axis="0 0 1"')
 HULL, PANEL = (5.0, 0.3, 0.3), (1.0, 0.03, 0.25)
-"""Mass, moment about the centre of mass, and how far that is from the hinge."""
+"""Mass (kg), inertia about the centre of mass (kg m^2), and its distance from the hinge (m)."""
 TRUE = 0.05
-"""N m s/rad of drag that the file lacks."""
+"""Drag in N m s/rad that the model file lacks."""
 SPINS = (0.8, -0.5, 0.3)
-"""rad/s of the hull as each run begins."""
+"""Initial angular velocity of the hull in rad/s, by run."""
 TOML = """model = "satellite.xml"
 [channels."q.boom"]
 unit = "rad"
@@ -38,15 +38,16 @@ TIMES = np.arange(0.0, 3.0, 0.02)
 
 
 def commands(run):
-    """(T,) N m, each held until the next."""
+    """Return (T,) torques in N m, each held until the next sample."""
     return 0.12 * np.sin((2.0 + run) * TIMES) + 0.05 * np.cos(5.0 * TIMES)
 
 
 def motion(run):
-    """(T,) angle of the boom: two bodies in a plane whose common centre of mass rests, by Lagrange.
+    """Return (T,) angles of the boom from Lagrange's equations.
 
-    With turns a of the hull and b of the panel, m = m1 m2 / (m1 + m2) and e the unit vectors along
-    the bodies, the kinetic energy is I1 a'^2 / 2 + I2 b'^2 / 2 + m |r1 a' e1 + r2 b' e2|^2 / 2.
+    The two bodies move in a plane and their common centre of mass rests. With turns a of the hull
+    and b of the panel, m = m1 m2 / (m1 + m2) and e the unit vectors along the bodies, the kinetic
+    energy is I1 a'^2 / 2 + I2 b'^2 / 2 + m |r1 a' e1 + r2 b' e2|^2 / 2.
     """
     (m1, i1, r1), (m2, i2, r2) = HULL, PANEL
     m = m1 * m2 / (m1 + m2)
@@ -68,7 +69,7 @@ def motion(run):
 
 STATED = "".join(f'[runs.{k}.initial]\n"qd.base.wz" = {spin}\n' for k, spin in enumerate(SPINS))
 TURNING = '[extra."qd.base.wz"]\nunit = "deg/s"\n'
-"""The spin as a column of the log."""
+"""Description of a log column with the spin of the hull."""
 
 
 def recorded(tmp_path, toml=TOML + STATED, runs=3, spins=False):
@@ -155,7 +156,7 @@ def test_a_simulated_log_says_where_its_runs_began(tmp_path):
 
 
 def compared(tmp_path, *given):
-    """The last row of every run of least squares on it."""
+    """Run a comparison with least squares; return the last row of each run by target."""
     free = ["--free", "damping@boom", "--tuners", "least_squares", "--targets", "1", "--seeds", "1"]
     size = ["--budget", "12", "--jobs", "0", "--trust", "--out", str(tmp_path / "out")]
     assert main(["compare", *given, *free, *size]) == 0

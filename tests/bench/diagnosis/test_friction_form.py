@@ -1,6 +1,6 @@
-"""Explain tells MuJoCo's soft form of dry friction from the stiff one, and writes down which it is.
+"""Tests that explain distinguishes MuJoCo's soft dry friction from the stiff form and writes it.
 
-The motion is that of plain MuJoCo, from a model file with `frictionloss` at the elbow.
+Plain MuJoCo makes the motion, from a model file with `frictionloss` at the elbow.
 """
 
 import json
@@ -35,7 +35,7 @@ from tests.sims.robot.test_friction_form import ARM
 NOISE, PLANTED = 1e-3, 0.06
 FORMS = {
     "soft": "",
-    # The stiff form at steps of 2 ms of `implicitfast`.
+    # Parameters of the stiff form for 2 ms steps of `implicitfast`.
     "stiff": 'solreffriction="0.004 1" solimpfriction="0.9999 0.9999 0.001"',
 }
 LOG = "".join(
@@ -47,7 +47,7 @@ LOG = "".join(
 
 
 def recorded(folder, form, friction=PLANTED, seconds=2.0):
-    """The path of a log of three runs; the model file beside it states no friction."""
+    """Write a log of three runs, with a model file without friction; return its path."""
     rng = np.random.default_rng(8)
     loss = f'frictionloss="{friction}" {FORMS[form]}'
     model = mujoco.MjModel.from_xml_string(ARM.format(integrator="implicitfast", elbow=loss))
@@ -56,7 +56,7 @@ def recorded(folder, form, friction=PLANTED, seconds=2.0):
     for run in (1, 2, 3):
         rates, phases = rng.uniform(3, 9, 2), rng.uniform(0, 6, 2)
         torque = np.array([0.8, 0.3]) * np.sin(times[:, None] * rates + phases)
-        # Commands are held from one row to the next, five steps.
+        # Each command is held for five steps, until the next row.
         torque = np.repeat(torque[::5], 5, axis=0)[: times.size]
         data = mujoco.MjData(model)
         data.qpos[:] = rng.uniform(-0.5, 0.5, 2)
@@ -75,9 +75,7 @@ def recorded(folder, form, friction=PLANTED, seconds=2.0):
 
 
 def fitted(path, name):
-    """The models of a log with stiff friction, the one with this effect alone, and a function that
-    makes the world of the other form.
-    """
+    """Return the models with stiff friction, that with this effect, and the soft run evaluator."""
     recording, kind = load_joined([path], None, None, ())
 
     def world(of):
@@ -112,7 +110,7 @@ def test_the_form_that_was_planted_fits_better(tmp_path, form):
 
 
 def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):
-    """Hysteresis is a force, and the same in both forms: the friction that it contains counts."""
+    """Hysteresis contains dry friction, and its force is equal in both forms."""
     models, hysteresis, other = fitted(recorded(tmp_path, "soft"), "friction.hysteresis@elbow")
     soft = choose_friction_form(models, hysteresis, other, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     assert soft is not None
@@ -125,7 +123,7 @@ def test_what_imitates_soft_friction_is_fitted_as_soft_friction(tmp_path):
 
 
 def names_friction_alone(search, held_out):
-    """What the search finds, without the time that it takes: the effect that was planted."""
+    """Replace the search: return the planted effect without the time of a search."""
     effect = "friction.coulomb@elbow"
     base = search.base_model
     search.refit_models([replace(base.fit.make_start(), effects=(effect,))], race=False)
@@ -164,7 +162,7 @@ def test_explain_says_the_form_and_its_files_reproduce_it(tmp_path, monkeypatch,
 
 @pytest.mark.slow
 def test_the_form_of_friction_that_is_free_is_chosen_too(tmp_path, monkeypatch):
-    """It is a parameter and no cause: the files hold its form, and the user is told."""
+    """The form is a parameter, not a cause: the files contain it and the user is informed."""
 
     def names_nothing(search, _):
         return DiagnosisResult(

@@ -1,6 +1,6 @@
-"""Explain finds what a model lacks although a drive is switched off in a part of each run.
+"""Tests that explain finds a missing effect although a drive is off in a part of each run.
 
-The motion is that of plain MuJoCo, whose servo has no gains while it is off.
+Plain MuJoCo makes the motion; its servo has no gains while it is off.
 """
 
 import json
@@ -39,7 +39,7 @@ CASE = SHARED / "cases" / "torque_switched_off" / "log.csv"
 
 
 def recorded(folder, description, has_column=True):
-    """The path of a log of three runs, in which the drive is off for a second and a half."""
+    """Write a log of three runs with the drive off for 1.5 s in each; return its path."""
     rng = np.random.default_rng(4)
     model = mujoco.MjModel.from_xml_string(ROD.format(damping=PLANTED))
     gain, bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
@@ -80,7 +80,7 @@ def test_the_planted_damping_is_found(tmp_path, given):
         "nothing": "the drives of joint hinge do nothing in some samples, which are left out",
     }
     assert sum(notes[given] in line for line in lines) == 1
-    # It stands right below the headline, before any number of a cause.
+    # The note follows the headline and precedes the first coefficient.
     told = " ".join(" ".join(format_summary(found.story)).split()).lower()
     assert told.index(notes[given].lower()) < told.index("coefficient")
     paths = {one.name: one for one in found.write(tmp_path / "out")}

@@ -1,4 +1,4 @@
-"""An end stop that a recording hides: a slider by scipy, that meets it now and then."""
+"""Tests of a hidden end stop, on a slider simulated with SciPy that reaches it at times."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ MASS, NOISE, INTERVAL, SAMPLES = 1.2, 1e-3, 0.02, 150
 
 
 def path(force, speed, stiffness, place, loss):
-    """Positions (SAMPLES,) with Hertz's contact beyond `place`, solved from command to command."""
+    """Return positions (SAMPLES,) with Hertz contact beyond `place`, integrated per command."""
 
     def rate(_t, state, u):
         depth = max(state[0] - place, 0.0)

@@ -1,4 +1,4 @@
-"""Data without noise give no false alarm: differences of the integrators are not explained."""
+"""Tests that noise-free data give no false alarm from differences between integrators."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -77,8 +77,10 @@ NOTHING = LackOfFitResult(0.3, "", np.ones(1), ())
 
 
 def judged(fitted, held_out, left=NOTHING, base_error=1.0):
-    """The verdict on an `unknown` finding without causes: merits of models with one effect on the
-    fitted and on the held-out runs, next to 100 of the base model.
+    """Return the verdict on an `unknown` finding without causes.
+
+    The dictionaries give penalised log-likelihoods of models with one effect on the fitted and on
+    the held-out runs; the base model has 100 on both.
     """
     base = SimpleNamespace(effects=(), penalised_log_likelihood=100.0)
     models = {
@@ -102,12 +104,12 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     ("fitted", "held_out", "refuted"),
     [
         ({"force.ripple@a": 90.0}, {}, True),
-        # Better on the fitted runs by chance, and not on the others.
+        # The effect is better on the fitted runs by chance, but not on the held-out runs.
         ({"force.ripple@a": 105.0}, {"force.ripple@a": 64.0}, True),
         ({"force.ripple@a": 105.0}, {"force.ripple@a": 101.0}, False),
-        # Not simulated on held-out runs: nothing speaks against it.
+        # Without a simulation of the held-out runs, nothing contradicts the effect.
         ({"force.ripple@a": 105.0}, {}, False),
-        # A score alone, which nobody has tried, is not refuted.
+        # A score without any fit is not refuted.
         ({}, {}, False),
     ],
 )
@@ -145,7 +147,7 @@ GRIPPER = """<mujoco><option timestep="0.002" integrator="implicitfast"/>
 
 
 def robot_log(folder, text, driven, resting, channels, noise):
-    """A log that MuJoCo makes with the file's own step: one servo moves, others rest at zero."""
+    """Simulate a log with the step of the file: one servo moves, the others stay at zero."""
     model, rng = mujoco.MjModel.from_xml_string(text), np.random.default_rng(5)
     inputs = [f"u.{name}" for name in (driven, *resting)]
     lines = [",".join(["run", "t", *inputs, *(f"q.{name}" for name in channels)])]

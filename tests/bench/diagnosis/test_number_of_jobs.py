@@ -1,4 +1,4 @@
-"""The answer does not depend on how many processes work."""
+"""Tests that the answer does not depend on the number of processes."""
 
 import json
 import sys
@@ -18,7 +18,7 @@ from tests.bench.diagnosis.explained_samples import recording
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked on Linux alone")
 def test_the_answer_is_the_same_to_the_last_bit_with_one_two_and_eight(monkeypatch):
-    # Small pieces of a small search, all of them given to workers, whatever threads there are.
+    # Use small chunks and force workers for all of them, so that the pool is tested.
     monkeypatch.setattr(worker_pool, "can_fork", lambda: True)
     monkeypatch.setattr(RunEvaluator, "is_cheap_to_split", True)
     monkeypatch.setattr(trajectory_fit, "GROUP_COST_SAMPLES", 10_000)

@@ -1,4 +1,4 @@
-"""A time step or an integrator is a cause only where the file's own is really the worse one."""
+"""Tests that a time step or integrator is a cause only if that of the model file is worse."""
 
 from types import SimpleNamespace
 
@@ -25,8 +25,9 @@ NOISE, EVERY, SECONDS = 3e-4, 2, 3.0
 
 
 def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
-    """A log that MuJoCo makes of the arm, changed, with the file's step or a part of it; the file's
-    own step misses the fine motion by 7 times this noise.
+    """Write a log of a changed arm, simulated with the step of the file or a part of it.
+
+    The step of the file misses the fine motion by 7 times this noise.
     """
     model = mujoco.MjModel.from_xml_string(ARM.replace(*change) if change[0] else ARM)
     step = model.opt.timestep
@@ -54,7 +55,7 @@ def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
 
 
 def chosen(path):
-    """The explainer of a log whose base model is fitted, with the step that it has chosen."""
+    """Return the explainer of a log after the base fit and the choice of the step."""
     subject = _ExplainInput([path], None, None, whole=False, pieces=None)
     said = []
     given = "batch", 0, (), None, said.append, False, SearchControl(), ForkedWorkerPool(1)
@@ -71,7 +72,7 @@ def test_a_missing_mass_does_not_make_the_files_own_step_look_worse(tmp_path, no
     there = chosen(log(tmp_path, HEAVY, noise))
     assert there.coarse is None
     assert there.kind.numerics.integrator == "Euler"
-    # What would make the difference is known, for the comparison with the causes.
+    # The alternative step remains available for the comparison with other causes.
     assert next(iter(there.finer)).error > 5.0
 
 
@@ -86,10 +87,10 @@ def test_a_step_that_is_the_only_thing_wrong_is_found_before_any_cause(tmp_path)
     ("gain", "gap", "left", "better"),
     [
         (400.0, 6.0, 0.1, True),
-        # Most of the gap is still there: something else is missing.
+        # Most of the gap remains, so another effect is missing.
         (279.0, 12.8, 12.7, False),
         (12.0, 1.0, 0.0, False),
-        # Better than the noise is not better than all of the gap.
+        # A residual below the noise does not close more than the whole gap.
         (30.0, 0.5, -0.02, True),
     ],
 )
@@ -102,7 +103,7 @@ def test_when_a_finer_step_is_used_in_the_search(gain, gap, left, better):
     [
         ((24327.0, -0.02), (24346.0, -0.02), True),
         ((24327.0, -0.02), (24333.0, -0.02), False),
-        # The likelihood is larger and so is the residual: neither model is near the data.
+        # Likelihood and residual both increase, so neither model is near the data.
         ((1903.0, 2.2), (2030.0, 3.4), False),
         ((1903.0, 2.2), (2030.0, 0.1), True),
         ((2030.0, -0.01), (1500.0, 6.0), False),

@@ -1,5 +1,7 @@
-"""The same cause is named whichever engine explains: two external simulators, on data that each
-system's batch engine did not make."""
+"""Tests that other engines find the same cause.
+
+Two external simulators explain data that the batch engine of the system did not make.
+"""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Ranges of times follow the recording, and a number at a bound is said to be there."""
+"""Tests that time ranges follow the recording and that parameters at a bound are reported."""
 
 import csv
 import json
@@ -41,7 +41,7 @@ RUNS = (
 
 
 def lagged_tanks(path):
-    """Write a recording of two tanks whose level sensors lag by `LAG`, solved by LSODA."""
+    """Write a recording of two tanks whose level sensors lag by `LAG`, integrated with LSODA."""
 
     def rates(_, h, volts):
         through, away = (a * np.sqrt(2 * 9.81 * x) for a, x in ((UPPER, h[0]), (LOWER, h[1])))
@@ -120,7 +120,7 @@ def test_a_fit_may_move_a_delay_up_to_the_longest_run(seconds):
     ("value", "low", "expected"),
     [
         (0.0, 0.0, "low"),
-        # A small drag is a drag.
+        # A small drag is not at the bound.
         (1e-9, 0.0, None),
         (1e-3 + 1e-9, 1e-3, "low"),
         (0.5, 0.0, None),
@@ -139,7 +139,7 @@ def test_which_bound_a_number_lies_at(value, low, expected):
         (FittedValue(1.0, "s", None, None), False),
         (FittedValue(4.0, "s", None, None, "high"), False),
         (FittedValue(-0.99, "1", None, None, "low"), False),
-        # No friction is as little as there can be.
+        # Zero friction is a result: it is the smallest possible value.
         (FittedValue(0.0, "N", None, None, "low"), True),
     ],
 )
@@ -151,8 +151,9 @@ def test_a_number_at_a_bound_or_without_interval_is_not_a_result(number, result)
 
 @pytest.fixture(scope="module")
 def bounded(tmp_path_factory):
-    """A pendulum with a drag that is larger than the range that a fit is given: friction of a joint
-    that warms for ever stands in for it.
+    """Explain a pendulum with a drag above the limited range of the fit.
+
+    Joint friction that warms without end can take the place of the drag.
     """
     folder = tmp_path_factory.mktemp("bounded")
     path = folder / "swing.csv"
@@ -230,9 +231,9 @@ def test_nothing_of_a_number_at_a_bound_is_written_into_a_model_file():
 @pytest.mark.parametrize(
     ("before", "after", "bent"),
     [
-        # Less than 0.1 %, though far outside both intervals.
+        # The change is below 0.1 %, although it is far outside both intervals.
         ((3.3e-3, 3.29999e-3, 3.30001e-3), (3.3005e-3, 3.30049e-3, 3.30051e-3), False),
-        # Within what the two intervals allow for.
+        # The change is within the two intervals.
         ((1.0, 0.9, 1.1), (1.08, 1.07, 1.09), False),
         ((1.0, 0.99, 1.01), (1.08, 1.07, 1.09), True),
     ],

@@ -1,4 +1,4 @@
-"""What a recording of a robot cannot fix is frozen: a pendulum in MJCF, swung by scipy."""
+"""Tests that unidentified parameters of a robot are fixed, on a pendulum simulated with SciPy."""
 
 import re
 
@@ -18,7 +18,7 @@ LOG = 'model = "swing.xml"\nfree = {free}\n[channels."q.hinge"]\nunit = "rad"\nn
 
 @pytest.fixture
 def log(tmp_path):
-    """A free swing: of mass and inertia only one ratio shows."""
+    """Write a free swing, which determines only one ratio of mass and inertia."""
     rng, times = np.random.default_rng(5), np.arange(0.0, 4.0, 0.02)
     rows = ["run,t,q.hinge"]
     for run, angle in enumerate((0.4, -0.7, 1.0)):
@@ -61,7 +61,7 @@ def test_a_number_that_is_mixed_up_is_frozen_and_said(log):
     numbers = found.answer.parameters
     assert numbers[name].value == 0
     assert numbers[name].low is None
-    # The others are those of the world then, and fixed.
+    # The other parameters are then identifiable and have their true values.
     others = numbers.keys() - {name, "drag.linear@hinge"}
     assert all(abs(numbers[other].value) < 0.01 for other in others)
     assert numbers["drag.linear@hinge"].value == pytest.approx(DAMPING - 0.1, abs=1e-3)

@@ -1,4 +1,4 @@
-"""Ranges for domain randomisation: what they hold, what is left out, and code that runs."""
+"""Tests of ranges for domain randomisation: their content, exclusions and generated code."""
 
 import csv
 import json
@@ -32,13 +32,13 @@ RUBS = "friction.coulomb@*"
 
 
 def number(value, half=None, unit="1", **changes):
-    """A fitted number with a symmetric interval."""
+    """Return a fitted value with a symmetric interval."""
     ends = (None, None) if half is None else (value - half, value + half)
     return FittedValue(value, unit, *ends, **changes)
 
 
 def one(value, half):
-    """The coefficients of an effect that has one."""
+    """Return the coefficients of an effect with one coefficient."""
     return {"coefficient": number(value, half)}
 
 
@@ -72,7 +72,7 @@ def arm(tmp_path_factory):
 
 
 def explanation_of(kind, effects, free=None, verdict="named", alternatives=(), title="a log"):
-    """An explanation with these causes; the first of them has the alternatives."""
+    """Return an explanation with these causes; the first one has the alternatives."""
     observed = [channel.name for channel in kind.channels] if kind else ["q"]
     extended = ExtendedSimulator(
         "arm_extended", "arm", None, title, free or {}, effects, {}, observed, kind,
@@ -93,7 +93,7 @@ def explanation_of(kind, effects, free=None, verdict="named", alternatives=(), t
 
 
 def by_name(explanation):
-    """Ranges by cause and coefficient."""
+    """Return the ranges by cause and coefficient."""
     return {(r.cause, r.coefficient): r for r in explanation.ranges.ranges}
 
 
@@ -121,7 +121,7 @@ def test_a_range_is_the_interval_of_the_number_in_the_model_file(everything):
     assert [f.name for f in stiffness.fields] == ["actuator_gainprm", "actuator_biasprm"]
     assert [stiffness.low, stiffness.high] == pytest.approx([51.0, 57.0])
     inertia = found["inertia.scale@fore", "coefficient"]
-    # The mass of the body scales its inertia too.
+    # The scale of the body's mass also scales its inertia.
     assert inertia.value == pytest.approx(0.009 * 1.25 * 1.1)
     assert [inertia.minimum, inertia.maximum] == pytest.approx([1.25 * 1.05, 1.25 * 1.15])
     late = found["input.delay@m_elbow", "coefficient"]
@@ -226,11 +226,11 @@ def test_files_are_written_together(everything, tmp_path, monkeypatch):
     assert not [path for path in without if path.name.startswith("ranges")]
 
 
-# -- the code for MuJoCo Playground, run with NumPy in place of JAX
+# -- code for MuJoCo Playground, run with NumPy instead of JAX
 
 
 class _Array(np.ndarray):
-    """An array with JAX's way to set an element."""
+    """Array with JAX's method to set elements."""
 
     @property
     def at(self):
@@ -249,7 +249,7 @@ class _Array(np.ndarray):
 
 
 class _Model:
-    """A model with the methods of mjx.Model that a randomiser calls."""
+    """Model with the methods of mjx.Model that a randomiser calls."""
 
     def __init__(self, model, values=None):
         self._model, self._values = model, dict(values or {})
@@ -266,7 +266,7 @@ class _Model:
 
 
 def randomized(code, model):
-    """What the function of a file makes of a model: the low ends first, then the high ones."""
+    """Run the generated function on a model; return the lower ends, then the upper ends."""
     jax = ModuleType("jax")
     jax.numpy = SimpleNamespace(
         array=lambda values: np.array(values).view(_Array), clip=np.clip, max=np.max
@@ -338,11 +338,11 @@ def test_another_model_is_refused_by_the_function(everything):
         randomized(code, other)
 
 
-# -- the code for Isaac Lab, run with recorders in place of its modules
+# -- code for Isaac Lab, run with stub modules that record calls
 
 
 def events(code):
-    """The event terms of a file by name: function and parameters."""
+    """Return function and parameters of the event terms of a file, by name."""
     names = (
         "isaaclab",
         "isaaclab.envs",
@@ -384,7 +384,7 @@ def test_the_event_terms_for_isaac_lab_have_the_ranges(everything):
     }
     stiffness = found["stiffness_shoulder"]["params"]["stiffness_distribution_params"]
     assert stiffness == pytest.approx((51.0, 57.0))
-    # 0.2 of the joint and 3 of its servo in the file, plus 0.3 and times 1.5.
+    # The file has 0.2 of the joint and 3 of its servo; the range adds 0.3 and scales by 1.5.
     damping = found["damping_shoulder"]["params"]["damping_distribution_params"]
     assert damping == pytest.approx((0.4 + 4.2, 0.6 + 4.8))
     spin = found["damping_spin"]["params"]["damping_distribution_params"]
@@ -430,7 +430,7 @@ def test_names_from_files_do_not_become_code(tmp_path):
         assert not line.startswith("import os")
 
 
-# -- the command
+# -- command
 
 
 @pytest.mark.slow

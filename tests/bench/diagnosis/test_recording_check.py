@@ -1,4 +1,4 @@
-"""The check before the fit: what it calls identifiable is, and what is mixed up is named."""
+"""Tests of the check before a fit: identifiable and confounded parameters."""
 
 import re
 
@@ -18,7 +18,7 @@ NOISE = 1e-3
 
 
 def recorded(folder, moved=True, mass=2.0, seed=0, damping=0.0):
-    """Runs of a slider that is pushed, or left alone, with an encoder's noise."""
+    """Write runs of a slider, driven or at rest, with encoder noise; return the path."""
     rng, times = np.random.default_rng(seed), np.arange(150) / 50.0
     runs = []
     for number in range(3):
@@ -77,7 +77,7 @@ def test_what_is_mixed_up_is_named(tmp_path, capsys):
     by_name = {number.name: dict(number.mixed) for number in check_identifiability(path)}
     assert by_name["input.delay"]["input.hold"] > 0.99
     assert by_name["force.bias"]["input.bias"] > 0.999
-    # A gain of the input is a mass: beside the mass, which is free, nothing is left of it.
+    # The gain of the input is confounded with the free mass, so it is not identifiable.
     (gain,) = [n for n in check_identifiability(path) if n.name == "input.gain"]
     assert gain.word == "not identifiable"
     assert main(["inspect", str(path), "--check", "--out", str(tmp_path / "out")]) == 0
@@ -101,7 +101,7 @@ def test_of_many_causes_the_surest_are_listed_and_the_others_counted(tmp_path):
     sure = [n.name for n in causes if n.word == "identifiable"]
     assert len(sure) > 6
     assert f"{len(sure)} identifiable" in lines[2]
-    # Each has an interval, and none is wider than those after it.
+    # Each line has an interval, and they are sorted by width.
     assert all("identifiable     " in line and "±" in line for line in lines[3:6])
     assert lines[6].startswith("  identifiable too: ")
     assert lines[6].endswith(" more")

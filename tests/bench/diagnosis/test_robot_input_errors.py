@@ -1,4 +1,4 @@
-"""Logs that are not what they are said to be: each one line, and never a traceback or a name."""
+"""Tests that logs which contradict their description give a one-line error and no cause."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ TIMES = np.arange(120) / 40.0
 
 
 def table_of(folder, change=lambda v: v, toml=TOML, columns=COLUMNS, model=ARM, second=1.0):
-    """A log of the arm that follows its commands, changed."""
+    """Write a log of the arm following its commands, with changes; return its path."""
     from bench.core.plugin_registries import make_robot_simulator
 
     path = folder / "arm.xml"
@@ -127,7 +127,7 @@ REFUSED = {
     "no robot": ({"model": "<mujoco/>"}, r"no joint that moves"),
     "a free base alone": ({"model": FREE}, r"expected a hinge or slide joint"),
     "unstable": (
-        # Damping that pushes: whatever is tried, it flies away.
+        # Negative damping makes every simulation diverge.
         {"model": ARM.replace('damping="0.1"', 'damping="-500"')},
         r"the simulation fails wherever a fit begins|damping",
     ),

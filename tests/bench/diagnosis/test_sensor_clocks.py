@@ -1,6 +1,4 @@
-"""What clocks do to a log, and that what is hidden besides is named all the same: sliders by scipy
-with dry friction, or with nothing.
-"""
+"""Tests of clock errors in logs, and of hidden effects in them, on sliders simulated with SciPy."""
 
 import numpy as np
 import pytest
@@ -14,13 +12,13 @@ NOISE, MASS, INTERVAL = 1e-3, 2.0, 0.02
 
 
 def log(folder, coulomb, stamp=None, lost=0.0, drift=0.0, seed=0, seconds=6.0):
-    """Three runs: a force that changes at every stamp, a position that is read there.
+    """Write three runs with a force that changes and a position that is read at every stamp.
 
     Args:
-        coulomb: N.
-        stamp: makes stamps of even ones.
-        lost: share of the sensor's samples that are missing.
-        drift: share by which the sensor's clock is fast.
+        coulomb: dry friction in N.
+        stamp: function that makes time stamps from equidistant ones.
+        lost: fraction of the sensor's samples that are missing.
+        drift: fraction by which the sensor's clock is fast.
     """
     rng = np.random.default_rng(seed)
     rows = ["run,t,u,x"]
@@ -88,7 +86,7 @@ def test_the_census_says_what_the_clock_does(tmp_path, clock):
     )
     told = [finding.text_line for finding in found if finding.about in ("clock", "drift")]
     if clock == "5 % of the samples lost":
-        # They are empty cells: the table of channels says so, and the clock is even.
+        # Lost samples are empty cells: the table of channels reports them, and the clock is even.
         assert told == []
     elif "drift" not in clock:
         (line,) = told
@@ -97,7 +95,7 @@ def test_the_census_says_what_the_clock_does(tmp_path, clock):
 
 
 def test_a_slip_in_the_only_run_is_named_at_its_stamp_and_borne_out_by_what_follows(tmp_path):
-    """A pendulum by scipy, in a log whose stamps begin at 100 s; its last third is held out."""
+    """The log of a pendulum has stamps from 100 s on; its last third is held out."""
     times, mass, length, inertia = np.arange(0.0, 5.0, 0.02), 0.15, 0.1, 3.3e-3
 
     def rate(_t, state):

@@ -1,5 +1,7 @@
-"""The example of two tanks: its recording is what its script makes, the simulator is what the
-script solves, and explain finds the rim that the recording hides, and none where there is none.
+"""Tests of the example of two tanks.
+
+Its script makes the recording and agrees with its simulator. Explain finds the hidden rim, and
+no rim in a recording without one.
 """
 
 import importlib.util
@@ -20,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("fresh_registries")
 
 @pytest.fixture
 def made():
-    """The script that makes the recording; the example's simulator is registered."""
+    """Load the script that makes the recording, and register the example's simulator."""
     spec = importlib.util.spec_from_file_location("tanks_log", EXAMPLES / "tanks" / "make_log.py")
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)

@@ -1,5 +1,6 @@
-"""A joint that gives, of whose drive the file states no inertia: what the drive weighs shows first,
-and what gives behind it, by matrix exponentials.
+"""Tests of an elastic joint whose drive inertia the model file lacks, with matrix exponentials.
+
+The inertia of the drive is found first, then the compliance on the load side.
 """
 
 import numpy as np
@@ -36,7 +37,7 @@ TIMES = np.arange(151) / 100.0
 
 
 def turned(torque):
-    """(T,) of the drive's side, whose torque holds from sample to sample; begun at rest."""
+    """Return (T,) angles of the drive side from rest; torques are held between samples."""
     spring = np.array([STIFF, DAMPED])
     rates = np.zeros((5, 5))
     rates[0, 1] = rates[2, 3] = 1.0

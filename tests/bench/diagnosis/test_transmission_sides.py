@@ -1,4 +1,4 @@
-"""What explain fits, what only measures, and what its seed draws."""
+"""Tests of the separation of fitted and held-out runs in explain, and of its seed."""
 
 from dataclasses import replace
 
@@ -11,12 +11,12 @@ from tests.bench.diagnosis.explained_samples import recorded, with_runs
 
 TIMES = np.arange(40) / 25
 FITTED, HELD_OUT = 3.3e-3, 3.6e-3
-"""Inertia in kg m^2 of the runs on either side."""
+"""Inertia in kg m^2 of the fitted and of the held-out pendulum."""
 
 
 @pytest.fixture(scope="module")
 def recording():
-    """Two runs of one pendulum and one of another, which is held out."""
+    """Return two runs of one pendulum and a held-out run of another."""
     noise = [0.003, 0.02]
     fitted = recorded(Pendulum(), [FITTED], [{"q": 0.6}, {"q": 1.2}], TIMES, noise, seed=1)
     other = recorded(Pendulum(), [HELD_OUT], [{"q": 0.9}], TIMES, noise, seed=2)
@@ -33,7 +33,7 @@ def test_parameters_are_those_of_the_fitted_runs_and_errors_those_of_the_held_ou
     inertia = found.parameters["inertia"]
     assert inertia.value == pytest.approx(FITTED, rel=0.005)
     assert inertia.low < FITTED < inertia.high < HELD_OUT
-    # The other pendulum swings slower, so that its phase runs away from the fitted one's.
+    # The held-out pendulum swings slower, so its phase departs from that of the fitted one.
     apart = [
         recorded(Pendulum(), [theta], [{"q": 0.9}], TIMES).runs[0].channels["q"]
         for theta in (FITTED, HELD_OUT)

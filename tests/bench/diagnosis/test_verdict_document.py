@@ -1,4 +1,4 @@
-"""The verdict as an object: what verdict.json says of it, and what a person sees of it."""
+"""Tests of the verdict object: verdict.json and the text for the user."""
 
 import json
 from dataclasses import FrozenInstanceError, replace

@@ -1,6 +1,4 @@
-"""What verdict.json must look like, checked by hand: the design's keys and types, and no key
-besides.
-"""
+"""Hand-written schema of verdict.json: the exact keys and their types."""
 
 import json
 from math import isfinite
@@ -49,7 +47,7 @@ def estimate(value):
 
 
 def check(text):
-    """Check the text of a verdict.json; returns what it says."""
+    """Check the text of a verdict.json; return its content."""
 
     def refuse(name):
         raise AssertionError(f"{name} is not JSON")

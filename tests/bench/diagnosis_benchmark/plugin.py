@@ -1,4 +1,4 @@
-"""Diagnosers outside the project: a short one, and some that misbehave."""
+"""External diagnosers: a short one, and some that violate the rules."""
 
 import os
 import time
@@ -10,7 +10,7 @@ from simgap import Answer, Diagnoser, NamedCause
 
 
 class Fifteen(Diagnoser):
-    """Alarms where a line through the motion changes more from run to run than noise says."""
+    """Diagnoser that names drag where a run deviates from the simulation by 0.5 or more (std)."""
 
     name = "fifteen"
 
@@ -26,16 +26,16 @@ class Fifteen(Diagnoser):
 
 
 WHERE = "/tmp"
-"""Where the truth lies; a test writes the very folder here."""
+"""Folder with the true causes; a test replaces this path."""
 
 
 class Peeks(Diagnoser):
-    """Looks for the truth where it lies, and in the memory of who knows it."""
+    """Diagnoser that searches for the true causes in the file system and in other processes."""
 
     name = "peeks"
 
     def diagnose(self, case):
-        # That a file is there may be seen; what is in it may not.
+        # It may see that a file exists, but not its content.
         found = [text for path in Path(WHERE).rglob("*") for text in read(path)]
         for process in Path("/proc").glob("[0-9]*"):
             if process.name != str(os.getpid()):
@@ -68,7 +68,7 @@ class Crashes(Diagnoser):
 
 
 class Declines(Diagnoser):
-    """Knows no sliders."""
+    """Diagnoser that declines sliders."""
 
     name = "declines"
 
@@ -90,7 +90,7 @@ class Spends(Diagnoser):
 
 
 class Lies(Diagnoser):
-    """Says that it has used fewer simulations than none."""
+    """Diagnoser that reports a negative number of simulations."""
 
     name = "lies"
 

@@ -1,4 +1,4 @@
-"""What a diagnoser may answer, and what its simulations cost."""
+"""Tests of the answers of a diagnoser and of the cost of its simulations."""
 
 import pytest
 
@@ -60,7 +60,7 @@ def test_every_lane_is_counted():
 
 
 class Counts(Diagnoser):
-    """One that simulates each run once, and looks at what it got."""
+    """Diagnoser that simulates each run once and checks the result."""
 
     name = "counts"
 

@@ -1,4 +1,4 @@
-"""The page of a comparison of diagnosers, of the answers in results/reference/diagnosis."""
+"""Tests of the comparison page of diagnosers, with the answers in results/reference/diagnosis."""
 
 import re
 
@@ -58,7 +58,7 @@ def opened(browser, page):
 
 
 def wrong_of(rows, diagnoser):
-    """Questions that a diagnoser got wrong, counted by hand."""
+    """Count directly the cases that a diagnoser got wrong."""
     own = rows[rows["diagnoser"] == diagnoser]
     clean, foreign = own["kind"] == "clean", own["kind"] == "foreign"
     named = ~clean & ~foreign & ((own["kind"] == "double") | (own["size"] >= 1))
@@ -83,7 +83,7 @@ def test_what_simgap_gets_wrong_comes_first(opened):
     said = opened.page.locator(".conclusion li").all_inner_texts()
     clean = rows[(rows["diagnoser"] == "simgap") & (rows["kind"] == "clean")]
     alarms = int(clean["alarm"].sum())
-    top = beta.ppf(0.975, alarms + 1, len(clean) - alarms)  # Clopper and Pearson's end
+    top = beta.ppf(0.975, alarms + 1, len(clean) - alarms)  # upper limit of Clopper and Pearson
     counted = "1 alarm leaves" if alarms == 1 else f"{alarms} alarms leave"
     assert any(f"{counted} up to {format_percent(top)}" in text for text in said)
 
@@ -101,7 +101,7 @@ def test_the_view_is_in_the_address(browser, opened, page):
         key = again.page.locator("#power .legend .key", has_text="stlsq").first
         assert key.get_attribute("aria-pressed") == "false"
     rows = len(answers())
-    # Tables leave out who is switched off.
+    # Tables omit diagnosers that are switched off.
     assert opened.text("#answers .count") == f"{rows - rows // len(ORDER)} of {rows} rows"
     opened.page.locator("#power .legend .key", has_text="stlsq").first.click()
     assert opened.text("#answers .count") == f"{rows} of {rows} rows"
@@ -131,7 +131,7 @@ def test_on_a_phone_and_without_a_script(browser, page):
 
 
 def test_one_who_is_better_than_simgap_is_said_to_be():
-    """simgap and the Gaussian process change their names, and with them their answers."""
+    """The labels, and so the answers, of simgap and of the Gaussian process are swapped."""
     rows = answers()
     swapped = rows.assign(diagnoser=rows["diagnoser"].replace({"simgap": "gp", "gp": "simgap"}))
     said = re.sub("<[^>]*>", "", render_page(shown(swapped)))
@@ -174,7 +174,7 @@ def test_the_confusion_of_families_counts_each_recording_once():
     shares = panel.images[0].get_array()
     place = labels.index(f"friction {len(friction)}")
     assert shares[place].sum() == pytest.approx(100.0)
-    # What is told as another of its family is told as that family.
+    # A diagnosis of another effect of the family counts as that family.
     told = friction["found_class"] | friction["named"].astype(str).str.startswith("friction.")
     told &= (friction["verdict"] != "unknown") & ~friction["named"].astype(str).str.contains(
         "+", regex=False

@@ -1,4 +1,4 @@
-"""The numbers of the board's page are those of its tables."""
+"""Tests that the numbers of the board's page are those of its tables."""
 
 import re
 
@@ -76,7 +76,7 @@ def test_what_simgap_does_not_name_stands_first():
 
 
 def test_every_count_of_the_page_is_in_a_table():
-    """Whatever reads `N of M`: of some diagnoser and metric, or of a group."""
+    """Each text `N of M` is a count of a diagnoser and metric, or of a group."""
     groups = pd.read_csv(FOLDER / "groups.csv")
     known = {
         (int(a), int(b)) for frame in (TABLE, groups) for a, b in frame[["count", "of"]].values

@@ -1,4 +1,4 @@
-"""A comparison of diagnosers: plugins in it, what misbehaves, what is kept."""
+"""Tests of a comparison of diagnosers: plugins, rule violations and stored files."""
 
 import csv
 import json
@@ -42,7 +42,7 @@ MISBEHAVING = ("peeks", "hangs", "crashes", "spends", "lies")
 
 
 def main(arguments):
-    """As in a process of its own: no plugin is known after it."""
+    """Run the command as in a separate process: registered plugins are removed afterwards."""
     before = [registry.snapshot() for registry in REGISTRIES]
     try:
         return cli.main(arguments)
@@ -53,7 +53,7 @@ def main(arguments):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Comparisons of diagnosers draw nothing: those of `made` do."""
+    """Disable the figures, which have tests of their own."""
     monkeypatch.setattr("bench.diagnosis_benchmark.diagnoser_report.draw_figures", lambda *_: {})
 
 
@@ -119,7 +119,7 @@ def test_what_fails_costs_itself_and_stays_in_the_table(made):
     assert "cannot have used" in rows["lies"]["reason"]
     assert {rows[name]["outcome"] for name in ("hangs", "crashes", "spends", "lies")} == {"failed"}
     clean = {row["diagnoser"]: row for row in items(out) if row["kind"] == "clean"}
-    assert clean["hangs"]["alarm"] == "True"  # no answer is none that one could rely on
+    assert clean["hangs"]["alarm"] == "True"  # a missing answer is not reliable
 
 
 def test_python_reads_what_the_command_has_made(made):
@@ -177,7 +177,7 @@ def test_it_goes_on_where_it_was(made, tmp_path, capsys):
     given = ["--plugin", str(PLUGIN), "--jobs", "1"]
     assert main(["compare", str(path), "--out", str(out), *given]) == 0
     lines = (out / ANSWERS_FILE).read_text().splitlines(keepends=True)
-    (out / ANSWERS_FILE).write_text(lines[0] + lines[1][:40])  # as if it had been killed
+    (out / ANSWERS_FILE).write_text(lines[0] + lines[1][:40])  # as if the run had been killed
     capsys.readouterr()
     assert main(["status", str(out)]) == 1
     assert "1 of 2 answers given" in capsys.readouterr().out
@@ -185,7 +185,7 @@ def test_it_goes_on_where_it_was(made, tmp_path, capsys):
     assert set(read_answers(out)) == {"clean/slider/0", "single/slider/drag.linear/8/50/3/0"}
     first = json.loads(lines[0])
     again = read_answers(out)[first["question"]]["rows"]["fifteen"]
-    assert again == first["rows"][0]  # and was not asked again
+    assert again == first["rows"][0]  # and was not evaluated again
     capsys.readouterr()
     assert main(["plot", str(out), "--json"]) == 0
     (said,) = json.loads(capsys.readouterr().out)["comparisons"]
@@ -204,7 +204,7 @@ def test_a_secret_is_kept_until_the_end_and_draws_other_questions(tmp_path):
     secret = ["--secret", "nobody knows", "--plugin", str(PLUGIN), "--jobs", "1"]
     assert main(["compare", str(path), "--out", str(out), *secret]) == 0
     configuration = (out / "experiment.toml").read_text()
-    assert "nobody knows" in configuration  # revealed, as nothing is left to ask
+    assert "nobody knows" in configuration  # revealed, as the study is complete
     names = {one["item"]["name"] for one in read_answers(out).values()}
     drawn = {q.draw_case(0).name for q in build_case_set(read_config(public))}
     assert not names & drawn

@@ -1,5 +1,7 @@
-"""A servo and an arm of two joints, by equations of their own: they move as simgap's simulators do
-with each effect, as mechanics says, and hide what they say they hide.
+"""Tests of a servo and a two-joint arm with independent equations.
+
+They move as simgap's simulators do with each effect and as mechanics requires, and their files do
+not reveal the hidden effects.
 """
 
 from dataclasses import replace
@@ -56,7 +58,7 @@ SOMEWHERE = {
     "mass.scale": (0.2,), "servo.deadband": (0.05,),
 }  # fmt: skip
 SOFT = 1e-3
-"""rad: MuJoCo's dry friction and drives bend no sharper than its step; see docs/engines.md."""
+"""Tolerance in rad: MuJoCo smooths dry friction and drives over its step; see docs/engines.md."""
 
 
 def commands(plant):
@@ -113,7 +115,7 @@ def test_each_effect_does_what_the_library_says(system, name, arm):
     change = np.abs(own - seen(system, {})).max()
     tolerance = SOFT if system == "arm2" else 2e-4
     assert np.abs(own - other).max() < tolerance
-    assert change > 10 * tolerance  # or else the agreement says nothing
+    assert change > 10 * tolerance  # otherwise the agreement is meaningless
     assert len(list_coefficient_names(system, name)) == len(c)
 
 
@@ -154,7 +156,7 @@ def test_foreign_causes_push_where_and_when_they_say():
     assert np.abs(gust - bare)[TIMES <= 0.6].max() == 0.0
     assert np.abs(gust - bare).max() > 0.01
     patch = seen("arm2", {}, {"patch@shoulder": (0.5, 5.0, 0.1)})
-    assert np.abs(patch - bare).max() < 1e-6  # it never goes there
+    assert np.abs(patch - bare).max() < 1e-6  # the arm never reaches the patch
 
 
 def case_of(item, folder):
@@ -207,6 +209,6 @@ def test_a_family_beside_one_of_its_places_is_one_answer():
     hidden = replace(item, kind="single", effects={"friction.coulomb@elbow": (1.0,)})
     cause = {"effect": "friction.coulomb@*", "alternatives": [], "coefficients": {}}
     verdict = {"verdict": "named", "causes": [cause], "parameters": {}}
-    assert grade_answer(hidden, verdict).outcome == "wrong"  # it says that the shoulder rubs too
+    assert grade_answer(hidden, verdict).outcome == "wrong"  # the shoulder has no friction
     cause["alternatives"] = ["friction.coulomb@elbow"]
     assert grade_answer(hidden, verdict).class_size == 1

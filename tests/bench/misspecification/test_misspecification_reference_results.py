@@ -1,4 +1,4 @@
-"""The README of the reference results says what its tables do."""
+"""Tests that the README of the reference results agrees with their tables."""
 
 import re
 
@@ -17,7 +17,7 @@ TABLE = pd.read_csv(FOLDER / "table.csv")
 
 
 def of(metric, model, tuner=FIT):
-    """Rows by system."""
+    """Return the rows of a metric, model and tuner, by system."""
     chosen = TABLE[(TABLE["metric"] == metric) & (TABLE["model"] == model)]
     return chosen[chosen["tuner"] == tuner].set_index("experiment")
 

@@ -1,8 +1,8 @@
-"""A study of a missing effect from begin to figures, on a world whose bias is known beforehand.
+"""Tests of a model-misspecification study, from its start to its figures, with a known bias.
 
-The shot's restitution falls with the impact's speed, e = e0 v^c, and its simulator knows no c. One
-impact is seen, at the speed v = sqrt(2 g H) cos(a) off an incline of angle a, so the best fit is
-e0 v^c, whatever the tuner: biased by e0 (v^c - 1).
+The shot's restitution falls with the impact speed, e = e0 v^c, and its simulator has no c. One
+impact is observed, at the speed v = sqrt(2 g H) cos(a) off an incline of angle a, so the best fit
+is e0 v^c for every tuner: biased by e0 (v^c - 1).
 """
 
 import json
@@ -40,13 +40,13 @@ from sims.recording.recording import read_recording
 EXPONENT, GRAVITY = -0.1, 9.81
 SHOT = load_experiment("misspecified-shot")
 WIDTH = 0.4
-"""Of restitution's training range, 0.5 to 0.9."""
+"""Width of the training range of restitution, 0.5 to 0.9."""
 
 
 def small(**changes) -> Experiment:
-    """The shot, short: three targets, a tuner that finds the optimum and one that guesses."""
+    """Return a short shot experiment: three targets, a least-squares tuner and a random one."""
     chosen = SHOT.with_tuners(["least_squares", "random"]).with_seeds(1)
-    # Held-out shots are higher, where the speed matters most.
+    # Held-out shots start higher, where the dependence on speed is largest.
     return replace(chosen, targets=3, budget=12, salt="public", trusted=True, **changes)
 
 
@@ -120,7 +120,7 @@ def test_the_recordings_truth_is_none_of_the_targets(tmp_path):
     assert made[0] != other[0]
     truths = [target.truth[0] for target in TuningProblem(small(), "secret").draw_targets()]
     assert made[0] not in truths
-    # Six runs of 120 samples and two channels are enough to tell the noise to a tenth.
+    # Six runs of 120 samples and two channels determine the noise to a tenth.
     seen = read_recording(tmp_path / "a.csv", simulators.get("bounce-shot")).runs
     world = TuningProblem(small(), "secret").world
     left = [
@@ -226,7 +226,7 @@ def test_worlds_have_what_the_simulators_lack(name):
     point = problem.cube.to_unit_cube(target.truth)[None]
     ours = problem.simulate(point, target.blinded.fitting.scenarios)[0]
     left = (ours - target.blinded.fitting.observed) / problem.noise
-    # At the truth a simulator that lacked nothing would leave the noise alone.
+    # Without a missing effect, the residual at the true parameters would be noise only (RMS 1).
     assert np.sqrt(np.mean(left**2)) > 3
 
 
@@ -290,7 +290,7 @@ def test_targets_that_not_all_have_met_are_left_out(folder):
     left = misspecification_scores._whole(lacking)
     assert set(left["target"]) == {"in-000", "in-002"}
     assert len(left) == 2 * 2 * 2
-    # A seed that is missing is a target that is not met.
+    # A target with a missing seed counts as incomplete.
     seeds = one.assign(runs=3)
     seeds.loc[seeds.index[0], "runs"] = 2
     assert set(misspecification_scores._whole(seeds)["target"]) == {"in-001", "in-002"}

@@ -1,4 +1,4 @@
-"""Many logs, each by itself: a folder for each, one table, and nothing made twice."""
+"""Tests of the separate explanation of many logs: a folder per log, one table, no repeated work."""
 
 import csv
 import hashlib
@@ -24,7 +24,7 @@ NOISE = 1e-3
 
 
 def log(folder, name, friction, seed):
-    """Runs of a slider that is pushed, with dry friction, and an encoder's noise."""
+    """Write runs of a driven slider with dry friction and encoder noise; return the path."""
     rng, times = np.random.default_rng(seed), np.arange(150) / 50.0
     simulator = Slider(observe=["x"], effects=["friction.coulomb"])
     runs = []
@@ -94,7 +94,7 @@ def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(l
     assert "1 could not be explained" in (out / "report.html").read_text(encoding="utf-8")
     assert "bad.toml" in first[2]["error"]
     stamps = [(out / f"day{k}" / "verdict.json").stat().st_mtime_ns for k in range(2)]
-    # Mended, and one log more: only these two are explained.
+    # After the repair, only the bad log and the added log are explained.
     log(tmp_path, "bad2", 0.5, 9)
     bad.write_bytes((tmp_path / "bad2.csv").read_bytes())
     bad.with_suffix(".toml").write_bytes((tmp_path / "bad2.toml").read_bytes())
@@ -104,7 +104,7 @@ def test_a_log_that_cannot_be_explained_costs_no_other_and_what_is_there_stays(l
     assert "<strong>4 named</strong>" in page
     again = [(out / f"day{k}" / "verdict.json").stat().st_mtime_ns for k in range(2)]
     assert again == stamps
-    # Asked otherwise, everything is another question.
+    # A changed option (here the seed) invalidates all stored results.
     assert explain(logs[:1], out, "--jobs", "1", "--seed", "3") == 0
     assert (out / "day0" / "verdict.json").stat().st_mtime_ns != stamps[0]
 

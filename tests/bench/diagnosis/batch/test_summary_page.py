@@ -1,4 +1,4 @@
-"""The page of many logs in a real browser: what it says, and that it leads to each log's own."""
+"""Tests of the summary page of many logs in a browser: its content and its links to the reports."""
 
 import json
 from dataclasses import replace
@@ -27,8 +27,9 @@ def cause(value, effect="friction.coulomb@elbow", alternatives=("joint.backlash@
 
 
 def made(tmp_path, count=4, left=2):
-    """Rows of so many logs with a cause, one without, one that failed; the folders of those that
-    were explained.
+    """Return results of `count` logs with a cause, one without and one failed, and the page input.
+
+    The page input has the folders of the explained logs.
     """
     rows = [
         LogResult(ODD if k == 0 else f"day{k}", "d", "ambiguous", (cause(0.1 * (k + 1)),), 0.9, 1.5)
@@ -74,7 +75,7 @@ def test_the_page_says_what_was_found_and_leads_to_every_log(browser, tmp_path, 
         assert together.count(".csv") == 4
         assert "bad.csv" not in together
         first = page.locator("#each tbody tr").first.locator("td").all_inner_texts()
-        # Errors of 20 and 3 above a floor of 2.
+        # The errors are 20 and 3, and the noise floor is 2.
         assert first[:9] == [
             ODD, "1", "ambiguous", EFFECTS,
             "0.9", "0.8", "0.95", "10", "1.5",
@@ -135,7 +136,7 @@ def test_no_number_beside_a_chart_is_cut_off(browser, tmp_path):
     asked = replace(asked, folders=folders, recordings=folders)
     file = tmp_path / "small.html"
     file.write_text(render_summary_page(small, asked), encoding="utf-8")
-    # Whatever is drawn in the first column of pixels is cut off there.
+    # A mark in the first column of pixels would be cut off by the edge of the canvas.
     column = """() => {
         const canvas = document.querySelector("#found canvas");
         const data = canvas.getContext("2d").getImageData(0, 0, 1, canvas.height).data;

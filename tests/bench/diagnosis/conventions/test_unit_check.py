@@ -1,6 +1,4 @@
-"""Wrong units and reversed signs are recognised before a search, and nothing else is taken for
-them.
-"""
+"""Tests that wrong units and reversed signs are detected before a search, without false alarms."""
 
 import json
 import re
@@ -44,8 +42,11 @@ WISHES = {
 
 
 def swing(folder, stated=None, factors=None):
-    """A recording of a pendulum in a folder, with units other than SI stated, or numbers that were
-    multiplied.
+    """Write a pendulum recording with wrong units or scaled values; return its path.
+
+    Args:
+        stated: wrong unit of each of these signals in the description.
+        factors: factor by which the values of each of these signals are multiplied.
     """
     simulated = simulate_recording(Wish("pendulum", **WISHES["pendulum"]))
     path = folder / "swing.csv"
@@ -66,7 +67,7 @@ def swing(folder, stated=None, factors=None):
 
 
 def fault_of(path=None, recording=None, kind=None):
-    """What the check finds in a recording."""
+    """Return the wrong unit or sign that the check finds, or None."""
     if recording is None:
         recording, kind = load_joined([path], None, None, ())
     kind = kind or simulators.get(recording.system)
@@ -98,7 +99,8 @@ def test_what_is_stated_wrongly_is_named_with_the_line_that_corrects_it(
     assert found is not None
     assert found.signals == signals
     assert found.lines[0] == line
-    # The stated noise is that of a column in the right unit, and may be too small by the factor.
+    # The specified noise is for the correct unit and may be too small by the factor, so only the
+    # ratio of the errors is checked in all cases.
     assert found.error_after < 0.02 * found.error_before
     if not factors:
         assert found.error_after < 1.1
@@ -175,7 +177,7 @@ def test_a_robot_that_lacks_a_friction_too_is_told_its_wrong_unit(factors, line)
 @pytest.mark.slow
 @pytest.mark.parametrize("system", WISHES)
 def test_neither_clean_recordings_nor_gains_nor_causes_are_called_wrong_units(system):
-    """Forty clean recordings, and true errors of 5 % and more."""
+    """Check 14 clean recordings and true errors of 5 % and more for each system."""
     effects = {
         "pendulum": ["sensor.gain=0.05", "input.gain=-0.3", "friction.coulomb=0.01"],
         "slider": ["sensor.gain=-0.05", "input.gain=0.4", "friction.coulomb=1", "force.bias=2"],
@@ -191,7 +193,7 @@ def test_neither_clean_recordings_nor_gains_nor_causes_are_called_wrong_units(sy
 def test_a_true_gain_near_a_conversion_is_not_a_unit():
     recording = simulate_recording(Wish("pendulum", **WISHES["pendulum"])).recording
     subject = Subject(simulators.get("pendulum"), recording, "batch")
-    # Turns for radians would be 2 pi: 4.5 % from it, the misfit falls by 95 %.
+    # A turn is 2 pi rad, 4.5 % more than 6: its factor reduces the misfit by 95 %.
     assert fault_of(recording=subject.rescaled({"q": 1 / 6.0})) is None
 
 
@@ -204,7 +206,7 @@ def test_a_true_gain_near_a_conversion_is_not_a_unit():
         ("input.gain", -1.99, "[inputs.u] scale = -1"),
         ("input.gain", 1e-3 - 1, '[inputs.u] unit = "mN*m"'),
         ("sensor.gain", -0.96, None),
-        # The lower bound of the range: the fit asks for less.
+        # This is the lower bound of the range; the fit would go below it.
         ("sensor.gain", -0.8, None),
     ],
 )

@@ -1,4 +1,4 @@
-"""One recording with known numbers, explained once, and its sheet."""
+"""Fixtures of one recording with known parameters, its explanation and its data sheet."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def sheet(log: Path, explained: Explanation) -> DataSheet:
 
 @pytest.fixture(scope="session")
 def files(log: Path, explained: Explanation, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command writes, from what explain has written."""
+    """Return the folder that the datasheet command writes from a saved explanation."""
     folder = tmp_path_factory.mktemp("made")
-    # The two of its files that are read again; to draw its figures takes seconds.
+    # The command reads only these two files; to draw the figures as well would take seconds.
     (folder / "verdict.json").write_text(json.dumps(explained.answer.to_document()))
     extended_simulator.write_extended(explained.extended, folder / "extended.toml")
     given = ["--from", str(folder), "--name", NAME, "--out", str(folder / "sheet")]

@@ -1,4 +1,4 @@
-"""A servo that carries a pendulum, with dry friction, stepped by no code under test."""
+"""Simulated servo with a pendulum and dry friction, independent of the code under test."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 TRUTH = {"torque_constant": 0.4, "resistance": 5.0, "armature": 0.002}
 FRICTION = 0.06
-"""N m."""
+"""Dry friction in N m."""
 CONSTANTS = {
     "mass": 0.4,
     "length": 0.1,
@@ -18,17 +18,17 @@ CONSTANTS = {
     "kp": 200.0,
 }
 NOISE = 0.004
-"""rad."""
+"""Standard deviation of the sensor noise in rad."""
 STEP = 1e-4
 EVERY = 100
-"""Steps from sample to sample."""
+"""Number of integration steps per sample."""
 SAMPLES = 300
 HELD = 5000
-"""Steps for which each command holds."""
+"""Number of integration steps for which each command is held."""
 
 
 def swings(rng: np.random.Generator) -> list[tuple[float, float, float]]:
-    """Time, command and noisy angle of one run, by the equations of a direct-current motor."""
+    """Return (time, command, noisy angle) of one run from the equations of a DC motor."""
     k, c = TRUTH, CONSTANTS
     inertia = k["armature"] + c["mass"] * c["length"] ** 2
     goals = rng.uniform(-1.5, 1.5, 1 + EVERY * SAMPLES // HELD)
@@ -46,14 +46,14 @@ def swings(rng: np.random.Generator) -> list[tuple[float, float, float]]:
             continue
         way = np.sign(rate) if rate else np.sign(pull)
         faster = rate + STEP * (pull - FRICTION * way) / inertia
-        # Friction stops a motion, and does not turn it round.
+        # Friction stops a motion but does not reverse it.
         rate = 0.0 if faster * rate < 0 else float(faster)
         angle += STEP * rate
     return rows
 
 
 def written(folder: Path, runs: int = 3, seed: int = 0) -> Path:
-    """A recording of it."""
+    """Write a recording of the servo; return its path."""
     rng = np.random.default_rng(seed)
     lines = ["run,t,goal,torque_enable,q"]
     for run in range(runs):

@@ -1,4 +1,4 @@
-"""The sheet of a servo whose numbers are known."""
+"""Tests of the data sheet of a servo with known parameters."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_what_was_put_in_lies_within_the_intervals(sheet: DataSheet) -> None:
         assert number.low is not None
         assert number.high is not None
         assert number.low <= value <= number.high, name
-        # An interval that holds everything would hold the truth, too.
+        # Without this limit, an arbitrarily wide interval would pass the test.
         assert number.high - number.low < 0.1 * abs(value), name
 
 
@@ -61,7 +61,7 @@ def test_a_ratio_is_known_better_than_its_parts(sheet: DataSheet) -> None:
         assert number.high is not None
         return (number.high - number.low) / number.value
 
-    # What shows is the torque for each volt: errors of its two parts go together.
+    # The data determine the torque per volt, so the errors of its two factors are correlated.
     assert width("torque constant over resistance") < 0.5 * width("resistance")
 
 
@@ -69,14 +69,14 @@ def test_what_is_not_there_is_not_shown_within_what_these_data_resolve(sheet: Da
     absent = [row for row in sheet.rows if row.number is None]
     names = {row.name for row in absent}
     assert {"drag.linear", "servo.deadband", "input.delay", "sensor.bias", "backlash"} <= names
-    # The plain friction of a richer law is that which was found: it is told once.
+    # The Coulomb part of a richer law is the friction already found, so it is listed only once.
     assert "friction.stribeck coulomb" not in names
     leaning = [
         row.name
         for row in absent
         if row.detection_limit and row.detection_limit.is_nonzero_if_fitted
     ]
-    # One in twenty of what is not there leans by more than its interval.
+    # On average, one in 20 absent effects has an interval that excludes zero.
     assert len(leaning) <= 0.2 * len(absent)
 
 
@@ -90,8 +90,9 @@ def test_the_terminal_names_few_of_the_effects_that_are_not_shown(sheet: DataShe
 
 
 def test_what_the_data_resolve_is_what_least_squares_says(sheet: DataSheet) -> None:
-    """An offset of the sensor, in a motion that gravity bends little: its interval is no narrower
-    than that of a mean, and not much wider than that of the pose that gravity tells.
+    """The detection limit of a sensor bias is between 1 and 30 times the half width of a mean.
+
+    The motion determines the bias by gravity, which has little effect here.
     """
     reach = row(sheet, "sensor.bias").detection_limit
     assert reach is not None
@@ -100,7 +101,7 @@ def test_what_the_data_resolve_is_what_least_squares_says(sheet: DataSheet) -> N
 
 
 def test_drag_cannot_be_told_from_the_motors_own(sheet: DataSheet) -> None:
-    """With any drag c, kt and R may be such that kt / R and kt^2 / R + c stay as they are."""
+    """Any drag c fits the data if kt and R keep kt / R and kt^2 / R + c constant."""
     reach = row(sheet, "drag.linear").detection_limit
     assert reach is not None
     assert {"torque_constant", "resistance"} <= set(reach.confounded_with)
@@ -121,11 +122,12 @@ def test_gaps_show_from_a_size_on_and_limits_up_to_one(sheet: DataSheet) -> None
     assert band is not None
     assert clipped is not None
     assert slow is not None
-    # Friction holds the arm off by up to 0.17 rad: a dead zone of a tenth of that moves it.
+    # Friction stops the arm up to 0.17 rad from its goal, so a dead zone of a tenth of this is
+    # visible.
     assert dead.limit == band.limit == "above"
     assert 0 < dead.size < 0.02
     assert 0 < band.size < 0.05
-    # Commands go to 1.5 rad, and jump: any limit of their rate would show.
+    # Commands reach 1.5 rad and contain steps, so any rate limit would be visible.
     assert clipped.limit == slow.limit == "below"
     assert 1.0 < clipped.size < 1.5
     assert slow.size > 10
@@ -138,13 +140,13 @@ def test_what_another_run_may_say_is_no_less_than_what_these_say(sheet: DataShee
         assert found.number.low is not None
         assert found.prediction_half_width is not None
         half = found.number.value - found.number.low
-        # These two runs are of one servo: they scatter by little more than their noise.
+        # Both fitted runs are of one servo, so they differ by little more than their noise.
         assert half * 0.999 < found.prediction_half_width < 5 * half
 
 
 def test_the_files_say_the_same_and_are_safe(files: Path, sheet: DataSheet) -> None:
     stated = tomllib.loads((files / "sheet.toml").read_text())
-    # Made from the folder that explain has written, and from what it has given.
+    # The file is made from the saved explanation, the fixture from the one in memory.
     assert stated == sheet.document()
     friction = stated["quantities"]["friction.coulomb"]
     assert friction["state"] == "found"

@@ -1,4 +1,4 @@
-"""The drive and back-drive diagram against its closed forms."""
+"""Tests of the drive and back-drive diagram against closed-form solutions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_dry_friction_holds_a_band() -> None:
 
 
 def test_friction_of_the_load_opens_a_cone() -> None:
-    """U - P = c |U + P| + d: beyond U = (P (1 + c) + d) / (1 - c) it moves forward."""
+    """U - P = c |U + P| + d, so the joint moves forward beyond U = (P (1 + c) + d) / (1 - c)."""
     found = of({"friction.coulomb": {"coefficient": DRY}, "friction.load": {"coefficient": LOADED}})
     against = found.load > 0
     ahead = (found.load * (1 + LOADED) + DRY) / (1 - LOADED)
@@ -43,7 +43,7 @@ def test_friction_of_the_load_opens_a_cone() -> None:
     np.testing.assert_allclose(found.forward[against], ahead[against], atol=1e-9)
     beyond = found.load > DRY / (1 - LOADED)
     np.testing.assert_allclose(found.back[beyond], back[beyond], atol=1e-9)
-    # Without power the load alone presses on the gears.
+    # Without power, only the load presses on the gears.
     assert found.backdrive == pytest.approx(DRY / (1 - LOADED))
 
 
@@ -76,7 +76,7 @@ def test_it_reaches_as_far_as_the_drive(sheet: DataSheet) -> None:
     "name", [effect.name for effect in make_subject(simulators.get("servo"), None).list_effects()]
 )
 def test_every_effect_of_the_library_has_its_place_in_it(name: str) -> None:
-    """Beside dry friction; what is no law of a joint at rest leaves the band as it is."""
+    """Each effect, added to dry friction, gives a finite break-away torque and an ordered band."""
     coefficients = effects.get(name).on(simulators.get("servo").system)
     law = {c.name: 0.02 for c in coefficients}
     dry = {"friction.coulomb": {"coefficient": DRY}}

@@ -1,4 +1,4 @@
-"""The class of a data sheet, loaded by MuJoCo, and what a model that uses it makes of the log."""
+"""Tests of the MuJoCo class of a data sheet: it loads, and a model with it reproduces the log."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_class_alone_is_a_file_that_mujoco_loads(files: Path) -> None:
 
 
 def test_it_reproduces_the_log(files: Path, tmp_path: Path) -> None:
-    """Nothing but the sensor's noise is left; without the friction of the class much is."""
+    """The residual is below 1.1 times the noise; without the friction of the class it exceeds 3."""
     found = score_model(files / "model.xml", files / "model.toml", held_out=True)
     assert found["runs"] == 3
     assert found["normalised_rmse"] < 1.1
@@ -62,7 +62,7 @@ def test_it_reproduces_the_log(files: Path, tmp_path: Path) -> None:
 
 
 def test_a_law_that_mujoco_lacks_is_its_mean(sheet: DataSheet, tmp_path: Path) -> None:
-    """Friction that falls with speed, if it falls by nothing, is dry friction of its limit."""
+    """Stribeck friction with an extra part of zero becomes dry friction of its Coulomb value."""
     numbers = {"coulomb": 0.03, "extra": 0.0, "speed": 0.1}
     law = {name: FittedValue(value, "1", None, None) for name, value in numbers.items()}
     other = replace(sheet, extended=replace(sheet.extended, effects={"friction.stribeck": law}))
@@ -85,7 +85,7 @@ def test_settings_that_differ_have_a_class_each(sheet: DataSheet, tmp_path: Path
 
 
 def test_a_robots_joint_is_the_same_with_its_class(sheet: DataSheet, tmp_path: Path) -> None:
-    """The arm with what was found, and the same with the elbow's numbers in a class."""
+    """The dry friction of the elbow is the value of the file plus the identified one."""
     kind = make_robot_simulator(EXAMPLE / "arm2.xml")
     extended = extended_of(kind, effects=ELBOW)
     arm = replace(sheet, subject=make_subject(kind, "elbow"), extended=extended, name="elbow")

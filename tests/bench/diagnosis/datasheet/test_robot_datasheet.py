@@ -1,4 +1,4 @@
-"""The sheet of a robot's joint: what the file states is added, and other joints stay out of it."""
+"""Tests of the data sheet of a robot joint: values of the file are added, other joints excluded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sheet of a joint without a drive says nothing of one."""
+"""Tests that the data sheet of a joint without a drive has no rows of a drive."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tests.bench.diagnosis.explained_samples import recording
 from tests.bench.figures.figure_readability import unreadable
 
 FRICTION = 0.004
-"""N m."""
+"""Dry friction in N m."""
 
 
 @pytest.fixture(scope="module")
 def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A pendulum that is let go, and comes to rest by dry friction."""
+    """Write a recording of a released pendulum that dry friction stops; return its path."""
     folder = tmp_path_factory.mktemp("free")
     command = ["simulate", "pendulum", "--effect", f"friction.coulomb={FRICTION}"]
     command += ["--noise", "q=0.003", "qd=0.02", "--runs", "3", "--seconds", "1.5", "--rate", "60"]

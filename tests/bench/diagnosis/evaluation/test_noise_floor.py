@@ -36,7 +36,7 @@ def test_rounding_is_noise():
     rounded = [changed(run, q=lambda v: np.round(v / 0.05) * 0.05) for run in made.runs]
     found = floor_of(replace(made, runs=tuple(rounded)))
     assert found.quantisation_step[0] == pytest.approx(0.05)
-    # an even distribution over one step
+    # The rounding error has a uniform distribution over one quantisation step.
     assert found.sigma[0] == pytest.approx(0.05 / 12**0.5, rel=0.4)
     assert found.quantisation_step[1] == 0
 
@@ -45,7 +45,7 @@ def test_without_noise_the_floor_is_a_share_of_the_range():
     made = recording(runs=2, seconds=2, rate=200, initial=["q=1.5"])
     found = floor_of(made)
     values = np.concatenate([run.channels["q"] for run in made.runs])
-    # all but the outermost fiftieth on each side
+    # The range excludes the outermost 2 % of the samples on each side.
     spread = np.ptp(np.quantile(values, [0.02, 0.98]))
     assert 0.99e-4 * spread <= found.sigma[0] < 1e-3 * spread
     stated = floor_of(replace(made, noise={"q": 1e-9}))

@@ -23,7 +23,7 @@ def test_whitening_makes_noise_that_remembers_independent_and_of_variance_one(ph
     noise = NoiseModel(np.array([0.3, 7.0]), np.full(2, phi))
     made = correlated(np.random.default_rng(1), phi, noise.sigma, (40, 500, 2))
     white = whiten(made, everything(made), noise)
-    # whatever its unit, each channel
+    # Each channel has unit variance, independent of its unit.
     for c in range(2):
         assert white[:, :, c].std() == pytest.approx(1.0, abs=0.015)
     for lag in (1, 2, 3):
@@ -35,11 +35,11 @@ def test_whitening_makes_noise_that_remembers_independent_and_of_variance_one(ph
 
 def test_whitening_by_hand_starts_anew_across_a_hole():
     noise = NoiseModel(np.array([2.0]), np.array([0.6]))
-    # what was not seen may be anything
+    # The value of a missing sample is arbitrary.
     values = np.array([1.0, 2.0, 99.0, 4.0, 5.0])
     seen = np.array([True, True, False, True, True])
     white = whiten(values.reshape(1, 5, 1), seen.reshape(1, 5, 1), noise)
-    # in units of sigma the values are 0.5, 1, -, 2 and 2.5; the root of 1 - 0.6² is 0.8
+    # In units of sigma the values are 0.5, 1, -, 2 and 2.5; sqrt(1 - 0.6²) is 0.8.
     expected = [
         0.5,
         (1.0 - 0.6 * 0.5) / 0.8,
@@ -74,7 +74,7 @@ def test_likelihood_is_that_of_the_normal_distribution(share):
     )
     half = compute_log_determinant(seen, phi)
     assert 2 * half == pytest.approx(-np.linalg.slogdet(correlation)[1], rel=1e-9)
-    # nowhere is it higher by more than its grid is coarse
+    # The likelihood is not higher anywhere else, except for the coarseness of the grid.
     for other in np.linspace(-0.4, 0.98, 70):
         correlation = covariance_of(seen[:, :, 0], other)
         variance = r @ np.linalg.solve(correlation, r) / count
@@ -108,7 +108,7 @@ def test_lost_degrees_of_freedom_enlarge_sigma_and_leave_the_value():
         maximise_likelihood(made, everything(made)),
         maximise_likelihood(made, everything(made), 19.0),
     )
-    # 19 of 100 samples are taken off
+    # 19 of 100 degrees of freedom are lost.
     ratio = fewer.sigma[0] / full.sigma[0]
     assert ratio == pytest.approx((100 / 81) ** 0.5, rel=1e-12)
     assert fewer.value == full.value
@@ -126,9 +126,7 @@ def test_a_channel_without_samples_is_left_out():
 
 @pytest.mark.parametrize(("phi", "wave"), [(0.0, 0.5), (0.6, 2.0)])
 def test_the_portmanteau_test_is_that_of_ljung_and_box(phi, wave):
-    """One degree of freedom is lost to the correlation, and the least of C channels counts C
-    times.
-    """
+    """The estimated correlation costs one degree of freedom, and C channels multiply p by C."""
     structure = wave * np.sin(np.arange(400) / 15.0)[None, :, None]
     made = correlated(np.random.default_rng(16), phi, 1.0, (1, 400, 1)) + structure
     found = maximise_likelihood(made, everything(made))
@@ -153,7 +151,7 @@ def test_first_order_noise_is_told_from_structure_that_is_as_large():
         rng = np.random.default_rng(seed)
         noise = correlated(rng, 0.7, np.array([1.0, 5.0]), seen.shape)
         wave = np.sin(np.arange(300) / 15.0 + rng.uniform(0, 6))[None, :, None]
-        # as loud as the first channel's noise, the same in all runs
+        # The wave has about the amplitude of the first channel's noise and is equal in all runs.
         mixed = rng.standard_normal(seen.shape) * np.array([1.0, 5.0]) + 1.2 * wave
         for name, values in (("noise", noise), ("structure", mixed)):
             chances[name].append(

@@ -33,14 +33,14 @@ def test_guesses_are_near_stated_states_are_kept_and_hidden_axes_stay():
     starts = [{"z": 3.0, "vx": 2.0, "vz": 1.0}] * 2
     times = np.arange(50) / 100
     made = recorded(Ball(observe=["x", "z"]), [0.7], starts, times, 0.001)
-    # the second run states something else
+    # The second run specifies other initial values.
     first, second = made.runs
     second = replace(second, initial={"z": 2.5, "vx": 7.0})
     made = replace(made, runs=(first, second))
     there = world(made, candidates=[])
     assert there.states == ["x", "y", "z", "vx", "vy", "vz"]
     np.testing.assert_allclose(there.guess[0], [0, 0, 3, 2, 0, 1], atol=0.15)
-    # nothing recorded has to do with y
+    # No recorded channel depends on y.
     known = [
         [0, 1, 0, 0, 1, 0],
         [0, 1, 1, 1, 1, 0],
@@ -64,7 +64,7 @@ def test_a_ball_whose_height_is_not_recorded_begins_too_high_for_an_impact():
 
 def test_missing_samples_at_the_beginning_and_first_samples():
     made = recording(runs=1, seconds=1, rate=100, initial=["q=1"], noise=["0.001"])
-    # the first four angles are lost, their rates are not
+    # The first four angles are missing, but their rates are present.
     run = changed(made.runs[0], q=lambda v: np.where(np.arange(v.size) < 4, np.nan, v))
     there = world(replace(made, runs=(run,)), candidates=[])
     assert there.guess[0, 0] == pytest.approx(1.0, abs=0.02)

@@ -32,7 +32,7 @@ def test_a_vector_holds_parameters_constants_set_free_and_coefficients():
 
 def test_lanes_are_what_the_simulator_gives():
     made = []
-    # of other lengths and rates
+    # The runs differ in length and sampling rate.
     for q, rate, samples in ((1.0, 50, 40), (0.4, 80, 90)):
         times = np.arange(samples) / rate
         made.append(recorded(Pendulum(), [3e-3], [{"q": q}], times))
@@ -41,7 +41,7 @@ def test_lanes_are_what_the_simulator_gives():
         candidates=["drag.linear"],
         free=["gravity"],
     )
-    # inertia, gravity, drag
+    # Columns: inertia, gravity, drag.
     rows = [
         [3e-3, 9.81, 0.0],
         [4e-3, 5.0, 1e-3],
@@ -58,7 +58,7 @@ def test_lanes_are_what_the_simulator_gives():
         times = there.tracks[runs[lane]].scenario.times
         initial = dict(zip(("q", "qd"), states[lane], strict=True))
         scenario = Scenario(times, initial, constants={"gravity": theta[lane, 1]})
-        # one at a time, with a step ten times shorter
+        # Simulate each element separately with a step ten times shorter.
         fine = Pendulum(fixed={"drag.linear": theta[lane, 2]}, time_step=1e-3).simulate(
             theta[lane : lane + 1, :1], scenario
         )
@@ -95,7 +95,7 @@ def test_effects_may_grow_beyond_what_is_plausible_but_not_change_their_meaning(
             beyond = (
                 MAX_RANGE_FACTOR_DRY_FRICTION if name.startswith("friction") else MAX_RANGE_FACTOR
             )
-            # what shapes an effect keeps its range
+            # A shape parameter keeps its range.
             assert wide_high in (beyond * high, high)
             assert wide_low == (low if low >= 0 else MAX_RANGE_FACTOR * low)
     assert compute_coefficient_bounds(there, "drag.linear") == [(0.0, MAX_RANGE_FACTOR * 0.1)]
@@ -138,6 +138,6 @@ def test_constants_of_a_run_are_its_own():
     theta = np.tile(there.get_nominal_theta(), (2, 1))
     states = np.array([[0.5, 0.0]] * 2)
     seen = there.simulate(theta, np.arange(2), states)
-    # without gravity the pendulum stays where it is let go
+    # Without gravity, the pendulum stays at its release angle.
     assert np.ptp(seen[0, :, 0]) > 0.9
     assert np.ptp(seen[1, :, 0]) < 1e-3

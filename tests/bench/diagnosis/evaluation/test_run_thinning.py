@@ -1,4 +1,4 @@
-"""Long runs with fewer samples: what is kept, what inputs become, and what is left alone."""
+"""Tests of run thinning: kept samples, resampled inputs, and runs that stay unchanged."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ PUSHED = np.sin(40.0 * TIMES)
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    """What is long is short here."""
+    """Lower the sample limits so that short runs are thinned."""
     monkeypatch.setattr(run_thinning, "MIN_SAMPLES_TO_THIN", 3000)
     monkeypatch.setattr(run_thinning, "MIN_THINNED_SAMPLES", 100)
 

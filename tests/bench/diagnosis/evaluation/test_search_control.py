@@ -1,4 +1,4 @@
-"""When a search has to end, and how far it says it is."""
+"""Tests of the deadline and the progress of a search."""
 
 import pytest
 
@@ -13,7 +13,7 @@ from bench.diagnosis.evaluation.search_control import (
 
 
 class Clock:
-    """A clock that stands still unless it is set."""
+    """Clock that changes only when a test sets it."""
 
     now = 100.0
 

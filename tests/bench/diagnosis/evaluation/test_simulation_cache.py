@@ -10,7 +10,7 @@ def rows(*values):
 
 
 def asked(cache, keys, made):
-    """Fill the cache as a world does; return the results and the keys that were simulated."""
+    """Fill the cache as a run evaluator does; return the results and the simulated keys."""
     new = cache.missing(keys)
     out = np.full((len(keys), 2, 1), np.nan)
     cache.fill(keys, new, rows(*(made[keys[place]] for place in new)), out)
@@ -20,7 +20,7 @@ def asked(cache, keys, made):
 def test_a_lane_is_simulated_once_and_given_whenever_it_is_asked_for():
     cache = LaneCache()
     assert asked(cache, [b"a", b"b", b"a"], {b"a": 1.0, b"b": 2.0}) == ([1, 2, 1], [b"a", b"b"])
-    # Another value shows that it is not simulated again.
+    # The other value of "a" shows that it is not simulated again.
     assert asked(cache, [b"c", b"a"], {b"c": 3.0, b"a": 9.0}) == ([3, 1], [b"c"])
     found, new = asked(cache, [b"a", b"b"], {})
     assert (found, new) == ([1, 2], [])
@@ -37,9 +37,9 @@ def test_what_it_holds_is_its_own():
 def test_beyond_its_limit_the_oldest_are_dropped():
     cache = LaneCache(limit=2 * ROW)
     made = {key: float(place) for place, key in enumerate([b"a", b"b", b"c", b"d"])}
-    # One call may ask for more than can be held.
+    # One call may request more results than the cache can hold.
     assert asked(cache, [b"a", b"b", b"c"], made) == ([0, 1, 2], [b"a", b"b", b"c"])
     assert asked(cache, [b"b", b"c"], made) == ([1, 2], [])
-    # What this call needs is given, although it is dropped at its end.
+    # Results needed by this call are returned although they are dropped at its end.
     assert asked(cache, [b"b", b"d", b"c", b"a"], made) == ([1, 3, 2, 0], [b"d", b"a"])
     assert asked(cache, [b"d", b"a"], {}) == ([3, 0], [])

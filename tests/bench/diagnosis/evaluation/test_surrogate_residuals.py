@@ -8,7 +8,7 @@ from tests.bench.diagnosis.explained_samples import autocorrelation, correlated,
 def test_surrogates_keep_variance_and_autocorrelation():
     rng = np.random.default_rng(12)
     made = rng.standard_normal((6, 700, 2))
-    # a second-order autoregression that rings, and white noise beside it
+    # The first channel is an oscillating second-order autoregression, the second is white noise.
     ringing = made[:, :, 0]
     for t in range(2, 700):
         ringing[:, t] += 1.2 * ringing[:, t - 1] - 0.6 * ringing[:, t - 2]
@@ -41,7 +41,7 @@ def test_surrogates_are_the_same_for_a_seed_and_zero_where_nothing_was_seen():
 def test_surrogates_have_no_offset_whatever_the_residual_has():
     made = correlated(np.random.default_rng(15), 0.8, 1.0, (4, 300, 1)) + 2.0
     like = draw_surrogates(made, everything(made), 80, np.random.default_rng(0))
-    # of 80 x 4 x 300 samples that remember for about nine each
+    # There are 80 x 4 x 300 samples with a correlation time of about nine samples.
     assert abs(like.mean()) < 4 * like.std() * 3 / np.sqrt(like.size)
 
 
@@ -59,7 +59,7 @@ def test_surrogates_of_few_samples_are_those_samples():
 
 
 def test_what_a_fit_leaves_of_surrogates_remembers_as_much_as_what_it_left_of_the_noise():
-    """Runs of 60 samples less a level and a slope of each: what is left remembers less."""
+    """Removing an offset and a slope from runs of 60 samples reduces the autocorrelation."""
     times = np.linspace(-1.0, 1.0, 60)
     absorbed, _ = np.linalg.qr(np.stack([np.ones(60), times], axis=1))
 

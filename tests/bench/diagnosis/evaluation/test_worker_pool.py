@@ -1,4 +1,4 @@
-"""Work on several cores: the same to the last bit, whoever does it, and nobody left behind."""
+"""Tests of the worker pool: results identical to the last bit, and no process left behind."""
 
 import os
 import signal
@@ -26,15 +26,13 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="workers are for
 
 
 def world(**watch):
-    """What a crew needs to know of a world."""
+    """Return the attributes of a run evaluator that a worker pool needs."""
     return SimpleNamespace(simulations=0, watch=SearchControl(**watch), crew=None, factor=3)
 
 
 @pytest.fixture(autouse=True)
 def eager(monkeypatch):
-    """Workers are started at once, however little there is to do, and whatever threads other tests
-    have left.
-    """
+    """Start workers at once, for any amount of work and any threads of other tests."""
     monkeypatch.setattr(crews, "PARALLEL_THRESHOLD_SECONDS", 0.0)
     monkeypatch.setattr(crews, "can_fork", lambda: True)
 
@@ -118,7 +116,7 @@ def test_beside_a_thread_nobody_is_forked(monkeypatch):
 def test_what_a_worker_that_died_was_at_is_done_again():
     there = world()
     with closing(ForkedWorkerPool(2)) as crew:
-        # Each that takes number 2 dies of it, until nobody is left but this process.
+        # Each worker that takes number 2 dies, until only this process remains.
         assert crew.map(there, dies, [(n,) for n in range(6)]) == list(range(6))
         assert crew.map(there, times, [(1,), (2,)])[0] == (3, os.getpid())
 

@@ -17,7 +17,7 @@ from tests.bench.diagnosis.explained_samples import marked, recording, white, wo
 
 
 def rivals(made, sigma, effects, **options):
-    """A search with one fitted model for each effect."""
+    """Return a search and one fitted model per effect."""
     there = world(made, candidates=list(effects), **options)
     noise = white(there, sigma)
     base = fit_base_model(there, noise)

@@ -1,4 +1,4 @@
-"""What is proposed to be recorded next keeps to the limits that the model file states."""
+"""Tests that proposed runs stay within the limits of the model file."""
 
 import json
 from types import SimpleNamespace
@@ -42,14 +42,14 @@ MANY = """<mujoco><compiler angle="radian"/><worldbody><body name="a">
 
 
 def kind_of(folder, text, name="arm.urdf", **options):
-    """The simulator of a model file that is written."""
+    """Write a model file and return its simulator class."""
     path = folder / name
     path.write_text(text)
     return make_robot_simulator(path, **options)
 
 
 def simulated(kind, command, effect=None, coefficient=0.0, begin=0.0):
-    """Positions of the hip under a command of the only actuator."""
+    """Return the hip positions under a command of the only actuator, and all inputs."""
     (name,) = (one.name for one in kind.inputs if one.name.startswith("u."))
     inputs = {channel.name: np.zeros(TIMES.size) for channel in kind.inputs} | {name: command}
     simulator = kind(observe=["q.hip"], effects=[effect] if effect else [])
@@ -58,7 +58,7 @@ def simulated(kind, command, effect=None, coefficient=0.0, begin=0.0):
 
 
 def world_of(kind, command, begin=0.0):
-    """The world of one run under a command, and a model that is true there."""
+    """Return the run evaluator of one run and a model with its true parameters."""
     seen, inputs = simulated(kind, command, begin=begin)
     run = Run("1", TIMES, {"q.hip": seen}, inputs, {}, {}, held_out=False)
     recording = RunEvaluator(
@@ -69,7 +69,7 @@ def world_of(kind, command, begin=0.0):
 
 
 def log(folder, kind, effect, coefficient, size, noise):
-    """Write a recording of three runs in which an effect acts that the model lacks."""
+    """Write a recording of three runs with an effect that the model file lacks."""
     rng = np.random.default_rng(0)
     rows = []
     for number in range(3):
@@ -99,7 +99,7 @@ def log(folder, kind, effect, coefficient, size, noise):
 
 
 def check_proposals(path, out, limits, capsys):
-    """Explain and design; what both propose is within the limits of commands and states."""
+    """Check that the runs proposed by explain and design keep the limits."""
     assert main(["explain", str(path), "--out", str(out), "--jobs", "1"]) == 0
     proposed = json.loads((out / "verdict.json").read_text())["next_experiment"]
     change = {} if proposed is None else proposed.get("change") or {}
@@ -159,7 +159,7 @@ def test_a_velocity_servo_keeps_to_the_velocity_of_a_urdf(tmp_path):
 def test_limits_of_an_mjcf_are_those_of_joint_and_actuator_together(tmp_path):
     kind = kind_of(tmp_path, MANY, "many.xml")
     found = stated_limits(SimpleNamespace(kind=kind))
-    # Two motors share the force range of the joint; the first also has one of its own.
+    # Two motors share the force range of the joint; the first also has its own range.
     assert found.commands["u.m"] == pytest.approx((-0.75, 0.5))
     assert found.commands["u.g"] == pytest.approx((-1.0, 1.0))
     assert found.commands["u.p"] == pytest.approx((-0.5, 1.0))
@@ -170,7 +170,7 @@ def test_limits_of_an_mjcf_are_those_of_joint_and_actuator_together(tmp_path):
 
 def test_every_simple_run_of_a_robot_is_within_the_limits(tmp_path):
     kind = kind_of(tmp_path, URDF, actuators=MOTOR)
-    # The recording itself went beyond: its commands are limited too.
+    # The recorded command exceeds the limits, which hold for runs with this command too.
     world, _ = world_of(kind, 1.3 * np.sin(2.0 * TIMES))
     limits = stated_limits(world)
     runs = list(_runs(world))

@@ -1,4 +1,4 @@
-"""The next recording: what is designed splits what was open, recorded by scipy."""
+"""Tests that a designed run, simulated with SciPy, separates the competing causes."""
 
 import numpy as np
 import pytest
@@ -17,12 +17,12 @@ TIMES = np.arange(0.0, 4.0, 0.02)
 
 
 def write(folder, name, runs, lag=0.0, push=0.0, seed=0):
-    """A pendulum whose torque lags, and which something pushes.
+    """Write a pendulum recording with a drive lag and a constant torque; return its path.
 
     Args:
-        runs: of each run stamps, torques held from stamp to stamp, angle and speed it begins with.
-        lag: s, of a drive of first order.
-        push: N m, all the time.
+        runs: for each run its times, torques (held between samples), initial angle and speed.
+        lag: time constant of the first-order drive in s.
+        push: constant torque in N m.
     """
     rng, rows = np.random.default_rng(seed), ["run,t,u,q"]
     for number, (times, torques, q0, v0) in enumerate(runs):
@@ -54,12 +54,12 @@ def write(folder, name, runs, lag=0.0, push=0.0, seed=0):
 
 
 def slow(count=3):
-    """Torques so slow that of a delay and a lag only how late they are is seen."""
+    """Return runs whose torques are so slow that a delay and a lag look alike."""
     return [(TIMES, 0.06 * np.sin(2 * TIMES + k), 0.05 * k, 0.0) for k in range(count)]
 
 
 def drawn(design):
-    """The runs that it says, twice."""
+    """Return three copies of the designed run."""
     (torques,) = design.inputs.values()
     one = design.times, torques, design.initial["q"], design.initial["qd"]
     return [one, one, one]
@@ -73,7 +73,7 @@ def names_of(explanation):
 @pytest.mark.slow
 def test_the_proposed_run_splits_the_set(tmp_path):
     before = write(tmp_path, "before", slow(), lag=0.04)
-    # Three fitted runs would tell a delay from a lag.
+    # With three fitted runs, a delay and a lag would be distinguishable.
     with before.with_suffix(".toml").open("a") as description:
         description.write("[runs.2]\nheld_out = true\n")
     proposed = simgap.design(before)
@@ -87,7 +87,7 @@ def test_the_proposed_run_splits_the_set(tmp_path):
     after = write(tmp_path, "after", drawn(design), lag=0.04, seed=1)
     names = names_of(simgap.explain([before, after]))
     assert "input.lag" in names
-    # What it says it would split is split.
+    # The run separates the causes that it was predicted to separate.
     kept = "input.lag" in (design.effect, *design.distinguished_effects)
     assert kept
     assert len(names) < len(ambiguous)
@@ -105,7 +105,7 @@ def test_what_no_run_can_split_is_said(tmp_path, capsys):
 
 
 def test_what_is_known_is_narrowed(tmp_path, capsys):
-    """Nothing is open: the run that says most of the numbers is proposed, and keeps its word."""
+    """No cause is open, so the most informative run is proposed, and its prediction is checked."""
     path = write(tmp_path, "clean", slow())
     out = tmp_path / "next.csv"
     assert main(["design", str(path), "--out", str(out), "--seconds", "3"]) == 0
@@ -117,7 +117,7 @@ def test_what_is_known_is_narrowed(tmp_path, capsys):
     assert columns["t"][-1] == pytest.approx(2.98, abs=0.021)
     design = simgap.design(path, seconds=3.0).design
     after = write(tmp_path, "after", drawn(design)[:1] * 3, seed=2)
-    # Of three runs one is held out, so that the two together are worth a little more than one.
+    # One of three runs is held out, so both logs together give slightly more than one alone.
     one = simgap.explain(path).answer.parameters["inertia"]
     both = simgap.explain([path, after]).answer.parameters["inertia"]
     narrowed = (one.high - one.low) / (both.high - both.low)
@@ -141,7 +141,7 @@ def test_what_hangs_together_and_what_a_longer_run_would_tell():
     least = np.array([[0, 90, 7, 80.0], [90, 0, 95, 3.0], [7, 95, 0, 60.0], [80, 3, 60, 0]])
     assert list(_connected_groups(["a", "b", "c", "d"], least)) == [("a", "c"), ("b", "d")]
     run = RunValue(None, least + np.triu(least), 0.0, is_exact=True)
-    # Of 7 and 3 squared noises a run twice as long may make 25 if it is lucky, twice of the first.
+    # With 7 and 3 noise variances, twice the run length may exceed the threshold of 25.
     assert _would_longer_run_help(run, 2.0)
     assert not _would_longer_run_help(run, 1.0)
     run = RunValue(None, np.where(least < 10, 1.0, least), 0.0, is_exact=True)

@@ -1,4 +1,4 @@
-"""What a rig may be made to do: plans in its own terms, and its limits, by simulation."""
+"""Tests of run plans and of the limits of an experimental setup, by simulation."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,8 +29,9 @@ URDF = """<robot name="arm"><link name="base"/>
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
-    """A function of the hip's fastest speed: the world of a run in which it swings gently, of which
-    positions alone are recorded.
+    """Return a function from the speed limit of the hip to a run evaluator and a model.
+
+    Only positions of a gently swinging arm are recorded.
     """
     folder = tmp_path_factory.mktemp("arm")
 
@@ -90,7 +91,7 @@ def test_commands_keep_to_what_joints_take(arm):
 
 @pytest.fixture(scope="module")
 def servo():
-    """The rig of a servo with two loads."""
+    """Return the experimental setup of a servo with two loads."""
     runs = tuple(
         Run(
             str(mass), TIMES, {"q": 0.3 * np.sin(TIMES)},
@@ -110,7 +111,7 @@ def test_loads_that_were_there_can_be_had_again(servo):
     other = servo.make_run(RunPlan(("goal",), "slow sine", constants=(("mass", 0.3),)))
     assert other.scenario.constants["mass"] == 0.3
     assert other.says.endswith("with mass = 0.3")
-    # What was the same all the time is no knob: torque is on, and stays on.
+    # A constant input is not driven: the torque is on and stays on.
     assert {name for one in servo.list_basic_plans() for name in one.driven_inputs} == {"goal"}
     assert (other.scenario.inputs["torque_enable"] == 1.0).all()
 

@@ -8,7 +8,7 @@ from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis.explained_samples import recorded, recording, white, with_runs, world
 
 TIMES = np.arange(90) / 60
-"""A second and a half."""
+"""Sample times of 1.5 s at 60 Hz."""
 
 
 def ball():
@@ -17,7 +17,7 @@ def ball():
 
 @pytest.mark.parametrize("inertia", [1.0e-3, 1.7e-3, 3.0e-3, 5.0e-3, 7.5e-3, 1.0e-2])
 def test_any_inertia_in_the_bounds_is_found(inertia):
-    # from a wrong inertia, the end of a wide swing may be anywhere
+    # With a wrong inertia, the end of a wide swing cannot be predicted.
     starts = [{"q": 0.9}, {"q": -2.0, "qd": 4.0}]
     sigma = [0.003, 0.02]
     made = recorded(Pendulum(), [inertia], starts, TIMES, sigma, seed=1)
@@ -41,7 +41,7 @@ def test_restitution_is_found_through_many_bounces(restitution):
 
 
 def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
-    # a second of fall from there is five metres
+    # A fall of one second from these heights is 5 m, so the ball does not reach the ground.
     starts = [{"z": 20.0, "vx": 1.0}, {"z": 25.0}]
     times = np.arange(60) / 60
     made = recorded(ball(), [0.9], starts, times, 0.005)
@@ -52,7 +52,7 @@ def test_restitution_that_a_fall_does_not_touch_is_reported_and_stays_nominal():
     assert base.fit.free.size == 0
     assert base.fit.cost / np.isfinite(there.observed).sum() == pytest.approx(1.0, abs=0.2)
 
-    # one run that lands is enough
+    # One run with an impact is enough.
     hit = recorded(ball(), [0.9], [{"z": 1.0}], TIMES, 0.005)
     again = world(with_runs(made, [*made.runs, *hit.runs]), candidates=[])
     touched = fit_base_model(again, white(again, 0.005))
@@ -65,7 +65,7 @@ def test_a_given_start_is_where_it_begins():
     there = world(made, candidates=[])
     noise = white(there, [0.003, 0.02])
     many = fit_base_model(there, noise)
-    # what the many starts have cost
+    # Number of simulations of the fit with many starts.
     before = there.simulations
     one = fit_base_model(there, noise, np.array([5.9e-3]))
     assert one.fit.theta[0] == pytest.approx(many.fit.theta[0], rel=1e-4)

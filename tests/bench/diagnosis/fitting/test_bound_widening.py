@@ -1,4 +1,4 @@
-"""A base parameter beyond its declared range is fitted there; no cause stands for it."""
+"""Tests that a base parameter beyond its declared range is fitted and not replaced by a cause."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,10 @@ HEAVIER = 1.025
 
 @pytest.fixture(scope="module")
 def heavy(tmp_path_factory):
-    """A free swing that asks for an inertia 2.5 % beyond the declared bound: the motion depends on
-    mass / inertia alone, and the description states a larger mass than the simulation had.
+    """Write a free swing whose inertia fits 2.5 % above the declared bound; return its path.
+
+    The motion depends on mass / inertia only, and the description states a larger mass than the
+    simulation had.
     """
     path = tmp_path_factory.mktemp("heavy") / "swing.csv"
     words = ["--theta", "inertia=0.01", "--constant", f"mass={0.15 / HEAVIER}"]
@@ -43,7 +45,7 @@ def test_an_inertia_beyond_its_range_is_fitted_and_no_cause_is_named(heavy):
 
 
 def test_a_parameter_at_a_bound_that_physics_sets_keeps_a_cause_from_being_named(tmp_path):
-    # Without any loss the restitution is 1, and the drag is found beside it.
+    # Without losses the restitution is 1, and the drag is found in addition.
     path = tmp_path / "ball.csv"
     words = ["--theta", "restitution=1.0", "--noise", "0.002", "--effect", "drag.linear=0.1"]
     assert main(["simulate", "ball", "--out", str(path), "--seconds", "1", *words]) == 0
@@ -70,7 +72,7 @@ def test_within_its_range_nothing_is_widened():
     [
         ("kg*m^2", (1e-3, 1e-2), (0.0, float("inf")), (2.5e-4, 4e-2)),
         ("1", (0.0, 1.0), (0.0, 1.0), (0.0, 1.0)),
-        # A damping that the file states as 0.3 can only be taken away.
+        # Damping that the file states as 0.3 can be reduced by 0.3 at most.
         ("N*m*s/rad", (-0.3, 2.4), (-0.3, 600.0), (-0.3, 10.5)),
         ("N*m", (-1.0, 1.0), (float("-inf"), float("inf")), (-7.0, 7.0)),
     ],

@@ -1,4 +1,4 @@
-"""The model that is told: fitted until nothing is left to gain, what it leaves being its noise."""
+"""Tests of the final convergence of the reported model, with the noise of its residual."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def there():
 
 
 def search_of(there, phi, seed=0):
-    """What is sought in white noise where there is noise of this correlation."""
+    """Return a search that assumes white noise, with AR(1) noise of this phi added to the data."""
     rng = np.random.default_rng(seed)
     there.observed[...] += correlated(rng, phi, SIGMA, there.observed.shape)
     return EffectSearch(there, white(there, SIGMA), frozenset(), rng, marked(there, True))
@@ -38,7 +38,7 @@ def entered(search, theta, iterations, noise=None, exact=False):
 
 
 def off(search, model, best):
-    """How far numbers are from the best ones, in what noise makes of them."""
+    """Return the largest parameter distance from the best fit, in standard errors."""
     found = compute_intervals(search, best)
     spread = np.array([(found[i][2] - found[i][1]) / 3.92 for i in range(2)])
     return np.abs((model.fit.theta - best.fit.theta) / spread).max()
@@ -56,7 +56,7 @@ def test_it_is_where_generalised_least_squares_ends(there, phi):
     assert off(search, told, best) < 0.05
     assert off(search, begun, best) > 0.3
     assert search.models[frozenset({NAME})] is told
-    # in units of the search's own noise, as all others
+    # The cost is in units of the search's own noise, as for all other models.
     left = (there.observed - told.fit.simulated)[search.observed_mask] / SIGMA
     assert told.fit.cost == pytest.approx(float(left @ left), rel=1e-3)
 
@@ -81,8 +81,10 @@ def test_a_model_that_cannot_be_simulated_stays_as_it_is(there):
 
 
 def test_what_is_left_over_and_is_no_noise_does_not_pull_it_away(there):
-    """A drift that nothing of the model is: weighed as noise that remembers, the fit would rather
-    leave all of it, smooth, with a drag of zero.
+    """A drift that no effect explains must not bias the converged fit.
+
+    With AR(1) noise weighting, a smooth residual of the whole drift and a drag of zero would fit
+    better.
     """
     search = search_of(there, 0.0)
     times = np.arange(there.observed.shape[1]) / 60

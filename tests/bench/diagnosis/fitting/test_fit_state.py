@@ -1,4 +1,4 @@
-"""Derivatives that serve for several steps: what they learn, and when they are taken anew."""
+"""Tests of Jacobians that serve for several steps: their updates and their renewal."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ TRUE = RNG.normal(size=(RUNS, LENGTH, CHANNELS, SHARED + STATES))
 
 
 def linear(theta, states):
-    """What a linear world shows, (R, T, C)."""
+    """Return the observations (R, T, C) of a linear model."""
     unknown = np.concatenate([np.broadcast_to(theta, (RUNS, SHARED)), states], axis=1)
     return np.einsum("rtcq,rq->rtc", TRUE, unknown)
 
@@ -24,7 +24,7 @@ def at(theta, states, jacobian):
 
 
 def problem(jacobian, steps=None):
-    """One that stands at zero, with derivatives that may be wrong."""
+    """Return a fit state at zero whose Jacobian may be wrong."""
     zero = at(np.zeros(SHARED), np.zeros((RUNS, STATES)), jacobian)
     steps = np.ones(SHARED + STATES) if steps is None else steps
     bounds = -np.ones(SHARED), np.ones(SHARED), 2 * np.ones(SHARED)
@@ -48,7 +48,7 @@ def test_derivatives_agree_with_the_step_that_they_have_learnt_from():
 
 
 def test_as_many_steps_as_unknowns_make_derivatives_right():
-    """Steps along one unknown after another, each in its own scale."""
+    """The steps move one unknown after another, each on its own scale."""
     steps = 10.0 ** RNG.uniform(-4, 2, SHARED + STATES)
     jacobian = np.zeros_like(TRUE)
     for k in range(SHARED + STATES):

@@ -4,22 +4,22 @@ import pytest
 from bench.diagnosis.fitting.gauss_newton import compute_gauss_newton_step
 
 NONE = np.zeros(3, dtype=bool)
-"""No parameter is stuck."""
+"""Mask of active bounds: none."""
 
 
 def dense_step(residual, jacobian, q, drift, prior, known):
-    """The undamped step of all unknowns at once, by ordinary least squares."""
+    """Compute the undamped step of all unknowns at once by ordinary least squares."""
     runs, s = drift.shape
     rows, right = [], []
     for r in range(runs):
         j = jacobian[r].reshape(-1, q + s)
-        # a run's own initial states have columns that are zero in every other run
+        # The columns of a run's initial states are zero in all other runs.
         own = np.zeros((len(j), runs * s))
         own[:, r * s : (r + 1) * s] = j[:, q:]
         rows.append(np.hstack([j[:, :q], own]))
         right.append(residual[r].ravel())
 
-    # what is known beforehand counts as one more observation of each initial state
+    # The prior counts as one more observation of each initial state.
     weights = np.diag(1 / np.tile(prior, runs))
     rows.append(np.hstack([np.zeros((runs * s, q)), weights]))
     right.append(-drift.ravel())
@@ -35,13 +35,13 @@ def dense_step(residual, jacobian, q, drift, prior, known):
 
 
 def equations(known):
-    """Four runs of nine samples, three parameters and two initial states of unlike sizes."""
+    """Return four runs of nine samples; three parameters and two initial states differ in size."""
     rng = np.random.default_rng(5)
     residual = rng.normal(size=(4, 9, 2))
     sizes = [1, 10, 0.1, 3, 0.5]
     jacobian = rng.normal(size=(4, 9, 2, 3 + 2)) * sizes
     drift = rng.normal(size=(4, 2))
-    # a known state is where it is said to be
+    # A known state does not differ from its specified value.
     drift[:, known] = 0.0
     prior = np.array([3.0, 0.7])
     return residual, jacobian, drift, prior, np.tile(known, (4, 1))
@@ -80,7 +80,7 @@ def test_damping_shortens_the_step_and_what_it_promises(known):
 
 @pytest.mark.parametrize("factor", [1e-3, 1e9, 1e12])
 def test_a_step_does_not_depend_on_the_units_of_the_parameters(factor):
-    """An outlet in m^2 and a lag in s: curvatures that differ by more than double precision."""
+    """An outlet in m^2 and a lag in s have curvature ratios beyond double precision."""
     residual, jacobian, drift, prior, known = equations([False, False])
     args = 3, drift, prior, known, 0.0, NONE
     plain = compute_gauss_newton_step(residual, jacobian, *args)

@@ -1,4 +1,4 @@
-"""Whether a robot's motion forgets how it began."""
+"""Tests of linearised robot runs, and of whether the motion forgets its initial state."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ TIMES = np.arange(0, 2, 0.02)
 
 
 def world(tmp_path, text):
-    """A log of two runs of an arm."""
+    """Return the run evaluator of a log with two runs of an arm."""
     kind = kind_of(text)
     simulator = kind(observe=["q.hinge"])
     rows = ["run,t,q.hinge" + (",u.m" if "u.m" in str(kind.system.inputs) else "")]
@@ -77,11 +77,11 @@ def test_a_lane_that_was_simulated_is_not_simulated_again(tmp_path):
     again = there.simulate(theta[::-1], runs[::-1], states[::-1])
     assert there.simulations == 3
     np.testing.assert_array_equal(again[::-1], first)
-    # A part of a run, or another run, is another lane.
+    # A part of a run is a separate batch element with its own simulation.
     half = there.simulate(theta[:1], runs[:1], states[:1], 0.5)
     assert there.simulations == 4
     assert np.isnan(half).any()
-    # What is taken out of all simulations is no part of what is held.
+    # A correction of all simulations is not part of the cached results.
     there.correction = np.full(there.observed.shape, 1.0)
     np.testing.assert_array_equal(there.simulate(theta, runs, states), first + 1.0)
     assert there.simulations == 4

@@ -1,4 +1,4 @@
-"""Short pieces of runs: what they are, why they are, and what they bring to fits of whole runs."""
+"""Tests of multiple shooting: segments of runs, their purpose and the fits that start from them."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from tests.bench.diagnosis.explained_samples import recorded, searched, white, w
 
 TIMES = np.arange(0, 12.0, 0.02)
 SIGMA = [0.002, 0.01]
-"""Of angle and rate."""
+"""Standard deviations of angle (rad) and rate (rad/s)."""
 STARTS = [{"q": 1.2}, {"q": -0.8, "qd": 2.0}]
 LONG = recorded(Pendulum(), [0.0035], STARTS, TIMES, noise=SIGMA)
 
@@ -47,7 +47,7 @@ def test_what_is_known_of_the_beginning_is_known_of_the_first_piece_alone():
 
 
 def test_runs_too_short_for_two_pieces_are_left_alone():
-    # one sample less than two pieces need
+    # This is one sample fewer than two segments need.
     times = np.arange(39) * 0.02
     short = recorded(Pendulum(), [0.0035], STARTS[:1], times, noise=SIGMA)
     assert make_segment_evaluator(world(short)) is None
@@ -66,7 +66,7 @@ def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_ma
             theta = some.get_nominal_theta()
             theta[0] = inertia
             starts.append(FitStart((), theta, some.guess))
-        # at each inertia the initial states that suit it
+        # Fit the initial states at each inertia.
         fits = TrajectoryFitter(some, white(some, SIGMA), parameters=False).fit_models(starts, 8)
         cost = np.array([f.cost for f in fits])
         left, here, right = cost[:-2], cost[1:-1], cost[2:]
@@ -83,7 +83,7 @@ def test_over_pieces_the_sum_of_squares_has_one_minimum_where_whole_runs_have_ma
 def test_a_fit_of_pieces_begins_that_of_whole_runs_with_their_first_pieces():
     there = world(LONG)
     cut = make_segment_evaluator(there)
-    # on whole runs the fit from here ends beside the truth
+    # On whole runs, a fit from this start does not reach the true parameters.
     theta = cut.get_nominal_theta()
     theta[0] = 0.0045
     begun = FitStart((), theta, cut.guess)

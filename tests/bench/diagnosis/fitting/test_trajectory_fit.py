@@ -25,7 +25,7 @@ TRUTH = 2.7e-3
 
 
 def swings():
-    """Runs of different lengths and rates, without noise."""
+    """Return noise-free runs of different lengths and rates."""
     made = []
     for q, rate, samples in ((0.7, 50, 60), (-1.2, 80, 130), (2.2, 100, 90)):
         times = np.arange(samples) / rate
@@ -49,7 +49,7 @@ def test_parameters_and_initial_states_of_noiseless_runs_come_back():
     released = [[0.7, 0], [-1.2, 0], [2.2, 0]]
     np.testing.assert_allclose(fit.states, released, atol=1e-3)
     seen = np.isfinite(there.observed)
-    # below the noise that the fit is told of, in rad/s
+    # The deviation is below the assumed noise, in rad and rad/s.
     assert np.abs(fit.simulated - there.observed)[seen].max() < 1e-3
     assert fit.cost < 60, "sum of squares over 560 samples in units of a noise of 1e-3"
     assert not seen[0, 60:].any()
@@ -64,7 +64,7 @@ def test_restitution_and_six_initial_states_of_noiseless_bounces():
     there = world(recorded(Ball(observe=["x", "y", "z"]), [0.72], starts, times))
     fit = fitted(there)
     assert fit.theta[0] == pytest.approx(0.72, abs=2e-5)
-    # x, y, z and their rates
+    # Columns: x, y, z and their rates.
     expected = [
         [0, 0, 2, 1, 0, 0.5],
         [0, 0.3, 3, 0, -0.7, 0],
@@ -91,7 +91,7 @@ def test_the_jacobian_is_the_derivative():
         moved[:, column] += [step, 2 * step]  # drag cannot be negative
         thetas = [np.tile(theta, (3, 1)) for theta in moved]
         one, two = (there.simulate(theta, runs, fit.states) for theta in thetas)
-        # second order, from three points on one side
+        # This is a second-order one-sided difference with three points.
         forward = (4 * one - two - 3 * fit.simulated) / (2 * step)
         near = np.isfinite(forward)
         scale = np.abs(forward[near]).max()
@@ -149,7 +149,7 @@ def test_only_the_first_share_counts():
 
 def test_bounds_are_kept():
     starts, times = [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60
-    # motion that feeds itself
+    # Negative drag makes the motion grow.
     runaway = Pendulum(fixed={"drag.linear": -5e-4})
     made = recorded(runaway, [TRUTH], starts, times)
     there = world(made, candidates=["drag.linear"])
@@ -161,7 +161,7 @@ def test_bounds_are_kept():
 
 def test_a_parameter_that_would_leave_its_bounds_ends_at_them():
     starts, times = [{"q": 0.8}, {"q": 1.3}], np.arange(80) / 60
-    # a tenth of the gravity that the recording states asks for ten times the inertia
+    # A tenth of the stated gravity requires ten times the inertia.
     light = recorded(Pendulum({"gravity": 0.981}), [6e-3], starts, times)
     there = world(replace(light, constants={**light.constants, "gravity": 9.81}))
     theta = there.get_nominal_theta()
@@ -171,7 +171,7 @@ def test_a_parameter_that_would_leave_its_bounds_ends_at_them():
 
 def test_frozen_parameters_and_known_initial_states_stay():
     made = swings()
-    # the first one is stated wrongly, and believed all the same
+    # The first angle is specified wrongly but treated as known.
     stated = (0.71, -1.2, 2.2)
     runs = [replace(run, initial={"q": q}) for run, q in zip(made.runs, stated, strict=True)]
     there = world(replace(made, runs=tuple(runs)))
@@ -214,7 +214,7 @@ def test_what_is_known_beforehand_depends_on_the_channels():
 
 
 def test_least_squares_with_coloured_noise_is_generalised():
-    """With noise that remembers, fits that know it come nearer to the truth."""
+    """With AR(1) noise, generalised least squares is closer to the true parameters."""
     times, errors = np.arange(150) / 100, []
     rng = np.random.default_rng(11)
     for _ in range(12):
@@ -226,7 +226,7 @@ def test_least_squares_with_coloured_noise_is_generalised():
         there = world(replace(clean, runs=(run,)))
         start = FitStart((), there.get_nominal_theta(), there.guess)
         plain = white(there, 0.02)
-        # the same noise, once taken for white and once for what it is
+        # The noise is treated once as white and once as AR(1).
         fitters = [
             TrajectoryFitter(there, noise) for noise in (plain, plain.with_correlation(0.95))
         ]

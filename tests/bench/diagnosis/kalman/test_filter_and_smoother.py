@@ -1,4 +1,4 @@
-"""The filter, the smoother and the process noise against dense linear algebra."""
+"""Tests of the Kalman filter, the smoother and the process noise against dense linear algebra."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ JUMPS = [3, 7]
 
 
 def runs_of(residuals, prior=(0.5, 0.8), with_jumps=False):
-    """A body of unit mass whose position is read, with an unknown force between samples."""
+    """Return runs of a unit mass with measured position and unknown forces between samples."""
     number, samples, _ = residuals.shape
     a = np.array([[1.0, 0.1], [-0.05, 0.98]])
     g = np.array([[0.005], [0.1]])
@@ -40,8 +40,9 @@ def runs_of(residuals, prior=(0.5, 0.8), with_jumps=False):
 
 
 def dense(runs, noise):
-    """Mean (T,) and covariance of the readings, and the matrix from unknowns to states: the first
-    state in units of its prior, then the forces, then the jumps.
+    """Return mean (T,) and covariance of the readings, and the matrix from unknowns to states.
+
+    The unknowns are the first state in units of its prior, then the forces, then the jumps.
     """
     samples = runs.residuals.shape[1]
     mean, states = np.zeros(SIZE), [np.zeros(SIZE)]

@@ -1,4 +1,4 @@
-"""Free numbers of a model file, identified by prediction errors; plain MuJoCo makes the data."""
+"""Tests of free model-file parameters identified by prediction errors on MuJoCo data."""
 
 import mujoco
 import numpy as np
@@ -13,15 +13,15 @@ CARRIAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/>
 """
 STIFF = 'solreffriction="0.001 1" solimpfriction="0.99 0.999 0.001"'
 MASS, DAMPING, FRICTION = 80.0, 200.0, 20.0
-"""Of the carriage that moves: kg, N s/m, N. Its model file states 100 kg, and nothing that rubs."""
+"""True mass (kg), damping (N s/m) and friction (N); the file has 100 kg and no friction."""
 NOISE = 2e-5
-"""Of the position, 1 sigma in m."""
+"""Standard deviation of the position noise in m."""
 STIFFNESS, DERIVATIVE = 40_000.0, 3_000.0
-"""Of the position control that makes the force, N/m and N s/m."""
+"""Gains of the position controller in N/m and N s/m."""
 
 
 def rows_of(seed):
-    """A log at 100 Hz of a carriage that follows a command, with the force that moves it."""
+    """Return the rows of a 100 Hz log of a carriage that follows a command, with its force."""
     rng = np.random.default_rng(seed)
     joint = f'damping="{DAMPING}" frictionloss="{FRICTION}" {STIFF}'
     model = mujoco.MjModel.from_xml_string(CARRIAGE.format(joint=joint, mass=MASS))
@@ -59,7 +59,7 @@ def answer(tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_mass_is_identified_beside_friction_that_the_file_lacks(answer):
-    """A fit of the mass alone makes it ten times as heavy, since friction slows it as well."""
+    """Without friction in the model, the fitted mass would be ten times too large."""
     assert answer.verdict == "named"
     assert answer.parameters["mass.scale@carriage"].value == pytest.approx(MASS / 100 - 1, abs=0.01)
 

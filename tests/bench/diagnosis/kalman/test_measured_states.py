@@ -1,4 +1,4 @@
-"""The linear model about a measured motion against simulations with an effect."""
+"""Tests of the linear model about a measured motion against simulations with an effect."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +36,7 @@ def theta_of(world, name, c):
 
 
 def motion_with(world, theta):
-    """The linear model about the motion that the simulator makes with some parameters."""
+    """Return the linear model about the motion simulated with these parameters."""
     half = len(world.states) // 2
     start = world.guess[0, :half], world.guess[0, half:]
     simulated = MeasuredLinear(world.simulator, theta, world.tracks[0].scenario, start)
@@ -49,7 +49,7 @@ def motion_with(world, theta):
 
 
 def added(linear, world, name, c):
-    """What an effect adds about the motion, with no deviation from it."""
+    """Return the force and readings that an effect adds about the motion, at zero deviation."""
     size = 2 * (len(world.states) // 2)
     return linear.added([(world.available_effects[name], c)], np.zeros((linear.knots.size, size)))
 
@@ -63,7 +63,8 @@ def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(world, name):
     pushed, _ = added(linear, world, name, c)
     expected = (maps.inputs @ pushed)[:, :, 0]
     joints = len(world.states) // 2
-    # Velocities alone: a force is taken for its mean, which moves positions a little otherwise.
+    # Only velocities are compared: the model uses the mean force, which moves positions
+    # differently.
     found, wanted = maps.defects[:, joints:], expected[:, joints:]
     error = np.sqrt(np.square(found - wanted).mean()) / np.sqrt(np.square(wanted).mean())
     assert error < 0.02, f"{name}: {error:.3f}"
@@ -83,7 +84,7 @@ def test_a_sensor_effect_changes_readings_alone(world):
 
 
 def test_a_gain_of_a_sensor_acts_on_what_is_predicted(world):
-    """Not on the reading itself, whose noise it would explain."""
+    """If the gain scaled the reading itself, it would explain the noise."""
     linear = motion_with(world, world.get_nominal_theta())
     predicted = np.zeros((linear.knots.size, 2 * (len(world.states) // 2)))
     elbow = world.channels.index("q.elbow")
@@ -96,7 +97,7 @@ def test_a_gain_of_a_sensor_acts_on_what_is_predicted(world):
 
 
 def test_jacobians_of_other_commands_are_not_used_again(world):
-    """Delayed steps change between samples, so that more instants are looked at."""
+    """Delayed steps change between samples, so the model is evaluated at more times."""
     scenario, half = world.tracks[0].scenario, len(world.states) // 2
     steps = {name: np.full_like(values, values[0]) for name, values in scenario.inputs.items()}
     for values in steps.values():
@@ -115,7 +116,7 @@ def test_jacobians_of_other_commands_are_not_used_again(world):
 
 
 def test_maps_carry_a_deviation_as_the_simulator_does(world):
-    """A states' deviation at a sample, mapped to the next one, against two simulations."""
+    """Compare a state deviation mapped to the next sample with that of two simulations."""
     linear = motion_with(world, world.get_nominal_theta())
     maps = linear.interval_maps()
     half = len(world.states) // 2

@@ -1,4 +1,4 @@
-"""Recordings on which the search by simulation failed, with their right answers."""
+"""Tests of recordings on which the simulation search failed, against their correct answers."""
 
 import os
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_a_four_bar_without_a_cause_is_adequate():
 
 @pytest.mark.slow
 def test_what_acts_alike_is_told_after_a_cause_that_does_not_hold_is_removed():
-    """The servo's damping acts as the joint's does, since its force limit is not reached."""
+    """The servo's damping is equivalent to the joint's, since its force limit is not reached."""
     verdict = answer("friction_and_drag_one_joint")
     assert verdict.verdict == "ambiguous"
     sets = [{cause.effect, *cause.alternatives} for cause in verdict.causes]

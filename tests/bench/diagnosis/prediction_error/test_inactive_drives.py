@@ -1,6 +1,6 @@
-"""Samples in which drives do nothing are found, and nothing else is taken for such.
+"""Tests that samples with inactive drives are found, without false detections.
 
-The motion is that of plain MuJoCo, with other gains, limits and brakes than the model file states.
+Plain MuJoCo makes the motion, with other gains, limits and brakes than the model file states.
 """
 
 from dataclasses import dataclass, field
@@ -48,15 +48,15 @@ LOG = "".join(
 
 @dataclass
 class Rig:
-    """How the recorded arm differs from its model file.
+    """Differences between the recorded arm and its model file.
 
     Attributes:
-        off: by run, from when to when which servos are off.
-        brakes: by run, when brakes stop the arm.
-        delay: samples by which commands act later.
-        dead: half width of a dead zone of the shoulder's servo.
+        off: for each run, first time, last time and the servos that are off.
+        brakes: for each run, the interval in which brakes stop the arm.
+        delay: number of samples by which commands are delayed.
+        dead: half width of the dead zone of the shoulder's servo.
         model: entries of the model file.
-        column: name of an extra column, and its values where drives are on and off.
+        column: name of an extra column, and its values while drives are on and off.
     """
 
     off: dict = field(default_factory=dict)
@@ -68,7 +68,7 @@ class Rig:
 
 
 def recorded(folder, rig):
-    """The path of a log of three runs."""
+    """Write a log of three runs; return its path."""
     rng = np.random.default_rng(3)
     model = mujoco.MjModel.from_xml_string(ARM.format(**{**USUAL, **rig.model}))
     gains, biases = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
@@ -103,7 +103,7 @@ def recorded(folder, rig):
 
 
 def times_of(recording, mask, run):
-    """When a mask of a run is set first and last."""
+    """Return the first and last time of a run at which a mask is set."""
     times = recording.runs[run].times[mask]
     return float(times[0]), float(times[-1])
 

@@ -1,4 +1,4 @@
-"""Selection by regression against least squares."""
+"""Tests of the selection of regressors against least squares."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ RUNS, SAMPLES, COLUMNS = 4, 80, 6
 
 
 def regression_of(rows, target, groups, **more):
-    """A regression of rows (R, n, K) and a target (R, n)."""
+    """Return the regression of a target (R, n) on rows (R, n, K)."""
     grams = np.einsum("rnk,rnl->rkl", rows, rows)
     crosses = np.einsum("rnk,rn->rk", rows, target)
     totals = np.square(target).sum(axis=1)
@@ -71,7 +71,7 @@ def test_what_acts_is_selected_and_nothing_else(rows):
 
 
 def test_noise_selects_nothing_in_most_draws(rows):
-    """The penalty k log N + 2 log M is exceeded by chance in less than one of 30 draws."""
+    """By chance, less than one of 30 draws exceeds the penalty k log N + 2 log M."""
     alarms = sum(bool(regression_of(rows, noise(s), singles()).select(6)) for s in range(60))
     assert alarms <= 2
 
@@ -86,7 +86,7 @@ def test_what_helps_one_run_alone_is_not_selected(rows):
 
 
 def test_an_effect_of_the_model_is_put_back(rows):
-    """About a model with an effect in it, the regression without it is that of the base model."""
+    """Without the model's own effect, the regression is that about the base model."""
     whole = rows[:, :, 0]
     target = 0.7 * whole + noise()
     about = regression_of(rows, target - whole, singles()[1:], always=(5, 0))

@@ -1,4 +1,4 @@
-"""Servos whose forces jump at their limits, in logs that MuJoCo alone has made."""
+"""Tests of servos whose forces reach their limits, in logs made by plain MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -24,7 +24,7 @@ TRUE = {"armature": 0.6, "kp": 1700.0}
 
 
 def log_of(changed, seed):
-    """Rows of three seconds with one changed number, and how often the wrist is at its limit."""
+    """Return rows of 3 s with one changed parameter, and how often the wrist is at its limit."""
     rng = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(
         ARM.format(limit=LIMIT, **{**STATED, changed: TRUE[changed]})

@@ -1,4 +1,4 @@
-"""The figure of the candidate causes as a reader sees it."""
+"""Tests of the texts in the figure of candidate causes."""
 
 from collections import Counter
 from dataclasses import replace
@@ -37,7 +37,7 @@ DRAG = {"drag.linear": (0.85, 0.97)}
 
 
 def words(drawn):
-    """All texts of a figure, those of its panels and ticks among them."""
+    """Return all texts of a figure, including panels and ticks."""
     texts = [text.get_text() for text in drawn.texts]
     for axes in drawn.axes:
         texts += [text.get_text() for text in axes.texts]

@@ -25,12 +25,12 @@ SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 
 
 def still(name):
-    """A figure that was not really drawn."""
+    """Return placeholder bytes for a rendered figure."""
     return RenderedFigure(b"\x89PNG\r\n\x1a\n", b"%PDF-" + name.encode(), SVG + name.encode())
 
 
 class Reader(HTMLParser):
-    """Checks that elements nest, and gathers tags, attributes and texts."""
+    """Parser that checks the nesting of elements and collects tags, attributes and texts."""
 
     def __init__(self, text):
         super().__init__()
@@ -67,7 +67,7 @@ def figures():
 
 
 def cells(text, first):
-    """The cells of the first table row that begins with a text."""
+    """Return the cells of the first table row that begins with this text."""
     rows = [
         re.findall(r"<td[^>]*>(.*?)</td>", row)
         for row in re.findall(r"<tr[^>]*>(.*?)</tr>", text, re.DOTALL)
@@ -277,7 +277,7 @@ def test_commands_name_the_recording_and_the_folder_as_a_shell_takes_them(figure
         ["simgap", "explain", "my logs/it's <b>.csv", "next.csv"],
         ["simgap", "score", "out dir/extended.toml", "OTHER.csv"],
     ]
-    # Nothing lies beside a page that stands alone.
+    # A page without a folder has no extended.toml to refer to.
     assert "extended.toml" not in render_report(told, figures)
     unknown = Reader(render_report(story("unknown"), figures)).text
     assert "--plugin my_effect.py" in unknown
@@ -298,7 +298,7 @@ def test_in_a_frame_the_page_stays_whole(figures):
     attributes = {name: value for _, name, value in reader.attributes}
     assert reader.tags == ["iframe"]
     assert attributes["srcdoc"] == html
-    # Not of the same origin: what runs in it reaches nothing of the notebook.
+    # The frame has another origin, so its code cannot access the notebook.
     assert attributes["sandbox"] == "allow-scripts allow-downloads"
 
 
@@ -330,7 +330,7 @@ def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
 
 @pytest.mark.parametrize("verdict", ["named", "ambiguous", "unknown"])
 def test_what_can_be_fixed_does_not_contradict_the_headline(figures, verdict):
-    """About the base model the named cause may score as not identifiable: its fit says more."""
+    """The named cause may be "not identifiable" about the base model; its own fit decides."""
     names = ["drag.linear", "friction.coulomb", "sensor.lag"]
     numbers = [
         ParameterIdentifiability(n, False, "1", np.inf, 0.0, 1.0, "not identifiable", ())
@@ -393,7 +393,7 @@ def test_of_a_tracked_film_the_picture_of_its_track_stands_beside_the_curves(fig
     assert track(tracked) == b""
     (tmp_path / "drop.png").write_bytes(png)
     assert track(tracked) == png
-    # A picture beside another recording, and what is none, stay where they are.
+    # An image for another recording and a file that is not an image are not embedded.
     assert track(("u", "v")) == b""
     (tmp_path / "drop.png").write_bytes(b"<svg onload=alert(1)>")
     assert track(tracked) == b""

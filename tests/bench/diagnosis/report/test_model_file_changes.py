@@ -1,4 +1,4 @@
-"""The lines of a model file to change, from the file and its extended one."""
+"""Tests of the model-file lines to change, from the original and the extended file."""
 
 from pathlib import Path
 

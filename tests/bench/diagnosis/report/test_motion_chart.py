@@ -1,4 +1,4 @@
-"""The samples of a page: few enough, each of them real, and none that stands out is lost."""
+"""Tests of the sample selection of a page: few real samples, and no lost extreme."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from tests.bench.diagnosis.sample_report_data import story
 
 
 def lost(kept, signals, peaks):
-    """Peaks that are not among the samples that are kept."""
+    """Return the peaks that are not among the kept samples."""
     return [at for at in peaks if at not in set(np.asarray(kept).tolist())]
 
 
@@ -40,7 +40,7 @@ def test_the_extremes_of_every_stretch_are_kept_and_every_tenth_sample_would_los
 
 
 def long_story(channels=6, runs=4, size=25_000):
-    """25 s at 1 kHz."""
+    """Return report data with runs of 25 s at 1 kHz."""
     rng = np.random.default_rng(4)
     t = np.arange(size) / 1000.0
     after = np.sin(np.arange(1, channels + 1) * t[:, None])[None].repeat(runs, axis=0)
@@ -61,7 +61,7 @@ def test_long_recordings_are_thinned_said_so_and_stay_below_3_mb():
     caption = make_motion_chart(told, found, None, "").caption
     assert "Of runs of up to 25000 samples not all are shown" in caption
     assert f"each of {found.stretches} stretches" in caption
-    # Every row is a sample as it was: nothing is averaged.
+    # Every row is an original sample, not an average.
     frame = pd.DataFrame(found.frame.rows())
     rows = frame[(frame["run"] == "2") & (frame["channel"] == "channel_3")]
     places = np.round(rows["t"].astype(float) * 1000).astype(int)

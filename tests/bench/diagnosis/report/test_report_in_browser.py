@@ -1,5 +1,7 @@
-"""The page of an explanation in a real browser: each control does what it says, and every number is
-the verdict's and the story's.
+"""Tests of the explanation page in a browser.
+
+Each control has its documented effect, and every number equals that of the verdict and of the
+report data.
 """
 
 import io
@@ -26,11 +28,11 @@ from tests.browser import WIDTHS, Opened
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Pages of a simple system and of a robot, with the stories and figures that they are of."""
+    """Write pages of a simple system and of a robot, with their report data and figures."""
     folder = tmp_path_factory.mktemp("pages")
     made = {}
     with pytest.MonkeyPatch.context() as patch:
-        # Drawn as links: what is rendered has tests of its own.
+        # Draw the robot as links, since rendering has its own tests.
         patch.setattr(drawing, "render_robot", lambda *_: None)
         for name, told in (
             ("simple", story("ambiguous")),
@@ -63,7 +65,7 @@ def heads(opened, figure="motion"):
 
 
 def table(opened, selector, button):
-    """The CSV that a button saves."""
+    """Return file name and content of the CSV that a button saves."""
     name, content = opened.saved(
         opened.page.locator(selector).get_by_role("button", name=button).click
     )
@@ -71,7 +73,7 @@ def table(opened, selector, button):
 
 
 def strays(frame, verdict):
-    """Candidates of whom a table says otherwise than verdict.json."""
+    """Return the candidates for which a table differs from verdict.json."""
     said = {c["effect"]: c for c in json.loads(json.dumps(verdict.to_document()))["candidates"]}
     wrong = sorted(set(said) ^ set(frame["effect"]))
     for row in frame.to_dict("records"):
@@ -110,7 +112,7 @@ def test_candidates_are_those_of_the_verdict_and_can_be_sorted_and_filtered(simp
         file, frame = table(opened, "#candidates-table", "save as CSV")
         assert file == "candidates.csv"
         assert strays(frame, written[name].story.verdict) == []
-    # A number that is another, and one that is missing, are noticed.
+    # A changed number and a missing row are detected.
     frame.loc[3, "score"] += 1e-9
     assert strays(frame.iloc[:-1], written["robot"].story.verdict) == [
         frame["effect"].iloc[-1],
@@ -181,7 +183,7 @@ def test_the_samples_are_the_recordings_and_residuals_are_in_noises(simple, writ
                     assert np.allclose(rows[column], values[r, :, c], rtol=0, **close)
                 left = (side.observed - side.after)[r, :, c] / channel.sigma
                 assert np.allclose(rows["residual_after"], left, rtol=0, atol=6e-3, equal_nan=True)
-    # A third of the tolerance beside it is noticed.
+    # The comparison is strict enough to detect an error of sigma / 50.
     assert not np.allclose(
         rows["measured"] + channel.sigma / 50, side.observed[r, :, c], rtol=0, **close
     )
@@ -234,7 +236,7 @@ def test_a_joint_lights_up_in_its_curves_its_picture_and_the_tables(robot):
     page.locator("#candidates-table").get_by_label("search").fill("wrist_3")
     page.locator("#candidates-table tbody tr", has_text="@wrist_3").first.hover()
     assert page.locator("#robot .spot.lit").get_attribute("data-lights") == "wrist_3"
-    # Joints stand where the picture has them: from the base to the tip of an arm, all within it.
+    # Marks of joints follow the picture, from the base to the tip of the arm, and stay inside it.
     places = page.locator("#robot .spot").evaluate_all(
         "a => a.map(s => [s.style.left, s.style.top])"
     )

@@ -1,4 +1,4 @@
-"""Causes at places of a robot, as the account says them."""
+"""Tests of the text summary of causes at places of a robot."""
 
 from dataclasses import replace
 

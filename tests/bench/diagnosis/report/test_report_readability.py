@@ -1,4 +1,4 @@
-"""Every figure of an explanation can be read: no name is shortened, cut off or covered."""
+"""Tests that no text in the figures of an explanation is shortened, cut off or covered."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ LONG = (
 
 
 def long_robot():
-    """A robot of six joints with long names, whose residual follows the velocity of one."""
+    """Return a six-joint robot with long names and a residual that follows one velocity."""
     told = robot_story(joints=LONG, at="elbow")
     profiles = tuple(
         replace(p, channel=f"q.{LONG[0]}", variable=f"velocity of {LONG[0]}") for p in told.profiles

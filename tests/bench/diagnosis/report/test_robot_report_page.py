@@ -1,4 +1,4 @@
-"""The page and the figures of a robot."""
+"""Tests of the page and the figures of a robot."""
 
 import io
 from dataclasses import replace
@@ -37,7 +37,7 @@ FIGURES = {name: still(name) for name in ALL}
 
 @pytest.fixture(autouse=True)
 def schematic(monkeypatch):
-    """Drawn as links: what is rendered has tests of its own."""
+    """Draw the robot as links, since rendering has its own tests."""
     monkeypatch.setattr(drawing, "render_robot", lambda *_: None)
 
 
@@ -80,7 +80,7 @@ def test_rows_are_on_one_scale_and_say_how_large_the_residual_is(overview):
 
 
 def named(drawn):
-    """Names of the rows that stand out, in colour and in grey."""
+    """Return the names of the highlighted rows."""
     texts = [text for axis in drawn.axes[::3] for text in axis.texts]
     return [
         t.get_text()[2:] for t in texts if t.get_text()[0] == "▸" and t.get_color() == "#0072B2"

@@ -1,4 +1,4 @@
-"""Models that nothing was fitted for: effects, a merit, and what they leave."""
+"""Constructed models for tests of the search: effects, log-likelihood and residuals."""
 
 from types import SimpleNamespace
 
@@ -11,14 +11,14 @@ from tests.bench.diagnosis.explained_samples import linear_fit
 
 
 def model(*names, merit=0.0):
-    """A model with these effects; its likelihood is its merit."""
+    """Return a model with these effects; its log-likelihood is its penalised log-likelihood."""
     fit = linear_fit(np.zeros((1, 1, 1, 1)), 1)
     fit = type(fit)(names, *list(vars(fit).values())[1:])
     return FittedModel(fit, Likelihood(merit, np.ones(1), np.zeros(1)), merit)
 
 
 def search_of(*models, excess=None):
-    """What stands for a search that has fitted them; `excess` by the effects of each."""
+    """Return a stub of a search with these models; `excess` maps their effects to excesses."""
     table = {frozenset(m.effects): m for m in models}
     excesses = excess or {}
     return SimpleNamespace(
@@ -30,8 +30,9 @@ def search_of(*models, excess=None):
 
 
 def held_out(left):
-    """Held-out runs of one channel with sigma 1 where models leave this RMS, by their effects; and
-    what was measured there: a model that leaves less has more merit.
+    """Return held-out runs with sigma 1, and fits with these RMS residuals by their effects.
+
+    A model with a smaller residual has a higher penalised log-likelihood.
     """
     runs = SimpleNamespace(
         world=SimpleNamespace(observed=np.zeros((1, 4, 1))),

@@ -48,7 +48,7 @@ def test_what_is_not_behind_by_the_odds_is_an_alternative(monkeypatch):
     ("luck", "best", "p_value"), [(150.0, 1e-5, 1e-5), (0.0, 0.7, 0.0), (150.0, 1.0, 1.0)]
 )
 def test_the_refit_or_the_best_score_may_see_that_it_is_no_chance(monkeypatch, luck, best, p_value):
-    """The fit gains 100, more than any surrogate, or less than what luck gives the effect."""
+    """The gain of 100 is above all surrogates or below the null quantile; the score also counts."""
     assert evidence(monkeypatch, luck=luck, best=best).p_value == pytest.approx(p_value, abs=1e-12)
 
 
@@ -95,7 +95,7 @@ def test_more_numbers_that_leave_as_much_structure_are_no_alternative(
 def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
     monkeypatch, family, contains, kept, place
 ):
-    """The plain one is; a family whose place is far behind stays in the set."""
+    """The simpler effect is preferred; a family whose place scores far lower stays in the set."""
     search = search_of(model(), BEST, ALIKE, BEHIND)
     effects = {name: placed() for name in "abc"} | {family: placed(place, contains)}
     search.world = SimpleNamespace(available_effects=effects, has_linearisation=False)
@@ -110,7 +110,7 @@ def test_what_contains_a_place_or_law_that_does_as_well_is_no_answer(
 def test_what_one_of_two_signs_gains_by_chance_is_no_reason_about_a_robot(
     least, alternatives, monkeypatch
 ):
-    """What has shapes to choose from pays for them."""
+    """Only an effect with shape parameters keeps its penalty."""
     search = search_of(
         model(), BEST, model("b", merit=100.0 - 3.0 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO)
     )

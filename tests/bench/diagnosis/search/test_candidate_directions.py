@@ -113,7 +113,7 @@ def test_driven_runs_try_limits_of_the_input():
     expected = there.tracks[0].observed[:, there.channels.index("x")]
     np.testing.assert_allclose(
         x, expected, atol=0.02
-    )  # what the input does to a slider at rest, once more
+    )  # equals the response of a slider at rest to the input
 
 
 def test_shapes_are_laid_on_a_grid_and_those_of_one_shape_act_together(swing):
@@ -185,7 +185,7 @@ def test_a_change_that_explodes_is_none_and_multiplies_without_a_warning(swing, 
 
     def exploding(world, at, added):
         changed = simulate_with_effect(world, at, added)
-        # numbers still, of which the products are none
+        # These values are finite, but their products overflow.
         changed[0, 0, 10:] = -1e200 * np.arange(1.0, changed.shape[2] - 9)[:, None]
         changed[0, 1, 10:] = np.nan
         return changed
@@ -264,5 +264,5 @@ def test_a_harder_stop_that_turns_back_at_the_same_place_is_met_later():
     )
     stops = np.array([s.theta[there.slots["state.limit"]] for s in starts])
     np.testing.assert_allclose(stops[:, 0] / 40.0, REFIT_STIFFNESS_FACTORS)
-    # the work of the way in is the same: k d^(5/2)
+    # All stops need the same work k d^(5/2) up to the end of the travel.
     np.testing.assert_allclose(stops[:, 0] * (high - stops[:, 1]) ** 2.5, 40 * (high / 2) ** 2.5)

@@ -1,6 +1,4 @@
-"""The share of the gap that a model closes on the fitted runs; and when a fuller account is asked
-for.
-"""
+"""Tests of the gap closed on the fitted runs, and of the search for a larger model."""
 
 from types import SimpleNamespace
 
@@ -14,8 +12,9 @@ SIGMA = 0.1
 
 
 def share(before, after, structure=True, own=np.nan):
-    """Of a base model that leaves `before` and a model that leaves `after` everywhere, with a
-    noise of 0.1; half of the samples are missing, where anything may stand.
+    """Return the gap closed for residuals `before` (base model) and `after` at a noise of 0.1.
+
+    Half of the samples are missing and hold an arbitrary value.
     """
     seen = np.arange(10).reshape(1, 10, 1) % 2 == 0
 
@@ -55,18 +54,18 @@ BASE, FOUND, FULLER, PLAINER = model(), model("a"), model("a", "b", "c"), model(
     [
         (FOUND, FULLER, True, True, PLAINER),
         (FOUND, FOUND, True, True, FOUND),
-        # nothing is left over
+        # Without lack of fit, no larger model is sought.
         (FOUND, FULLER, False, True, FOUND),
-        # nobody judges
+        # Without held-out runs, no larger model is accepted.
         (FOUND, FULLER, True, False, FOUND),
-        # where nothing was found nothing is added to it
+        # A base model without causes is not extended.
         (BASE, FULLER, True, True, BASE),
     ],
 )
 def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
     found, fuller, structure, held_out, stands
 ):
-    """It is fitted to its end, and told by its simplest laws."""
+    """The larger model is fitted to convergence and its laws are simplified."""
     measured = []
     watch = SimpleNamespace(watch=None)
     search = SimpleNamespace(

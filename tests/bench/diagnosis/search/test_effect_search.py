@@ -1,4 +1,4 @@
-"""By which chances a search takes an effect, and looks no further."""
+"""Tests of the p-values at which a search accepts an effect or stops."""
 
 from types import SimpleNamespace
 
@@ -14,7 +14,7 @@ BASE, LARGER = model(merit=10.0), model("a", merit=30.0)
 
 
 def search(monkeypatch, **answers):
-    """A search that has fitted two models and is told the answers to its questions."""
+    """Return a search with two fitted models and fixed results of its methods."""
     made = EffectSearch.__new__(EffectSearch)
     made.models = {frozenset(m.effects): m for m in (BASE, LARGER)}
     for question, answer in answers.items():
@@ -72,7 +72,7 @@ def test_a_model_is_plain_that_neither_scores_nor_loudness_doubt(
 
 
 def scores(p_value, lucky):
-    """Of two effects; a hundred surrogates whose best gains 0, 1, ... 99 less its chance."""
+    """Return scores of two effects; 100 surrogates exceed their null quantile by 0, 1, ... 99."""
     drawn = np.vstack([np.arange(100.0), np.full(100, -50.0)])
     return SimpleNamespace(
         effects=("a", "b"),
@@ -83,7 +83,7 @@ def scores(p_value, lucky):
 
 
 def test_a_gain_counts_less_what_luck_gives_its_effects(monkeypatch):
-    """The model gains 20: beside a luck of 12 beaten by 92 of 100 surrogates, else by 80."""
+    """The gain is 20: with a null quantile of 12, 92 of 100 surrogates exceed it, without it 80."""
     about = {None: scores(0.9, 5.0), "larger": scores(0.95, 0.0)}
     made = search(
         monkeypatch,
@@ -123,7 +123,7 @@ def test_what_is_left_may_be_noise_up_to_the_floor_or_if_it_forgets(
 
 
 def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
-    """A sketch that was begun for fewer effects may have no model of so many."""
+    """Segments searched with fewer effects may have no model with this number of effects."""
     recorded = recording("pendulum", noise=["0.01"], observe=["q"], runs=2, seconds=4.0, rate=50.0)
     made, _ = searched(recorded, 0.01, candidates=["friction.coulomb", "gravity.tilt"])
     made.refit_from_segments(1)
@@ -142,7 +142,7 @@ def test_pieces_that_explain_nothing_leave_nothing_to_refit(monkeypatch):
 def test_a_thorough_search_goes_on_where_the_nearest_models_come_nearer(
     thorough, nearest, hopeless
 ):
-    """The best single effect leaves 5, of which 0.85 are 4.25; what is built upon leaves 4.9."""
+    """The best single effect leaves 5 (0.85 of it is 4.25); its extension leaves 4.9."""
     left = {(): 20.0, ("a",): 5.0, ("a", "b"): 4.9, ("c", "d"): nearest}
     models = [model(*names) for names in left]
     asked = search_of(*models, excess=left)

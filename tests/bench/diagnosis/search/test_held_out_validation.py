@@ -20,9 +20,9 @@ def test_excess_is_what_is_left_over_the_noise():
     [
         ({(): 5.0, ("a",): 3.0, ("b",): 3.0, ("a", "b"): 1.0}, ("a", "b")),
         ({(): 5.0, ("a",): 1.0, ("b",): 3.0, ("a", "b"): 1.1}, ("a",)),
-        # far from the noise a gain of less than a tenth is none, and then neither helps
+        # Far above the noise, a gain below a tenth does not count, so neither effect helps.
         ({(): 5.0, ("a",): 4.9, ("b",): 4.8, ("a", "b"): 4.7}, ()),
-        # a model that was not tried there has no voice
+        # A model without held-out results is not considered.
         ({(): 5.0, ("b",): 3.0, ("a", "b"): 1.0}, ("a", "b")),
     ],
 )
@@ -34,14 +34,14 @@ def test_effects_that_do_not_help_go(left, stands):
 @pytest.mark.parametrize(
     ("fitted", "left", "stays"),
     [
-        # a limit that no held-out run comes near: the fitted runs decide
+        # No held-out run comes near the limit, so the fitted runs decide.
         ({(): 3.2, ("a",): 0.0}, {(): 1.02, ("a",): 1.03}, True),
-        # held-out runs speak against it
+        # The held-out runs contradict the effect.
         ({(): 3.2, ("a",): 0.0}, {(): 1.02, ("a",): 1.12}, False),
-        # the fitted runs are no clear case
+        # The fitted runs do not decide clearly.
         ({(): 3.2, ("a",): 2.0}, {(): 1.02, ("a",): 1.03}, False),
         ({(): 0.3, ("a",): 0.0}, {(): 1.02, ("a",): 1.03}, False),
-        # much is left of the held-out ones, of which nothing is known
+        # The held-out residual is large and unexplained.
         ({(): 3.2, ("a",): 0.0}, {(): 2.02, ("a",): 2.03}, False),
     ],
 )
@@ -65,23 +65,23 @@ A_B, A_C, A_B_C, B_C = model("a", "b"), model("a", "c"), model("a", "b", "c"), m
 @pytest.mark.parametrize(
     ("fitted", "unseen", "stands"),
     [
-        # two further effects that leave six tenths of both; with one of them nothing is won
+        # Two further effects leave six tenths of both residuals; one of them alone gains nothing.
         ({"a": 9.0, "ab": 8.9, "abc": 5.4}, {"a": 9.0, "ab": 8.9, "abc": 5.4}, "abc"),
-        # only the runs that were fitted are nearer
+        # Only the residual of the fitted runs decreases.
         ({"a": 9.0, "ab": 8.9, "abc": 5.4}, {"a": 9.0, "ab": 8.9, "abc": 8.0}, "a"),
-        # only those that were not
+        # Only the residual of the held-out runs decreases.
         ({"a": 9.0, "ab": 8.9, "abc": 8.0}, {"a": 9.0, "ab": 8.9, "abc": 5.4}, "a"),
-        # enough for one effect, and not for two
+        # The gain is enough for one effect but not for two.
         ({"a": 9.0, "ab": 8.9, "abc": 7.0}, {"a": 9.0, "ab": 8.9, "abc": 7.0}, "a"),
         ({"a": 9.0, "ab": 7.0, "abc": 6.9}, {"a": 9.0, "ab": 7.0, "abc": 6.9}, "ab"),
-        # one of the two does nothing on held-out runs: it goes again
+        # One of the two effects does not help on held-out runs, so it is removed.
         ({"a": 9.0, "ab": 5.6, "abc": 5.0}, {"a": 9.0, "ab": 5.1, "abc": 5.05}, "ab"),
-        # what was found is not exchanged for something else
+        # The effects already found are not exchanged for others.
         ({"a": 9.0, "bc": 1.0}, {"a": 9.0, "bc": 1.0}, "a"),
     ],
 )
 def test_a_fuller_account_is_taken_that_held_out_runs_bear_out(fitted, unseen, stands):
-    """Excesses by effects; those that are not given are far off."""
+    """The parameters give the excess by effects; for all other models it is large."""
     models = [BASE, A, B, model("c"), A_B, A_C, B_C, A_B_C]
     left = {m.effects: fitted.get("".join(m.effects), 20.0) for m in models}
     there = {m.effects: 1.0 + unseen.get("".join(m.effects), 20.0) for m in models}
@@ -92,7 +92,7 @@ def test_a_fuller_account_is_taken_that_held_out_runs_bear_out(fitted, unseen, s
 
 
 class _Measured(HeldOutValidation):
-    """A trial in which all has been measured."""
+    """Validation in which all models have been evaluated."""
 
     def evaluate_models(self, models):
         assert {m.effects for m in models} <= self.held_out_fits.keys()

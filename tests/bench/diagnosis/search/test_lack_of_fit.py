@@ -23,7 +23,7 @@ TIMES = np.arange(100) / 50
 
 
 class Gust(Force):
-    """A push for a while, which no effect of the library is."""
+    """A temporary push that no effect of the library describes."""
 
     name, says, source = "test.gust", "something pushes for a while", "this test"
     coefficients = (Coefficient("force", ("m/s^2", "N", "N*m"), ((-1, 1), (-1, 1), (-1, 1))),)
@@ -104,7 +104,7 @@ def test_noise_that_is_louder_than_stated_is_structure():
 
 @pytest.mark.parametrize(("phi", "samples"), [(0.0, 1.0), (0.6, 0.64 / 1.36), (-0.6, 0.64 / 1.36)])
 def test_noise_that_remembers_is_known_less_well(phi, samples):
-    """As if there were so many times fewer samples; Bartlett's formula."""
+    """AR(1) noise reduces the effective number of samples (Bartlett's formula)."""
     models = SimpleNamespace(observed_mask=np.ones((2, 100, 1), dtype=bool))
     model = SimpleNamespace(likelihood=SimpleNamespace(phi=np.array([phi])))
     assert _sigma_standard_error(models, model, 0) == pytest.approx(

@@ -1,4 +1,4 @@
-"""A simpler law takes the place of a richer one that comes no nearer to the data."""
+"""Tests that a simpler law replaces a richer one that does not fit the data better."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ MASS, NOISE = 1.4, 1e-3
 
 
 def search(effects, seed=0):
-    """A slider that is pushed about, with these effects; a search that has fitted nothing."""
+    """Return a search without fits, for a driven slider with these effects."""
     names = list(effects)
     simulator = Slider(observe=["x"], effects=names)
     theta = [MASS, *np.concatenate([np.ravel(c) for c in effects.values()])]
@@ -25,7 +25,7 @@ def search(effects, seed=0):
 
 
 def fitted(made, names, values):
-    """The model with these effects, fitted from these coefficients."""
+    """Return the model with these effects, fitted from these coefficients."""
     theta = made.world.get_nominal_theta()
     for name in names:
         theta[made.world.slots[name]] = values[name]
@@ -62,7 +62,7 @@ def test_the_richer_law_stands_where_it_comes_nearer(truth, richer, kept):
     ids=["far longer than the run", "within it"],
 )
 def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts(truth, kept):
-    """In 4 s friction that falls over 300 s does not fall: it is dry and viscous friction."""
+    """Over 4 s, friction with a time constant of 300 s equals dry plus viscous friction."""
     made = search({**truth, "force.bias": 0.4})
     values = {"friction.warming": (0.7, 0.6, 2.0 if len(kept) == 1 else 300.0), "force.bias": 0.3}
     plainer = made.simplify_laws(fitted(made, ("force.bias", "friction.warming"), values))
@@ -73,7 +73,7 @@ def test_a_law_whose_time_the_data_do_not_show_gives_way_to_the_sum_of_its_parts
 
 
 def test_what_is_far_from_the_data_is_told_by_the_shorter_account(monkeypatch):
-    """Where structure is left merits mislead: a richer law that leaves as much as its part goes."""
+    """With lack of fit, likelihoods mislead: a richer law must reduce the residual clearly."""
     made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
     model = fitted(made, ("friction.stribeck",), {"friction.stribeck": (0.5, 0.5, 0.2)})
     part = fitted(made, ("friction.coulomb",), {"friction.coulomb": 0.5})
@@ -85,7 +85,7 @@ def test_what_is_far_from_the_data_is_told_by_the_shorter_account(monkeypatch):
 
 
 def test_a_simpler_law_that_is_known_and_caught_is_fitted_from_the_richer_one():
-    """The way up may end where a joint sticks a sample longer than it should."""
+    """The fit of the simpler law may end where a joint sticks one sample too long."""
     made = search({"friction.coulomb": 0.7, "force.bias": 0.4})
     values = {"friction.coulomb": 0.5, "friction.stribeck": (0.7, 0.0, 0.2), "force.bias": 0.4}
     part = fitted(made, ("force.bias", "friction.coulomb"), values)

@@ -61,8 +61,10 @@ def test_a_rival_that_is_better_fitted_to_the_end_stands_unless_structure_is_lef
 
 
 def test_a_rival_of_a_pair_is_fitted_from_what_the_pair_shares_with_it_as_well(monkeypatch):
-    """A law of many numbers ends elsewhere each time: 10.4 in twice the log likelihood kept a bias
-    of command from being told beside the bias of force that is the same.
+    """Fits of a law with many parameters end in different optima.
+
+    A difference of 10.4 in twice the log-likelihood once hid that a command bias and a force bias
+    are equivalent.
     """
     best, rival = model("a", "b", merit=100.0), model("a", "c", merit=90.0)
     best = replace(best, fit=replace(best.fit, theta=np.array([1.0, 2.0, 3.0, 0.0])))

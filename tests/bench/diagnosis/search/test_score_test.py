@@ -1,4 +1,4 @@
-"""Scores against generalised least squares done the long way, with whole matrices."""
+"""Tests of scores against generalised least squares with full matrices."""
 
 from types import SimpleNamespace
 
@@ -23,7 +23,7 @@ RUNS, SAMPLES, Q, STATES, K = 3, 14, 2, 2, 5
 
 
 def problem(seed=0, holes=0.0):
-    """Jacobian, directions, residual and mask of a small problem; two directions nearly alike."""
+    """Return Jacobian, directions, residual and mask; two directions are nearly equal."""
     rng = np.random.default_rng(seed)
     jacobian = rng.normal(size=(RUNS, SAMPLES, 2, Q + STATES))
     directions = rng.normal(size=(RUNS, SAMPLES, 2, K)) * [1.0, 1e3, 1.0, 1e-3, 1.0]
@@ -34,10 +34,9 @@ def problem(seed=0, holes=0.0):
 
 
 def dense(jacobian, seen, phi, *values):
-    """Values (R, T, C, ...) as independent numbers (n, ...), less what parameters and initial
-    states absorb.
+    """Return values (R, T, C, ...) whitened to (n, ...), with parameters and states projected out.
 
-    The square root of the inverse covariance of each run and channel, taken of the whole matrix.
+    It uses the square root of the full inverse covariance of each run and channel.
     """
     design, rest = [], [[] for _ in values]
     for r in range(RUNS):
@@ -59,7 +58,7 @@ def dense(jacobian, seen, phi, *values):
 
 
 def whole(jacobian, directions, residual, seen):
-    """Products of one residual with all directions in one block."""
+    """Return the inner products of one residual with all directions in one block."""
     block = np.arange(directions.shape[3])[None]
     design = WhiteningDesign(linear_fit(jacobian, Q), directions, seen, SIGMA, [block])
     products = InnerProducts(design, residual[None])
@@ -91,7 +90,7 @@ def test_what_the_models_own_freedom_leaves_is_what_least_squares_leave(holes):
     noises = np.stack([residual, np.where(seen, residual[::-1], 0.0)])
     left = design.project_out(noises)
     assert (left[:, ~seen] == 0).all()
-    # The long way runs through the samples run by run and channel by channel.
+    # The dense computation orders the samples by run, then by channel.
     order = [left[:, r, seen[r, :, c], c] / SIGMA[c] for r in range(RUNS) for c in range(2)]
     expected = dense(jacobian, seen, 0.0, np.moveaxis(noises, 0, -1))[0]
     np.testing.assert_allclose(np.concatenate(order, axis=1).T, expected, atol=1e-9)
@@ -102,7 +101,7 @@ def probes(signed=True):
 
 
 def log_likelihood(residual, seen, phi):
-    """Twice it, the common sigma estimated, up to a constant."""
+    """Return twice the log-likelihood with a common estimated sigma, up to a constant."""
     count = int(seen.sum())
     determinants = sum(
         np.linalg.slogdet(covariance_of(seen[r, :, c][None], phi))[1]
@@ -179,7 +178,7 @@ def test_groups_solved_together_are_what_each_is_alone():
     shrunk = d.T @ np.stack([r, r[::-1], -r], axis=1)
     columns = np.array([[0, 4], [1, 2], [3, 3], [2, 0]])
     gram = np.stack([(d.T @ d)[np.ix_(some, some)] for some in columns])
-    gram[3, 1] = gram[3, :, 1] = 0.0  # absorbed
+    gram[3, 1] = gram[3, :, 1] = 0.0  # projected out completely
     cross = shrunk[columns]
     for positive in ((False, True), (True, True), (False, False)):
         gain, c = compute_explained_squares(gram, cross, positive)
@@ -203,7 +202,7 @@ def test_what_the_model_absorbs_is_no_evidence():
     assert found.score[found.effects.index("a")] == pytest.approx(0.0, abs=1e-6)
     directions[..., 1] = (
         1e9 * jacobian[..., 1] + directions[..., 2]
-    )  # of two alike little but rounding is left
+    )  # of two equal directions only rounding errors remain
     directions[..., 3] = 1e9 * jacobian[..., 1] + directions[..., 2]
     projected = whole(jacobian, directions, residual, seen)
     for phi in PHI_GRID:
@@ -229,9 +228,7 @@ def test_directions_of_an_effect_act_together_within_a_group():
 
 @pytest.mark.parametrize("phi", [0.0, 0.8])
 def test_p_values_of_clean_residuals_are_uniform(phi):
-    """200 residuals of noise alone: as many below each level as the level says, within three
-    standard errors.
-    """
+    """For 200 noise residuals, p-values match each level within three standard errors."""
     rng = np.random.default_rng(6)
     times = np.linspace(0, 1, 150)
     jacobian = np.stack([times, np.ones(150), np.sin(5 * times)], axis=1)[None, :, None].repeat(

@@ -1,4 +1,4 @@
-"""What is kept between scans of one model."""
+"""Tests of the results that are cached between score tests of one model."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from tests.bench.diagnosis.explained_samples import recording, searched
 
 @pytest.mark.parametrize(("moved", "anew"), [(0.01, False), (1.0, True)])
 def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
-    """A fit a little to the side, by so many sigmas RMS, takes the place of the base model."""
+    """A fit that differs by `moved` sigmas RMS replaces the base model."""
     recorded = recording("slider", noise=["0.01"], observe=["x"], runs=2, seconds=2.0, rate=50.0)
     search, base = searched(recorded, 0.01, candidates=["friction.coulomb", "spring.linear"])
     search.score_missing_effects(base)
@@ -25,7 +25,7 @@ def test_directions_are_simulated_anew_where_a_model_has_moved(moved, anew):
     again = search.add_fit(shifted)
     scores = search.score_missing_effects(again)
     assert (search.world.simulations > once) is anew
-    # The residual is the new one's, whatever it is compared with.
+    # The residual is that of the new fit, even if the directions are those of the old one.
     assert scores is not search.superseded_scans.get(frozenset())
     assert set(scores.effects) == {"friction.coulomb", "spring.linear"}
     np.testing.assert_array_equal(
@@ -84,7 +84,7 @@ def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkey
     held = {frozenset(), frozenset(first.effects)}
     assert set(search.cached_scans) == held
 
-    # Room for one of them beside the base model's.
+    # The cache has space for one model next to the base model.
     size = search.cached_scans[frozenset(first.effects)].directions.responses.nbytes
     monkeypatch.setattr("bench.diagnosis.search.scored_models.DIRECTION_CACHE_BYTES", 1.5 * size)
     search.score_missing_effects(second)
@@ -93,7 +93,7 @@ def test_what_was_scored_longest_ago_makes_room_and_is_scored_again_alike(monkey
     assert search.score_missing_effects(first) is before
     assert search.world.simulations == once
 
-    # Who extends both has both, the one that was gone among them.
+    # Extensions of both models are fitted, including those of the dropped model.
     search.refit_extensions([first, second], 3)
     assert search.scores_by_effects[frozenset(first.effects)] is before
     known = {frozenset([*one, "friction.coulomb"]) for one in (first.effects, second.effects)}

@@ -1,4 +1,4 @@
-"""Long recordings are searched with fewer samples, and all of them have the last word."""
+"""Tests of the subsampled search of long recordings, confirmed on all samples."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ RUBBED = {"effects": ["friction.coulomb=0.3"], "observe": ["x"], "noise": ["x=0.
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    """What is long is short here."""
+    """Lower the sample limits so that short runs are thinned."""
     monkeypatch.setattr(run_thinning, "MIN_SAMPLES_TO_THIN", 600)
     monkeypatch.setattr(run_thinning, "MIN_THINNED_SAMPLES", 100)
 

@@ -1,4 +1,4 @@
-"""Each rule by itself, on either side of each threshold."""
+"""Tests of each verdict rule on both sides of each threshold."""
 
 from itertools import product
 from typing import get_args
@@ -24,7 +24,7 @@ def test_every_verdict_has_one_sentence_and_is_in_the_form_of_verdict_json():
 
 
 def rests(ranges=(5.9, 5.9), left=(2.9, 2.9), touched=False):
-    """Ranges and what is left in units of the noise."""
+    """Evaluate `is_motionless` for ranges and residuals in units of the noise."""
     return verdict_rules.is_motionless(
         np.array(ranges) * SIGMA, np.array(left) * SIGMA, SIGMA, touched=touched
     )

@@ -1,4 +1,4 @@
-"""Recordings of two or three unmarked runs: all are fitted, and each is predicted by the others."""
+"""Tests of recordings with two or three unmarked runs: all are fitted and cross-validated."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ SIGMA = 0.002
 
 
 def released(inertia, friction=0.0, seed=0, times=TIMES):
-    """Free swings of a pendulum, one an inertia, as columns."""
+    """Return free swings of a pendulum, one per inertia, as columns."""
     rng, runs = np.random.default_rng(seed), []
     for number, value in enumerate(inertia):
         effects = {"friction.coulomb": friction} if friction else None
@@ -59,7 +59,7 @@ def test_two_runs_are_both_fitted_and_each_is_predicted_by_the_other(tmp_path):
 
 
 def test_each_run_is_predicted_by_a_fit_to_the_other_alone():
-    """A fit to both inertias lies between them: it must not be what predicts."""
+    """A fit to both runs lies between their inertias, so it must not make the predictions."""
     parts = [
         recorded(Pendulum(observe=["q"]), [value], [{"q": 0.6}], TIMES, SIGMA)
         for value in (3.3e-3, 3.5e-3)
@@ -80,7 +80,7 @@ def test_each_run_is_predicted_by_a_fit_to_the_other_alone():
 
 @pytest.mark.slow
 def test_a_cause_on_which_runs_disagree_is_not_named(tmp_path):
-    """One run has strong dry friction and the other none: neither predicts the other with it."""
+    """One run has strong dry friction and the other none, so neither predicts the other."""
     times = TIMES[:75]
     parts = released([3.3e-3] * 2, 6e-3, times=times), released([3.3e-3] * 2, seed=1, times=times)
     path = table(tmp_path, [parts[0][0], parts[1][1]], ("q",), noise={"q": SIGMA})
@@ -90,7 +90,7 @@ def test_a_cause_on_which_runs_disagree_is_not_named(tmp_path):
 
 
 def test_an_effect_that_the_other_runs_do_not_show_predicts_nothing():
-    """Only run 2 has an input, so a fold without it says nothing of the input's gain."""
+    """Only run 2 has an input, so a fold without it cannot determine the input gain."""
     torque = {"u": 0.02 * np.sin(3 * TIMES)}
     still = {"u": np.zeros(TIMES.size)}
     made = recorded(

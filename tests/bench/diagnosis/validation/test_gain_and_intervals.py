@@ -30,7 +30,7 @@ from tests.bench.diagnosis.explained_samples import (
 
 
 def errors(rmse, runs=6, samples=200, seed=0):
-    """Residuals (R, T, 1) with this root mean square over all of them, different in each run."""
+    """Return residuals (R, T, 1) with this total RMS; each run has another RMS."""
     made = (
         np.random.default_rng(seed).normal(size=(runs, samples, 1))
         * np.linspace(0.9, 1.1, runs)[:, None, None]
@@ -97,20 +97,20 @@ def test_a_gain_below_the_floor_counts_as_all_and_no_gap_as_nothing():
 
 
 def three_runs(sizes=(0.1, 0.15, 0.2)):
-    """A model that leaves so much of each run, where the base model leaves 0.3 of each."""
+    """Return a model with these residuals per run; the base model has 0.3 in each."""
     after = np.ones((3, 100, 1)) * np.reshape(sizes, (3, 1, 1))
     return runs_of(np.zeros((3, 100, 1))), np.full((3, 100, 1), 0.3), after
 
 
 def test_the_gains_interval_is_one_of_95_percent_with_runs_put_back():
-    """Of three runs the worst is drawn three times in 1 of 27 resamples, more than 2.5 %."""
+    """Of three runs, a resample contains only the worst one with p = 1/27, above 2.5 %."""
     found = compute_held_out_gain(*three_runs(), [0], 0.05, np.random.default_rng(0))
     assert (found.low, found.high) == (
         pytest.approx((0.3 - 0.2) / 0.25),
         pytest.approx((0.3 - 0.1) / 0.25),
     )
     single = runs_of(np.full((1, 100, 1), np.nan))
-    single.observed[0, :10] = 0.0  # one stretch of ten has samples
+    single.observed[0, :10] = 0.0  # one block of ten has samples
     found = compute_held_out_gain(
         single, *np.ones((2, 1, 100, 1)) * [[[[0.3]]], [[[0.1]]]], [0], 0.05,
         np.random.default_rng(0),
@@ -133,9 +133,7 @@ def test_missing_samples_do_not_count():
 
 @pytest.mark.parametrize("phi", [0.0, 0.7])
 def test_intervals_cover_the_truth(phi):
-    """60 recordings of a driven slider with drag: 95 % intervals of mass and drag hold what made
-    them.
-    """
+    """Check 95 % intervals of mass and drag on 60 recordings of a driven slider."""
     times, rng, held = np.arange(120) / 60, np.random.default_rng(20), []
     push = np.where(np.sin(5 * times) > 0, 1.0, -1.0)
     made = recorded(
@@ -177,10 +175,10 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
         flattened = jacobian[r].reshape(-1, 3)
         rows[r, :, 0], rows[r, :, 1 + 2 * r : 3 + 2 * r] = flattened[:, 0], flattened[:, 1:]
     normal = np.einsum("rnk,rnl->kl", rows, rows) + np.diag([0, *[1e-4] * 4])
-    # What is told is no unknown.
+    # A known initial state is not an unknown.
     unknown = [0, *(1 + np.flatnonzero(~search.world.known))]
     inverse = np.linalg.inv(normal[np.ix_(unknown, unknown)])
-    # Squared kg m^2 are far below any absolute tolerance, so the ratio is asked.
+    # Values in kg^2 m^4 are far below absolute tolerances, so they are scaled.
     known = compute_covariance(search, model)[0, 0]
     assert known * 1e12 == pytest.approx(inverse[0, 0] * 1e12, rel=1e-6)
     least = 1.0 if told else 3.0
@@ -192,7 +190,7 @@ def test_the_covariance_is_that_of_all_unknowns_at_once(told):
 
 
 def test_a_coordinate_that_is_not_recorded_hides_no_coefficient_of_the_others():
-    """Where a ball drifts sideways is not known; how its spin lifts it is."""
+    """The sideways drift of the ball is not recorded, but its lift coefficient is identifiable."""
     made = recording(
         "ball",
         effects=["lift.magnus=0.25"],
@@ -217,8 +215,9 @@ def test_a_coordinate_that_is_not_recorded_hides_no_coefficient_of_the_others():
 
 
 def test_parameters_that_act_alike_have_no_interval():
-    """Inertia and gravity of a free swing: one-sided differences would tell them apart by their own
-    error.
+    """Inertia and gravity of a free swing are equivalent.
+
+    One-sided differences would separate them only by their own error.
     """
     made = recorded(
         Pendulum(), [3.3e-3], [{"q": 0.8}, {"q": 1.2}], np.arange(90) / 60, [0.003, 0.02], seed=5
@@ -265,7 +264,7 @@ def test_held_out_runs_estimate_initial_states_and_nothing_else():
     assert np.sqrt(np.square(left).mean()) == pytest.approx(1.0, abs=0.1)
     assert np.sqrt(np.square((there.observed - wrong.simulated) / [0.003, 0.02]).mean()) > 10
     assert right.penalised_log_likelihood > wrong.penalised_log_likelihood + 500
-    # Of six initial states each costs the logarithm of the samples.
+    # Each of the six initial states costs the logarithm of the number of samples.
     residual, count = there.observed - right.simulated, there.observed.size
     likeliest = maximise_likelihood(residual, np.ones(residual.shape, dtype=bool)).value
     assert right.penalised_log_likelihood == pytest.approx(likeliest - 6 * np.log(count), abs=1.0)

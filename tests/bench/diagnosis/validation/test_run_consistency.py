@@ -1,4 +1,4 @@
-"""Which number to trust: sliders whose mass or friction changes from log to log, by scipy."""
+"""Tests of parameters that change between logs, on sliders simulated with SciPy."""
 
 import csv
 
@@ -21,7 +21,7 @@ TIMES = np.arange(0.0, 3.0, 0.02)
 
 
 def write(folder, name, mass=2.0, drag=0.0, coulomb=0.0, seed=0, runs=3, sizes=(2.0,)):
-    """Runs of a slider that is pushed by held forces, and begins to move with drag and friction."""
+    """Write runs of a moving slider with held forces, drag and dry friction; return the path."""
     rng, rows = np.random.default_rng(seed), ["run,t,u,x"]
     for run in range(runs):
         size = sizes[run % len(sizes)]
@@ -60,7 +60,7 @@ def test_logs_of_one_world_agree(tmp_path):
     assert [part.group for part in mass.group_estimates] == ["log0", "log1", "log2"]
     assert all(abs(part.value - 2.0) < 4 * part.error for part in mass.group_estimates)
     assert mass.value == pytest.approx(2.0, abs=3 * mass.error)
-    # Three logs of the same length: each knows it to root three times what all know.
+    # Each of three equal logs has sqrt(3) times the standard error of all logs together.
     assert np.mean([part.error for part in mass.group_estimates]) == pytest.approx(
         mass.error * 3**0.5, rel=0.1
     )
@@ -89,7 +89,7 @@ def test_a_mass_that_grows_from_day_to_day(tmp_path):
         == "a load that changes"
     )
     assert mass.scatter == pytest.approx(np.std(masses, ddof=1), rel=0.3)
-    # For a day not yet recorded the truth is within it; by curvature alone it is not.
+    # The prediction error for a new day covers 2.03 kg; the standard error does not.
     assert abs(mass.value - 2.03) < 2.5 * mass.prediction_sigma
     assert abs(mass.value - 2.03) > 3 * mass.error
 
@@ -107,7 +107,7 @@ def test_the_groups_disagree_by_chance_as_often_as_they_say(tmp_path):
 
 
 def test_what_is_missing_makes_a_number_move(tmp_path, capsys):
-    """Dry friction taken for drag looks larger in small motions than in large ones."""
+    """Dry friction fitted as drag looks larger in small motions than in large ones."""
     sizes = {"small": 1.5, "middle": 4.0, "large": 10.0}
     paths = [
         write(tmp_path, name, coulomb=0.3, seed=i, sizes=(size,))
@@ -175,8 +175,9 @@ def test_a_constant_that_logs_state_differently_is_one_of_their_runs(tmp_path):
 
 
 def warm(folder, drags, temperatures):
-    """Runs of a slider whose viscous friction is another one in each, by the closed form for a
-    force that is held: the speed goes to u / drag as exp(-drag t / mass).
+    """Write runs of a slider with another viscous friction in each; return the path.
+
+    It uses the closed form for a held force: the speed goes to u / drag as exp(-drag t / mass).
     """
     rng, rows, mass = np.random.default_rng(0), ["run,t,u,x,temperature"], 2.0
     for run, (drag, heat) in enumerate(zip(drags, temperatures, strict=True)):
@@ -198,7 +199,7 @@ def warm(folder, drags, temperatures):
 
 @pytest.mark.slow
 def test_what_a_number_moves_with_says_what_is_missing(tmp_path):
-    """Friction that falls as it warms, on days in no order."""
+    """Friction decreases with temperature, and the runs are in no order of temperature."""
     heat = np.array([3, 0, 7, 5, 1, 8, 2, 6, 4])
     found = explain(warm(tmp_path, 2.0 - 0.08 * heat, 20.0 + 5.0 * heat))
     drag = by(found.story.consistency.after, "drag.linear", "run")
@@ -217,7 +218,7 @@ def test_the_missing_effect_by_what_a_number_moves_with():
     assert name("friction.coulomb", "speed").endswith("(drag.linear)")
     assert name("friction.coulomb", "speed", grows=False).endswith("(friction.stribeck)")
     assert name("spring.linear", "amplitude").endswith("(spring.cubic)")
-    # What is in the model already is not missing, and of other numbers nothing is known.
+    # An effect of the model is not proposed again; for other parameters no effect is known.
     known = ("friction.load@elbow",)
     assert name("drag.linear@elbow", "load", known=known) == "friction that depends on x"
     assert name("lift.magnus", "speed") == "something that depends on x"
