@@ -119,7 +119,7 @@ def test_deals_do_not_depend_on_methods_or_numbers(experiment):
 @vision
 @pytest.mark.parametrize("kind", ["squash", "golf"])
 def test_a_filmed_drop_is_tracked_to_millimetres(experiment, tmp_path, kind):
-    """The camera also sees the shadow, which touches a squash ball at the bounce."""
+    """At its bounce, a squash ball touches its shadow, which then moves on as the ball did."""
     settings, path = read_shot_config(experiment), tmp_path / "drop.csv"
     dealt = draw_shot(experiment, settings, kind, 0)
     record_drop(experiment, dealt, settings, path)
