@@ -1,6 +1,4 @@
-"""Wrong arguments of the public functions: each is one line that names the argument, what was
-expected and what was found.
-"""
+"""Tests of wrong arguments of public functions: one line names argument, expectation and value."""
 
 import inspect
 from pathlib import Path
@@ -35,7 +33,7 @@ NEEDED = {
 
 
 class Odd:
-    """What no argument can be."""
+    """Object that is not valid as any argument."""
 
 
 CASES = [
@@ -129,7 +127,7 @@ def test_a_wrong_argument_is_named(call, message):
 
 @pytest.mark.slow
 def test_names_and_numbers_may_be_given_as_people_write_them(tmp_path):
-    """Names with commas between, numpy's numbers, 1e1 for ten."""
+    """Names may be separated by commas, and numbers may be NumPy scalars or floats such as 3.0."""
     run = simgap.compare(
         "ball-drop",
         tuners="random, least_squares",

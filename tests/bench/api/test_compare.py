@@ -1,4 +1,4 @@
-"""`simgap.compare` and `simgap.sweep`: the command's results, from Python."""
+"""Tests of `simgap.compare` and `simgap.sweep`: the results of the commands, from Python."""
 
 import matplotlib
 import numpy as np
@@ -14,7 +14,7 @@ from tests.sample_experiments import SPRING
 
 
 class Halving(simgap.Tuner):
-    """Half of the way to the training range's middle, again and again."""
+    """Tuner that repeatedly halves the distance to the centre of the training range."""
 
     def tune(self, task, rng):
         point = task.start

@@ -21,7 +21,7 @@ def test_a_recording_is_explained_from_memory_as_from_its_file(swing, tmp_path):
     assert cause.effect == "drag.linear"
     drag = cause.coefficients["coefficient"]
     assert drag.low < 8e-4 < drag.high
-    # In the file numbers have nine digits.
+    # Numbers in the file have nine digits.
     values = [one.extended.effects["drag.linear"]["coefficient"].value for one in found]
     assert values[0] == values[1] == pytest.approx(values[2], rel=1e-5)
 

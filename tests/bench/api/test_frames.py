@@ -1,4 +1,4 @@
-"""Recordings in pandas data frames, in place of NAME.csv with NAME.toml."""
+"""Tests of recordings given as pandas data frames instead of NAME.csv with NAME.toml."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def frame(folder):
 
 @pytest.fixture
 def stated(folder):
-    """All that swing.toml states beyond the system and the units."""
+    """Return the entries of swing.toml other than the system and the units."""
     meta = read_toml(folder / "swing.toml")
     noise = {name: {"noise": own["noise"]} for name, own in meta["channels"].items()}
     return {
@@ -42,7 +42,7 @@ def stated(folder):
 
 
 def same(one, other):
-    """Whether two recordings have the same runs, to the last bit."""
+    """Check that two recordings have bitwise identical runs."""
     assert [run.name for run in one.runs] == [run.name for run in other.runs]
     for left, right in zip(one.runs, other.runs, strict=True):
         assert left.held_out == right.held_out
@@ -61,7 +61,7 @@ def test_a_frame_is_read_as_its_file(folder, frame, stated):
     assert same(read, file)
     assert read.noise == file.noise
     assert read.constants == file.constants
-    # Nothing of the user's is changed.
+    # The user's objects are not changed.
     assert stated["description"]["channels"]["q"] == {"noise": 0.003}
     whole = {**read_toml(folder / "swing.toml")}
     assert same(simgap.read_recording(frame, description=whole), file)
@@ -77,7 +77,7 @@ def test_units_are_converted_wherever_they_stand(frame):
     assert same(by_argument, by_attribute)
     np.testing.assert_allclose(by_argument.runs[0].channels["q"], plain.runs[0].channels["q"])
     np.testing.assert_allclose(by_argument.runs[1].times, plain.runs[1].times, atol=1e-9)
-    # An argument stands above an attribute.
+    # The argument takes precedence over the attribute of the frame.
     radians = simgap.read_recording(degrees, "pendulum", units={"q": "rad"})
     assert radians.runs[0].channels["q"][0] == degrees.q[0]
 
@@ -209,7 +209,7 @@ def test_the_next_recording_is_designed_from_a_frame(frame):
 
 
 def test_a_frame_of_a_robot():
-    """Its columns are joints and actuators of the model file."""
+    """The columns of the frame are joints and actuators of the model file."""
     frame = pd.read_csv(ROBOT / "log.csv")
     meta = read_toml(ROBOT / "log.toml")
     units = {
@@ -233,7 +233,7 @@ def test_a_frame_of_a_robot():
 
 
 def flat(tables, before=""):
-    """Tables of signals by their whole names, as ``q.shoulder``."""
+    """Flatten tables of signals to full names such as ``q.shoulder``."""
     found = {}
     for name, own in tables.items():
         found |= {before + name: own} if "unit" in own else flat(own, f"{before}{name}.")

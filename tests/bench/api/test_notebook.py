@@ -1,4 +1,4 @@
-"""What a person meets in a notebook: a real kernel, one cell after another."""
+"""Tests in a real Jupyter kernel that executes one cell after another."""
 
 import pytest
 
@@ -34,13 +34,11 @@ except simgap.InputError as error:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("default")  # of jupyter's own packages
+@pytest.mark.filterwarnings("default")  # warnings of Jupyter's own packages are not errors here
 def test_a_cells_tuner_is_compared_its_fault_shows_its_line_and_figures_are_inline(
     tmp_path, monkeypatch
 ):
-    """A kernel of Jupyter's, so that `__main__`, the cells' text and the display are as they
-    are there.
-    """
+    """A real kernel provides `__main__`, the source text of cells and the display."""
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     cells = [nbformat.v4.new_code_cell(text) for text in (TUNER, COMPARE, MENDED, AGAIN, WORKERS)]
     notebook = nbformat.v4.new_notebook(cells=cells)

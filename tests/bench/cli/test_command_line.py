@@ -48,7 +48,7 @@ def test_help_is_quick_and_imports_nothing_heavy():
     code = "import bench.cli.main; bench.cli.main.main(['--help'])"
     command = [sys.executable, "-c", code]
     seconds = []
-    for _ in range(3):  # processor time, since a busy machine says nothing about us
+    for _ in range(3):  # processor time, because wall time depends on the load of the machine
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run(command, capture_output=True, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -157,13 +157,13 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     deadline = time.monotonic() + 60
-    # Once some runs are kept, however long the workers took to start; then all of them have.
+    # Wait until some runs are stored, so that all workers have started, however long that took.
     journals = tmp_path / "out" / "segments"
     while time.monotonic() < deadline:
         if sum(path.stat().st_size for path in journals.glob("*.journal")) > 20_000:
             break
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and workers
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: signal the parent and the workers
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
@@ -334,7 +334,7 @@ def test_the_terminal_says_who_is_best_and_marks_a_tuner_whose_runs_all_failed(
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glfw asks on Linux")
 def test_a_command_names_the_library_that_glfw_would_choose(monkeypatch):
-    """Else each import of MuJoCo starts an interpreter to ask for its version."""
+    """Without this variable, each import of MuJoCo starts an interpreter to query a version."""
     pytest.importorskip("glfw")
     for name in ("PYGLFW_LIBRARY", "PYGLFW_LIBRARY_VARIANT", "XDG_SESSION_TYPE"):
         monkeypatch.delenv(name, raising=False)

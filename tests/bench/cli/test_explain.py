@@ -1,4 +1,4 @@
-"""`simgap explain` and `simgap score` as they are typed."""
+"""Tests of the commands `simgap explain` and `simgap score`."""
 
 import json
 import signal
@@ -14,9 +14,7 @@ from tests.bench.diagnosis import verdict_schema
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A swing with drag, made by another engine than the one that explains it, and what explain
-    wrote about it.
-    """
+    """Folder with recordings of a pendulum with drag, simulated with MuJoCo, and an explanation."""
     there = tmp_path_factory.mktemp("commands")
     command = [
         "simulate",
@@ -36,7 +34,7 @@ def folder(tmp_path_factory):
 
 
 def faulty(capsys, *command):
-    """The one line on stderr of a command that must fail, progress left out."""
+    """Return the single error line of a command that must fail, without progress lines."""
     capsys.readouterr()
     assert main([str(part) for part in command]) == 2
     told = capsys.readouterr()
@@ -236,7 +234,7 @@ def test_a_bad_budget_is_one_line(folder, budget, capsys):
 
 
 def interrupted(monkeypatch, times):
-    """Have Ctrl-C pressed so often as soon as something is shown."""
+    """Send Ctrl-C `times` times from `ProgressDisplay.completed`."""
     left = [times]
 
     def completed(*_):

@@ -1,4 +1,4 @@
-"""The packages that `simgap explain` loads for a simple system: none that it does not need."""
+"""Tests of the imports of `simgap explain`: a simple system loads only what it needs."""
 
 import json
 import subprocess
@@ -26,15 +26,15 @@ HEAVY = {
     "statsmodels",
     "torch",
 }
-"""Packages whose import takes longer than the whole search of a small diagnosis, or nearly so."""
+"""Packages whose import takes about as long as a small diagnosis, or longer."""
 ROBOTS = {"sims.robot.robot_model", "sims.robot.robot_simulator", "sims.robot.model_field_effects"}
-"""Modules that only a model file needs."""
+"""Modules that are needed only for a model file."""
 BACKENDS = {
     "matplotlib.pyplot",
     "matplotlib.backends.backend_pdf",
     "matplotlib.backends.backend_svg",
 }
-"""Modules of Matplotlib that only vector graphics and notebooks need."""
+"""Modules of Matplotlib that are needed only for vector graphics and notebooks."""
 RUN = """
 import json, sys
 import bench.cli.main
@@ -60,7 +60,7 @@ def swing(tmp_path_factory):
 
 
 def loaded(*arguments):
-    """Run the command in a process of its own; return the modules that it has loaded at its end."""
+    """Run the command in its own process and return the modules that are loaded at its end."""
     command = [sys.executable, "-c", RUN, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Every command's --json: one document on stdout, of the form that its schema publishes."""
+"""Tests of --json: each command prints one document that conforms to its published schema."""
 
 import copy
 import json
@@ -23,7 +23,7 @@ ARM = """<mujoco><worldbody><body name="arm"><joint name="hinge" type="hinge" ax
 
 
 def answered(capsys, *arguments, code=0):
-    """The document that a command prints, which nothing stands beside."""
+    """Return the document that a command prints, and check that it is the only output."""
     capsys.readouterr()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "80")
@@ -37,7 +37,7 @@ def answered(capsys, *arguments, code=0):
 
 
 def document_of(command):
-    """The document that a command prints, for a fixture."""
+    """Return the document that a command prints; for fixtures, which cannot use capsys."""
     with redirect_stdout(StringIO()) as said:
         assert main([*map(str, command), "--json"]) == 0
     return json.loads(said.getvalue())
@@ -45,7 +45,7 @@ def document_of(command):
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with a small comparison, a robot, and a recording with its explanation."""
+    """Folder with a small experiment and a robot model, to which other fixtures add results."""
     folder = tmp_path_factory.mktemp("json")
     document = {
         **SPRING, "targets": 2, "seeds": 1, "budget": 4, "tuners": ["random", "least_squares"]
@@ -57,20 +57,20 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def compared(place):
-    """What compare prints."""
+    """Document printed by `simgap compare`."""
     command = ["compare", place / "spring-small.toml", *PLUGIN, "--jobs", 0, "--out", place / "run"]
     return document_of(command)
 
 
 @pytest.fixture(scope="module")
 def run(place, compared):
-    """The comparison's folder."""
+    """Folder of the comparison."""
     return place / "run"
 
 
 @pytest.fixture(scope="module")
 def log(place):
-    """A recording of a pendulum with a hidden drag."""
+    """Recording of a pendulum with a hidden drag."""
     path = place / "swing.csv"
     command = ["simulate", "pendulum", "--effect", "drag.linear=4e-4", "--noise", "q=0.01"]
     command += ["qd=0.05", "--runs", "3", "--seconds", "3", "--rate", "50", "--out", str(path)]
@@ -80,18 +80,18 @@ def log(place):
 
 @pytest.fixture(scope="module")
 def explanation(place, log):
-    """What explain prints of it."""
+    """Document printed by `simgap explain` for the recording."""
     return document_of(["explain", log, "--jobs", 1, "--out", place / "explained"])
 
 
 @pytest.fixture(scope="module")
 def explained(place, explanation):
-    """Its explanation's folder."""
+    """Folder of the explanation."""
     return place / "explained"
 
 
 CASES = {}
-"""By command what runs it, and gives its documents."""
+"""For each command, the generator that runs it and yields its documents."""
 
 
 def case(function):
@@ -317,7 +317,7 @@ def test_what_a_command_prints_is_of_the_form_that_its_schema_publishes(name, re
     assert documents
     for document in documents:
         assert find_violations(document, name) == []
-        # What is not of the form is refused: without a key, and with one more.
+        # A document is rejected if a key is removed or an unknown key is added.
         if "required" in load_schema(name) or "anyOf" in load_schema(name):
             for key in document:
                 assert find_violations({k: v for k, v in document.items() if k != key}, name) or (
@@ -402,7 +402,7 @@ def test_what_a_tuner_prints_does_not_come_to_stand_in_the_document(place):
     )  # fmt: skip
     found = json.loads(done.stdout)
     assert find_violations(found, "compare") == []
-    # A run that crashes is a result, and the exit code says so.
+    # A crashed run is a result, and the exit code reports it.
     assert (done.returncode, found["comparisons"][0]["failed"]) == (1, 4)
     for said in ("from Python", "from a system call", "from C, and kept there"):
         assert said in done.stderr

@@ -1,4 +1,4 @@
-"""What `simgap explain` shows of a long search, on a terminal and in a log."""
+"""Tests of the progress display of `simgap explain` on a terminal and in a log."""
 
 import fcntl
 import io
@@ -42,7 +42,7 @@ class Terminal(io.StringIO):
         return True
 
     def screen(self):
-        """The lines that stand there in the end, as a terminal shows them."""
+        """Return the final lines as a terminal displays them."""
         lines = []
         for line in self.getvalue().split("\n"):
             cells, column = [], 0
@@ -67,7 +67,7 @@ def wide(monkeypatch):
 
 
 def display(clock, stream=None, **options):
-    """A display without a timer signal, which would depend on the real time."""
+    """Create a display without a timer signal, because that signal depends on real time."""
     return ProgressDisplay(clock=clock, stream=Terminal() if stream is None else stream, **options)
 
 
@@ -223,7 +223,7 @@ def test_nothing_is_shown_where_a_program_asks(clock):
 
 
 class Events:
-    """A listener that keeps what it hears."""
+    """Listener that records all events."""
 
     def __init__(self):
         self.stages, self.finished, self.best, self.shares = [], [], [], []
@@ -273,12 +273,12 @@ def test_a_watch_without_a_listener_is_silent():
 
 
 def terminal_output(command, columns=120, interrupt_at=None):
-    """What a command writes to a terminal of its own, and its exit code.
+    """Run a command in a pseudo-terminal and return its output and exit code.
 
     Args:
-        command: its words.
-        columns: of the terminal.
-        interrupt_at: Ctrl-C is pressed once as soon as this is written.
+        command: command line as a list of words.
+        columns: width of the terminal.
+        interrupt_at: text after whose first appearance Ctrl-C is pressed once.
     """
     child, terminal = pty.fork()
     if not child:
@@ -302,7 +302,7 @@ def terminal_output(command, columns=120, interrupt_at=None):
 
 @pytest.fixture
 def command(tmp_path):
-    """The words of an explanation of a small recording."""
+    """Return the command line that explains a small recording."""
     log = str(tmp_path / "swing.csv")
     noise = ["--noise", "q=0.003", "qd=0.02"]
     make = ["simulate", "pendulum", "--effect", "drag.linear=1e-3", *noise]
@@ -320,7 +320,7 @@ def test_explain_shows_a_live_line_on_a_terminal_and_erases_it(command):
     assert any("fitting the base model" in line for line in lines)
     assert any("drawing the figures" in line for line in lines)
     assert max(len(line) for line in lines) < 120
-    # The last line is overwritten with spaces before anything else is printed.
+    # The progress line is overwritten with spaces before anything else is printed.
     assert re.search(r"\r +\r$", shown)
     assert "\r " not in account
 

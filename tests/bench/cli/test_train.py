@@ -115,9 +115,7 @@ def test_hybrid_starts_from_the_same_network_as_tunenet(experiment):
 
 
 def test_looking_on_changes_nothing(experiment):
-    """Weights are the same whether somebody looks on, as `simgap train` does, or not, as `simgap
-    compare`.
-    """
+    """Training gives the same weights with an observer (`simgap train`) and without (`compare`)."""
     settings, entry = (
         load_experiment(str(experiment)),
         TunerEntry("small", "tunenet", TUNER["options"]),
@@ -128,7 +126,7 @@ def test_looking_on_changes_nothing(experiment):
     first = dict(np.load(watched.path))
     assert watched.simulations == 56
     apart = TrainingRequest(entry, 0, make_tuner_spec(entry))
-    # Nor where: in a process of its own a tuner learns the same, looked at or not.
+    # Isolated training also gives the same weights, with and without an observer.
     for lesson, watch in (
         (TrainingRequest(entry, 0), None),
         (apart, None),
@@ -176,9 +174,7 @@ def foreign(path):
 
 
 def another(path):
-    """Weights that were trained with another seed, or for other shapes, put in the place of
-    these.
-    """
+    """Replace a weights file by one trained with another seed or for other shapes."""
     other = next(file for file in path.parent.iterdir() if file != path)
     path.write_bytes(other.read_bytes())
 
@@ -309,7 +305,7 @@ def test_an_interrupted_training_leaves_nothing(experiment, tmp_path, cache):
         env={**os.environ},
         start_new_session=True,
     )
-    assert process.stderr.read(1)  # the bar: it is in the midst of it
+    assert process.stderr.read(1)  # the progress bar has started, so the training is running
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=30)

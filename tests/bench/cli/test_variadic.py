@@ -1,4 +1,4 @@
-"""A positional argument may stand before or after an option of several values."""
+"""Tests of command lines: a positional argument may come before or after a variadic option."""
 
 import argparse
 
@@ -13,7 +13,7 @@ def commands():
 
 
 def variadic():
-    """(command, option) of every option that takes several values."""
+    """Return (command, option) for each option that takes several values."""
     return [
         (name, action.option_strings[0])
         for name, command in commands().items()
@@ -23,7 +23,7 @@ def variadic():
 
 
 def words_of(name, option):
-    """A complete command line in two parts: the positional arguments, and all options."""
+    """Return a complete command line in two parts: positional arguments and required options."""
     actions = commands()[name]._actions
     positionals = [f"word{i}" for i, a in enumerate(actions) if not a.option_strings]
     required = [a.option_strings[0] for a in actions if a.option_strings and a.required]
@@ -44,7 +44,7 @@ def test_every_such_option_may_stand_before_the_positional(name, option, values)
     for words in (
         [option, *values, *positionals, *required],
         [*required, option, *values, *positionals],
-        [option[:-1], *values, *positionals, *required],  # argparse takes a unique beginning
+        [option[:-1], *values, *positionals, *required],  # argparse accepts a unique abbreviation
         [option, *values, *required, *positionals],
     ):
         assert read([name, *words]) == expected, words
@@ -59,11 +59,11 @@ def test_several_such_options_may_stand_before_it():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        # No word is taken from an option where the positional argument has its own.
+        # The positional argument is given, so no word is taken from the option.
         (["pendulum", "--effect", "wind=1", "drag"], "--effect drag: expected NAME=VALUE"),
-        # An option keeps its only word: this is its fault, and not the name of a system.
+        # An option keeps its only word: the error is about this word, not about the system name.
         (["--effect", "drag.linear"], "--effect drag.linear: expected NAME=VALUE"),
-        # Its last word alone can be the positional argument.
+        # Only the last word of the option can be the positional argument.
         (["--effect", "drag.linear", "pendulum"], "--effect drag.linear: expected NAME=VALUE"),
         (["--effect", "drag.linear=1", "pendulun"], "unknown simulator 'pendulun'"),
     ],

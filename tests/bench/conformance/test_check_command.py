@@ -1,4 +1,4 @@
-"""`simgap check NAME` on sound and on broken subjects."""
+"""Tests of `simgap check NAME` with correct and with broken plugins."""
 
 import json
 

@@ -90,7 +90,7 @@ def test_every_registered_name_is_the_name_its_class_says():
 
 
 def cell(says):
-    """A class as a notebook's cell defines it: run again, it is another class of the same name."""
+    """Define a class as a notebook cell does: each call gives a new class of the same name."""
 
     class FromACell(Tuner):
         pass

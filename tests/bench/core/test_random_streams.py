@@ -1,4 +1,4 @@
-"""Random streams by name."""
+"""Tests of named random streams."""
 
 import numpy as np
 

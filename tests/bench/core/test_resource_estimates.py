@@ -1,4 +1,4 @@
-"""What is too large for any machine, or no number at all, is refused in one line beforehand."""
+"""Tests of resource estimates: impossible sizes and invalid numbers are refused with one line."""
 
 import time
 
@@ -47,7 +47,7 @@ def steps(engine, **sampling):
     return {"settings": {"engine": engine, "time_step": 1e-12}, **sampling}
 
 
-# What is changed in the file, and what the line must say.
+# Changes to the experiment file, and the text that the error line must contain.
 EXPERIMENTS = [
     ({"budget": 10**18}, "of memory"), ({"budget": 10**12}, "lower budget"),
     ({"budget": 10**400}, "whole number within"), ({"seeds": 10**9}, "lower seeds"),
@@ -118,11 +118,11 @@ EXPERIMENTS = [
 
 
 def refused(capsys, arguments):
-    """The one line with which a command refuses; nothing takes long."""
+    """Return the one-line error with which a command refuses, and check that it is quick."""
     begun = time.perf_counter()
     try:
         code = main([str(a) for a in arguments])
-    except SystemExit as end:  # a fault in an option
+    except SystemExit as end:  # error in an option
         code = end.code
     out, err = capsys.readouterr()
     assert code == 2, out + err
@@ -210,7 +210,7 @@ DESCRIPTION = 'system = "pendulum"\n[channels.q]\nunit = "rad"\n'
 
 
 def swing(folder, factor=1.0, gap=0.0, start=0.0, toml=DESCRIPTION, name="1"):
-    """A recorded swing, its stamps in seconds over `factor`."""
+    """Write a recording of a swing; stamps are `start + factor * t`, with a gap after t = 0.6 s."""
     t = np.arange(120) * 0.01
     q = 0.5 * np.cos(8.2 * t)
     stamps = start + factor * np.where(t > 0.6, t + gap, t)
@@ -329,7 +329,7 @@ def test_this_machine_says_what_it_has(tmp_path):
 
 
 def test_needs_are_made_of_the_experiment(tmp_path):
-    """Twice as many targets make twice as many rows; none of it depends on this machine."""
+    """Disk use is proportional to the number of targets and does not depend on this machine."""
     path = tmp_path / "e.toml"
     path.write_text(tomli_w.dumps({**BASE, "budget": 99, "targets": 50}))
     small = estimate_comparison_need(load_experiment(str(path)))
@@ -340,7 +340,7 @@ def test_needs_are_made_of_the_experiment(tmp_path):
 
 
 def test_long_work_is_not_refused():
-    """A million runs of a hundred simulations, which docs/scale.md measures, need no insisting."""
+    """A million runs of 100 simulations, as measured in docs/scale.md, do not need --force."""
     big = estimate_comparison_need(
         load_experiment("ball-drop").chosen(targets=20_000).with_seeds(5), jobs=2
     )
@@ -348,7 +348,7 @@ def test_long_work_is_not_refused():
 
 
 def test_who_insists_begins(tmp_path):
-    """Stamps in milliseconds are taken, and a hopeless experiment is begun, with force."""
+    """With force, stamps in milliseconds and an infeasible comparison are accepted."""
     path = swing(tmp_path, factor=1e3)
     recording, kind = recorded(path)
     with pytest.raises(InputError, match=r"milliseconds.*or insist with --force"):
@@ -373,7 +373,7 @@ def test_the_same_through_python(tmp_path, call):
 
 
 def test_sound_recordings_are_not_odd(recordings, tmp_path):
-    """Every real recording that lies here, whose motion is up to 14 times slower than free."""
+    """No shared real recording is anomalous; motion is up to 14 times slower than free motion."""
     tables = sorted(recordings.glob("*/*.csv"))
     assert tables
     for path in tables:

@@ -1,4 +1,4 @@
-"""`simgap download` gets a data set whole and unchanged, or says in one line why not."""
+"""Tests of `simgap download`: a data set arrives complete and unchanged, or one line says why."""
 
 import hashlib
 import io
@@ -25,17 +25,17 @@ from sims.systems.pendulum import Pendulum
 MAT = "ParameterEstimation/SinglePendulum/SinglePendulumDataForParameterEstimation.mat"
 LICENCE = b"Anybody may use this.\n"
 PIECES = (2600, 2600, 2600, 2601)
-"""Samples of 1 ms of each piece of the made swing: two runs of 5 s and a rest."""
+"""Number of 1 ms samples in each piece of the synthetic swing: two runs of 5 s and a remainder."""
 
 
 def made_swing():
-    """(2, T) angles and rates at 1 ms; the angle hangs at pi."""
+    """Return (2, T) angles and rates at 1 ms; the pendulum hangs down at an angle of pi."""
     t = np.arange(sum(PIECES)) * 1e-3
     return np.stack([np.pi + 0.8 * np.cos(8.0 * t), -6.4 * np.sin(8.0 * t)])
 
 
 def cells(pieces):
-    """A MATLAB cell array of column shape."""
+    """Return a MATLAB cell array of shape (n, 1)."""
     array = np.empty((len(pieces), 1), object)
     array[:, 0] = pieces
     return array
@@ -43,8 +43,8 @@ def cells(pieces):
 
 @pytest.fixture
 def repository(tmp_path, monkeypatch):
-    """A folder like a clone of the pendulum's repository with a short made swing, which the
-    catalogue takes for the published one; nothing of this machine's data sets is found.
+    """Create a clone of the pendulum repository with a short synthetic swing, declared in the
+    catalogue as the published file; data sets of this machine are not found.
     """
     parts = np.split(made_swing(), np.cumsum(PIECES)[:-1], axis=1)
     content = io.BytesIO()
@@ -74,7 +74,7 @@ class Quiet(SimpleHTTPRequestHandler):
 
 
 class CutOff(Quiet):
-    """Announces a whole file, sends 100 bytes and closes the connection."""
+    """Handler that announces a whole file, sends 100 bytes and closes the connection."""
 
     def do_GET(self):
         path = Path(self.translate_path(self.path))
@@ -85,7 +85,7 @@ class CutOff(Quiet):
 
 
 class Endless(Quiet):
-    """Sends a file of unknown length that does not end."""
+    """Handler that sends a file of unknown length that does not end."""
 
     sent = 0
 
@@ -102,7 +102,7 @@ class Endless(Quiet):
 
 @pytest.fixture
 def served(repository):
-    """Serves the repository on this machine; gives its address, and takes another handler."""
+    """Return a function that serves the repository on localhost and returns its address."""
     servers = []
 
     def serve(handler=Quiet):
@@ -119,7 +119,7 @@ def served(repository):
 
 
 def refused(capsys, *words):
-    """The one line with which `simgap download` refuses; nothing has been written."""
+    """Return the one-line error of `simgap download`, and check that no file has been written."""
     capsys.readouterr()
     assert main(["download", "pendulum_free_swing", *map(str, words)]) == 2
     said = capsys.readouterr()
@@ -160,7 +160,7 @@ def test_runs_from_the_seventh_on_are_held_out():
     files = free_swing({"swing.mat": content.getvalue()})
     rows = files["recording.csv"].splitlines()
     assert len(rows) == 1 + 8000
-    assert rows[1001].startswith("2,0,")  # every run starts at 0 s
+    assert rows[1001].startswith("2,0,")  # each run starts at 0 s
     held_out = [line for line in files["recording.toml"].splitlines() if line.startswith("[runs")]
     assert held_out == ["[runs.7]", "[runs.8]"]
 
@@ -319,7 +319,7 @@ def test_the_list_says_what_there_is_where_and_for_what(repository, capsys):
 
 
 def test_every_experiment_that_lacks_a_file_of_the_project_names_a_data_set(repository):
-    """In a clone without any data, experiments lack nothing that a command does not bring."""
+    """Without any data, experiments lack only files that a command can download."""
     for name in list_experiment_names():
         lacks = availability(load_experiment(name))
         if lacks.data_set is None:
@@ -333,7 +333,7 @@ def test_every_experiment_that_lacks_a_file_of_the_project_names_a_data_set(repo
 
 
 def test_the_published_swing_is_the_recording_that_results_were_made_with(recordings, tmp_path):
-    """Where the published file and the recording are both on this machine."""
+    """This test needs both the published file and the recording on this machine."""
     published = os.environ.get("SIMGAP_FREE_SWING")
     if not published:
         pytest.skip("SIMGAP_FREE_SWING does not name the published file")
@@ -349,7 +349,7 @@ def test_data_sets_are_those_that_results_were_made_with(recordings):
         for file in dataset_catalogue.get(data_set).files:
             path = folder / data_set / file.name
             if not path.is_file():
-                continue  # what is converted is compared above
+                continue  # converted files are compared in the test above
             content = path.read_bytes()
             assert len(content) == file.bytes
             assert hashlib.sha256(content).hexdigest() == file.sha256

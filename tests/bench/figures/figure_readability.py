@@ -1,11 +1,11 @@
-"""Finds texts in a figure that a reader cannot read."""
+"""Check that all texts of a figure are readable."""
 
 
 def unreadable(figure):
-    """Texts of a figure that are shortened, lie outside it, or overlap another text.
+    """Return the texts of a figure that are shortened, outside it, or overlap another text.
 
     Args:
-        figure: a matplotlib figure, whose layout is final.
+        figure: a Matplotlib figure with its final layout.
     """
     from matplotlib.text import Text
 
@@ -15,11 +15,11 @@ def unreadable(figure):
     shown = []
     for text in _texts(figure):
         if text.get_visible() and text.get_text().strip():
-            # Of an annotation its words, without the line that leads to its place.
+            # For an annotation, measure the text without its arrow.
             shown.append((text.get_text(), Text.get_window_extent(text, renderer)))
     faults = [f"shortened: {words}" for words, _ in shown if "…" in words]
     for words, box in shown:
-        # A pixel of antialiasing is not a cut.
+        # Antialiasing may exceed the figure by one pixel.
         inside = (
             box.x0 > -1 and box.y0 > -1 and box.x1 < page.width + 1 and box.y1 < page.height + 1
         )
@@ -29,14 +29,14 @@ def unreadable(figure):
         for other, other_box in shown[i + 1 :]:
             width = min(box.x1, other_box.x1) - max(box.x0, other_box.x0)
             height = min(box.y1, other_box.y1) - max(box.y0, other_box.y0)
-            # Boxes include the room for descenders, so that neighbouring lines touch.
+            # Boxes include space for descenders, so adjacent lines touch.
             if width > 2 and height > 4:
                 faults.append(f"overlapping: {words} / {other}")
     return faults
 
 
 def _texts(figure):
-    """The texts that are drawn: of ticks only those within the limits of their axis."""
+    """Yield the drawn texts; tick labels only within the limits of their axis."""
     from matplotlib.text import Text
 
     yield from figure.texts

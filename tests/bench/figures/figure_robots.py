@@ -1,4 +1,4 @@
-"""Robots as MJCF for the tests of pictures: an arm that moves in a plane, one in space."""
+"""MJCF robots for tests of figures: one planar arm and one spatial arm."""
 
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def arm2():
 
 
 def arm6(shapes=True):
-    """Six joints; as a file whose meshes are absent where it has no shapes."""
+    """Build an arm with six joints; without shapes, like a file whose meshes are missing."""
     bare = '<inertial pos="0 0 .01" mass="1" diaginertia=".01 .01 .01"/>'
     bodies = ""
     for name, (axis, at, end) in zip(ARM6, _LINKS, strict=True):

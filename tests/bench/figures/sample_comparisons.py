@@ -1,6 +1,4 @@
-"""An invented comparison that allows every figure: two tuners, one of them trained, on targets of
-both ranges.
-"""
+"""Synthetic comparison that allows each figure: two tuners, one learned, and both target ranges."""
 
 import numpy as np
 import pandas as pd
@@ -52,7 +50,7 @@ def _spectra():
 
 
 def stored(**changes):
-    """The comparison; `changes` replace its fields."""
+    """Return the comparison; `changes` replace its fields."""
     rng = np.random.default_rng(0)
     experiment = load_experiment("ball-crossengine").chosen(budget=BUDGET)
     experiment = experiment.with_tuners(list(RATES))

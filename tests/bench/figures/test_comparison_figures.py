@@ -1,4 +1,4 @@
-"""Every figure of a comparison by name, and the tables beside them."""
+"""Tests of the figures of a comparison, by name, and of the tables next to them."""
 
 from dataclasses import replace
 
@@ -89,7 +89,7 @@ def test_errors_that_count_as_equal_are_shaded_and_cut_no_curve():
     drawn = draw_figure(whole, LABELS, "error")
     for axis in drawn.axes:
         (said,) = (text.get_text() for text in axis.texts)
-        assert said == "below 0.02: count as equal"  # 0.4 of restitution are one training width
+        assert said == "below 0.02: count as equal"  # 0.4 of restitution is one training width
         low, high = axis.get_ylim()
         values = np.concatenate([line.get_ydata() for line in axis.lines])
         assert low <= values.min()

@@ -1,4 +1,4 @@
-"""PNG files are what Pillow reads as the same pixels, and as large as the figure asks for."""
+"""Tests of the PNG encoder: Pillow reads the same pixels, and the image has the requested size."""
 
 from io import BytesIO
 

@@ -1,4 +1,4 @@
-"""Reference results in grey behind one's own: found, drawn as their tables say, and told apart."""
+"""Tests of reference results drawn in grey behind the user's own: search, curves and legend."""
 
 import json
 import re
@@ -17,7 +17,7 @@ REFERENCE = "ball-crossengine"
 
 
 def grey_lines(drawn, reference):
-    """By tuner: the lines of a reference, a panel each."""
+    """Return, for each tuner, the lines of a reference, one per panel."""
     named = {make_reference_id(reference, tuner): tuner for tuner in reference.tuners}
     found = {}
     for axis in drawn.axes:
@@ -37,7 +37,7 @@ def test_references_are_found_by_name_by_their_last_name_and_by_folder(tmp_path)
         "it has no curves"
     )
     assert find_reference("ball-wind").folder == find_reference("comparison/ball-wind").folder
-    # A whole name goes before an ending.
+    # An exact name takes precedence over a name that ends with it.
     assert find_reference("ball-drop").name == "ball-drop"
     shutil.copytree(find_reference("ball-wind").folder, tmp_path / "mine")
     assert find_reference(str(tmp_path / "mine")).table.equals(find_reference("ball-wind").table)
@@ -74,10 +74,10 @@ def test_grey_lines_are_the_medians_of_the_table_up_to_the_budget(name, metric):
             expected = np.maximum(part.set_index("simulations")["median"], ERROR_FLOOR)
             np.testing.assert_allclose(line.get_ydata(), expected[[0, 1, 2, 3, 5, 10]])
             assert line.get_color() == REFERENCE_GREYS[0]
-    # Behind: every one of the user's own lines is drawn after it.
+    # All lines of the user are drawn after (above) the reference.
     own = [line for line in drawn.axes[0].get_lines() if line.get_gid() is None]
     assert min(line.get_zorder() for line in own) > found["random"][0].get_zorder()
-    # A tuner of both has one marker.
+    # A tuner has the same marker in both results.
     mine = next(line for line in own if line.get_label() == "random")
     assert mine.get_marker() == found["random"][0].get_marker()
 

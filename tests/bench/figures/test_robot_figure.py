@@ -44,7 +44,7 @@ def schematic(monkeypatch):
 
 @pytest.fixture(scope="module")
 def picture():
-    """The arm rendered: what needs a GL is skipped where there is none."""
+    """Rendered image of the arm; tests that need it are skipped on machines without OpenGL."""
     made = arm6()
     data = make_posed_data(made, POSE6)
     image = offscreen_rendering.render_robot(
@@ -84,9 +84,9 @@ def test_labels_do_not_cover_each_other(schematic):
     for made, pose, marks in cases:
         figure = draw_robot_figure(made, pose, marks)
         draw = FigureCanvasAgg(figure).get_renderer()
-        # A text knows its place once it is drawn.
+        # The position of a text is known only after drawing.
         figure.draw(draw)
-        # Of the text alone: the line to its place may cross others.
+        # Compare the texts without their arrows, which may cross other texts.
         boxes = [Text.get_window_extent(text, draw) for text in figure.axes[0].texts]
         for i, box in enumerate(boxes):
             assert not any(box.overlaps(other) for other in boxes[:i])
@@ -129,7 +129,7 @@ def test_links_lead_from_joint_to_joint_and_to_the_end():
     data = make_posed_data(made, {})
     ends = compute_link_segments(made, data)
     assert any(np.allclose([a, b], [[0, 0, 0], [0.4, 0, 0]]) for a, b in ends)
-    # A capsule is as much longer as it is thick.
+    # The capsule of the forearm is longer than its axis of 0.35 m by its radius of 0.03 m.
     assert any(np.allclose([a, b], [[0.4, 0, 0], [0.78, 0, 0]]) for a, b in ends)
 
 
@@ -184,7 +184,7 @@ def test_a_rendered_robot_stands_where_the_view_says(picture):
     there = choose_projection(made, data)
     rows, columns, _ = picture.shape
     assert columns / rows == pytest.approx(there.width / there.height, rel=0.01)
-    # The middle of every capsule is inside of it: grey, where the ground is white.
+    # The centre of each capsule is inside it: grey, whereas the background is white.
     for x, y in there.project(data.geom_xpos):
         row = int((0.5 - y / there.height) * rows)
         column = int((0.5 + x / there.width) * columns)

@@ -27,7 +27,7 @@ def test_a_planar_robot_is_seen_along_the_common_axis_of_its_joints():
     assert np.abs(there.axes[2]) == pytest.approx([0, 1, 0], abs=1e-12)
     assert there.axes[0] == pytest.approx([1, 0, 0], abs=1e-12)
     assert there.axes[1] == pytest.approx([0, 0, 1], abs=1e-12)
-    # Along the axis nothing is foreshortened: the upper arm is 0.4 m long.
+    # A view along the axis has no foreshortening: the upper arm is 0.4 m long.
     shoulder, elbow = there.project(data.xanchor)
     assert np.linalg.norm(elbow - shoulder) == pytest.approx(0.4, abs=1e-12)
 

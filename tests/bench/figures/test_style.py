@@ -1,4 +1,4 @@
-"""Drawing leaves a notebook as it was; one palette, one way to write files."""
+"""Tests of the figure style: notebook state is kept, colours have one source, files are whole."""
 
 import re
 from pathlib import Path
@@ -66,7 +66,7 @@ def tracked():
 
 @pytest.fixture
 def notebook(monkeypatch):
-    """A user's own backend, setting and open figure; gives what must be the same afterwards."""
+    """Set a user's backend, setting and open figure; return a function that reads this state."""
     before = matplotlib.get_backend()
     pyplot.switch_backend("svg")
     matplotlib.rcParams["lines.linewidth"] = 3.25

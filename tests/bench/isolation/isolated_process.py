@@ -1,4 +1,4 @@
-"""Runs of tuners in processes of their own, without a comparison around them."""
+"""Helpers that run tuners in isolated processes without a comparison."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ PROBE = str(PLUGINS / "probe.py")
 
 
 def told(code, files=(), memory=0):
-    """What a sealed process makes of a piece of code, as text."""
+    """Run code in an isolated process and return its result as text."""
     tuned = TunerSpec("probe", "", PROBE, {"code": code})
     house = sandboxed_tuner.get_fork_server()
     child = house.start_process(
@@ -51,7 +51,7 @@ def _run(child, tuned):
 
 
 def held():
-    """The seals that hold on this machine."""
+    """Return the isolation layers that are active on this machine."""
     child = sandboxed_tuner.get_fork_server().start_process(
         "bench.benchmark.isolation.tuner_server:serve_requests"
     )
@@ -61,13 +61,13 @@ def held():
 
 
 def need(seal):
-    """Skip a test, visibly, where a seal does not hold."""
+    """Skip a test, visibly, if an isolation layer is not available."""
     if seal not in held():
         pytest.skip(f"no seal {seal} on this machine: {ISOLATION_LAYERS[seal]}")
 
 
 def experiment(name, **changes):
-    """An experiment of one of the plugin's tuners, which is known afterwards."""
+    """Create an experiment with one tuner of the probe plugin, and load the plugin."""
     tuners = {name: {}}
     made = spring_experiment(tuners=tuners, targets=2, ranges=["in"], budget=4, **changes)
     load_plugins_for_experiment([PROBE], made)
@@ -75,7 +75,7 @@ def experiment(name, **changes):
 
 
 def outcome(made, seed=0, target=0):
-    """One run of it."""
+    """Execute one run of the experiment."""
     (entry,) = made.tuners
     sealed = get_problem(made).draw_targets()[target].blinded
     order = RunRequest("run", entry, seed, sealed, made.budget)
@@ -83,6 +83,6 @@ def outcome(made, seed=0, target=0):
 
 
 def lesson(name, **options):
-    """One training of a known tuner."""
+    """Return a training request for a registered tuner."""
     entry = TunerEntry(name, name, options)
     return TrainingRequest(entry, 0, sandboxed_tuner.make_tuner_spec(entry))

@@ -1,4 +1,4 @@
-"""What a run in a process of its own may take, and what its process begins with."""
+"""Tests of long time limits and of random numbers in isolated processes."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""What a tuner's process may reach, asked from within."""
+"""Tests of the access of a tuner process, made from inside the process."""
 
 import fcntl
 import os
@@ -9,7 +9,7 @@ from tests.bench.isolation.isolated_process import PROBE, held, need, told
 
 LIBC = "import ctypes, os\nlibc = ctypes.CDLL(None, use_errno=True)\n"
 CALL = LIBC + "result = libc.{}\n(result, ctypes.get_errno())"
-"""A call of the C library, what it gave and its error."""
+"""Code that calls a C library function and gives its result and errno."""
 NOT_PERMITTED, ABSENT = "(-1, 1)", "(-1, 38)"
 
 
@@ -159,7 +159,7 @@ def test_its_environment_tells_of_nothing_but_the_machine(monkeypatch):
     names = set(eval(told("import os\nsorted(os.environ)")))
     sandboxed_tuner.close_isolated_processes()
     known = {"PATH", "LANG", "LC_ALL", "LC_CTYPE", "LD_LIBRARY_PATH", "HOME", "TMPDIR"}
-    # the last is where compiled steps are kept
+    # SIMGAP_COMPILED is the folder of compiled integration steps.
     known |= {"CUDA_VISIBLE_DEVICES", "PYTHONDONTWRITEBYTECODE", "SIMGAP_COMPILED"}
     others = names - known
     assert all(name.startswith(("OPENBLAS_", "MKL_", "OMP_", "NPY_")) for name in others), others

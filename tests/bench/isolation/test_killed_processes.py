@@ -1,4 +1,4 @@
-"""A process that is killed from outside says nothing about what it was at: that is made again."""
+"""Tests of processes that are killed from outside: their work is repeated with the same result."""
 
 import os
 import subprocess
@@ -63,7 +63,7 @@ def slow(tmp_path, spring, fresh_registries):
 
 
 class Killing:
-    """Kills the first process of a kind that it sees, a while after that began."""
+    """Kill the first process of a kind, 0.05 s after a tuner process is seen."""
 
     def __init__(self, what):
         self._what, self.killed = what, 0
@@ -128,7 +128,7 @@ def test_a_look_at_the_seals_is_begun_again_as_often_as_a_run(monkeypatch, kills
                 return held
 
     monkeypatch.setattr(sandboxed_tuner, "_seals", looked)
-    # Another test's look is kept, and is no business of this one.
+    # Call the undecorated function, because another test may have cached its result.
     look = sandboxed_tuner.list_active_isolation_layers.__wrapped__
     if kills < sandboxed_tuner.MAX_RETRIES:
         assert look() == ("process",)

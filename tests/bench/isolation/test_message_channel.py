@@ -1,4 +1,4 @@
-"""The pipe between the harness and a tuner's process, and what is foul on it."""
+"""Tests of the message channel between harness and tuner process, and of invalid messages on it."""
 
 import os
 import struct
@@ -26,7 +26,7 @@ HEAD = struct.Struct("<cBxxIQ")
 
 
 class Ends:
-    """A channel, and the bare ends of its pipes."""
+    """A channel and the raw ends of its pipes."""
 
     def __init__(self):
         (self.reading, there), (here, self.writing) = os.pipe(), os.pipe()
@@ -122,7 +122,7 @@ def test_two_messages_at_once_are_foul(ends):
 
 
 class Nobody:
-    """In place of a nursery."""
+    """Stand-in for a fork server."""
 
     def __init__(self):
         self.ended = []
@@ -255,7 +255,7 @@ def test_a_stream_goes_through_as_numbers_and_one_that_stands_still_does_not():
     other = np.random.default_rng()
     other.bit_generator.state = decode_rng_state(numbers)
     np.testing.assert_array_equal(other.random(5), rng.random(5))
-    # With this step every number is the first.
+    # With this increment, the generator would always give its first number.
     still = numbers.copy()
     still[2:4] = np.array([4, 0])
     for wrong in (still, np.array([*numbers[:4], 2, 0]), np.array([*numbers[:4], 0, 1 << 40])):

@@ -1,4 +1,4 @@
-"""Training in a process of its own: the same weights, counted and fenced on the other side."""
+"""Tests of training in an isolated process: equal weights, and limits enforced by the harness."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def experiment():
 
 
 class Learned(Tuner):
-    """As `school` of the plugin, here."""
+    """In-process equivalent of the plugin's tuner `school`."""
 
     name = source_digest = "learned"
     learned = True
@@ -59,7 +59,7 @@ def test_a_sealed_training_gives_the_weights_of_a_trusted_one_bit_for_bit(experi
 
 
 class Watch:
-    """Looks on, and notes what it is told."""
+    """Training observer that records the calls made to it."""
 
     def __init__(self, problem):
         self.problem, self.told, self.asked = problem, [], 0

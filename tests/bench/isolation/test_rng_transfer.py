@@ -1,6 +1,4 @@
-"""What a run's random stream depends on: the tuner, the target and the seed, each of them; and how
-many runs and trainings there are.
-"""
+"""Tests of random streams, which depend on tuner, target and seed, and of the number of runs."""
 
 import itertools
 
@@ -29,7 +27,7 @@ class AlsoDrawing(Drawing):
 
 
 class Learned(Tuner):
-    """Learns two numbers by drawing them, and proposes them."""
+    """Tuner that learns two random numbers and proposes them."""
 
     name = source_digest = "learned"
     learned, stochastic = True, False
@@ -57,7 +55,7 @@ class TrainedApart(Learned):
 
 
 def made(*kinds, **changes):
-    """Statuses, and proposed rates by label, target and seed, in this process."""
+    """Run an experiment in this process; return statuses and rates by (label, target, seed)."""
     for kind in kinds:
         tuners.register(kind)
     results = prepare_experiment(spring_experiment(**{"trusted": True, **changes}))
@@ -74,7 +72,7 @@ def made(*kinds, **changes):
 
 @pytest.fixture(scope="module")
 def proposals(spring):
-    """Proposed rates (12,) in rad/s, by label, target and seed; two labels of one tuner."""
+    """Proposed rates (12,) in rad/s by (label, target, seed); two labels belong to one tuner."""
     tuners = {"random": {}, "again": {"tuner": "random"}, "cma_es": {}}
     return made(tuners=tuners, targets=2, seeds=3)[1]
 
@@ -89,9 +87,9 @@ def test_every_seed_draws_numbers_of_its_own(proposals, tuner):
         for one, other in itertools.combinations(range(3), 2):
             pair = proposals[tuner, target, one], proposals[tuner, target, other]
             assert len(pair[0]) == 12
-            # What lies outside the cube is moved to its border, which all share.
+            # Proposals outside the cube are moved to its border, so border values may be equal.
             inside = [p[(p > 1.0) & (p < 5.0)] for p in pair]
-            # A tuner of the start begins where the target lets all begin.
+            # A tuner that uses the start begins there in each run, so one value may be shared.
             assert shared(*inside) <= 1, (target, one, other)
 
 
@@ -153,6 +151,6 @@ def test_an_entry_has_its_own_number_of_seeds_and_of_simulations():
     }  # fmt: skip
     statuses, rates = made(tuners=entries, targets=1, ranges=["in"], seeds=2)
     made_of = {name: [s.simulations for s in statuses if s.tuner == name] for name in entries}
-    # Nothing is random in the simplex, so one run tells all.
+    # Nelder-Mead is deterministic, so one seed is enough.
     assert made_of == {"random": [12, 12], "few": [12], "short": [5, 5], "nelder_mead": [12]}
     np.testing.assert_array_equal(rates["short", "in-000", 1], rates["random", "in-000", 1][:5])

@@ -1,4 +1,4 @@
-"""Runs of sealed tuners: what a process remembers, whose time is counted, and how it ends."""
+"""Tests of isolated runs: state kept between runs, timing, and how a run ends."""
 
 import numpy as np
 import psutil
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 
 @pytest.fixture(autouse=True)
 def no_process_is_left():
-    # Tests of other files may have left processes that wait for further runs.
+    # Tests of other files may have left idle processes that wait for further runs.
     sandboxed_tuner.close_isolated_processes()
     yield
     sandboxed_tuner.close_isolated_processes()
@@ -54,7 +54,7 @@ def test_who_leaves_as_if_killed_gets_no_other_try(exits):
 
 
 class Killing(ProposalEvaluator):
-    """Kills the tuner's process once, while its second proposal is simulated."""
+    """Evaluator that kills the tuner process once, while its second proposal is simulated."""
 
     calls = 0
 

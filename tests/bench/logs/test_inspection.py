@@ -20,7 +20,7 @@ def lines(path, system=None):
 
 @pytest.fixture
 def odd(tmp_path):
-    """Runs of different length, rate and gain, with missing samples and a gap."""
+    """Recording with runs of different length, rate and input, with missing samples and a gap."""
     rows = ["run,t,goal,q"]
     rows += [f"slow,{0.02 * i:.2f},0.5,{np.sin(0.1 * i):.6f}" for i in range(50)]
     rows += [

@@ -1,4 +1,4 @@
-"""`simgap import`: logs as they lie become a description that every command reads."""
+"""Tests of `simgap import`: raw logs become a description that each command reads."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def arm(tmp_path):
 
 
 def motion(arm):
-    """Commands and what follows them, (T, 2) positions and rates."""
+    """Return commands (T, 2) and the simulated positions and rates (T, 2) of the arm."""
     names = ["q.shoulder", "q.elbow", "qd.shoulder", "qd.elbow"]
     commands = np.column_stack([np.sin(3 * TIMES), 0.7 * np.cos(2 * TIMES)])
     given = {"u.m_shoulder": commands[:, 0], "u.m_elbow": commands[:, 1]}
@@ -34,7 +34,7 @@ def motion(arm):
 
 
 def logged(folder, commands, positions, rates):
-    """Two files of one run: degrees, microseconds of a clock, lists and names in cells."""
+    """Write one run as two files: degrees, a microsecond clock, lists and text in cells."""
     stamps = 1.7e15 + 1e6 * TIMES
     degrees = np.degrees(positions)
     rows = ["TIMESTAMP;Elbow Position;Shoulder Position;note;Joint_Vel;temperature"]

@@ -1,5 +1,5 @@
-"""`simgap import` of logs as people have them: nothing is misread in silence. Each kind is written
-here; the shared cases of the same kinds are read where they are there.
+"""Tests of `simgap import` for common log formats: nothing is misread without a message. Most logs
+are written here; shared cases of the same formats are read where available.
 """
 
 import json
@@ -53,7 +53,7 @@ def model(folder, drive):
 
 
 def table(path, columns, separator=",", comma=False, above=""):
-    """A table of text of columns by name."""
+    """Write a text table from columns by name."""
     rows = [separator.join(columns)]
     for row in np.column_stack(list(columns.values())):
         cells = separator.join(f"{value:.9g}" for value in row)
@@ -73,7 +73,7 @@ def inputs(out):
 
 
 def right(out, atol=1e-6):
-    """Whether positions and commands are those of their joints."""
+    """Check that positions and commands are assigned to the right joints."""
     for k, joint in enumerate(JOINTS):
         seen = channel(out, f"q.{joint}")
         np.testing.assert_allclose(seen[np.isfinite(seen)], POSITIONS[:, k], atol=atol)
@@ -85,7 +85,7 @@ def right(out, atol=1e-6):
 
 
 def rostopic(folder, order, words="field.name{}", commands=JOINTS):
-    """The tables of `rostopic echo -p`."""
+    """Write tables in the format of `rostopic echo -p`."""
     stamps = 1.7e9 + TIMES
     names = sorted(JOINTS) if order == "sorted" else order
     rows = ["%time,field.header.seq," + ",".join(
@@ -193,7 +193,7 @@ def test_an_order_is_told_by_the_distance_of_positions_from_commands():
     u, q = COMMANDS.T, POSITIONS.T
     assert order_of_commands(u, q) is None
     assert order_of_commands(u, q[[1, 2, 0]]) == [2, 0, 1]
-    # Two joints that do the same tell nothing, nor do a few samples.
+    # Two joints with equal motion, or a few samples, do not determine the order.
     assert order_of_commands([u[0], u[0]], [q[0], q[0]]) is None
     assert order_of_commands(u[:, :9], q[[1, 2, 0]][:, :9]) is None
 
@@ -239,7 +239,7 @@ def test_counts_of_an_encoder_are_no_angles(arm, tmp_path):
     assert "q.yaw" not in made.text
 
 
-# -- what a command asks for
+# -- kind of a command
 
 
 def test_a_desired_position_is_no_torque(tmp_path):
@@ -372,7 +372,7 @@ def test_a_small_file_of_events_does_not_stop_the_others(name, arm, tmp_path):
     right(tmp_path / "log.toml")
     (line,) = (line for line in made.untold if line.startswith("events.csv: "))
     assert line.endswith("; left out")
-    # A file that the user names is wanted.
+    # A file that the user names explicitly must be readable.
     files = [tmp_path / "one" / "log.csv", tmp_path / "one" / "events.csv"]
     with pytest.raises(InputError, match=r"events\.csv"):
         simgap.import_logs(files, arm, tmp_path / "other.toml")
@@ -474,7 +474,7 @@ CALIBRATION = {
 
 
 def normalised(angles):
-    """As LeRobot normalises positions, -100 to 100."""
+    """Normalise positions (T, 3) to -100..100 as LeRobot does."""
     columns = []
     for k, (low, high, mode) in enumerate(RANGES.values()):
         counts = np.degrees(angles[:, k]) * 4095 / 360 + 0.5 * (low + high)
@@ -553,7 +553,7 @@ def test_a_faulty_calibration_is_one_line(text, message, arm, tmp_path):
     assert not (tmp_path / "l.toml").exists()
 
 
-# -- the shared cases
+# -- shared cases
 
 
 @pytest.mark.data

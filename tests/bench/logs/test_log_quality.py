@@ -1,4 +1,4 @@
-"""The census of a recording: logs made by scipy of linear servos, each spoiled in one way."""
+"""Tests of the log quality check on SciPy simulations of linear servos, each with one fault."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +19,7 @@ ARM = """<mujoco model="two"><compiler angle="radian" autolimits="true"/><worldb
 <position name="m_knee" joint="knee" kp="100" kv="10" ctrlrange="-1 1"/></actuator></mujoco>"""
 RATE, SECONDS, NOISE = 100.0, 40.0, 1e-3
 JOINTS = {"hip": 12.0, "knee": 20.0}
-"""rad/s of each servo."""
+"""Natural frequency of each servo in rad/s."""
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +36,14 @@ def multisine(t, rng):
 
 
 def followed(u, w, fine):
-    """A servo of second order with damping 0.7, held commands, stepped exactly."""
+    """Return the exact response of a second-order servo with damping 0.7 to held commands."""
     a, b = [1.0, 1.4 * w, w * w], [w * w]
     numerator, denominator, _ = cont2discrete((b, a), 1.0 / fine)
     return lfilter(np.ravel(numerator), denominator, u)
 
 
 def run_of(seed, name="1", stamp=lambda t, rng: t, late=lambda t: t, seconds=SECONDS):
-    """A run with sensors read at `late(t)` where the log says t, and stamps that `stamp` makes."""
+    """Simulate a run with stamps `stamp(t, rng)` whose sensors are read at `late(stamp)`."""
     rng, fine = np.random.default_rng(seed), 1000.0
     t = stamp(np.arange(0.0, seconds, 1.0 / RATE), rng)
     whole = np.arange(0.0, seconds + 1.0, 1.0 / fine)
@@ -69,7 +69,9 @@ def found(kind, *runs, noise=None):
 
 
 def changed(run, **signals):
-    """The run with channels changed: name of the channel with _ for its dot, and a function."""
+    """Return the run with changed channels: `signals` maps channel names, with _ for the dot, to
+    functions.
+    """
     changes = {name.replace("_", ".", 1): change for name, change in signals.items()}
     return replace(
         run, channels={n: changes.get(n, lambda y: y)(y.copy()) for n, y in run.channels.items()}
@@ -85,7 +87,7 @@ def test_jitter(kind):
     run = run_of(1, stamp=lambda t, rng: np.sort(t + 0.2 / RATE * rng.normal(size=t.size)))
     (finding,) = found(kind, run)
     assert finding.about == "clock"
-    # of two stamps that are each off by 20 % the interval is off by 28 %
+    # Two stamps that are each off by 20 % give an interval that is off by 20 % * sqrt(2) = 28 %.
     assert "vary by 2" in finding.text
     assert int(finding.text.split("by ")[1].split("%")[0]) == pytest.approx(28, abs=3)
     assert "its own stamp" in finding.remedy
@@ -102,7 +104,7 @@ def test_lost_samples(kind):
 
 
 def test_stamps_of_commands_are_no_samples(kind):
-    """A command's topic has stamps of its own: between two of the sensors none is lost."""
+    """Command stamps between two sensor stamps do not count as lost sensor samples."""
     run = run_of(4)
     times = np.sort(np.concatenate([run.times, run.times + 1e-5]))
 
@@ -136,7 +138,7 @@ def test_samples_that_came_twice(kind):
 
 @pytest.mark.parametrize("ppm", [100.0, -250.0])
 def test_drift(kind, ppm):
-    """A sensors' clock that is fast says t at t / (1 + e)."""
+    """A sensor clock that is fast by e shows t at the true time t / (1 + e)."""
     runs = [run_of(seed, str(seed), late=lambda t: t / (1 + ppm * 1e-6)) for seed in range(4)]
     (finding,) = found(kind, *runs)
     assert finding.about == "drift"
@@ -148,7 +150,7 @@ def test_drift(kind, ppm):
 
 
 def test_an_interval_of_drift_holds():
-    """Clean logs: what is estimated is within two sigmas of none in about 95 of 100."""
+    """In clean logs, the estimated drift is within two sigmas of zero in about 95 % of cases."""
     from bench.logs.quality import clock_drift
 
     inside = 0

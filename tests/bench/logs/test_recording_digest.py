@@ -1,4 +1,4 @@
-"""Whether a recording is another one: any of its files, and none besides."""
+"""Tests of the recording digest: it changes with each file of a recording and no other."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Recordings of robots: made from a model file, read again, looked into."""
+"""Tests of robot recordings: simulated from a model file, read again and inspected."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_what_is_simulated_of_a_model_file_is_read_again(tmp_path):
     assert [c.name for c in kind.inputs][:2] == ["u.m_shoulder", "u.s_elbow"]
     first, again = made.recording.runs[0], recording.runs[0]
     np.testing.assert_allclose(again.channels["q.elbow"], first.channels["q.elbow"], rtol=1e-8)
-    # In memory it is of the same robot.
+    # The recording in memory has the same robot.
     assert load_recording(made.recording)[1].system.coordinates == kind.system.coordinates
 
 
@@ -77,7 +77,7 @@ def test_a_wish_names_a_system_or_a_model(tmp_path):
 
 @pytest.fixture
 def odd_log(tmp_path):
-    """A log in which degrees pass for radians, and one command is missing."""
+    """Log in which degrees are declared as radians and one command is missing."""
     written(tmp_path)
     (tmp_path / "log.toml").write_text(
         'model = "swinging.xml"\n[channels."q.shoulder"]\nunit = "rad"\n'

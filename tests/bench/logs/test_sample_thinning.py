@@ -1,4 +1,4 @@
-"""Recordings that are sampled much faster than the robot moves are thinned."""
+"""Tests of sample thinning for recordings sampled much faster than the robot moves."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ NOISE = 1e-4
 
 
 def run(rate, motion, seconds=4.0, noise=NOISE, linear=frozenset()):
-    """A run of one channel at a sample rate in Hz, with a ramp as its input."""
+    """Return a run with one channel at a sample rate in Hz and a ramp as its input."""
     times = np.arange(int(seconds * rate) + 1) / rate
     values = motion(times) + noise * RNG.standard_normal(times.size)
     return Run("1", times, {"q": values}, {"u": 2.0 * times}, {}, {}, False, linear=linear)
@@ -30,7 +30,7 @@ def slow(times):
 
 
 def shaken(times):
-    """With a vibration of 60 Hz, 0.01 rad."""
+    """Add a vibration of 60 Hz with an amplitude of 0.01 rad to the slow motion."""
     return slow(times) + 0.01 * np.sin(2.0 * np.pi * 60.0 * times)
 
 
@@ -50,7 +50,7 @@ def test_a_slow_motion_is_thinned_to_a_hundred_hertz(rate, every):
 def test_a_vibration_is_kept():
     found, note = thin(recording(run(1000, shaken)), Robot)
     (kept,) = found.runs
-    # A spline needs some five samples in each period.
+    # A spline needs about five samples per period; at least half of this is required here.
     assert np.median(np.diff(kept.times)) < 1.0 / (2.5 * 60.0)
     assert "each sample of" in note
 
@@ -58,7 +58,7 @@ def test_a_vibration_is_kept():
 def test_inputs_that_are_held_take_their_mean():
     found, _ = thin(recording(run(500, slow)), Robot)
     (kept,) = found.runs
-    # Of a ramp held over steps of 2 ms, five values from the sample on.
+    # The mean of a ramp held over five steps of 2 ms is its value 4 ms after the first sample.
     np.testing.assert_allclose(kept.inputs["u"][:-1], 2.0 * (kept.times[:-1] + 0.004), atol=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""Long logs of robots are searched in pieces: which, how long, and that it is said."""
+"""Tests of the segmentation of long robot logs: number, length, position and notes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +26,7 @@ def recording_of(seconds, held_out=20.0):
     runs = []
     for name, length in (("a", seconds), ("b", seconds / 2), ("c", held_out)):
         t = np.arange(0.0, length, 0.02)
-        # It is commanded for a second, and left alone for another.
+        # The command is active for 1 s and zero for the next 1 s.
         u = np.where(t % 2.0 < 1.0, multisine(t, rng), 0.0)
         q = {"q.hip": u, "q.knee": 0.5 * u}
         inputs = {"u.m_hip": u, "u.m_knee": 0 * u}
@@ -59,9 +59,9 @@ def test_a_long_log_is_cut_evenly_and_where_it_is_quiet(kind):
         begins = np.array([p.times[0] for p in own])
         (run,) = [r for r in whole.runs if r.name == name]
         gaps = np.diff(np.concatenate([[run.times[0]], begins, [run.times[-1]]]))
-        # All over the run: no gap of two parts of it.
+        # The segments cover the whole run: no gap is as long as two average intervals.
         assert gaps.max() < 2.0 * run.times[-1] / len(own) + segmentation.SEGMENT_SECONDS
-        # After at least QUIET of silence, in the second half of each two seconds.
+        # Segments start QUIET_LEAD_SECONDS after the command stops, in the second half of each 2 s.
         assert np.all(
             (begins % 2.0 >= 1.0 + segmentation.QUIET_LEAD_SECONDS - 0.04) | (begins % 2.0 == 0.0)
         )
@@ -70,7 +70,7 @@ def test_a_long_log_is_cut_evenly_and_where_it_is_quiet(kind):
             rows = slice(first, first + part.times.size)
             np.testing.assert_array_equal(part.channels["q.hip"], run.channels["q.hip"][rows])
             np.testing.assert_array_equal(part.inputs["u.m_hip"], run.inputs["u.m_hip"][rows])
-            # What is known of the beginning of a run is known of no other piece.
+            # Only the segment at the start of a run has the known initial state of the run.
             assert bool(part.initial) == (first == 0)
     assert found.recording.held_out() == whole.held_out()
     assert "63.4 s of 6000 s for fitting, in 32 pieces" in found.note
@@ -86,7 +86,7 @@ def test_held_out_runs_are_cut_for_themselves(kind):
 
 
 def test_pieces_that_are_asked_for(kind):
-    """A system's, too; together they are the whole of every run."""
+    """A requested segment length also applies to built-in systems; the segments cover each run."""
     whole = recording_of(30.0)
     for simulator in (kind, simulators.get("pendulum")):
         found = segment_recording(whole, simulator, seconds=1.5)
@@ -107,7 +107,7 @@ def test_many_short_runs_are_all_there(kind):
 
 @pytest.mark.slow
 def test_explain_says_it_and_is_told_to_take_the_whole(tmp_path, monkeypatch):
-    """A clean log of the shipped arm: cut or whole, nothing is missing."""
+    """In a clean log of the pendulum, no effect is missing, with segments or with the whole log."""
     from tests.bench.diagnosis.test_parameter_freezing import DAMPING, MODEL
 
     times = np.arange(0.0, 12.0, 0.02)
@@ -132,7 +132,7 @@ def test_explain_says_it_and_is_told_to_take_the_whole(tmp_path, monkeypatch):
     found = explain(path, say=said.append)
     assert found.verdict == "adequate"
     (note,) = [text for text in said if "pieces" in text]
-    # All three runs are fitted, and each is validated by the others.
+    # All three runs are fitted, and each is validated with the other two.
     assert note.startswith("of the recording 5.94 s of 35.94 s for fitting")
     assert note in found.story.lack_of_fit
     samples = sum(len(t) for t in found.story.fitting.times)

@@ -1,4 +1,4 @@
-"""A small page with everything that a page can hold, and texts that are no markup."""
+"""Small page with each kind of content, and texts that look like markup."""
 
 import numpy as np
 import pandas as pd

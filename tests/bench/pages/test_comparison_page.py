@@ -1,5 +1,5 @@
-"""The page of a comparison: it says what the statistics support, shows the numbers of its tables,
-and holds whatever texts come.
+"""Tests of the comparison page: conclusions follow the statistics, numbers agree with the tables,
+and arbitrary texts are escaped.
 """
 
 import csv
@@ -34,7 +34,7 @@ TRACEBACK = 'Traceback:\n  File "mine.py", line 3, in tune\n    <b>x</b>\nValueE
 
 
 def statuses(of):
-    """Two runs of the invented comparison have failed."""
+    """Return the statuses of the synthetic comparison with two failed runs."""
     frame = of.statuses.copy()
     failed = frame["run"].isin(["random/in-0/0", "random/in-1/0"])
     frame.loc[failed, "status"] = "crashed"
@@ -55,7 +55,7 @@ def results(whole=None, pictures=None, missing=0):
 
 
 def many(targets):
-    """The invented comparison on so many targets, each ten times as good with tunenet."""
+    """Repeat the synthetic comparison on N targets, with ten times smaller errors of tunenet."""
     rng = np.random.default_rng(1)
     whole = stored()
     parts = []
@@ -75,12 +75,12 @@ def many(targets):
 
 @pytest.fixture(scope="module")
 def shown():
-    """A comparison that allows every figure, with failures and odd texts."""
+    """Comparison that allows each figure, with failed runs and unusual texts."""
     whole = stored()
     whole = whole._replace(
         experiment=replace(whole.experiment, title=TITLE), statuses=statuses(whole)
     )
-    # One figure stands for all: that each is drawn is tested beside the figures.
+    # One image is used for all figures, because the tests of figures draw each of them.
     drawn = render_all_formats(comparison_figures.draw_figure(whole, LABELS, "runtime"))
     return results(whole, dict.fromkeys(comparison_figures.list_figure_names(whole), drawn))
 
@@ -175,7 +175,7 @@ def test_the_median_of_the_headline_is_that_of_the_table():
 
 def test_a_tuner_whose_runs_all_crashed_is_last_and_marked_everywhere():
     whole = many(12)
-    crashed = whole.statuses["tuner"] == "tunenet"  # has the smallest errors
+    crashed = whole.statuses["tuner"] == "tunenet"  # tunenet has the smallest errors
     whole.statuses.loc[crashed, "status"] = "crashed"
     held = results(whole)
     assert held.statistics.order == ["random", "tunenet"]
@@ -220,7 +220,7 @@ def test_a_chart_has_the_numbers_of_the_table(opened, shown):
         if key in table.index:
             assert float(row["median"]) == pytest.approx(table.loc[key, "median"], rel=1e-6)
             compared += 1
-    # two tuners, two ranges, seven numbers of simulations
+    # two tuners, two ranges, seven checkpoints
     assert compared == 2 * 2 * 7
 
 
@@ -249,7 +249,7 @@ def test_a_tuner_that_is_switched_off_is_gone_from_tables_too(opened):
 def test_errors_to_be_reached_are_chosen(opened, shown):
     before = opened.page.locator("#cost canvas").first.screenshot()
     pick = opened.page.locator("#cost").get_by_label("error reached")
-    # An error that nobody reached has no curves.
+    # An error level that no tuner reached has no curves.
     prices = shown.statistics.tuning_costs
     reached = [v for v in prices if not build_time_per_target_table(prices[v]).empty]
     levels = [f"{format_number(v)} [training widths]" for v in reached]

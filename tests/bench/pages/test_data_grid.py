@@ -1,4 +1,4 @@
-"""The table of a page writes what pandas writes, without it."""
+"""Tests of the page table: it writes the same CSV as pandas, without pandas."""
 
 from io import StringIO
 

@@ -1,4 +1,4 @@
-"""The base of every page, in a real browser: each control does what it says, and nothing leaves."""
+"""Tests of the page base in a real browser: each control works, and no request leaves the page."""
 
 import base64
 import hashlib
@@ -30,7 +30,7 @@ def opened(browser, path):
 
 
 def rows(page, name):
-    """The cells of a table as they are shown."""
+    """Return the displayed cells of a table."""
     return [
         line.locator("td").all_inner_texts() for line in page.locator(f"#{name} tbody tr").all()
     ]
@@ -110,7 +110,7 @@ def test_the_policy_allows_the_pages_script_and_no_other(opened, path):
     script = re.search(r"<script>(.*)</script>\n</body>", html, re.DOTALL)[1]
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in html
-    # Neither an injected script nor a request of the page itself gets past it.
+    # The policy blocks an injected script and requests of the page itself.
     opened.page.evaluate(
         "() => { const s = document.createElement('script'); s.textContent = 'window.ran = 1';"
         " document.body.append(s); }"
@@ -148,14 +148,14 @@ def test_what_nobody_sees_is_drawn_when_it_comes_into_sight(browser, opened):
     left = "#motion canvas[data-drawn]"
     page.locator("canvas").evaluate_all(marked)
     page.locator("#error .key").first.click()
-    # The figure that was clicked is drawn anew; one far below knows of it, and waits.
+    # The clicked figure is drawn again; a figure far below is drawn when it becomes visible.
     assert page.locator("#error canvas[data-drawn]").count() == 0
     assert page.locator(left).count() == 4
     page.locator("#theme").select_option("dark")
     assert page.locator(left).count() == 4
     page.locator("#motion").scroll_into_view_if_needed()
     page.locator(left).first.wait_for(state="detached")
-    # What is chosen in a figure itself is drawn at once, wherever the reader is.
+    # A choice in a figure itself is drawn at once, wherever the page is scrolled.
     page.evaluate("scrollTo(0, 0)")
     page.locator("canvas").evaluate_all(marked)
     page.locator("#motion .key", has_text="hip").dispatch_event("click")
@@ -189,7 +189,7 @@ def test_dragging_zooms_and_whole_shows_everything_again(opened):
     low, high, least, most = map(
         float, re.search(r"error\.zoom=(.*)", opened.state())[1].split(",")
     )
-    # Half and nine tenths of an axis that is 2.2 decades long, with 4 % more at both ends.
+    # 50 % and 90 % of an axis of 2.2 decades with a margin of 4 % at both ends.
     assert (low, high) == (pytest.approx(3.98, rel=0.03), pytest.approx(35.4, rel=0.03))
     assert 1e-4 < least < most < 1
     assert page.locator("#error canvas").first.screenshot() != before
@@ -351,7 +351,7 @@ def test_panels_are_switched_on_and_off_one_by_one(browser, opened, path):
     assert "Everything is switched off." in motion.inner_text()
     motion.get_by_role("button", name="all", exact=True).click()
     motion.locator(".switches .key", has_text="hip").click()
-    # As at first: the address says nothing of it.
+    # The state is the initial one, so the address does not contain it.
     assert opened.state() == ""
 
 
@@ -367,7 +367,7 @@ def test_one_stretch_of_time_is_zoomed_in_every_panel_and_the_vertical_axis_foll
     page.mouse.up()
     page.wait_for_url(re.compile("zoom"))
     low, high, least, most = re.search(r"motion\.zoom=(.*)", opened.state())[1].split(",")
-    # A quarter and a half of 9.9 s with 4 % more at both ends.
+    # 25 % and 50 % of an axis of 9.9 s with a margin of 4 % at both ends.
     assert float(low) == pytest.approx(2.28, abs=0.1)
     assert float(high) == pytest.approx(4.95, abs=0.1)
     assert (least, most) == ("", "")
@@ -395,7 +395,7 @@ def test_what_bears_one_name_lights_up_together(opened):
     page.locator("#motion .panel").first.hover()
     assert page.locator("#joints tr.lit td:first-child").all_inner_texts().count("elbow") >= 5
     assert page.locator("#joints tr.found").count() == page.locator("#joints tr.lit").count()
-    # The last comes first: sorted downwards.
+    # The last row comes first because the order is descending.
     assert rows(page, "joints")[0][1] == "9.9"
 
 
@@ -413,7 +413,7 @@ def test_a_picture_is_the_same_on_the_screen_and_has_its_files(browser, opened, 
     assert texts == ["PDF", "SVG", "PNG", "numbers as CSV (bins)", "numbers as CSV (notes)"]
     name, content = opened.saved(picture.get_by_role("button", name="notes").click)
     assert (name, content) == ("notes.csv", sample_pages.notes().to_csv(index=False).encode())
-    # A figure without a printed one is not promised where no script can draw it.
+    # Without JavaScript, a figure that has no static version is not shown.
     with Opened(browser, path, java_script_enabled=False) as one:
         assert one.page.locator("#same img.still").is_visible()
         assert not one.page.locator("#motion").is_visible()

@@ -1,4 +1,4 @@
-"""The pages of several comparisons, and of a bounce shot."""
+"""Tests of the pages of several comparisons and of a bounce shot."""
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ def drawn():
 
 
 def with_third(whole):
-    """A third tuner beside the two, twice as bad as random."""
+    """Add a third tuner with twice the errors of random."""
     third = whole.runs[whole.runs["tuner"] == "random"].copy()
     third["tuner"] = "cma_es"
     third["run"] = third["run"].str.replace("random", "cma_es")
@@ -36,7 +36,7 @@ def with_third(whole):
 
 
 def page_of(count, tmp_path, drop=None):
-    """The page of so many times the invented comparison, each of two problems."""
+    """Render the page of `count` copies of the synthetic comparison, which has two problems."""
     whole = with_third(stored())
     if drop:
         whole = whole._replace(runs=whole.runs[whole.runs["tuner"] != drop])
@@ -58,7 +58,7 @@ def test_several_comparisons_have_a_page(browser, tmp_path, width):
         means = frames["ranks"].drop(columns="problem").mean()
         assert means.idxmin() == "tunenet"
         assert "tunenet has the best mean rank over 10 problems: 1 among 3 tuners" in said
-        # Of ranks 1, 2, 3 on ten problems the first and the last are told apart, neighbours not.
+        # With ranks 1, 2, 3 on ten problems, first and last differ, but neighbours do not.
         assert "better than cma_es; not told apart from random." in said
         saved = one.saved(one.page.locator("#each-rank").get_by_text("save as CSV").click)
         assert saved == ("ranks.csv", frames["ranks"].to_csv(index=False).encode())

@@ -1,4 +1,4 @@
-"""Training over effects that the world may have: what is drawn, and that it acts."""
+"""Tests of domain randomisation: the distribution of the effects and their action."""
 
 from dataclasses import replace
 
@@ -41,11 +41,11 @@ def test_the_effect_acts_on_each_simulation_with_its_own_coefficient():
     seen = nuisance.simulate(np.random.default_rng(2), points, scenes)
     plain = problem.simulate(points, scenes)
     coefficients = nuisance.draw_coefficients(np.random.default_rng(2), 12)[:, 0]
-    # The first impact is at more than 3 m/s, so who loses more there leaves more slowly.
+    # The first impact is faster than 3 m/s, so a nonzero exponent reduces the speed after it.
     away = np.abs(seen - plain).max(axis=(1, 2))
     assert (away[coefficients == 0] == 0).all()
     assert away[coefficients != 0].min() > 0.01
-    # Of two simulations the one with the larger exponent's size is further from the plain one.
+    # The deviation from the simulation without the effect grows with the size of the exponent.
     order = np.argsort(-coefficients)
     assert (np.diff(away[order][coefficients[order] != 0]) > 0).all()
     assert problem.simulated == 24, "counted like any others"

@@ -44,7 +44,7 @@ def test_fisher_information_of_a_line_is_that_of_regression():
         found.vectors @ np.diag(found.values) @ found.vectors.T, information, rtol=1e-9
     )
     np.testing.assert_allclose(found.vectors.T @ found.vectors, np.eye(2), atol=1e-12)
-    # the bound is what regression reaches: its covariance, along the directions
+    # Linear regression attains the bound: its covariance, projected on the directions.
     covariance = (
         np.linalg.inv(widths) @ np.linalg.inv(design.T @ design / sigma**2) @ np.linalg.inv(widths)
     )
@@ -82,7 +82,7 @@ def test_only_the_product_of_two_factors_is_stiff():
     found = compute_spectrum(product, np.array([3.0, 0.5]), factors, np.array([0.01]))
     assert found.is_stiff.tolist() == [True, False]
     np.testing.assert_allclose(found.values[1], 0.0, atol=1e-9 * found.values[0])
-    # d(ab) = 0: da / a = -db / b, in training ranges da = 4 x, db = y
+    # d(ab) = 0 gives da / a = -db / b; in units of the training ranges, da = 4 x and db = y.
     expected = np.array([3.0 / 4, -0.5]) / np.hypot(3.0 / 4, 0.5)
     np.testing.assert_allclose(found.vectors[:, 1], expected, atol=1e-6)
     stiff, sloppy = found.compute_directional_errors(
@@ -129,7 +129,7 @@ def test_spring_against_its_derivatives():
 
 
 def test_servo_that_is_always_driven_cannot_tell_resistance_from_drag():
-    """Its torque is kt V / R duty - (kt^2 / R + c) q': three numbers in two combinations."""
+    """The torque is kt V / R duty - (kt^2 / R + c) q': two combinations of three parameters."""
     problem = TuningProblem(load_experiment("servo-friction").chosen(targets=1))
     target = problem.draw_targets()[0]
     found = problem.compute_spectrum(target)

@@ -1,4 +1,4 @@
-"""A target whose own simulation diverges is drawn again; runs without a finite loss diverged."""
+"""Tests of diverging simulations: targets are redrawn and runs are reported."""
 
 import json
 import subprocess
@@ -47,7 +47,9 @@ samples = 40
 
 @pytest.fixture
 def exploding(tmp_path):
-    """Writes the simulator with bounds up to `high`; gives the arguments of a comparison."""
+    """Return a function that writes the simulator with bounds up to `high` and the experiment, and
+    returns the arguments of `simgap compare`.
+    """
 
     def written(high):
         (tmp_path / "exploding.py").write_text(PLUGIN.replace("{high}", str(high)))
@@ -59,7 +61,7 @@ def exploding(tmp_path):
 
 
 def simgap(*arguments):
-    """The command in a process of its own, whose terminal shows every warning."""
+    """Run the command in its own process with all warnings shown."""
     command = [sys.executable, "-W", "always", "-m", "simgap", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
@@ -77,7 +79,7 @@ def test_diverging_targets_are_drawn_again_and_counted(exploding, tmp_path):
     )
     runs = pd.read_parquet(tmp_path / "a" / "runs.parquet")
     assert runs["true_rate"].max() < 20.0
-    # The error of the truth is finite, so that of a start beyond 20 is not.
+    # Targets have finite errors; a run is reported as diverged if none of its losses is finite.
     status = pd.read_csv(tmp_path / "a" / "status.csv").set_index("run")
     best = runs.groupby("run")["loss"].min()
     np.testing.assert_array_equal(
@@ -101,7 +103,7 @@ def test_too_many_diverging_targets_are_refused_in_one_message(exploding, tmp_pa
 
 
 class Lossy(Simulator):
-    """Diverges above 0.5 in a way of its own."""
+    """Simulator that returns `value` for parameters above 0.5."""
 
     name = "lossy"
     parameters = (Parameter("p", "1", 0.1, (0.0, 1.0), (0.0, 1.0)),)
@@ -126,7 +128,7 @@ def test_what_is_not_finite_or_beyond_the_limit_counts_as_diverged(value, monkey
     assert redraws.redrawn == sum(target.redraws > 0 for target in drawn)
     # Half of all draws fail: 60 draws for 30 targets, with a standard deviation of 8.
     assert 36 <= redraws.draws <= 84
-    # Each target has streams of its own: alone it is the same.
+    # Each target has its own random streams, so it is the same when drawn alone.
     alone = TuningProblem(experiment, "salt").draw_target("in", 7)
     assert alone.truth.tolist() == drawn[7].truth.tolist()
 

@@ -32,7 +32,7 @@ from sims.core.simulator import InputError
 from tests.bench.diagnosis.pendulum_recordings import SWINGING, written
 
 ROBOTS = Path(__file__).parents[4] / "shared" / "robots"
-"""Where robots lie on machines that have them; elsewhere what needs them is skipped."""
+"""Folder of shared robots; tests that need it are skipped on machines without it."""
 ARM = {
     "model": "swinging.xml",
     "free": ["damping@elbow", "mass@fore"],
@@ -44,7 +44,7 @@ ARM = {
 
 @pytest.fixture
 def arm(tmp_path):
-    """The experiment on the arm, whose file lies beside it; changes may be made to it."""
+    """Return a function that builds the arm experiment with changes, next to its model file."""
     written(tmp_path)
 
     def made(**changes):
@@ -89,7 +89,7 @@ def test_usual_commands_move_every_joint_and_keep_within_limits(arm):
 
 
 def ids(experiment):
-    """The name of a run and of a training."""
+    """Return the id of a run and the key of a training."""
     target = TuningProblem(experiment).draw_target("in", 0).blinded
     run = RunIds(experiment).make_run_id(experiment.tuners[0], target, 0, 12)
     return run, compute_training_key(experiment, TunerEntry("regressor", "regressor"), 0)
@@ -190,7 +190,7 @@ def test_what_a_shipped_experiment_lacks_is_said_in_the_list(tmp_path, monkeypat
 
 
 def without(monkeypatch, *packages):
-    """Make packages look as if they were not installed."""
+    """Simulate that these packages are not installed."""
     find = importlib.util.find_spec
 
     def found(name, *more):

@@ -1,4 +1,4 @@
-"""A salt is committed before it is known, and targets follow from it and from nothing else."""
+"""Tests of the salt: it is committed by hash, and targets depend only on it and the experiment."""
 
 import hashlib
 from dataclasses import replace
@@ -53,7 +53,7 @@ def test_targets_follow_from_the_salt():
 
 
 def test_a_salt_draws_each_thing_from_a_stream_of_its_own():
-    """What a tuner sees of one, as its start, is no part of the stream of another."""
+    """Values visible to the tuner, such as the start, are not part of any other stream."""
     streams = TargetStreams("a", "e", "in", 0)
     drawn = {
         w: streams.get_stream(w).uniform(size=4) for w in ("start", "truth", "scenario", "noise")
@@ -62,7 +62,7 @@ def test_a_salt_draws_each_thing_from_a_stream_of_its_own():
     numbers = np.concatenate(list(drawn.values()))
     assert len(np.unique(numbers)) == numbers.size
     again = TargetStreams("a", "e", "in", 0)
-    for what in ("truth", "start"):  # in another order
+    for what in ("truth", "start"):  # the order of the calls does not matter
         np.testing.assert_array_equal(again.get_stream(what).uniform(size=4), drawn[what])
 
 
@@ -74,7 +74,7 @@ def test_public_targets_are_those_of_the_published_stream():
 
 
 def test_nobody_draws_a_secret_target_from_public_names():
-    """As a plugin tried: name, range and number are public, and give another target."""
+    """A plugin can draw from public names (experiment, range, number), but gets another target."""
     problem = TuningProblem(spring_experiment(salt="", targets=1, ranges=["in"]), generate_salt())
     (target,) = problem.draw_targets()
     low, high = problem.cube.training

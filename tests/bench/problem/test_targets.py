@@ -1,4 +1,4 @@
-"""Who meets which targets, and which simulator makes what of them."""
+"""Tests of targets: which experiments share them, and which simulator generates their data."""
 
 from dataclasses import replace
 
@@ -12,13 +12,13 @@ from tests.sample_experiments import spring_experiment
 
 TIMES = np.arange(60) / 20
 BIAS = 0.4
-"""N, a force that the world has and the tuned simulator lacks."""
+"""Constant force in N that acts in the true system but not in the tuned simulator."""
 NARROW = 1e-6
-"""kg, how wide the range is in which start and truth lie, so that both are the mass of 1 kg."""
+"""Width in kg of the range of start and truth, so small that both are practically 1 kg."""
 
 
 def everything(target):
-    """All numbers of a target, one after another."""
+    """Return all numbers of a target as one array."""
     sides = target.blinded.fitting, target.blinded.held_out
     starts = [list(s.initial.values()) for side in sides for s in side.scenarios]
     observed = [side.observed.ravel() for side in sides]
@@ -26,7 +26,7 @@ def everything(target):
 
 
 def test_targets_of_another_experiment_are_met_whole(spring):
-    """Truth, start, scenario, noise and held-out scenarios, in each range."""
+    """Shared targets have equal truth, start, noise, scenario and held-out scenarios."""
     other = spring_experiment(noise={"x": 0.05}, held_out={"scenarios": 2}, targets=2)
     met = replace(other, name="mine", same_targets_as="spring-test", budget=5, seeds=1)
     own = replace(other, name="mine")
@@ -51,9 +51,9 @@ def test_a_comparison_meets_the_targets_of_another_and_searches_them_in_its_own_
     for place in theirs:
         for name in ("true_rate", "true_decay"):
             assert theirs[place][name][0] == mine[place][name][0] != apart[place][name][0]
-        # At the start only the target and its noise make the error.
+        # At the start, the error depends only on the target and its noise.
         assert theirs[place]["obs_error"][0] == mine[place]["obs_error"][0]
-        # Both simulate the start first, and what they like from then on.
+        # Both runs simulate the start first and then choose different points.
         assert theirs[place]["loss"][1] == mine[place]["loss"][1]
         assert not np.isin(theirs[place]["loss"][2:], mine[place]["loss"][2:]).any()
 
@@ -85,7 +85,7 @@ def test_every_channel_has_noise_of_its_own_size(spring):
 
 
 def slider(**changes):
-    """A mass at rest that nothing pushes, but for a constant force in the world alone."""
+    """Build an experiment with a mass on which a constant force acts only in the true system."""
     document = {
         "simulator": "slider", "observe": ["x"], "targets": 1, "ranges": ["in"], "budget": 1,
         "parameters": {"mass": {"training": [1.0, 1.0 + NARROW]}},
@@ -99,7 +99,7 @@ def slider(**changes):
 
 
 def test_held_out_runs_are_the_worlds_and_not_the_tuned_simulators():
-    """The bias moves the mass by F t^2 / 2 m, in the fitted run and in those held out."""
+    """The force moves the mass by F t^2 / 2 m, in the fitted run and in the held-out runs."""
     results = prepare_experiment(slider())
     held_out = results.plan[0].target.blinded.held_out
     moved = 0.3 + 0.5 * TIMES + BIAS * TIMES**2 / 2

@@ -1,4 +1,4 @@
-"""Where learned tuners train: counted exactly, and fenced to the training range."""
+"""Tests of the training simulator: simulations are counted, and points are limited to the range."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from methods.tuner import BudgetExceededError
 from tests.sample_experiments import spring_experiment
 
 LOW, HIGH = np.array([0.25, 0.2]), np.array([0.75, 0.6])
-"""The spring's training range, 2..4 rad/s of 1..5 and 0.2..0.6 1/s of 0..1, in the unit cube."""
+"""Training range of the spring in the unit cube: 2..4 of 1..5 rad/s and 0.2..0.6 of 0..1 1/s."""
 
 
 @pytest.fixture
@@ -46,4 +46,4 @@ def test_no_point_outside_the_training_range_is_simulated(practice, outside):
     with pytest.raises(ValueError, match="only simulate inside the training range"):
         practice.simulate(np.random.default_rng(0), points)
     assert practice.used == 0
-    practice.simulate(np.random.default_rng(0), np.array([LOW, HIGH]))  # its corners are inside
+    practice.simulate(np.random.default_rng(0), np.array([LOW, HIGH]))  # corners are inside

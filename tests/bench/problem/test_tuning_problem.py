@@ -1,6 +1,4 @@
-"""The problems of several parameters can be solved: least squares ends where the data's own noise
-lets it.
-"""
+"""Tests of problems with several parameters: least squares reaches the noise limit."""
 
 import numpy as np
 import pytest
@@ -41,6 +39,6 @@ def test_truth_is_recovered_as_closely_as_the_noise_allows(name, index, budget, 
     assert columns["stiff_error"][-1] < 0.05
     assert columns["stiff_error"][-1] < 0.2 * columns["stiff_error"][0]
     assert columns["heldout_error"][-1] < predicts
-    if name == "servo-friction":  # what nobody could know is not known, and is not needed
+    if name == "servo-friction":  # the sloppy direction is not identifiable and not needed
         assert columns["sloppy_error"][-1] > 0.1
     problem.close()

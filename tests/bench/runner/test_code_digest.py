@@ -1,4 +1,4 @@
-"""Whatever makes a run or trains a tuner changes the run's id and the key of the weights."""
+"""Tests of code digests: each cause of a changed result changes the run id or the weights key."""
 
 import shutil
 import sys
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 
 @contextmanager
 def alone(*plugins):
-    """These plugins are loaded, and gone again."""
+    """Load these plugins only, and restore the registries afterwards."""
     before = [registry.snapshot() for registry in REGISTRIES]
     load_plugins(plugins)
     yield
@@ -53,7 +53,7 @@ def alone(*plugins):
 
 
 def extended(path, scale):
-    """A fitted pendulum, every number of it times `scale`."""
+    """Write an extended pendulum whose numbers are all multiplied by `scale`."""
     model = ExtendedSimulator(
         "pendulum_extended", "pendulum", "batch", "A swing, measured",
         {"inertia": FittedValue(3.1e-3 * scale, "kg*m^2", 3.0e-3 * scale, 3.2e-3 * scale)},
@@ -70,7 +70,7 @@ def swing(path):
 
 
 def names_with(plugin, experiment, entry):
-    """Training key and run ids with this plugin alone loaded."""
+    """Return the training key and the run ids with only this plugin loaded."""
     with alone(plugin):
         plan = prepare_experiment(replace(experiment, tuners=(entry,), trusted=True)).plan
         return compute_training_key(experiment, entry, 0), {job.request.run for job in plan}
@@ -255,7 +255,7 @@ def test_a_new_file_in_a_room_counts_and_what_python_compiles_does_not(tmp_path,
 
 
 def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatch):
-    """As IPython does it: a cell's text is known to linecache and its classes are __main__'s."""
+    """IPython stores the text of a cell in linecache, and its classes belong to `__main__`."""
     import linecache
 
     main = sys.modules["__main__"]
@@ -273,14 +273,14 @@ def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatc
     one = cell(1, 1)
     cell(2, 2)
     with pytest.raises(InputError, match="whose source cannot be told"):
-        hash_class_source(one)  # the name is another class's by now
+        hash_class_source(one)  # another class has this name now
     digests = [hash_class_source(cell(number, step)) for number, step in ((3, 1), (4, 2), (5, 1))]
     assert digests[0] == digests[2] != digests[1]
     assert digests[1] == hash_class_source(cell(6, 2))
 
 
 def test_class_of_a_notebook_that_has_no_file_takes_the_text_of_its_cell(monkeypatch):
-    """As in Jupyter, where __main__ has no file, so that inspect finds functions and no classes."""
+    """In Jupyter, `__main__` has no file, so that inspect finds functions but no classes."""
     import linecache
 
     main = sys.modules["__main__"]
@@ -351,12 +351,12 @@ CHANGES = {
     "sampling": type(Experiment("x").sampling)(20.0, 61),
     "training_budget": 99,
 }
-"""A change to every key of an experiment that determines a run or a training."""
+"""A change to each key of an experiment that determines a run or a training."""
 NO_MATTER = {
     "run_ids": {"training_budget"},
     "tuner_training": {"error_channel", "world", "timeout", "memory", "isolation"},
 }
-"""Those of them that determine the other of the two alone."""
+"""For each module, the keys of CHANGES that do not affect its digest."""
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,9 @@ NO_MATTER = {
     [("run_ids", "RUN_IRRELEVANT_KEYS"), ("tuner_training", "TRAINING_IRRELEVANT_KEYS")],
 )
 def test_every_key_of_an_experiment_matters_or_has_its_reason(module, but):
-    """A new key that nobody gives a reason for must stand in CHANGES, and is seen to matter."""
+    """A new key must be listed either with a reason as irrelevant, or in CHANGES, where it changes
+    the digest.
+    """
     from bench.benchmark.runner.code_digest import select_relevant_keys
 
     reasons = getattr(import_module(f"bench.benchmark.runner.{module}"), but)

@@ -1,4 +1,4 @@
-"""Interrupted comparisons: nothing lost, nothing doubled, nothing mixed."""
+"""Tests of interrupted comparisons: no run is lost, repeated or mixed with another."""
 
 import json
 import os
@@ -61,9 +61,7 @@ def finished_folder(tmp_path_factory):
 
 
 def begun(folder, experiment, enough):
-    """Starts a comparison, kills it without warning when `enough` runs are there, and gives the
-    folder.
-    """
+    """Start a comparison, kill it once `enough` runs are finished, and return its folder."""
     command = [
         *COMMAND,
         "compare",
@@ -109,9 +107,7 @@ def test_killed_without_warning_and_resumed_the_result_is_the_undisturbed_one(
     assert main(["status", str(folder)]) == 0
     assert "48 of 48 runs finished, complete" in capsys.readouterr().out
 
-    again = simgap(
-        "compare", "--resume", folder
-    )  # there is nothing left to do, and it says so by doing nothing
+    again = simgap("compare", "--resume", folder)  # no run is missing, so none is executed
     assert again.returncode == 0
     assert "running" not in again.stderr
 

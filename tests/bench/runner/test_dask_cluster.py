@@ -1,4 +1,4 @@
-"""A real scheduler and two workers on loopback."""
+"""Tests with a real Dask scheduler and two workers on the loopback interface."""
 
 import os
 import subprocess
@@ -32,7 +32,7 @@ def test_cluster_gives_the_table_of_two_local_workers_and_a_lost_worker_costs_no
     local = simgap(*common, "--jobs", 2, "--out", tmp_path / "local")
     assert local.returncode == 0, local.stderr
     folder = tmp_path / "far"
-    # A cache of its own: the weights that the cluster trains must come back and go out again.
+    # With a separate cache, the weights trained on the cluster must be returned and sent out again.
     environment = {**os.environ, "SIMGAP_CACHE": str(tmp_path / "cache")}
     command = [*COMMAND, *map(str, common), "--cluster", started.address]
     process = subprocess.Popen(
@@ -117,7 +117,7 @@ shot = { balls = ["golf"] }
 
 @pytest.mark.slow
 def test_bounce_shot_on_a_cluster_is_the_one_of_two_local_workers(started, tmp_path):
-    """Recordings and weights travel there; workers find none of them on this machine's paths."""
+    """Recordings and weights are sent to the workers, which do not use paths of this machine."""
     (tmp_path / "shot.toml").write_text(SHOT)
     tables = []
     for name, where in (("local", ["--jobs", 2]), ("far", ["--cluster", started.address])):

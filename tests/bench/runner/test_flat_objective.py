@@ -1,4 +1,4 @@
-"""A comparison on a simulator whose parameter does nothing: all tuners are alike."""
+"""Test of a comparison on a simulator whose parameter has no effect: all tuners are equal."""
 
 import pytest
 
@@ -39,7 +39,7 @@ def test_nothing_warns_where_the_parameter_does_nothing(tmp_path, capfd):
     (tmp_path / "flat.py").write_text(FLAT)
     (tmp_path / "flat.toml").write_text(EXPERIMENT)
     plugin = ["--plugin", str(tmp_path / "flat.py"), "--jobs", "0"]
-    # In this process, where a warning is an error, with all tables and figures.
+    # The command runs in this process, where a warning is an error, with all tables and figures.
     code = main(["compare", str(tmp_path / "flat.toml"), *plugin, "--out", str(tmp_path / "out")])
     said = capfd.readouterr()
     assert code == 0, said.err

@@ -1,4 +1,4 @@
-"""Runs without worker processes: the same table, and whoever wrote the tuner can look on."""
+"""Tests of runs without worker processes: equal tables, and tuners that can be observed."""
 
 import linecache
 import os
@@ -50,7 +50,7 @@ def plugins():
 
 
 def in_a_cell(monkeypatch, then):
-    """A tuner as a notebook's cell defines it, registered."""
+    """Register a tuner that is defined as in a notebook cell."""
     text = CELL.format(then=then)
     linecache.cache["<cell>"] = (len(text), None, text.splitlines(keepends=True), "<cell>")
     space = {"__name__": "__main__"}
@@ -76,14 +76,14 @@ def test_table_is_the_same_without_workers_and_with_one_or_two(tmp_path, monkeyp
     experiment = spring_experiment(tuners=EVERYONE, targets=2, training_budget=60)
     tables = []
     for jobs in (1, 2, 0):
-        # Each trains for itself: a file that the first one left would hide a difference.
+        # Each run trains anew, because weights cached by the first would hide a difference.
         monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / f"cache{jobs}"))
         folder = tmp_path / str(jobs)
         load_plugins_for_experiment(PLUGIN_FILES, experiment.chosen(trusted=not jobs))
         assert Comparison.begin(experiment, PLUGIN_FILES, folder, jobs).run(jobs).is_complete
         tables.append(read_comparison(folder))
     assert [table.experiment.trusted for table in tables] == [False, False, True]
-    # A tuner in a process of its own does what it does in this one, to the last bit.
+    # An isolated tuner gives bitwise the same results as a tuner in this process.
     unlike = ["run", "trusted", "tuner_seconds", "simulator_seconds", "seconds", "reason"]
     for other in tables[1:]:
         for frames in ((tables[0].runs, other.runs), (tables[0].statuses, other.statuses)):

@@ -1,4 +1,4 @@
-"""An experiment on a recording: what is fitted, what measures, in which units."""
+"""Tests of experiments on a recording: fitted and held-out runs, errors and units."""
 
 import numpy as np
 import pytest
@@ -12,13 +12,13 @@ from tests.sample_experiments import SPRING
 
 TIMES = np.arange(60) / 20
 OFF = {"1": 0.1, "2": 0.1, "3": 0.25}
-"""m, by how much each run lies above the spring of 3 rad/s and 0.3 1/s; the third is held out."""
+"""Offset in m of each run from the spring of 3 rad/s and 0.3 1/s; the third run is held out."""
 
 pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 
 
 class Knowing(Tuner):
-    """Simulates and recommends the spring of 3 rad/s and 0.3 1/s."""
+    """Tuner that simulates and recommends the spring of 3 rad/s and 0.3 1/s."""
 
     name = "knowing"
     source_digest = "knowing"
@@ -31,7 +31,7 @@ class Knowing(Tuner):
 
 
 def recorded(folder, **changes):
-    """What the knowing tuner made of a recording: columns, and why it stopped."""
+    """Run the tuner `knowing` on a recording; return the columns and the reason for its end."""
     lines = [
         f"{name},{t},{np.exp(-0.3 * t) * np.cos(3.0 * t) + off}"
         for name, off in OFF.items()
@@ -69,7 +69,7 @@ def test_fitted_runs_are_fitted_and_held_out_ones_measure(tmp_path):
 
 @pytest.mark.parametrize(("noise", "sigma"), [({}, 0.02), ({"x": 0.05}, 0.05)])
 def test_errors_are_in_the_channels_unit_and_in_that_of_its_noise(tmp_path, noise, sigma):
-    """What the experiment says of the noise stands above what the recording does."""
+    """The noise given in the experiment overrides the noise given in the recording."""
     columns, reason = recorded(tmp_path, noise=noise)
     assert reason == f"scale {sigma:g}"
     assert columns["loss"][1] == pytest.approx(0.1 / sigma, rel=1e-9)

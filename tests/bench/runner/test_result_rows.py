@@ -1,6 +1,4 @@
-"""Parameter errors of a run: each in its training range's width, and how far the target lies
-outside.
-"""
+"""Tests of result rows: parameter errors in training widths, and the distance outside the range."""
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from tests.sample_experiments import spring_experiment
 pytestmark = pytest.mark.usefixtures("spring", "fresh_registries")
 
 DELIVERED = [(3.0, 0.3), (4.6, 0.9), (1.4, 0.1)]
-"""rad/s and 1/s, what is recommended after 0, 1 and 2 simulations of other points."""
+"""Recommendations in rad/s and 1/s after 0, 1 and 2 simulations, which are made at other points."""
 
 
 class Wandering(Tuner):

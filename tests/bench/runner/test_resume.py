@@ -1,4 +1,4 @@
-"""A comparison is not taken up again after something that it was begun with has changed."""
+"""Tests of resuming: a comparison is not resumed if one of its inputs has changed."""
 
 import json
 from dataclasses import replace
@@ -45,7 +45,7 @@ pytestmark = pytest.mark.usefixtures("fresh_registries")
 
 
 class Interrupting(simgap.Tuner):
-    """As Ctrl-C does, before its first simulation."""
+    """Tuner that raises KeyboardInterrupt once, before its first simulation, as Ctrl-C does."""
 
     name = "interrupting"
     source_digest = "interrupting"
@@ -59,7 +59,7 @@ class Interrupting(simgap.Tuner):
 
 
 def begun(experiment, plugins, folder):
-    """A folder whose first run is finished and whose second was interrupted."""
+    """Run a comparison whose first run is finished and whose second is interrupted."""
     Interrupting.left = 1
     made = Comparison.begin(experiment, plugins, folder, jobs=0).run(jobs=0)
     assert made.interrupted
@@ -68,7 +68,7 @@ def begun(experiment, plugins, folder):
 
 
 def refused(folder, what, words="its {} changed since it was begun"):
-    """Resuming is refused for this, in one line, and nothing in the folder changes."""
+    """Check that resuming is refused with one line and changes no file of the folder."""
     before = {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     with pytest.raises(InputError, match=words.format(what)) as caught:
         Comparison.resume(folder)
@@ -77,7 +77,7 @@ def refused(folder, what, words="its {} changed since it was begun"):
 
 
 def goes_on(folder):
-    """Resumed, it makes what is missing and no more."""
+    """Check that resuming executes the missing run only."""
     kept = read_finished_statuses(folder)
     made = Comparison.resume(folder).run(jobs=0)
     assert made.is_complete
@@ -88,7 +88,7 @@ def goes_on(folder):
 
 @pytest.mark.parametrize("name", ["hung.py", "mine.py"])
 def test_a_changed_plugin_is_refused_and_the_same_one_goes_on(name, tmp_path):
-    """Also one that holds neither simulator nor tuner, and so is in no other hash."""
+    """This includes a plugin that holds neither simulator nor tuner and so enters no other hash."""
     from bench.core.plugin_registries import tuners
 
     tuners.register(Interrupting)
@@ -112,7 +112,7 @@ def test_a_changed_plugin_is_refused_and_the_same_one_goes_on(name, tmp_path):
     ("name", "old", "new"),
     [
         ("swing.csv", "1,0.30,0.44", "1,0.30,0.45"),
-        ("swing.csv", "2,0.30,0.38", "2,0.30,0.39"),  # held out: it measures alone
+        ("swing.csv", "2,0.30,0.38", "2,0.30,0.39"),  # held out, only for scoring
         ("swing.toml", "mass = 0.15", "mass = 0.16"),
         ("swing.toml", "noise = 0.01", "noise = 0.02"),
         ("swing.toml", 'system = "pendulum"', '# words\nsystem = "pendulum"'),

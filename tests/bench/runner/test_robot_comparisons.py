@@ -1,5 +1,5 @@
-"""A robot from its file through the public commands: a log is made, tuners are compared on it in
-sealed processes, and who is right gets the truth back.
+"""Tests of a robot from its model file with the public commands: a log is simulated, isolated
+tuners are compared on it, and least squares recovers the true parameters.
 """
 
 import pandas as pd
@@ -13,7 +13,7 @@ TRUTH = {"drag.linear@elbow": 0.13, "mass.scale@fore": 0.2}
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """A log of the arm with another damping and another mass than its file states."""
+    """Log of the arm with a damping and a mass that differ from its model file."""
     folder = tmp_path_factory.mktemp("log")
     model = written(folder)
     given = [f"{name}={value}" for name, value in TRUTH.items()]
@@ -25,7 +25,7 @@ def log(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def compared(log, tmp_path_factory):
-    """The folder of a comparison on it, by the command."""
+    """Folder of a comparison on the log, made with the command."""
     out = tmp_path_factory.mktemp("compared") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SIMGAP_CACHE", str(out.parent / "cache"))

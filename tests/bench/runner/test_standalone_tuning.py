@@ -12,7 +12,7 @@ PARAMETERS = [
 
 
 def problem(asked):
-    """A line with TRUTH as its intercept and slope; what is evaluated is noted in `asked`."""
+    """Fit a line with intercept and slope TRUTH; append each evaluated point to `asked`."""
     times = np.linspace(0.0, 1.0, 8)
 
     def line(theta):
@@ -40,7 +40,7 @@ def test_a_registered_tuner_works_in_physical_units_from_the_start_within_its_bu
     assert asked[0] == pytest.approx([5.0, 1e-3]), "the first simulation is that of the start"
     assert 5 < len(asked) <= 40
     lows, highs = zip(*(p.bounds for p in PARAMETERS), strict=True)
-    # a bound goes through a logarithm and back
+    # log-scaled bounds are converted to logarithms and back
     assert (np.array(asked) >= np.array(lows) * (1.0 - 1e-12)).all()
     assert (np.array(asked) <= np.array(highs) * (1.0 + 1e-12)).all()
 

@@ -1,6 +1,4 @@
-"""What the author of a tuner is told of isolation: why it failed, what was thrown away, and what it
-costs.
-"""
+"""Tests of messages about isolation: errors it causes, discarded files and import times."""
 
 import csv
 
@@ -21,7 +19,7 @@ REFUSED = ("reads_beside", "reads_here", "starts_program", "starts_pool", "asks_
 
 
 def compared(tmp_path, capsys, tuners, plugin, *options, targets=1):
-    """What `simgap compare` says of these tuners, and the reasons of its status.csv by tuner."""
+    """Run `simgap compare`; return its output and the reasons of status.csv by tuner."""
     changes = {"targets": targets, "seeds": 1, "budget": 3, "ranges": ["in"]}
     path = tmp_path / "e.toml"
     path.write_text(tomli_w.dumps({**SPRING, **changes, "tuners": {name: {} for name in tuners}}))

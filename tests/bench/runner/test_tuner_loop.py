@@ -21,7 +21,7 @@ def task(budget, dim=2):
 
 
 class Counted:
-    """Loss: distance to the truth; counts what is simulated."""
+    """Objective with the distance to the truth as loss, which counts simulations."""
 
     def __init__(self):
         self.simulated = 0
@@ -84,7 +84,7 @@ def test_recommendation_of_an_ask_is_what_the_tuner_would_deliver_after_what_it_
     np.testing.assert_allclose(trace.proposals[:, 0], [0.1, 0.2, 0.3])
     np.testing.assert_allclose(
         trace.recommendations[:, 0], [0.1, 0.2, 0.3, 0.4]
-    )  # the newest guess, not simulated
+    )  # the newest recommendation, which was not simulated
     assert trace.status == "done"
 
 

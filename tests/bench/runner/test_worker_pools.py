@@ -32,7 +32,7 @@ def hang(path):
 
 
 def killed_until(path, times):
-    """Dies by SIGKILL the first `times` times."""
+    """Kill this process with SIGKILL in the first `times` calls; then return their number."""
     count = len(Path(path).read_text()) if Path(path).exists() else 0
     Path(path).write_text("x" * (count + 1))
     if count < times:
@@ -41,7 +41,7 @@ def killed_until(path, times):
 
 
 def half_a_message():
-    """Leaves a large answer half written, with the lock held: the parent waits for the rest."""
+    """Die while a large result is sent with the lock held: the parent waits for the rest."""
     import threading
 
     threading.Timer(0.2, lambda: os.kill(os.getpid(), signal.SIGKILL)).start()
@@ -168,9 +168,9 @@ def test_no_worker_outlives_its_parent(tmp_path):
 
 def allocate_within_and_beyond_the_limit():
     with limited_memory(200):
-        held = np.ones(12_500_000)  # 100 MB: within
+        held = np.ones(12_500_000)  # 100 MB: within the limit
         with pytest.raises(MemoryError):
-            np.ones(37_500_000)  # 300 MB
+            np.ones(37_500_000)  # 300 MB: beyond the limit
     del held
     assert np.ones(37_500_000).nbytes == 300_000_000
     with limited_memory(0):
@@ -178,7 +178,7 @@ def allocate_within_and_beyond_the_limit():
 
 
 def test_memory_beyond_the_limit_is_refused_and_the_limit_ends_with_the_block():
-    """In a process of its own: one that has freed much memory is given that again, unlimited."""
+    """Run in a new process, because memory that a process has freed is reused without limit."""
     process = multiprocessing.get_context("spawn").Process(
         target=allocate_within_and_beyond_the_limit
     )
@@ -188,7 +188,7 @@ def test_memory_beyond_the_limit_is_refused_and_the_limit_ends_with_the_block():
 
 
 def interrupted_at_birth(context):
-    """A process that Ctrl-C reaches as soon as it is there: its exit code."""
+    """Return the exit code of a process that receives Ctrl-C as soon as it exists."""
     process = context.Process(target=leave_when_told)
     process.start()
     os.kill(process.pid, signal.SIGINT)
@@ -203,7 +203,7 @@ def leave_when_told():
 
 
 def test_an_interrupt_waits_for_a_worker_that_is_not_there_yet():
-    """Ctrl-C goes to the whole group; a worker at its imports would end with a traceback."""
+    """Ctrl-C goes to the whole process group; a worker that is importing would show a traceback."""
     assert interrupted_at_birth(WorkerContext()) == 7
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 

@@ -12,7 +12,7 @@ from bench.benchmark.statistics.error_table import (
 
 
 def runs_of(curves, tuner="a", kind="in", metric="param_abs_error"):
-    """curves: {(target, seed): errors after 0..k}"""
+    """Build run rows from `curves`: {(target, seed): errors after 0..k simulations}."""
     frames = [
         pd.DataFrame({
             "run": f"{tuner}/{kind}-{target}/{seed}", "experiment": "e", "tuner": tuner,

@@ -1,4 +1,4 @@
-"""Intervals hold 95 %, over targets: widths against the normal distribution's, or by hand."""
+"""Tests of 95 % intervals over targets: widths agree with a normal distribution or with SciPy."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_the_tables_interval_is_as_wide_as_95_percent_of_a_normal_distribution()
 )
 def test_intervals_are_those_of_scipy_from_the_same_draws(targets, own, plain):
     values = np.exp(3 * np.random.default_rng(targets).normal(size=(targets, 3)))
-    # Equal values, as where errors end at rounding, in one column.
+    # One column has equal values, as for errors that end at rounding.
     values[: targets // 2 + 1, 0] = 1e-9
     stream = make_rng("bootstrap", "a", "b")
     expected = bootstrap(
@@ -55,7 +55,7 @@ def test_seeds_of_one_target_are_no_further_evidence():
 
 
 def geometric(tuners, targets=120):
-    """Runs that reach the threshold after so many simulations, the same of every tuner."""
+    """Build equal curves for all tuners with geometric times until the threshold is reached."""
     times = np.random.default_rng(6).geometric(0.1, size=targets).clip(max=60)
     errors = {(f"{i:03d}", 0): [1.0] * t + [0.01] for i, t in enumerate(times)}
     return times, curves_of(dict.fromkeys(tuners, errors), budget=60)

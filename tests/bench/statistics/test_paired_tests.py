@@ -1,4 +1,4 @@
-"""What is paired by target, which metric decides, and what counts as a failure."""
+"""Tests of paired comparisons: pairing by target, the deciding metric, and failures."""
 
 import numpy as np
 import pandas as pd
@@ -58,7 +58,7 @@ def test_the_truth_decides_then_held_out_runs_then_what_was_fitted():
     [("crashed", 1), ("timeout", 1), ("diverged", 1), ("done", 0), ("converged", 0)],
 )
 def test_a_run_that_crashed_timed_out_or_diverged_has_failed(status, failed):
-    """It is counted, its errors stay in the mean, and it delivers nothing that one could trust."""
+    """A failed run is counted and stays in the mean, but its final value is infinite."""
     runs = runs_of({(0, 0): [0.8, 0.4], (1, 0): [0.4, 0.2]}, metric="param_error")
     statuses = statuses_of(runs, **{"a_in-0_0": status})
     line = at(build_error_table(runs, statuses, 1), 1, "param_error")

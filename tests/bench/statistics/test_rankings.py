@@ -1,4 +1,4 @@
-"""Mean ranks, Kendall's tau and what it is worth, against numbers worked out by hand."""
+"""Tests of mean ranks, Kendall's tau and its p-value against values computed by hand."""
 
 import numpy as np
 import pytest
@@ -10,16 +10,16 @@ from bench.benchmark.statistics.rank_agreement import (
 )
 
 EASY = np.array([[1.0, 2.0, 3.0, 4.0]]) * np.linspace(1, 2, 12)[:, None]
-"""Twelve targets on which four tuners stand in the same order."""
+"""Twelve targets on which four tuners have the same order."""
 
 
 @pytest.mark.parametrize(
     ("first", "second", "expected"),
     [
-        # Of the 6 pairs of (1 2 3 4) one is turned round in (1 2 4 3): (5 - 1) / 6.
+        # Of the 6 pairs of (1 2 3 4), one is reversed in (1 2 4 3): (5 - 1) / 6.
         ([1, 2, 3, 4], [1, 2, 4, 3], 4 / 6),
         ([1, 2, 3, 4], [4, 3, 2, 1], -1.0),
-        # The pair that the second ties counts for neither: (5 - 0) / sqrt(6 * 5).
+        # The pair that is tied in the second ranking counts for neither: (5 - 0) / sqrt(6 * 5).
         ([1, 2, 3, 4], [1, 2, 3.5, 3.5], 5 / np.sqrt(30)),
     ],
 )
@@ -50,7 +50,7 @@ def test_the_same_order_agrees_and_the_exchange_finds_nothing():
 def test_a_turned_order_is_told_from_chance():
     turned = compute_rank_agreement(EASY, EASY[:, ::-1], "turned")
     assert turned.tau == pytest.approx(-1.0)
-    # Of 2^12 exchanges only all and none change mean ranks as much: 2 / 4096, give or take.
+    # Of 2^12 exchanges, only all and none change mean ranks as much: p is about 2 / 4096.
     assert turned.p_value < 0.005
     assert turned.halves == pytest.approx(1.0), "the first condition agrees with itself"
 

@@ -1,5 +1,5 @@
-"""ERT, runtime distributions, paired tests, ranks, break-even: numbers worked out by hand or by
-another way.
+"""Tests of ERT, runtime distributions, paired tests, ranks and break-even against values computed
+by hand or with another method.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ from tests.bench.statistics.test_error_table import runs_of, statuses_of
 
 
 def curves_of(errors, budget=4, failed=(), seconds=None):
-    """errors: {tuner: {(target, seed): errors after 0..k}}"""
+    """Build curves from `errors`: {tuner: {(target, seed): errors after 0..k simulations}}."""
     runs = pd.concat(
         [runs_of(c, tuner=t, metric="param_error") for t, c in errors.items()], ignore_index=True
     )
@@ -84,7 +84,7 @@ def test_interval_of_ert_covers():
     rng = np.random.default_rng(0)
     inside = 0
     for i in range(200):
-        times = rng.geometric(0.1, size=40)  # success after so many: ERT is 10
+        times = rng.geometric(0.1, size=40)  # number of simulations until success; the ERT is 10
         spent = ThresholdEffort(times.astype(float), np.zeros(40), np.ones(40, dtype=int), 40)
         low, high = np.percentile(spent.compute_ert(rng.integers(40, size=(300, 40))), [2.5, 97.5])
         inside += low <= 10 <= high
@@ -241,7 +241,7 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     seeds = np.arange(runs) // 200 % 5
     names = np.array([f"{t}/{on}/{s}/0" for t, on, s in zip(tuners, targets, seeds, strict=True)])
     rng = np.random.default_rng(0)
-    # Before the first simulation there is none that took any time.
+    # No time is recorded before the first simulation.
     start = np.tile(np.where(k == 0, np.nan, 0.0), runs)
     numbers = {
         name: rng.exponential(size=runs * 100) + (start if after else 0.0)

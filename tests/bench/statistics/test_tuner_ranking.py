@@ -1,4 +1,4 @@
-"""The one ranking rule: medians with a floor, ties, failures, and the test against the best."""
+"""Tests of the ranking rule: medians with a floor, ties, failures, and tests against the best."""
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,7 @@ FLOOR = 1e-3
 
 
 def curves_of(errors, failed=(), kind="in"):
-    """Curves of {tuner: (targets, K + 1) errors}, one seed; all runs of `failed` failed."""
+    """Build curves from {tuner: (targets, K + 1) errors}, one seed; all runs of `failed` failed."""
     rows = [
         ("e", tuner, kind, f"{kind}-{i:03d}", tuner in failed, line)
         for tuner, lines in errors.items()
@@ -32,7 +32,7 @@ def curves_of(errors, failed=(), kind="in"):
 
 
 def constant(errors, budget=20):
-    """Curves that start at 1 and have these errors from the first simulation on."""
+    """Return curves that are 1 at the start and equal `errors` from the first simulation on."""
     return np.column_stack([np.ones(len(errors)), np.tile(np.array(errors)[:, None], budget)])
 
 
@@ -62,7 +62,7 @@ def test_the_best_is_tested_against_each_other_tuner_and_not_all_pairs():
     found = last(curves_of(errors))
     assert found.loc["best", "verdict"] == "best"
     worst = found.drop(index="best")
-    # Corrected for all 45 pairs, 2 / 2^10 would be 0.088 and decide nothing.
+    # Corrected for all 45 pairs, p would be 45 * 2 / 2^10 = 0.088, which is not significant.
     assert worst["p_holm"].max() == pytest.approx(others * 2 / 2**10)
     assert set(worst["verdict"]) == {"worse"}
 
@@ -107,7 +107,7 @@ def test_equal_tuners_stand_in_the_order_in_which_they_got_there():
 
 
 def test_the_best_of_equal_tuners_is_rarely_called_worse():
-    """Under equality any given tuner is excluded from the best in at most 5 % of comparisons."""
+    """If all are equal, a given tuner is called worse than the best in at most 5 % of cases."""
     rng = np.random.default_rng(1)
     repeats, tuners, targets = 100, 6, 12
     excluded = 0
@@ -115,7 +115,7 @@ def test_the_best_of_equal_tuners_is_rarely_called_worse():
         logs = rng.normal(size=(tuners, targets)) + rng.normal(size=targets)
         errors = {f"t{i}": constant(np.exp(log), budget=1) for i, log in enumerate(logs)}
         excluded += last(curves_of(errors), budget=1).loc["t0", "verdict"] == "worse"
-    # 5 % of 100 is 5, with a standard deviation of 2.2.
+    # The expected value is 5 % of 100 = 5, with a standard deviation of 2.2.
     assert excluded <= 5 + 2 * 2.2
 
 
@@ -126,9 +126,9 @@ def test_a_covered_curve_is_told_up_to_where_it_coincides():
     flat = pd.Series([1, 1, 1, 0.5, 0.4], index=points)
     drawn = {"tunenet": [below], "search": [flat], "hybrid": [above]}
     assert coinciding(drawn) == {"tunenet": "same as hybrid up to 2"}
-    # In a second panel they part after one simulation.
+    # In the second panel, the curves differ after one simulation.
     drawn = {"tunenet": [below, below], "hybrid": [above, above * [1, 1, 2, 1, 1]]}
     assert coinciding(drawn) == {"tunenet": "same as hybrid up to 1"}
     assert coinciding({"tunenet": [below], "hybrid": [below]}) == {"tunenet": "same as hybrid"}
-    # All start alike: that is no news.
+    # All curves have the same start, so a coincidence there is not reported.
     assert coinciding({"search": [flat], "other": [flat * [1, 1, 1, 0.1, 0.1]]}) == {}

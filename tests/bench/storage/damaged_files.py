@@ -1,5 +1,5 @@
-"""Damages to result folders: by what a person would call it, the file that a message must name, and
-what spoils it.
+"""Kinds of damage to result folders: by name, the file that the message must mention, and a
+function that damages the folder.
 """
 
 import json
@@ -12,7 +12,7 @@ from pyarrow import parquet
 
 
 def rows(change, name="runs.parquet"):
-    """Damage to a Parquet file: `change` gets a frame and gives one."""
+    """Return a function that damages a Parquet file; `change` maps a frame to a frame."""
 
     def damage(folder):
         path = folder / name
@@ -38,7 +38,7 @@ def column(name, values):
 
 
 def text(name, old, new, count=1):
-    """Damage to a text file."""
+    """Return a function that damages a text file."""
 
     def damage(folder):
         path = folder / name
@@ -67,7 +67,7 @@ def raw(name, change):
 
 
 def key(name, value):
-    """Damage to environment.json; None takes the key away."""
+    """Return a function that damages environment.json; the value None removes the key."""
 
     def damage(folder):
         path = folder / "environment.json"
@@ -81,12 +81,12 @@ def key(name, value):
 
 
 def another(row):
-    """A run's id with another tuner."""
+    """Return the id of a run with another tuner."""
     return row.replace("random", "annealing")
 
 
 def column_of(name, place, change):
-    """Damage to a cell of the second line of a CSV file."""
+    """Return a function that damages a cell of the second line of a CSV file."""
 
     def changed(before):
         cells = before[1].split(",")
@@ -97,7 +97,7 @@ def column_of(name, place, change):
 
 
 def both(first, second):
-    """Two damages that hide each other."""
+    """Combine two kinds of damage that hide each other."""
     return lambda folder: (first(folder), second(folder))
 
 
@@ -235,7 +235,7 @@ HALF = {
 
 
 def statuses(change):
-    """Damage to the statuses of a part."""
+    """Return the damaged segment file and a function that changes its statuses."""
 
     def damage(folder):
         path = folder / "segments" / "000001.parquet"

@@ -1,4 +1,4 @@
-"""Damaged result folders: one line that names the file, whoever reads it."""
+"""Tests of damaged result folders: each reader gives one line that names the file."""
 
 import shutil
 from contextlib import redirect_stderr
@@ -53,7 +53,7 @@ SPRING_PLUGIN = str(PLUGINS / "spring.py")
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory, spring):
-    """A finished comparison, and one whose runs are all in its segments."""
+    """Folder with a finished comparison and with one whose runs are all in its segments."""
     experiment = spring_experiment(
         targets=2, seeds=2, budget=3, tuners={"random": {}, "nelder_mead": {"seeds": 1}}
     )
@@ -70,7 +70,7 @@ def folders(tmp_path_factory, spring):
 
 
 def by_api(folder):
-    """What a notebook does."""
+    """Read the runs with the Python API; return exit code and message like a command."""
     try:
         ComparisonResult(folder).runs  # noqa: B018
     except InputError as error:
@@ -116,7 +116,7 @@ def test_a_damaged_folder_is_one_line_that_names_the_file(damage, folders, tmp_p
     folder = damaged(folders, "done", act, tmp_path)
     before = sorted(path.name for path in folder.iterdir())
     for who, does in COMMANDS.items():
-        # What was changed by hand is said as that where it would be resumed.
+        # On resume, an edited experiment.toml is reported as a change, and the folder is named.
         changed = who == "resume" and name in ("experiment.toml",)
         is_one_line(*does(folder), folder, "" if changed else name)
     assert sorted(path.name for path in folder.iterdir()) == before
@@ -135,7 +135,7 @@ def test_rows_of_a_part_are_checked_before_more_are_made(damage, folders, tmp_pa
     name, act = ROWS_OF_PARTS[damage]
     folder = damaged(folders, "half", act, tmp_path)
     is_one_line(*COMMANDS["resume"](folder), folder, name)
-    again = RunJournal(folder)  # nobody holds the folder
+    again = RunJournal(folder)  # the folder is not locked
     again.close()
 
 

@@ -1,4 +1,4 @@
-"""The short form of `make chaos`."""
+"""Short version of `make chaos`."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Results that were published, by older code too, are sound by what is declared of them."""
+"""Tests of the published results, some of older versions: they match their declared form."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Rows and statuses stand in the order of the plan, whichever run ended first."""
+"""Test of the order of rows and statuses: it is that of the plan, not of the ends of runs."""
 
 import pandas as pd
 

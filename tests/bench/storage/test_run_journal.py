@@ -30,7 +30,7 @@ def status(place):
 
 @pytest.fixture(autouse=True)
 def closed(monkeypatch):
-    """Journals that a test leaves open, as a kill does."""
+    """Close the journals that a test leaves open, as a killed process does."""
     opened = []
     begin = RunJournal.__init__
     monkeypatch.setattr(
@@ -105,7 +105,7 @@ def test_killed_between_the_part_and_the_deletion_of_its_journal_doubles_nothing
     journal.close()
     assert not (tmp_path / SEGMENTS_FOLDER / "000001.journal").exists()
     (tmp_path / SEGMENTS_FOLDER / "000001.journal").write_bytes(kept)
-    # The next is begun after that.
+    # The next journal is started only after that deletion, so it does not exist yet.
     (tmp_path / SEGMENTS_FOLDER / "000002.journal").unlink()
     (tmp_path / SEGMENTS_FOLDER / "000002.partial").write_bytes(b"half a part")
     again = RunJournal(tmp_path)

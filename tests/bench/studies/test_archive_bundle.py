@@ -1,4 +1,4 @@
-"""An archive holds a folder whole, and whatever was done to it afterwards is noticed."""
+"""Tests of archives: they hold the whole folder, and each later change is detected."""
 
 import hashlib
 import json
@@ -17,12 +17,12 @@ from tests.sample_experiments import SPRING
 
 PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
 CENTRAL = b"PK\x01\x02\x14\x03\x14\0"
-"""How an entry of the central directory begins, up to its flags."""
+"""First bytes of an entry of the central directory, up to its flags."""
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A small comparison, and an explanation of a recording."""
+    """Folder with a small comparison, a recording and its explanation."""
     folder = tmp_path_factory.mktemp("bundle")
     document = {**SPRING, "salt": "", "targets": 2, "seeds": 1, "budget": 3, "tuners": ["random"]}
     (folder / "small.toml").write_text(tomli_w.dumps(document))
@@ -38,14 +38,14 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def compared(place):
-    """The comparison's archive."""
+    """Archive of the comparison."""
     assert main(["bundle", str(place / "run"), "--out", str(place / "run.zip")]) == 0
     return place / "run.zip"
 
 
 @pytest.fixture(scope="module")
 def told(place):
-    """The explanation's archive, with its recording."""
+    """Archive of the explanation with its recording."""
     command = ["bundle", str(place / "told"), "--with", str(place / "swing.csv")]
     assert main([*command, "--out", str(place / "told.zip")]) == 0
     return place / "told.zip"
@@ -58,13 +58,13 @@ def verified(archive, capsys, *options):
 
 
 def content(archive):
-    """By name, what is in an archive."""
+    """Return the contents of an archive by name."""
     with zipfile.ZipFile(archive) as packed:
         return {name: packed.read(name) for name in packed.namelist()}
 
 
 def packed(path, files, entries=()):
-    """An archive of files, and of entries that are none."""
+    """Write an archive with files and with `entries` that are not regular files."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as made:
         for name, data in files.items():
             made.writestr(name, data)
@@ -74,7 +74,7 @@ def packed(path, files, entries=()):
 
 
 def listed_again(files, top):
-    """The manifest of a forger, who hashes what was changed."""
+    """Forge the manifest: replace its sizes and hashes by those of the changed files."""
     manifest = json.loads(files[f"{top}/manifest.json"])
     for each in manifest["files"]:
         data = files[f"{top}/{each['path']}"]
@@ -93,7 +93,7 @@ def test_the_folder_is_in_it_whole_and_the_same_folder_gives_the_same_bytes(
     assert all(files[name] == path.read_bytes() for name, path in there.items())
     assert manifest["command"] == "simgap compare run/experiment.toml"
     again = tmp_path / "again.zip"
-    shutil.copytree(place / "run", tmp_path / "run")  # other times, another place
+    shutil.copytree(place / "run", tmp_path / "run")  # other time stamps and another location
     assert main(["bundle", str(tmp_path / "run"), "--out", str(again)]) == 0
     assert again.read_bytes() == compared.read_bytes()
 
@@ -129,7 +129,7 @@ def test_a_folder_of_an_explanation_is_checked_too_and_what_cannot_be_is_said(pl
 
 
 def test_the_plugins_that_an_archive_names_or_holds_are_not_run(compared, capsys, tmp_path):
-    """The simulator is a plugin's: without it on the command line nothing is simulated."""
+    """The simulator is in a plugin; without it on the command line, nothing is simulated."""
     from bench.core.plugin_registries import simulators
 
     before = simulators.snapshot()
@@ -260,7 +260,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(
 def test_a_file_that_holds_more_than_it_says_is_refused(compared, tmp_path, capsys):
     path = packed(tmp_path / "a.zip", {**content(compared), "run/zeros": bytes(3 << 20)})
     data = bytearray(path.read_bytes())
-    # The last entry of the central directory is that of the zeros: its size is made small.
+    # The last entry of the central directory is that of the zeros; its size is replaced by 10.
     place = data.rindex(b"PK\x01\x02")
     data[place + 24 : place + 28] = struct.pack("<I", 10)
     path.write_bytes(data)

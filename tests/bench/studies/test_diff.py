@@ -1,4 +1,4 @@
-"""Two comparisons, two explanations: what differs is said, and what is chance is not."""
+"""Tests of `simgap diff`: differences are reported, but differences within the noise are not."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ PLUGIN = ["--plugin", str(PLUGINS / "spring.py")]
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A comparison with targets enough for small p-values."""
+    """Comparison with enough targets for small p-values."""
     folder = tmp_path_factory.mktemp("diff")
     document = {
         **SPRING, "ranges": ["in"], "targets": 14, "seeds": 2, "budget": 4,
@@ -35,7 +35,7 @@ def run(tmp_path_factory):
 
 
 def copied(run, place, change=None, name="b"):
-    """The same comparison, with other rows."""
+    """Copy the comparison and change its rows."""
     shutil.copytree(run, place / name)
     if change:
         path = place / name / "runs.parquet"
@@ -54,8 +54,9 @@ def differ(a, b, capsys, *options):
 
 
 def scaled(factor, tuner="random", which=slice(None)):
-    """Errors of a tuner times a factor, on some of its targets a little more than on others: equal
-    differences are ties, of which a signed-rank test knows no exact p-value.
+    """Multiply the errors of a tuner by a factor that varies slightly between targets.
+
+    Equal differences would be ties, for which the signed-rank test has no exact p-value.
     """
 
     def change(rows):
@@ -82,7 +83,7 @@ def test_a_comparison_does_not_differ_from_itself(run, tmp_path, capsys):
 def test_a_small_shift_on_every_target_is_significant_as_pairs(
     run, tmp_path, capsys, factor, worse
 ):
-    """Ten per cent is far less than targets differ by among each other."""
+    """A change of 10 % is far smaller than the differences between targets."""
     other = copied(run, tmp_path, scaled(factor))
     code, found = differ(run, other, capsys, "--fail-on", "worse")
     assert (code, found["changed"], found["worse"]) == (int(worse), True, worse)
@@ -90,7 +91,7 @@ def test_a_small_shift_on_every_target_is_significant_as_pairs(
     assert {line["tuner"] for line in moved} == {"random"}
     assert {line["simulations"] for line in moved} == {3, 4}
     assert [line["ratio"] for line in moved] == pytest.approx([factor] * 2, rel=0.01)
-    # Wilcoxon of 14 differences of one sign is 2 / 2**14; Holm times the 4 lines, then 3.
+    # Wilcoxon p-value of 14 differences of one sign: 2 / 2**14. Holm multiplies by 4, then by 3.
     assert sorted(line["p_value"] for line in moved) == pytest.approx([2 / 2**14] * 2)
     assert max(line["p_holm"] for line in moved) == pytest.approx(8 / 2**14)
 
@@ -103,7 +104,7 @@ def test_a_shift_on_some_targets_is_chance(run, tmp_path, capsys):
 
 
 def test_other_targets_of_the_same_names_are_not_paired(run, tmp_path, capsys):
-    """As with another salt: in-000 is then another target."""
+    """With another salt, in-000 is another target."""
 
     def elsewhere(rows):
         rows["true_rate"] *= 1.01
@@ -176,7 +177,7 @@ def test_the_table_is_written_once_and_faults_are_told(run, tmp_path, capsys):
 
 
 def verdict(**changes):
-    """A verdict as explain writes it."""
+    """Return a verdict document as written by explain."""
 
     def estimate(value, half, unit="N*m*s/rad"):
         return {"value": value, "unit": unit, "low": value - half, "high": value + half}
@@ -207,7 +208,7 @@ def explained(folder, **changes):
 
 @pytest.mark.parametrize(
     ("coefficient", "moved"),
-    # Two intervals of ± 0.2 allow a difference of 0.28; Holm's correction for two numbers 0.32.
+    # Half-widths of 0.2 allow a difference of 0.28; with Holm's correction for two numbers, 0.32.
     [((4.2e-4, 0.2e-4), False), ((4.3e-4, 0.2e-4), False), ((4.4e-4, 0.2e-4), True)],
 )
 def test_a_coefficient_has_moved_where_both_intervals_do_not_allow_it(

@@ -1,4 +1,4 @@
-"""A folder that tells the truth follows from its salt and its rows; a changed one does not."""
+"""Tests of `simgap verify`: results follow from salt and rows; changed results are detected."""
 
 import json
 import os
@@ -201,7 +201,7 @@ def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, mon
     assert titles
     assert all(title.endswith("(trusted)") for title in titles), titles
     for path in sorted((tmp_path / "out").glob("*.csv")):
-        if path.name != "identifiability.csv":  # made by no tuner
+        if path.name != "identifiability.csv":  # this file does not depend on a tuner
             assert pd.read_csv(path).get("trusted", pd.Series([False])).all(), path.name
     assert pd.read_parquet(tmp_path / "out" / "runs.parquet")["trusted"].all()
     assert main(["status", str(tmp_path / "out")]) == 0
