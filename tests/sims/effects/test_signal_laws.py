@@ -42,7 +42,7 @@ RAMP = np.array([-2.0, -1.0, 0.0, 0.5, 1.0, 2.0])
         ("input.rate", -0.1, RAMP),
         ("servo.derivative", -0.1, RAMP),
         ("servo.profile", -0.1, RAMP),
-        # the rate of a held value acts twice if its time constant is twice as long
+        # a jump counts twice for the time c, over which the rate is computed
         ("servo.derivative", 0.1, [-4.0, 0.0, 1.0, 1.0, 1.5, 3.0]),
         ("servo.derivative", 0.2, [-4.0, -2.0, 2.0, 2.0, 2.0, 3.5]),
         ("servo.derivative", 0.05, [-3.0, -0.5, 0.5, 0.75, 1.25, 2.5]),
