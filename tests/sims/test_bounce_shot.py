@@ -190,8 +190,8 @@ def test_world_falls_as_scipy_integrates():
 
 @pytest.mark.parametrize("restitution", [0.4, 0.75, 0.95])
 def test_world_gives_the_restitution_asked_for(restitution):
-    """The height of the first bounce without air gives the restitution; the contact, about v
-    CONTACT / pi deep, adds to it.
+    """The height of the first bounce without air gives the restitution; it includes the depth of
+    the contact, about v CONTACT / pi.
     """
     ball = replace(BALL_KINDS["tennis"], restitution=restitution, exponent=0.0)
     times = np.arange(0, 1.2, 1e-3)
