@@ -1,5 +1,5 @@
-"""Every check has a subject that breaks exactly what it checks, and a sound one that passes them
-all.
+"""Tests of every conformance check with a subject that violates only this check, and a valid
+subject that passes all.
 """
 
 import os
@@ -28,7 +28,7 @@ from tests.conftest import PLUGINS
 
 
 class Sound(Tuner):
-    """Shrinks a cloud around the best point."""
+    """Shrink a cloud of points around the best point."""
 
     def tune(self, task, rng):
         best, best_loss, width = task.start, np.inf, 0.3
@@ -161,7 +161,7 @@ BROKEN_TUNERS = {
     "check_easy_problem_is_improved": NeverBetter,
     "check_what_was_learned_can_be_stored": ForgetsWhatItLearned,
     "check_instances_can_be_sent_to_workers": HoldsAFunction,
-    "check_same_run_when_sealed": "spawning",  # of a plugin file: a test's class is in none
+    "check_same_run_when_sealed": "spawning",  # a plugin file: a class in a test has none
 }
 
 
@@ -211,7 +211,7 @@ def test_training_outside_the_training_range_or_beyond_the_budget_is_rejected():
 
 
 class Wave(Simulator):
-    """A sound simulator."""
+    """A valid simulator."""
 
     name, says = "wave", "a wave"
     parameters = (
@@ -284,7 +284,7 @@ class WrongColumns(Wave):
 
 
 class Cart(OwnSimulator):
-    """A sound simulator of one's own: two carts with a spring between them, one on a heater."""
+    """A valid user-defined simulator: two carts with a spring between them, one on a heater."""
 
     name, says = "cart", "two carts that are coupled by a spring"
     parameters = (Parameter("stiffness", "N/m", 20.0, (5.0, 50.0)),)
@@ -345,7 +345,7 @@ class ForcesWithoutCoordinates(Cart):
 
 
 class KeepsHeat(Cart):
-    """Heat that only its inputs make, and that the next run begins with."""
+    """Heat from the inputs of a run, wrongly retained in the next run."""
 
     name = "keeps_heat"
     warmth = 0.0
@@ -380,7 +380,7 @@ class IgnoresForces(Cart):
 
 
 class SumsForces(Cart):
-    """Adds each force to those before, and never takes one away."""
+    """Add each force to the previous ones, and never remove one."""
 
     name = "sums_forces"
 
@@ -397,7 +397,7 @@ class SumsForces(Cart):
 
 
 class KeepsForces(Cart):
-    """A force that is applied is there until another is, also in the next run."""
+    """Keep an applied force until the next one, also in the next run."""
 
     name = "keeps_forces"
     last = np.zeros(2)
@@ -407,7 +407,7 @@ class KeepsForces(Cart):
         super().step(inputs, seconds)
 
     def apply_force(self, force):
-        # The zero forces of later steps change nothing, as in a cache of forces that act.
+        # Zero forces of later steps change nothing, as in a cache of active forces.
         if force.any():
             self.last = force
 
@@ -548,7 +548,7 @@ def test_awkward_tuners_do_not_conform():
 
 
 class Breeze(Force):
-    """A sound effect."""
+    """A valid effect."""
 
     name, says, source = "breeze.sound", "a breeze pushes along the track", "any textbook"
     coefficients = (
@@ -596,7 +596,9 @@ class Elsewhere(Breeze):
 
 
 def of_robot(moment):
-    """Whether a force is asked for at a joint of a robot: elsewhere these effects are sound."""
+    """Return whether a force is computed at a joint of a robot; elsewhere these effects are
+    valid.
+    """
     return hasattr(moment, "carried")
 
 

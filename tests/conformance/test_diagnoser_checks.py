@@ -1,4 +1,4 @@
-"""Every check of diagnosers has a subject that it must reject."""
+"""Tests of every diagnoser check with a subject that it must reject."""
 
 import random
 
@@ -58,7 +58,7 @@ class Seeds(Right):
 
 
 class Spends(Right):
-    """It takes the error for a crash of its own, and says what it would have said."""
+    """Exceed the simulation budget by removing the limit of the counter."""
 
     def diagnose(self, case):
         checks.SIMULATION_COUNTER.limit = None

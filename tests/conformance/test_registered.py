@@ -1,4 +1,4 @@
-"""The conformance suites over everything registered: to register is to be tested."""
+"""Conformance suites applied to everything registered: registration includes the tests."""
 
 import pytest
 
@@ -26,14 +26,14 @@ def subject(registry, name):
 def test_tuner(name, check):
     kind = subject(tuners, name)
     if reason := kind.known_failures.get(check.__name__):
-        with pytest.raises(CheckError):  # one that passes is no known failure any more
+        with pytest.raises(CheckError):  # a check that passes is no longer a known failure
             check(kind)
         pytest.skip(f"known failure: {reason}")
     made(check, kind)
 
 
 def made(check, kind):
-    """A check that had nothing to check has not passed."""
+    """Run a check, and skip the test if the check is not applicable."""
     if outcome := check(kind):
         pytest.skip(f"not applicable: {outcome.reason}")
 
@@ -52,7 +52,7 @@ def test_effect(name, check):
 
 @pytest.mark.parametrize("name", diagnosers.names())
 def test_diagnoser(name):
-    """All checks of one in one process: they share what they look at."""
+    """All checks of a diagnoser run in one process, since they share cached data."""
     kind = subject(diagnosers, name)
     for check in DIAGNOSER_CHECKS:
         check(kind)

@@ -1,4 +1,6 @@
-"""Toy tasks: a function from parameters to an observation, with known truth."""
+"""Analytic tuning tasks: functions from parameters to an observation, with known true
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,15 @@ START = np.array([0.6, 0.3, 0.7, 0.4, 0.55])
 
 
 def decays(theta: Array) -> Array:
-    """(30, dim): smooth, nonlinear, coupled; one global minimum of the loss."""
+    """Return decays (30, dim): smooth, nonlinear, coupled; the loss has one global minimum."""
     t = np.linspace(0.0, 1.5, 30)[:, None]
     return np.exp(-(1.0 + 3.0 * theta) * t) + 0.1 * np.sin(2.0 * np.roll(theta, 1) * t)
 
 
 def logistic(theta: Array) -> Array:
-    """(60, 1): the logistic map in its chaotic range; only the first samples respond smoothly."""
+    """Return the logistic map (60, 1) in its chaotic range; only its first samples respond
+    smoothly.
+    """
     x, out = 0.4, []
     for _ in range(60):
         x = (3.7 + 0.3 * theta[0]) * x * (1.0 - x)
@@ -32,7 +36,7 @@ def logistic(theta: Array) -> Array:
 def problem(
     observe: Observe, truth: Array, start: Array, budget: int, observed: Array | None = None
 ) -> tuple[Task, Evaluate]:
-    """A task whose target is `observe(truth)`, or `observed`, and its simulator; all arrays are
+    """Return a task with target `observe(truth)` or `observed`, and its simulator; arrays are
     read-only.
     """
     target = observe(truth) if observed is None else observed
@@ -51,15 +55,15 @@ def problem(
 
 
 def smooth(dim: int, budget: int) -> tuple[Task, Evaluate]:
-    """The smooth problem in so many dimensions."""
+    """Return the smooth problem with `dim` parameters."""
     return problem(decays, TRUTH[:dim], START[:dim], budget)
 
 
 def errors(
     tuner: Tuner, observe: Observe, truth: Array, start: Array, budget: int, seed: int = 0
 ) -> Array:
-    """(budget + 1,) largest error of the recommendation after k simulations; an early end counts
-    with its last.
+    """Return the largest error of the recommendation after each simulation, (budget + 1,); after an
+    early end the last error is repeated.
     """
     task, evaluate = problem(observe, truth, start, budget)
     found = np.abs(run(tuner, task, evaluate, seed).recommendations - truth).max(axis=1)
@@ -67,7 +71,7 @@ def errors(
 
 
 def run(tuner: Tuner, task: Task, evaluate: Evaluate, seed: int = 0) -> RunTrace:
-    """A run that must not fail."""
+    """Run the tuner, and assert that the run did not fail."""
     trace = drive_tuner(tuner, task, evaluate, np.random.default_rng(seed))
     assert trace.status in {"done", "converged"}, trace.reason
     return trace

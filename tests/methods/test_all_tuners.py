@@ -1,4 +1,4 @@
-"""What holds for each of the search methods."""
+"""Tests of properties common to all search methods."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ each = pytest.mark.parametrize(
 
 
 def beyond(truth: Array) -> Array:
-    """A target that no parameters reproduce, so that no tuner is done early."""
+    """Return a target that no parameters reproduce, so that no tuner stops early."""
     target = decays(truth)
     target[::2] += 0.1
     target[1::2] -= 0.1

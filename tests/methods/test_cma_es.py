@@ -75,7 +75,7 @@ def test_restarts_with_twice_the_population_when_pycma_stops() -> None:
         sizes.append(len(points))
         seen = steps.send(Evaluation(points, *flat[1](points)))
     assert sizes[0] == 1
-    assert sorted(set(sizes[1:])) == [6, 12, 24, 48, 96, 192, 384, 400]  # no more than the budget
+    assert sorted(set(sizes[1:])) == [6, 12, 24, 48, 96, 192, 384, 400]  # at most the budget
     trace = drive_tuner(CMAES(restarts=False), *flat, np.random.default_rng(0))
     assert trace.status == "converged"
     assert trace.reason.startswith("pycma: tol")

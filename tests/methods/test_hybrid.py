@@ -39,7 +39,7 @@ def test_starts_as_the_network_and_ends_as_least_squares(two):
 
 
 def test_finishes_where_the_network_is_wrong():
-    """A network of one epoch on two scenarios, outside its training range."""
+    """The network has one epoch on two scenarios, and targets are outside its training range."""
     poor = trained(Toy(2, budget=16), scenarios=2, epochs=1)
     alone = TuneNet(points=60)
     alone.restore(poor.state())
@@ -61,7 +61,7 @@ def test_noise_is_averaged_as_least_squares_does(two):
 
 
 def seen_so_far(points, matrix, offset=0.0):
-    """A run whose residuals are linear in the points."""
+    """Return the history of a run whose residuals are linear in the points."""
     task = Task(2, np.zeros(2), np.zeros((4, 1)), np.ones(1), TRAINING[2], 9, (4,))
     run = EvaluationHistory(task, 0.0)
     residuals = points @ matrix.T + offset
@@ -73,7 +73,7 @@ def seen_so_far(points, matrix, offset=0.0):
 
 
 def modelled(run, matrix):
-    """The model, and the points that had to be simulated for it."""
+    """Return the model, and the points simulated for it."""
     steps, asked = TuneNetLeastSquares()._model(run, LeastSquares()), []
     try:
         points = next(steps)

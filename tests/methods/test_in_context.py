@@ -41,7 +41,7 @@ def test_what_was_tried_before_changes_what_is_proposed(fitted):
     points = [np.array([0.4]), np.array([0.6])]
     alone = network.propose_next(target, shown[1:], points[1:])
     assert not np.allclose(network.propose_next(target, shown, points), alone, atol=1e-6)
-    # beyond the window nothing is heard
+    # points before the window are ignored
     long = [shown[0]] * network.design.window
     for before in (shown[1:], shown[:1] * 3):
         found = network.propose_next(target, before + long, [points[0]] * (len(before) + len(long)))
@@ -105,7 +105,7 @@ def test_histories_are_binary_searches_for_their_first_point():
             assert ((low <= point) & (point <= high)).all()
             low, high = np.where(point < target, point, low), np.where(point < target, high, point)
         widths.append((high - low) / [0.4, 1.0])
-    # seven halvings leave 0.008; a middle missed by chance leaves more
+    # seven halvings leave 0.008; points that randomly miss the centre leave more
     assert 0.008 < np.median(widths) < 0.05
 
 

@@ -1,4 +1,4 @@
-"""The tuners that need an optional extra; each skips visibly where it is not installed."""
+"""Tests of tuners that need an optional extra; without it they are reported as skipped."""
 
 import importlib.util
 

@@ -24,7 +24,9 @@ TRAINING = {1: np.array([[0.3], [0.7]]), 2: np.array([[0.3, 0.2], [0.7, 0.6]])}
 
 
 def swing(points: Array, amplitude: float, samples: int = 60) -> Array:
-    """A damped oscillation and its rate, two channels: damping and, where asked, frequency."""
+    """Return a damped oscillation and its rate, two channels; parameters: damping, optional
+    frequency.
+    """
     t = np.linspace(0.0, 6.0, samples)
     damping = 0.1 + 0.9 * points[:, :1]
     frequency = 2.0 + (points[:, 1:2] if points.shape[1] > 1 else 0.0)
@@ -33,7 +35,7 @@ def swing(points: Array, amplitude: float, samples: int = 60) -> Array:
 
 
 class Toy:
-    """A `Practice` that holds its users to the fence and the budget."""
+    """A training simulator that checks the training range and the budget."""
 
     def __init__(self, dim: int = 1, budget: int = 10_000, runs: int = 1) -> None:
         self.dim, self.budget, self.used, self.runs = dim, budget, 0, runs
@@ -48,7 +50,7 @@ class Toy:
         return rng.uniform(1.0, 2.0, size=self.runs)
 
     def known(self, scenario):
-        """What a tuner is told of a scenario."""
+        """Return the scenario information given to a tuner."""
         return EMPTY_SCENE
 
     def observe(self, points, scenario):
@@ -67,7 +69,7 @@ class Toy:
 
 
 def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
-    """Trace of one target and its truth."""
+    """Return the trace of one target, and its true parameters."""
     rng = np.random.default_rng(seed)
     low, high = (np.zeros(toy.dim), np.ones(toy.dim)) if wide else toy.training
     start, truth, scenario = rng.uniform(low, high), rng.uniform(low, high), toy.scenario(rng)
@@ -88,7 +90,7 @@ def run(tuner, toy, seed, wide=False, budget=10, spoil=None):
 
 
 def errors(tuner, toy, seeds=range(20), **kwargs):
-    """Mean absolute error after each simulation, (budget + 1,)."""
+    """Return the mean absolute error after each simulation, (budget + 1,)."""
     rows = []
     for seed in seeds:
         trace, truth = run(tuner, toy, seed, **kwargs)
@@ -137,7 +139,7 @@ def test_two_parameters_three_runs_two_channels(two):
 def test_missing_samples_leave_the_truth_where_it_was(two):
     def spoil(observed):
         observed[10:20] = np.nan
-        observed[60:120, 1] = np.nan  # one channel of one run is not there at all
+        observed[60:120, 1] = np.nan  # one channel of one run is missing completely
 
     assert errors(two, Toy(2, runs=3), seeds=range(10), spoil=spoil)[10] < 1e-6
 
@@ -166,7 +168,7 @@ def test_roughness_is_the_noise_and_sees_no_motion():
     share = estimate_noise_sigma(rough, (1000, 1000))[0] / [
         0.01,
         0.3,
-    ]  # the calmest of eight parts is a little calmer
+    ]  # the estimate is the lowest of eight parts, so it is slightly low
     assert ((share > 0.75) & (share < 1.0)).all()
     assert (estimate_noise_sigma(np.full((1, 9, 1), np.nan), (3, 6)) == 0.0).all()
 
@@ -289,9 +291,7 @@ def test_state_survives_a_round_trip_and_is_checked(one, tmp_path):
 
 
 def test_weight_decay_is_that_of_equation_1():
-    """A step of gradient descent on data alike: w <- w - rate * 2 * lambda * w where the data have
-    no say.
-    """
+    """With constant data, a gradient descent step gives w <- w - rate * 2 * lambda * w."""
     rows, parameters = PairInputs(*[np.zeros((4, 2, 5))] * 2), np.full((4, 2, 1), 0.5)
     design = {
         "smooth": False,
@@ -386,7 +386,7 @@ def test_failed_simulation_is_no_evidence(one):
     failed = evaluation(0.0)._replace(observations=np.full((1, 60, 2), np.nan))
     assert steps.send(failed).recommend.tolist() == [
         0.25
-    ]  # half the way to the middle of the training range
+    ]  # half-way to the centre of the training range
 
 
 def test_torch_stays_out_until_it_trains(one):

@@ -1,4 +1,4 @@
-"""TuneNet with another sensor on the target's side."""
+"""Tests of TuneNet with another sensor for the target than for the simulation."""
 
 import numpy as np
 import pytest
@@ -9,8 +9,8 @@ from tests.methods.test_tunenet import Toy, errors, run
 
 
 class Filmed(Toy):
-    """The toy's oscillation, and another sensor that shows it magnified, shifted and upside down by
-    chance.
+    """The toy oscillation, also shown by a sensor with random scale and offset and inverted
+    sign.
     """
 
     def scenario(self, rng):
@@ -48,7 +48,9 @@ def test_there_is_one_network_which_is_prepared_for_the_sensor(tuner):
 
 
 def test_gaps_are_bridged_by_the_proposed_model(tuner):
-    """The beginning is hidden. Held where it is seen first, it would be read as another motion."""
+    """The beginning is hidden. Filling it with the first visible sample would look like another
+    motion.
+    """
     toy, rng = Filmed(), np.random.default_rng(2)
     scenario = toy.scenario(rng)
     target = toy.observe(np.array([[0.55]]), scenario)[0]

@@ -1,4 +1,4 @@
-"""Tuners that misbehave, each in its own way."""
+"""Tuners for tests, each with a different misbehaviour."""
 
 import gc
 import hashlib
@@ -48,8 +48,9 @@ class Stopping(Tuner):
 
 
 class Snooping(Tuner):
-    """Looks at every number that it can reach: from its task, the frames that call it, everything
-    alive; says how many there are, and the places of those whose hash is wanted.
+    """Inspect all accessible numbers: in the task, the calling frames and all live objects.
+
+    The tuner reports how many numbers there are, and which of the wanted hashes it found.
     """
 
     def __init__(self, wanted=()):
@@ -73,7 +74,7 @@ class Snooping(Tuner):
 
 
 def hashed(number):
-    """Stands for a number to nine digits, and cannot be found in its place."""
+    """Hash a number to nine digits, so that the hash does not reveal the number to the search."""
     return hashlib.sha256(f"{number:.8e}".encode()).hexdigest()[:16]
 
 
@@ -96,7 +97,7 @@ def walk(thing, numbers, visited, depth):
 
 
 class Spawning(Tuner):
-    """Has another program compute."""
+    """Start another program for the computation."""
 
     def tune(self, task, rng):
         import subprocess

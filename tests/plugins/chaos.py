@@ -1,4 +1,4 @@
-"""Tuners that misbehave as badly as they can; each names the status in which its runs must end."""
+"""Tuners with severe misbehaviour; each names the status with which its runs must end."""
 
 import ctypes
 import os
@@ -74,7 +74,7 @@ class ChaosNan(Tuner):
 
 @ends("crashed")
 class ChaosCheat(Tuner):
-    """Fetches the simulator from the frames that call it, and simulates beside its budget."""
+    """Take the simulator from the calling frames, and simulate outside the budget."""
 
     def tune(self, task, rng):
         yield task.start
@@ -89,7 +89,7 @@ class ChaosCheat(Tuner):
 
 @ends("crashed")
 class ChaosRecordSpoiler(Tuner):
-    """Makes what it was shown look better than it was."""
+    """Modify the recorded losses to look better."""
 
     def tune(self, task, rng):
         seen = yield task.start
@@ -109,7 +109,7 @@ class ChaosMemoryHog(Tuner):
 
 @ends("done")
 class ChaosShout(Tuner):
-    """Prints megabytes."""
+    """Print megabytes."""
 
     def tune(self, task, rng):
         while True:
@@ -120,7 +120,7 @@ class ChaosShout(Tuner):
 
 @ends("done")
 class ChaosGlobals(Tuner):
-    """Seeds what others might draw from, and changes the folder."""
+    """Seed the global random generator, and change the working directory."""
 
     def tune(self, task, rng):
         np.random.seed(0)  # noqa: NPY002

@@ -1,4 +1,4 @@
-"""Tuners that do what isolation forbids, as people write them by habit."""
+"""Tuners that do what isolation forbids, as in common practice."""
 
 import os
 import socket
@@ -10,7 +10,7 @@ from methods.tuner import Tuner
 
 
 class ReadsBeside(Tuner):
-    """Begins with points that an earlier run has left beside this file."""
+    """Begin with the content of a file next to this file."""
 
     name = "reads_beside"
 
@@ -19,7 +19,7 @@ class ReadsBeside(Tuner):
 
 
 class ReadsHere(Tuner):
-    """Reads a file of the folder in which the command was given."""
+    """Read a file of the working directory of the command."""
 
     name = "reads_here"
 
@@ -52,7 +52,7 @@ class AsksServer(Tuner):
 
 
 class Mistaken(Tuner):
-    """Fails by itself; its line of code and its message name what isolation raises."""
+    """Raise an error unrelated to isolation, although its message names an isolation error."""
 
     name = "mistaken"
 
@@ -62,7 +62,7 @@ class Mistaken(Tuner):
 
 
 class KeepsLog(Tuner):
-    """Writes a log, a table in a folder, and what libraries hide."""
+    """Write a log, a table in a folder, and a hidden file as libraries do."""
 
     name = "keeps_log"
 

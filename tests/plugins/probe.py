@@ -1,4 +1,4 @@
-"""Tuners that do in their process what a test asks for, and say as they stop what came of it."""
+"""Tuners that execute in their process what a test needs, and report the result when they stop."""
 
 import time
 
@@ -7,11 +7,11 @@ import numpy as np
 from methods.tuner import Proposal, Tuner
 
 SEEN = []
-"""Of earlier runs in this process."""
+"""Tasks of earlier runs in this process."""
 
 
 class Probe(Tuner):
-    """Runs a piece of code whose last line is an expression.
+    """Run a piece of code whose last line is an expression.
 
     Args:
         code: Python.
@@ -32,7 +32,7 @@ class Probe(Tuner):
 
 
 class Remembering(Tuner):
-    """Says how many runs this process has seen before."""
+    """Report the number of earlier runs in this process."""
 
     def tune(self, task, rng):
         before = len(SEEN)
@@ -42,7 +42,7 @@ class Remembering(Tuner):
 
 
 class Late(Tuner):
-    """Takes its time before, between and behind its simulations, and has stopped its clock."""
+    """Sleep before, between and after the simulations, with stopped clocks."""
 
     def tune(self, task, rng):
         time.perf_counter = time.monotonic = time.time = lambda: 0.0
@@ -54,7 +54,7 @@ class Late(Tuner):
 
 
 class Drawing(Tuner):
-    """Draws from the system's chance, so that no two runs are alike."""
+    """Draw from the system's entropy, so that no two runs are equal."""
 
     def tune(self, task, rng):
         other = np.random.default_rng()
@@ -64,7 +64,7 @@ class Drawing(Tuner):
 
 
 class Logging(Tuner):
-    """Writes a log in its first run, and another file beside it in every further one."""
+    """Write a log in the first run, and another file in every further run."""
 
     def tune(self, task, rng):
         yield task.start
@@ -75,7 +75,7 @@ class Logging(Tuner):
 
 
 class Boasting(Tuner):
-    """Answers for itself when it is asked for its files."""
+    """Send `says` in place of the list of written files."""
 
     def __init__(self, says="{}"):
         self.says = says

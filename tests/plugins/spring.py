@@ -1,4 +1,4 @@
-"""A closed-form simulator for tests: a spring let go at x0 swings and decays."""
+"""A closed-form simulator for tests: a spring released at x0 oscillates and decays."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The same motion on every engine: scenarios, coefficients, and how far engines are apart.
+"""Comparison of the same motion on every engine: scenarios, coefficients and differences.
 
 `python -m tests.sims.engine_agreement` measures the tables of docs/engines.md; it takes some
 minutes.
@@ -22,8 +22,8 @@ STEPS = {
 }
 OTHERS = ("pybullet", "mujoco")
 
-# For systems that count force per unit mass, in N, and in N*m. An effect has as many of them as the
-# system takes.
+# Coefficients for systems that state forces per unit mass, in N, and in N*m. An effect with fewer
+# coefficients on a system uses only the first ones.
 COEFFICIENTS = {
     "backlash": (None, 0.02, 0.02),
     "clock.skew": (0.002, 0.002, 0.002),
@@ -77,7 +77,7 @@ COEFFICIENTS = {
 
 
 def scenario(system):
-    """Two seconds in which every effect shows."""
+    """Return a scenario of about two seconds in which every effect changes the motion."""
     if system == "ball":
         return Scenario(np.arange(120) / 60, {"x": 0.1, "z": 3.0, "vx": 2.0, "vy": -1.0, "vz": 1.0})
     t = np.arange(200) / 100
@@ -92,17 +92,17 @@ def scenario(system):
 
 
 def has(system, effect):
-    """Whether the system can have the effect."""
+    """Return whether the effect applies to the system."""
     return effect in effects.list_effects_for(SIMULATORS[system].system)
 
 
 def carried(effect):
-    """Whether engines of one coordinate can have the effect."""
+    """Return whether engines of one coordinate support the effect, which has no hidden state."""
     return effects.get_effect(effect).hook != "hidden"
 
 
 def coefficients(system, effect):
-    """The effect's numbers on this system."""
+    """Return the coefficients of the effect on this system."""
     kind = SIMULATORS[system].system
     values = COEFFICIENTS[effect][("point", "linear", "rotary").index(kind.kind)]
     count = len(effects.get_effect(effect).on(kind))
@@ -110,7 +110,7 @@ def coefficients(system, effect):
 
 
 def motion(system, engine, fixed=None, **settings):
-    """Positions (T, D) as observed."""
+    """Return the observed positions, (T, D)."""
     simulator = SIMULATORS[system](engine=engine, fixed=fixed or {}, **settings)
     observation = simulator.simulate(np.array([THETA[system]]), scenario(system))[0]
     simulator.close()
@@ -118,12 +118,12 @@ def motion(system, engine, fixed=None, **settings):
 
 
 def apart(first, second):
-    """Largest distance of two motions."""
+    """Return the largest difference between two motions."""
     return float(np.abs(first - second).max())
 
 
 def seconds(system, engine, fixed=None):
-    """Least time of a rollout."""
+    """Return the minimum time of a rollout in 20 repetitions, s."""
     simulator, times = SIMULATORS[system](engine=engine, fixed=fixed or {}), []
     run, theta = scenario(system), np.array([THETA[system]])
     for _ in range(20):
@@ -134,7 +134,7 @@ def seconds(system, engine, fixed=None):
 
 
 def systems_table():
-    """Engine by system: errors against the batch engine at a 40th of its step."""
+    """Yield table rows, engine by system: errors against the batch engine at a step of 0.25 ms."""
     for system, steps in STEPS.items():
         exact = motion(system, "batch", time_step=2.5e-4)
         for engine in ("batch", *OTHERS):
@@ -149,7 +149,9 @@ def systems_table():
 
 
 def effects_table():
-    """Effect by system: how much it changes, and how far both other engines are from batch."""
+    """Yield table rows, effect by system: the change due to the effect, and the larger difference
+    of the two other engines from the batch engine.
+    """
     for effect in effects.list_names():
         cells = []
         for system in SIMULATORS:

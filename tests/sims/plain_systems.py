@@ -1,4 +1,4 @@
-"""The compiled engine's functions as plain Python, and lanes to give them."""
+"""Helpers to test the functions of the compiled engine as plain Python."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ PLAIN = SimpleNamespace(
 
 
 def lanes_of(simulator, theta, scenarios, monkeypatch):
-    """What the simulator gives its engine."""
+    """Return the batch that the simulator passes to its engine."""
     seen = []
     engine = simulator.engine
     whole = engine.integrate

@@ -1,9 +1,8 @@
-"""The systems and effects once more, written out lane by lane for scipy: what the batch engine is
-measured against.
+"""Independent SciPy implementation of the systems and effects, the reference for the batch engine.
 
-Nothing here uses the code under test but its scenarios. Motion between events is integrated by an
-explicit method of eighth order (DOP853, rtol 1e-9, atol 1e-11); impacts, standstill and breaking
-loose are events.
+It uses nothing of the code under test except its scenarios, and simulates one batch element at a
+time. Motion between events is integrated by an explicit method of eighth order (DOP853, rtol 1e-9,
+atol 1e-11); impacts, standstill and break-away are events.
 """
 
 import bisect
@@ -15,12 +14,12 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 SETTINGS = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-11}
-OVER = 1e-6  # m/s: slower rebounds are none
+OVER = 1e-6  # m/s: slower rebounds are ignored
 
 
 @dataclass
 class Case:
-    """One lane.
+    """One batch element.
 
     Attributes:
         system: its name.
@@ -40,7 +39,7 @@ class Case:
 
 
 def held(case, name, t):
-    """The command that holds at t."""
+    """Return the zero-order-hold command at time t."""
     return float(case.inputs[name][max(bisect.bisect_right(case.t, t) - 1, 0)])
 
 
@@ -49,7 +48,9 @@ def dead(u, width):
 
 
 class Plant:
-    """Forces of one lane: `pull` all but dry friction, `limit` the largest dry friction."""
+    """Forces of one batch element: `pull` without dry friction, `limit` the maximum dry
+    friction.
+    """
 
     def __init__(self, case):
         self.case, self.k, self.p = case, case.constants, case.parameters
@@ -70,7 +71,7 @@ class Plant:
             self.breaks |= set((there + (delay if place == 0 else 0.0)).tolist())
 
     def feel(self, t):
-        """Inputs at t, set for the calls that follow."""
+        """Compute the applied inputs at t and set them for the following calls."""
         values = []
         for place, name in enumerate(self.names):
             shift = self.effects.get("input.delay", [0.0])[0] if place == 0 else 0.0
@@ -109,7 +110,7 @@ class Plant:
         return -self.k["mass"] * self.k["gravity"] * self.k["length"] * sin(x)
 
     def sideways(self, x):
-        """Generalised force of a horizontal acceleration of 1."""
+        """Return the generalised force of a horizontal acceleration of 1."""
         if self.case.system == "slider":
             return self.mass
         return self.k["mass"] * self.k["length"] * cos(x)
@@ -153,7 +154,7 @@ class Plant:
 
 
 def hinge(case):
-    """Positions and velocities (T, 2) of a system with one coordinate."""
+    """Return positions and velocities (T, 2) of a system with one coordinate."""
     plant = Plant(case)
     now, state = 0.0, np.array([case.initial["x"], case.initial["v"]])
     out = np.empty((case.t.size, 2))
@@ -167,7 +168,7 @@ def hinge(case):
 
 
 def _glide(plant, now, state, end, times, out):
-    """Until the next standstill, breaking loose, or `end`; fills in the samples on the way."""
+    """Integrate to the next standstill, break-away or `end`; fill in the samples on the way."""
     x, v = state
     way = copysign(1.0, v) if v else 0.0
     if plant.dry and v == 0.0:
@@ -206,7 +207,7 @@ def _glide(plant, now, state, end, times, out):
 
 
 def _loose(plant, now, x, end):
-    """When what pulls exceeds friction, else `end`."""
+    """Return the time at which the driving force exceeds friction, or `end`."""
     if "force.periodic" not in plant.effects:
         return end
 
@@ -222,7 +223,7 @@ def _loose(plant, now, x, end):
 
 
 def ball(case):
-    """Positions, velocities, accelerations (T, 9) of the ball, and the instants of its impacts."""
+    """Return positions, velocities and accelerations (T, 9) of the ball, and the impact times."""
     effects = {name: np.atleast_1d(c).tolist() for name, c in case.effects.items()}
     g, radius = case.constants["gravity"], case.constants["radius"]
 
@@ -265,8 +266,8 @@ def ball(case):
     out[0, :6], out[0, 6:] = y, accelerate(0.0, y[3:])
     rising = 0.0
     while now < end:
-        # the rise after a bounce is integrated without looking for the ground, which is where it
-        # begins
+        # The rise after a bounce starts on the ground, so it is integrated without the ground
+        # event.
         until = min(end, now + rising) if rising else end
         solved = solve_ivp(
             rate,

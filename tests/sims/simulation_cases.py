@@ -1,4 +1,4 @@
-"""Random lanes of every system, for the batch engine and for scipy."""
+"""Random batch elements of every system, for the batch engine and for SciPy."""
 
 from functools import cache
 
@@ -12,7 +12,7 @@ from sims.systems.slider import Slider
 from tests.sims import scipy_reference
 
 SIMULATORS = {"ball": Ball, "pendulum": Pendulum, "slider": Slider, "servo": Servo}
-# Ranges of coefficients: a little wider than plausible where that is harder.
+# Ranges of coefficients, slightly wider than plausible where that makes the test harder.
 FORCES = {
     "ball": {
         "drag.linear": [(0, 0.5)],
@@ -82,12 +82,12 @@ def drawn(rng, ranges):
 
 
 def steps(rng, size, scale):
-    """A command that changes three times."""
+    """Return a command with four constant levels, which changes three times."""
     return np.repeat(rng.uniform(-scale, scale, 4), -(-size // 4))[:size]
 
 
 def random_case(system, seed):
-    """One lane: parameters anywhere in their bounds, up to three effects."""
+    """Return one batch element with parameters anywhere in their bounds and up to three effects."""
     rng = np.random.default_rng([seed, *system.encode()])
     t = np.arange(121) / rng.choice([40.0, 60.0, 100.0])
     names = rng.permutation(list(FORCES[system]))
@@ -114,7 +114,7 @@ def random_case(system, seed):
 
 
 def simulated(case, **settings):
-    """The case's observation (T, C) by the batch engine."""
+    """Simulate the case on the batch engine; return the observation (T, C)."""
     cls = SIMULATORS[case.system]
     states = list(cls.states)
     values = case.initial if case.system == "ball" else (case.initial["x"], case.initial["v"])
@@ -126,13 +126,13 @@ def simulated(case, **settings):
 
 @cache
 def solved(system, seed):
-    """A random case with scipy's solution, which takes longer than all the rest."""
+    """Return a random case with SciPy's solution, the slowest part of these tests."""
     case = random_case(system, seed)
     return case, (scipy_reference.ball if system == "ball" else scipy_reference.hinge)(case)
 
 
 def errors(system, seed, **settings):
-    """Largest difference of each channel of a random case from scipy's."""
+    """Return the largest difference of each channel of a random case from SciPy's solution."""
     case, solution = solved(system, seed)
     seen = simulated(case, **settings)
     if system != "ball":
@@ -141,7 +141,7 @@ def errors(system, seed, **settings):
     differences = np.abs(
         seen - np.column_stack([expected[:, :3], expected[:, 8] + case.constants["gravity"]])
     )
-    if impacts.size:  # the acceleration jumps at an impact if drag acts
+    if impacts.size:  # with drag, acceleration jumps at impacts
         away = np.abs(case.t[:, None] - impacts).min(axis=1) > 1e-3
         differences[~away, 3] = 0.0
     return differences.max(axis=0)

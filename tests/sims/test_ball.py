@@ -1,5 +1,5 @@
-"""The ball on the stepping engines: free fall, drag, bounces, rest, and that a used world is as
-good as a new one.
+"""Tests of the ball on the stepping engines: free fall, drag, bounces, rest, and bit-identical
+results of used and new worlds.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from sims.systems.ball import Ball
 GRAVITY, DAMPING, RADIUS = 9.8, 0.04, 0.5
 PUBLISHED = Scenario(np.arange(400) / 60)
 NATIVE = {"engine": "pybullet", "native_contact": True}
-AIR = {"drag.linear": DAMPING, "drag.quadratic": DAMPING}  # what Bullet takes for air
+AIR = {"drag.linear": DAMPING, "drag.quadratic": DAMPING}  # the drag that Bullet applies
 ENGINES = ["pybullet", "mujoco"]
 BUILDS = [
     NATIVE,
@@ -28,7 +28,7 @@ def heights(restitution, scenario=PUBLISHED, constants=None, **settings):
 
 
 def bullet_law(restitution, step, samples, z=4.5, v=0.0):
-    """Bullet's update of the height, as the world's module documents it."""
+    """Apply Bullet's update of the height, as documented in the module of the world."""
     result = [z]
     for _ in range(samples - 1):
         gap = z - RADIUS
@@ -43,7 +43,7 @@ def bullet_law(restitution, step, samples, z=4.5, v=0.0):
 
 
 def parabolas(restitution, times, z=4.5, gravity=GRAVITY):
-    """The exact height of a ball without air."""
+    """Return the exact height of a ball without air."""
     start, v, result = 0.0, 0.0, []
     for t in times:
         while (
@@ -58,14 +58,16 @@ def parabolas(restitution, times, z=4.5, gravity=GRAVITY):
 
 
 def first_apex(z):
-    """Greatest height of the ball's lower side between the first impact and the second."""
+    """Return the maximum height of the ball's lower side between the first two impacts."""
     rises = np.flatnonzero(np.diff(z) > 0)
     falls = np.flatnonzero(np.diff(z) < 0)
     return z[falls[falls > rises[0]][0]] - RADIUS
 
 
 def exact_ratio(restitution, damping):
-    """Square root of the ratio of apex heights under a = -g - k v (1 + |v|), to solver accuracy."""
+    """Return the square root of the ratio of apex heights under a = -g - k v (1 + |v|), to solver
+    accuracy.
+    """
 
     def law(_, state):
         return [state[1], -GRAVITY - damping * state[1] * (1 + abs(state[1]))]
@@ -82,7 +84,7 @@ def exact_ratio(restitution, damping):
 
 
 def apex_ratio(restitution, **settings):
-    """The same as simulated, at samples so dense that the apex is not missed."""
+    """Return the simulated ratio of `exact_ratio`, with samples dense enough to hit the apex."""
     return (
         first_apex(heights(restitution, Scenario(np.arange(2400) * 1e-3), **settings)) / 4.0
     ) ** 0.5
@@ -92,11 +94,11 @@ def order(steps, errors):
     return np.polyfit(np.log(steps), np.log(errors), 1)[0]
 
 
-# ---------------------------------------------------------------------- Bullet as it comes
+# ---------------------------------------------------------------------- native Bullet contact
 
 
-# Heights before this ball became an engine's: restitution 0.5123, dropped from 4.3217 m, every 20th
-# of 400 samples.
+# Heights recorded before the ball moved into the engine classes: restitution 0.5123, dropped from
+# 4.3217 m, every 20th of 400 samples.
 GOLDEN = [
     "0x1.1496bb98c7e28p+2", "0x1.e0ce97c122145p+1", "0x1.158322f0f1bcdp+1", "0x1.93e36b846c479p-1",
     "0x1.f4d7bb63965e5p-1", "0x1.3a70211bd478ap-1", "0x1.1242438432eb6p-1", "0x1.01392d1c2811ep-1",
@@ -168,7 +170,7 @@ def test_native_fall_matches_an_accurate_integrator_in_three_dimensions():
     np.testing.assert_allclose(found, exact, atol=6e-4)
     np.testing.assert_allclose(
         2 * fall(5e-5) - found, exact, atol=1e-7
-    )  # what is left is of second order
+    )  # the remaining error is of second order
 
 
 def test_the_published_first_bounce():
@@ -177,8 +179,8 @@ def test_the_published_first_bounce():
 
 
 def test_bullets_own_contact_swallows_bounces_at_short_steps():
-    # Why it is not the default; with the published 60 Hz the same ball bounces to 0.656 squared of
-    # its height.
+    # Native contact is not the default for this reason. At the published 60 Hz the same ball
+    # bounces to 0.656 squared of its height.
     z = heights(0.7, Scenario(np.arange(2400) / 960), **NATIVE)
     assert z[np.flatnonzero(z < 0.51)[0] :].max() < 0.51
 
@@ -216,7 +218,7 @@ def test_native_effects_change_impacts_too():
     def first(**settings):
         return (first_apex(heights(0.7, **NATIVE, linear_damping=0.0, **settings)) / 4.0) ** 0.5
 
-    # impact speed 8.85 m/s (less what the step takes); e = 0.7 * 8.85^-0.2 = 0.4526
+    # Impact speed 8.85 m/s, minus the discretisation error; e = 0.7 * 8.85^-0.2 = 0.4526.
     assert first(fixed={"restitution.speed": -0.2}) / first() == pytest.approx(8.85**-0.2, rel=0.03)
     plain, sticky = (
         Ball({}, ["x"], **NATIVE, lateral_friction=0.0, linear_damping=0.0, fixed=fixed).simulate(
@@ -232,7 +234,7 @@ def test_native_effects_change_impacts_too():
     )
 
 
-# ---------------------------------------------------------------------- the converging ball
+# ---------------------------------------------------------------------- corrected contact
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -240,7 +242,7 @@ def test_native_effects_change_impacts_too():
 @pytest.mark.parametrize("restitution", [0.0, 0.3, 0.5123, 0.9, 1.0])
 def test_without_air_bounces_are_exact_at_any_step(engine, step, restitution):
     z = heights(restitution, engine=engine, time_step=step)
-    # MuJoCo lets a ball at rest sink in by 10 (1 - 0.9999) g h^2
+    # A ball at rest penetrates MuJoCo's ground by 10 (1 - 0.9999) g h^2.
     np.testing.assert_allclose(
         z, parabolas(restitution, PUBLISHED.times), atol=2e-9 + 1e-2 * step**2
     )
@@ -271,14 +273,14 @@ def test_energy_is_kept_without_air_at_full_restitution(engine):
     z = heights(1.0, Scenario(np.arange(6000) * 1e-3), engine=engine)
     apexes = z[1:-1][(z[1:-1] > z[:-2]) & (z[1:-1] >= z[2:])]
     assert len(apexes) == 3
-    np.testing.assert_allclose(apexes, 4.5, atol=2e-6)  # what falls between samples
+    np.testing.assert_allclose(apexes, 4.5, atol=2e-6)  # an apex can fall between two samples
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("friction", "kept"), [(0.25, 1 - 0.25 * 1.6 * 2.0 / 5.0), (3.0, 0.0)])
 def test_friction_takes_what_it_says_and_no_more(engine, friction, kept):
-    # Tangential speed lost: c (1 + e) |vn|, whatever the direction along the ground; the ball does
-    # not spin.
+    # Tangential speed lost: c (1 + e) |vn|, in any direction along the ground; the ball does not
+    # spin.
     ball = Ball(
         {"gravity": 0.0}, ["x", "y", "z"], engine=engine, fixed={"contact.friction": friction}
     )
@@ -319,7 +321,7 @@ def test_ball_rests_on_the_ground(engine):
 
 def test_native_ball_rests_on_the_ground():
     assert heights(0.0, **NATIVE)[-1] == pytest.approx(RADIUS, abs=2e-5)
-    for restitution in (0.2, 0.5):  # Bullet goes on making tiny bounces
+    for restitution in (0.2, 0.5):  # Bullet continues with tiny bounces
         z = heights(restitution, Scenario(np.arange(1200) / 60), **NATIVE)
         assert z[-1] == pytest.approx(RADIUS, abs=2e-3)
     assert heights(0.0, constants={"radius": 0.2}, **NATIVE)[-1] == pytest.approx(0.2, abs=2e-5)
@@ -340,7 +342,7 @@ def test_a_ball_at_rest_slides_and_lifts_off(engine):
         fixed={"force.periodic": [12.0, 0.0, 1.0]},
     )
     z, a = lifted.simulate(np.array([[0.0]]), Scenario(t, start))[0].T
-    off = np.arcsin(GRAVITY / 12.0) / (2 * np.pi)  # when the push exceeds the weight
+    off = np.arcsin(GRAVITY / 12.0) / (2 * np.pi)  # time at which the push exceeds the weight
     assert np.abs(z[t < off] - RADIUS).max() < 1e-6
     assert z.max() > RADIUS + 0.01
     np.testing.assert_allclose(a[t < off], GRAVITY)
@@ -366,7 +368,7 @@ def test_samples_between_do_not_change_the_motion(settings):
     np.testing.assert_allclose(coarse, fine[::4], atol=1e-11)
     if (
         "native_contact" not in settings
-    ):  # otherwise the step makes a difference, and uneven samples change it
+    ):  # native contact depends on the step size, which uneven samples change
         uneven = np.sort(np.random.default_rng(0).choice(np.arange(1, 241), 50, replace=False))
         uneven = np.concatenate([[0], uneven])
         np.testing.assert_allclose(
@@ -387,8 +389,8 @@ def test_first_sample_is_the_initial_state_and_observe_orders(settings):
 
 @pytest.mark.parametrize("settings", BUILDS)
 def test_a_used_world_gives_the_same_bits_as_a_new_one(settings):
-    # Starts on, in and just above the ground, at the same place: where contacts left over from
-    # before would matter.
+    # The runs start on, inside and just above the ground at the same place, where contacts cached
+    # from an earlier run would change the result.
     rng = np.random.default_rng(3)
     effects = ["drag.quadratic", "contact.friction", "restitution.speed"]
     used, new = (Ball(effects=effects, **settings) for _ in range(2))
@@ -403,7 +405,7 @@ def test_a_used_world_gives_the_same_bits_as_a_new_one(settings):
         theta = np.array([[rng.choice([0.0, 0.2, 0.5, 0.9, 1.0]), 0.0, 0.0, 0.0]])
         theta[0, 1:] = [0.1, 0.2, -0.1] * (rng.uniform(size=3) < 0.2)
         if i % 20 and settings["engine"] == "pybullet":
-            new.engine._world.invalidate()  # rebuilt, which is quicker than connecting anew
+            new.engine._world.invalidate()  # rebuilding is faster than reconnecting
         else:
             new.close()
         np.testing.assert_array_equal(used.simulate(theta, scenario), new.simulate(theta, scenario))

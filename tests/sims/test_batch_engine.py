@@ -1,4 +1,4 @@
-"""The batch engine against scipy, closed forms, and itself."""
+"""Tests of the batch engine against SciPy, closed forms and itself."""
 
 from types import SimpleNamespace
 
@@ -26,7 +26,9 @@ T = np.arange(201) / 100
 
 @pytest.fixture(autouse=True, params=["machine code", "numpy"])
 def way(request, monkeypatch):
-    """Everything holds in machine code and in numpy, which steps what does not compile."""
+    """Run each test with machine code and with numpy, the fallback for code that does not
+    compile.
+    """
     if request.param == "numpy":
         monkeypatch.setattr(kernel, "get_kernel", lambda: None)
     elif kernel.get_kernel() is None:
@@ -52,7 +54,7 @@ def test_agrees_with_scipy_to_its_own_accuracy_when_steps_are_short(system, seed
 
 
 def order(cls, fixed, theta, scenario, lengths=(0.02, 0.01, 0.005)):
-    """Slope of the logarithm of the error over that of the step."""
+    """Return the order of convergence: the slope of log error over log step."""
     exact = cls(engine="batch", fixed=fixed, time_step=2.5e-4).simulate(theta, scenario)
     found = [
         np.sqrt(
@@ -115,7 +117,7 @@ def test_bounces_die_out_and_the_ball_rests_and_glides(fixed):
     over = np.sqrt(2 * h / g) * (1 + e) / (1 - e)
     times = np.array(
         [0.0, over - 0.05, over + 1e-3, over + 1.0]
-    )  # the last bounces fall into one interval
+    )  # the last bounces are in one interval
     ball = Ball(engine="batch", fixed={"contact.friction": 0.1, **fixed})
     seen = ball.simulate(np.array([[e]]), Scenario(times, {"z": h + 0.5, "vx": 4.0}))[0]
     assert (seen[2:, 2] == 0.5).all()
@@ -181,7 +183,7 @@ def test_what_sticks_breaks_loose_within_a_step():
 
 
 class Puck(System):
-    """A body on a level plane, for friction in two dimensions."""
+    """A body on a level plane, to test friction in two dimensions."""
 
     name, says, kind = "puck", "a puck", "point"
     parameters = (Parameter("unused", "1", 0.5, (0, 1)),)
@@ -222,7 +224,7 @@ def test_friction_in_two_dimensions_follows_the_direction_of_motion():
     motion = slid([-0.5, 0.8], 1.0, np.full(80, 0.01))
     solved = solve_ivp(rate, (0, 0.8), [0, 0, -0.5, 0.8], rtol=1e-10, atol=1e-12).y[:, -1]
     np.testing.assert_allclose([*motion.x[0, -1], *motion.v[0, -1]], solved, atol=1e-6)
-    back = slid([-0.5, 0.0], 0.2, np.full(300, 0.01))  # turns round, and never sticks
+    back = slid([-0.5, 0.0], 0.2, np.full(300, 0.01))  # reverses and never sticks
     turn = 0.5 / 0.5
     assert back.v[0, -1, 0] == pytest.approx(0.1 * (3.0 - turn), rel=1e-9)
     held = slid([-0.5, 0.0], 0.4, np.full(300, 0.01))
@@ -263,7 +265,7 @@ def test_a_lane_depends_on_itself_alone(system):
         assert alone.tobytes() == np.ascontiguousarray(together[lane, : len(alone)]).tobytes(), lane
         assert np.isnan(together[lane, len(alone) :]).all()
     bare = cls(engine="batch")
-    for lane in range(20, 25):  # everything off is the bare system
+    for lane in range(20, 25):  # all coefficients are zero: equal to the system without effects
         expected = bare.simulate(theta[lane : lane + 1, : len(cls.parameters)], scenarios[lane])[0]
         assert expected.tobytes() == np.ascontiguousarray(together[lane, : len(expected)]).tobytes()
 
@@ -383,7 +385,7 @@ def test_a_lane_that_needs_too_many_steps_is_given_up_and_no_other():
 
 @pytest.mark.parametrize("kind", [Slider, Pendulum])
 def test_a_force_that_jumps_at_rest_is_no_fast_decay(kind):
-    """A drive that hardly brakes takes about as many steps as one that does."""
+    """With a drive that hardly brakes, a run stays below four times the planned number of steps."""
     times = np.arange(60) / 50
     run = Scenario(times, {}, {"u": 0.05 * np.sign(np.sin(7 * times + 0.2))})
     theta = [1.0] if kind is Slider else [0.003]
@@ -414,8 +416,8 @@ def test_an_effect_becomes_the_one_it_contains(simple, rich):
 
 
 def test_a_lane_given_up_holds_nobody_up():
-    """Its clock has ended at once: one that an impact without speed had set back ran on for
-    minutes.
+    """The remaining time of an abandoned element is zero. Before, an element that an impact at zero
+    speed had set back in time continued for minutes.
     """
     lanes = SimpleNamespace(
         steps=np.full((2, 3), 0.1), inputs={}, steps_per_sample=1, x=np.zeros((2, 1))

@@ -1,5 +1,5 @@
-"""Lanes integrated together come out as one by one, to the bit; so do those that fail, and what
-stands beside them.
+"""Tests that batch elements integrated together, also next to failed ones, give the same bits as
+one by one.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ NEVER = dict.fromkeys(mujoco_joint_batch.MIN_BATCH_SIZE, 10**9)
 
 @pytest.fixture
 def split(monkeypatch):
-    """Sets from how many lanes on they are integrated together."""
+    """Return a function that sets the minimum number of elements integrated together."""
 
     def choose(fewest):
         for engine in (mujoco_joint_batch, mujoco_ball_batch, bullet_joints):
@@ -48,14 +48,14 @@ def split(monkeypatch):
 
 
 def signals(kind, count, seed):
-    """An input that changes at some samples."""
+    """Return inputs of which the first changes every fifth sample."""
     rng = np.random.default_rng(seed)
     held = np.repeat(rng.uniform(-1.0, 1.0, count), 5)[:count]
     return {c.name: held if place == 0 else np.ones(count) for place, c in enumerate(kind.inputs)}
 
 
 def runs(kind):
-    """Runs of three lengths: even, longer steps, uneven steps."""
+    """Return runs of three lengths: even samples, longer steps, uneven samples."""
     position, velocity = list(kind.states)[:2]
     uneven = np.cumsum(np.where(np.arange(24) % 7, 0.01, 0.013))
     times = (np.arange(40) / 100, np.arange(30) / 90, uneven)
@@ -66,7 +66,7 @@ def runs(kind):
 
 
 def lanes(name, chosen, per_run=2, engine="mujoco"):
-    """A simulator, and lanes on which each effect acts on some only."""
+    """Return a simulator, and batch elements of which only some have each effect."""
     kind = SIMULATORS[name]
     simulator = kind(engine=engine, effects=list(chosen))
     values = np.concatenate([np.ravel(c) for c in chosen.values()] or [[]])
@@ -87,7 +87,7 @@ def test_together_is_one_by_one_to_the_bit(name, case, engine, split):
     alone = simulator.simulate_batch(theta, scenarios)
     split(ALWAYS)
     assert np.isfinite(alone[:, 0]).all()
-    for _ in range(2):  # made anew, and used
+    for _ in range(2):  # newly built, then reused
         np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), alone)
 
 
@@ -116,7 +116,7 @@ def test_a_lane_that_fails_is_nan_silently_and_harms_no_other(
     broken = scenarios.copy()
     broken[wild] = Scenario(scenarios[wild].times, {"q": 0.3, "qd": 1e300}, scenarios[wild].inputs)
     theta = theta.copy()
-    theta[light, 0] = 1e-9  # less than MuJoCo can represent
+    theta[light, 0] = 1e-9  # below what MuJoCo can represent
     found = simulator.simulate_batch(theta, broken)
     assert np.isnan(found[[wild, light]]).all()
     others = [0, 2, 4, 5]
@@ -128,7 +128,7 @@ def test_a_lane_that_fails_is_nan_silently_and_harms_no_other(
 
 
 def test_what_mujoco_only_warns_of_is_as_alone(split):
-    # Beyond 1e10 rad/s MuJoCo warns, and goes on.
+    # Above 1e10 rad/s MuJoCo warns and continues.
     pendulum = SIMULATORS["pendulum"](engine="mujoco")
     theta = np.full((2, 1), THETA["pendulum"])
     fast = [Scenario(np.arange(5) / 100, {"qd": qd}) for qd in (1.0, 3e10)]
@@ -147,12 +147,12 @@ def test_a_warning_is_forgotten(split, monkeypatch):
     assert np.isfinite(pendulum.simulate(theta, wild)).all()
     monkeypatch.setattr(
         batch_grouping, "integrate_one_by_one", lambda alone, discard, lanes: iter(lanes)
-    )  # none left
+    )  # disables integration one by one
     assert np.isfinite(pendulum.simulate(theta, Scenario(wild.times))).all()
 
 
 class Picky(Force):
-    """A force that can be asked about numbers only, as a table can."""
+    """A force that accepts finite numbers only, like a lookup table."""
 
     name, says = "test.picky", "there is a table"
     coefficients = (Coefficient("size", ("m/s^2", "N", "N*m"), ((0, 1), (0, 1), (0, 1))),)
@@ -201,9 +201,9 @@ def test_a_long_stretch_is_handed_over_in_parts(split, monkeypatch):
     split(ALWAYS)
     simulator, theta, scenarios = lanes("slider", {})
     expected = simulator.simulate_batch(theta, scenarios)
-    monkeypatch.setattr(mujoco_joint_batch, "_UNINTERRUPTED", 20)  # three steps of six lanes
+    monkeypatch.setattr(mujoco_joint_batch, "_UNINTERRUPTED", 20)  # three steps of six elements
     np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), expected)
-    monkeypatch.setattr(batch_grouping, "_MAX_BATCH_STEPS", 400)  # lanes in parts
+    monkeypatch.setattr(batch_grouping, "_MAX_BATCH_STEPS", 400)  # integrates the elements in parts
     np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), expected)
 
 
@@ -266,7 +266,7 @@ def test_a_bullet_world_whose_bodies_may_meet_is_stepped_one_by_one(split, monke
     crowded = SIMULATORS["pendulum"](engine="pybullet", effects=list(EFFECTS["asked"]))
     split(ALWAYS)
     np.testing.assert_array_equal(crowded.simulate_batch(theta, scenarios), expected)
-    assert len(built) == 1 + 3  # the world of each lane by itself, and a try for each run
+    assert len(built) == 1 + 3  # one world for single elements, and one attempt for each run
     crowded.close()
 
 
@@ -291,15 +291,15 @@ def test_all_that_a_world_writes_reaches_its_lane(split, monkeypatch):
 FORCES = {
     "known": {"drag.quadratic": 0.05, "restitution.speed": -0.1, "contact.friction": 0.1},
     "asked": {"lift.magnus": [0.3, 0.1], "drag.linear": 0.2, "contact.friction": 0.1},
-    # at times it pulls a ball that rests up from the ground
+    # the periodic force sometimes lifts a resting ball off the ground
     "lifting": {"force.periodic": [0.5, 12.0, 1.0], "force.bias": 0.1},
     "without": {"contact.friction": 0.1},
 }
 
 
 def balls(case, count=8):
-    """Balls that bounce, come to rest, lie on the ground or begin inside it, in runs of their
-    own.
+    """Return balls that bounce, come to rest, rest on the ground or begin inside it, in several
+    runs.
     """
     simulator = SIMULATORS["ball"](engine="mujoco", effects=list(FORCES[case]))
     values = np.concatenate([np.ravel(c) for c in FORCES[case].values()])
@@ -307,7 +307,7 @@ def balls(case, count=8):
     theta = np.zeros((count, len(simulator.parameters)))
     theta[:, 0] = np.linspace(0.3, 1.0, count)
     theta[:, 1 : 1 + values.size] = values * rng.uniform(0.7, 1.3, (count, 1))
-    theta[-2:, 2:] = 0.0  # the first effect alone
+    theta[-2:, 2:] = 0.0  # only the first effect acts
     uneven = np.cumsum(np.where(np.arange(50) % 7, 0.02, 0.013))
     runs = [
         Scenario(np.arange(60) / 50, {"z": 0.7, "vx": 1.0}),
@@ -324,7 +324,7 @@ def test_balls_together_are_balls_one_by_one_to_the_bit(case, split):
     split(NEVER)
     alone = simulator.simulate_batch(theta, scenarios)
     split(ALWAYS)
-    for _ in range(2):  # made anew, and used
+    for _ in range(2):  # newly built, then reused
         np.testing.assert_array_equal(simulator.simulate_batch(theta, scenarios), alone)
 
 

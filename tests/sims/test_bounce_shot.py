@@ -1,4 +1,4 @@
-"""The bounce shot: closed forms without air, the planner against them, the world against an
+"""Tests of the bounce shot: the planner against closed forms without air, the world against an
 independent integrator.
 """
 
@@ -29,12 +29,12 @@ from sims.systems.bounce_shot import BounceShot
 
 ANGLE, RADIUS, E = 0.35, 0.03, 0.75
 HEIGHTS = (0.2, 3.0)
-FINE = 1e-5  # the hoop's plane is met on a chord of 1/240 s, which sags by g / 8 / 240^2
+FINE = 1e-5  # the crossing is on a chord of 1/240 s, whose sag is g / 8 / 240^2
 
 
 def launch(height, restitution=E, kept=1.0, angle=ANGLE):
-    """Velocity (vx, vz) after a fall from `height`: normal speed times -e, tangential speed times
-    `kept`.
+    """Return the velocity (vx, vz) after a fall from `height`: normal speed times -e, tangential
+    speed times `kept`.
     """
     v = math.sqrt(2 * GRAVITY * height)
     away, along = restitution * v * math.cos(angle), kept * v * math.sin(angle)
@@ -44,7 +44,7 @@ def launch(height, restitution=E, kept=1.0, angle=ANGLE):
 
 
 def landing(height, drop, kept=1.0, restitution=E):
-    """x at which the centre comes down to `drop` below the height at which it touched."""
+    """Return x at which the centre is `drop` below its height at contact."""
     vx, vz = launch(height, restitution, kept)
     return vx * (vz + math.sqrt(vz**2 + 2 * GRAVITY * drop)) / GRAVITY
 
@@ -73,9 +73,9 @@ def test_drop_without_friction_leaves_the_incline_as_in_closed_form():
 
 
 @pytest.mark.parametrize(("friction", "inertia", "kept"), [
-    (1.0, 0.4, 5 / 7),  # grips: a solid sphere keeps 5/7 of its tangential speed, a shell 3/5
+    (1.0, 0.4, 5 / 7),  # rolls: a solid sphere keeps 5/7 of its tangential speed, a shell 3/5
     (1.0, 2 / 3, 3 / 5),
-    (0.02, 0.4, 1 - 0.02 * (1 + E) / math.tan(ANGLE)),  # slides all through the impact
+    (0.02, 0.4, 1 - 0.02 * (1 + E) / math.tan(ANGLE)),  # slides during the whole impact
 ])  # fmt: skip
 def test_friction_takes_tangential_speed_until_the_ball_grips(friction, inertia, kept):
     times, seen = path(1.2, friction, inertia)
@@ -86,7 +86,7 @@ def test_friction_takes_tangential_speed_until_the_ball_grips(friction, inertia,
 
 
 def test_drag_acts_against_the_velocity_in_the_rooms_frame():
-    """Against an integrator that knows no incline's frame."""
+    """The reference integrator uses room coordinates, not those of the incline."""
     c = 0.2
     times, seen = path(1.2, effects={"drag.quadratic": c}, seconds=0.7)
 
@@ -159,7 +159,7 @@ def test_where_a_path_comes_through_the_hoop_counts_after_its_bounce():
     twice = [(0, 0, 1), (0, 0, 0.2), (0.4, 0, 0.8), (0.6, 0, 0.55), (0.9, 0, 0.7), (1.0, 0, 0.3)]
     assert np.isnan(
         compute_hoop_crossings(np.array([twice], dtype=float), scene)
-    ).all()  # it struck something before the hoop
+    ).all()  # it hit something before the hoop
     np.testing.assert_allclose(where[0], [0.9, 0.09])
     assert np.isnan(where[1]).all()
     assert compute_rim_margins(np.array([falls], dtype=float), scene)[0] == pytest.approx(
@@ -185,13 +185,13 @@ def test_world_falls_as_scipy_integrates():
     )
     seen = simulate_shot(ball, InclinedGround(), (0.0, 0.0, 3.0), times)
     assert (3 - exact.y[0]).max() < 1.75 - 0.03  # a fall without air: 1.766 m
-    np.testing.assert_allclose(seen[:, 2], exact.y[0], atol=6e-5)  # drag is held through a step
+    np.testing.assert_allclose(seen[:, 2], exact.y[0], atol=6e-5)  # drag is constant within a step
 
 
 @pytest.mark.parametrize("restitution", [0.4, 0.75, 0.95])
 def test_world_gives_the_restitution_asked_for(restitution):
-    """Height of the first bounce without air; contact at a distance of about v CONTACT / pi in the
-    ground counts.
+    """The height of the first bounce without air gives the restitution; it includes the depth of
+    the contact, about v CONTACT / pi.
     """
     ball = replace(BALL_KINDS["tennis"], restitution=restitution, exponent=0.0)
     times = np.arange(0, 1.2, 1e-3)
@@ -229,7 +229,9 @@ def test_world_restitution_falls_with_speed_as_its_exponent_says():
 
 
 def test_damping_ratio_inverts_the_restitution_of_a_contact_that_ends_with_its_force():
-    """Against a contact integrated by scipy: r'' = -2 d r' - r until the force d r' + r/2 pulls."""
+    """Reference: a contact integrated by SciPy, r'' = -2 d r' - r until the force d r' + r/2
+    pulls.
+    """
     for restitution in (0.1, 0.3, 0.7, 0.95):
         ratio = compute_damping_ratio(restitution)
 
@@ -267,8 +269,8 @@ def test_world_bounces_off_the_incline_as_an_impact_would(friction, inertia, kep
 
 
 def test_world_spin_bends_the_path_downward_as_lift_of_topspin():
-    """Gripping topspin takes w = v_t / r; its lift, integrated by scipy from the launch, shortens
-    the flight.
+    """A topspin ball that rolls at impact has w = v_t / r; its lift, integrated by SciPy from the
+    launch, shortens the flight.
     """
     ball = replace(BALL_KINDS["table-tennis"], restitution=E, exponent=0.0)
     touching = ball.radius / math.cos(ANGLE)

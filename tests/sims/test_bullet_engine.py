@@ -1,4 +1,6 @@
-"""What is Bullet's own: quiet import, the life of its worlds, an interrupted rollout, leaks."""
+"""Tests specific to Bullet: silent import, lifetime of its worlds, interrupted rollouts, memory
+leaks.
+"""
 
 import gc
 import subprocess
@@ -125,8 +127,8 @@ print(-rollouts(count // 4) + rollouts(count))
 
 
 def growth(kind, count, samples, constants, engine="pybullet", **settings):
-    """Growth in bytes of the memory of a process of its own over `count` rollouts, after a quarter
-    as many.
+    """Return the memory growth in bytes of a separate process over `count` rollouts, after a
+    warm-up of a quarter as many.
     """
     values = {
         "kind": kind.__name__,
@@ -149,6 +151,6 @@ def test_ten_thousand_rollouts_leak_nothing(kind, settings):
 @pytest.mark.parametrize(("kind", "settings"), KINDS[:3:2])
 def test_rebuilding_worlds_leaks_nothing(kind, settings):
     gravities = [{"gravity": 9.8}, {"gravity": 9.81}]
-    # The allocator may grow once by chance. A leak grows every time.
+    # The allocator may grow once at random; a leak grows every time.
     grown = (growth(kind, 800, 2, gravities, **settings) for _ in range(4))
     assert any(size < 800 * 1000 for size in grown)

@@ -1,6 +1,6 @@
-"""The compiled engine against the one in numpy, lane by lane.
+"""Tests of the compiled engine against the numpy engine, element by element.
 
-Its functions are plain Python, so all but the last tests run without a compiler, slowly.
+Its functions are plain Python, so all but the last tests run slowly without a compiler.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ from tests.sims.simulation_cases import FORCES, SIMULATORS, drawn, random_case, 
 
 
 def two_lanes(system, seed, monkeypatch):
-    """A random case, and beside it one of other parameters."""
+    """Return a random case and a second element with other parameters."""
     case = random_case(system, seed)
     cls = SIMULATORS[system]
     values = case.initial if system == "ball" else (case.initial["x"], case.initial["v"])
@@ -49,7 +49,7 @@ def test_the_same_numbers_as_in_numpy(system, seed, monkeypatch):
 
 
 def test_a_lane_depends_on_itself_alone(monkeypatch):
-    """More lanes than slots, of different effects, at different times in their runs."""
+    """The batch has more elements than slots, and the elements have different effects."""
     rng = np.random.default_rng(3)
     names = ["drag.linear", "friction.stribeck", "input.delay"]
     simulator = Pendulum(engine="batch", effects=names, compiled=False)
@@ -70,9 +70,11 @@ def test_a_lane_depends_on_itself_alone(monkeypatch):
 
 
 def test_how_long_steps_may_be_depends_on_the_lane_alone(monkeypatch):
-    """Inputs that decide it are asked for in every lane, not in the first slots' alone."""
+    """Inputs that determine the step size are read for every element, not only for the first
+    slots.
+    """
     t = np.arange(12) / 50
-    on = np.where(t > 0.1, 1.0, 0.0)  # a servo that is let go first has nothing that is fast
+    on = np.where(t > 0.1, 1.0, 0.0)  # while its torque is off, the servo has no fast dynamics
     run = Scenario(t, {"q": 0.5}, {"goal": 0.3 + 0.0 * t, "torque_enable": on})
     simulator = SIMULATORS["servo"](engine="batch", compiled=False)
     theta = np.array([[1.3 * p.nominal for p in simulator.parameters]] * 40)
@@ -156,7 +158,9 @@ def test_machine_code_gives_what_the_functions_give(system, monkeypatch):
 
 
 def spoilt(lanes, rng):
-    """The lanes, with one of what they bring beyond all measure here and there."""
+    """Yield the batch with random states, inputs or coefficients replaced by non-finite or extreme
+    values.
+    """
 
     def bad(values, share):
         values = np.array(values)

@@ -1,4 +1,4 @@
-"""How machine code is made, kept and loaded, and what is seen to before it is given arrays."""
+"""Tests of compiling, caching and loading machine code, and of the checks on its arrays."""
 
 import importlib
 import signal
@@ -145,7 +145,7 @@ def test_stepping_imports_no_translator():
 
 
 def small():
-    """Arrays of a program that computes nothing for two lanes."""
+    """Return the arrays of an empty program for two elements."""
     program = data_layout.ProgramArrays(
         code=np.zeros((0, 5), dtype=np.int64),
         ends=np.zeros(4, dtype=np.int64),

@@ -1,4 +1,6 @@
-"""``[actuators.NAME] enable`` and ``disable``: what they read, and what they refuse in one line."""
+"""Tests of ``[actuators.NAME] enable`` and ``disable``: accepted values and one-line error
+messages.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ LOG = 'model = "robot.xml"\n[channels."q.hinge"]\nunit = "rad"\n[inputs."u.m"]\n
 
 
 def written(folder, more, column="on", cells=("1", "1", "0", "0", "1")):
-    """The path of a log of two equal runs."""
+    """Write a log of two equal runs and return its path."""
     rows = [f"run,t,u.m,q.hinge,{column}" if column else "run,t,u.m,q.hinge"]
     for run in "ab":
         for k, cell in enumerate(cells):
@@ -36,7 +38,7 @@ def written(folder, more, column="on", cells=("1", "1", "0", "0", "1")):
         ('[actuators.m]\nenable = "on"\n', "11001", "00110"),
         ('[actuators.m]\ndisable = "on"\n', "11001", "11001"),
         ('[actuators.m]\nenable = "on"\n[extra.on]\nunit = "1"\n', "20030", "01101"),
-        # A missing cell is as the one before it, and at the beginning as the first.
+        # A missing cell repeats the previous value; at the beginning, the first known value.
         ('[actuators.m]\nenable = "on"\n', ("", "1", "0", "", "1"), "00110"),
         ('[actuators.m]\nenable = "on"\n', "11111", None),
     ],

@@ -1,5 +1,5 @@
-"""All engines: they agree, system by system, effect by effect; each gives the same bits whatever it
-did before.
+"""Tests of all engines: agreement by system and by effect, and bit-identical results whatever ran
+before.
 """
 
 import copy
@@ -32,13 +32,13 @@ from tests.sims.engine_agreement import (
     scenario,
 )
 
-# Largest distance from the batch engine in metres or radians with any one effect of the library, at
+# Maximum distance from the batch engine in metres or radians with any one effect of the library, at
 # the default step.
 TOLERANCE = {"ball": 1.5e-4, "pendulum": 1e-3, "slider": 5e-6, "servo": 1.6e-4}
-# A lag follows the reading from step to step; it rounds off the ball's bounces, where steps of
-# 1/120 s tell.
+# A lag follows the reading from step to step and smooths the ball's bounces, where the difference
+# between steps of 1/120 s is visible.
 LAGGED = {"ball": 5e-3}
-# A force that jumps where the motion turns round is late there by what is left of a step.
+# A force that jumps where the motion reverses acts late by the rest of the step.
 JUMPING = {"pendulum": 2e-3, "servo": 4e-4}
 LOOSER = {"sensor.lag": LAGGED, "supply.braking": JUMPING}
 
@@ -58,7 +58,7 @@ def order(steps, errors):
 
 @functools.cache
 def plain(system, **settings):
-    """The motion without effects on the batch engine."""
+    """Return the motion without effects on the batch engine."""
     return motion(system, "batch", **settings)
 
 
@@ -71,8 +71,8 @@ def theta_for(kind, count=1, seed=0):
 
 
 def test_every_effect_of_the_library_is_measured():
-    # What a model file states is the engine's own, and tested where robots are; what has levels
-    # steps itself.
+    # Effects on numbers of a model file belong to MuJoCo and are tested with robots; levels need a
+    # simulator that steps itself.
     own = ("model", "level")
     general = {name for name in effects.list_names() if effects.get_effect(name).needs not in own}
     assert set(COEFFICIENTS) == general
@@ -101,7 +101,7 @@ def test_without_effects_engines_converge_in_second_order(system):
 @pytest.mark.parametrize(("system", "effect"), CASES)
 def test_engines_agree_with_each_effect(system, effect):
     fixed = {effect: coefficients(system, effect)}
-    # what a lag makes of a signal depends on the step, on every engine, and so does its slope
+    # The result of a lag, and its slope, depends on the step size on every engine.
     slow = effect.endswith((".lag", ".hold"))
     exact = motion(system, "batch", fixed, **({"time_step": 1e-3} if slow else {}))
     tolerance = LOOSER.get(effect, {}).get(system, TOLERANCE[system])
@@ -171,7 +171,7 @@ def test_the_servo_against_an_accurate_integrator(engine):
 
 
 def test_the_servo_is_stable_over_all_its_bounds():
-    # The stiffest: back EMF with a time constant of 0.28 ms, at steps of 2.5 ms.
+    # Stiffest corner: back EMF with a time constant of 0.28 ms, at steps of 2.5 ms.
     servo = SIMULATORS["servo"]
     corners = np.array(np.meshgrid(*[p.bounds for p in servo.parameters])).reshape(3, -1).T
     fine, *others = (
@@ -211,12 +211,11 @@ def test_sliding_to_a_stop_takes_the_closed_distance(engine, step):
     np.testing.assert_allclose(x, 1.03 * t - 0.25 * t**2, atol=0.125 * 0.5 * step**2 + 1e-12)
 
 
-# ---------------------------------------------------------------------- plain numbers for common
-# effects
+# ---------------------------------------------------------------------- scalar common effects
 
 
 class Linear(effects.get_effect("drag.linear")):
-    """The library's law by another name, which the engines do not know."""
+    """The library's law under another name, without the engines' scalar shortcut."""
 
     name = "elsewhere.linear"
 
@@ -257,11 +256,11 @@ def test_only_the_librarys_own_laws_are_taken_for_known():
     assert make_resistance(Lane) is None
 
 
-# ---------------------------------------------------------------------- effects from elsewhere
+# ---------------------------------------------------------------------- third-party effects
 
 
 class Stop(Force):
-    """A hard spring beyond a position, without slope in the velocity."""
+    """A stiff spring beyond a position, without velocity dependence."""
 
     name, says = "test.stop", "there is a stop"
     coefficients = (Coefficient("stiffness", (None, "N/m", None), ((0, 1), (0, 1000), (0, 1))),)
@@ -288,10 +287,10 @@ def test_any_effect_runs_on_any_engine(engine, fresh_registries):
     exact = motion("slider", "batch", fixed, time_step=5e-4)
     errors = [apart(motion("slider", engine, fixed, time_step=h), exact) for h in STEPS["slider"]]
     assert errors[-1] < 1e-6
-    assert order(STEPS["slider"], errors) > 1.4  # the stop has an edge
+    assert order(STEPS["slider"], errors) > 1.4  # the force of the stop has a kink
 
 
-# ---------------------------------------------------------------------- lanes, worlds, bits
+# ------------------------------------------------------------------ batches, worlds, bits
 
 
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
@@ -317,7 +316,9 @@ def test_lanes_of_different_runs_come_out_as_alone(system, engine, settings):
     for row, run, found in zip(theta, runs, together, strict=True):
         n = run.times.size
         assert np.isnan(found[n:]).all()
-        if not settings:  # the step, which the longest interval sets for all, must not matter
+        if (
+            not settings
+        ):  # otherwise the step, set by the longest interval of the batch, changes the result
             np.testing.assert_allclose(found[:n], simulator.simulate(row[None], run)[0], atol=2e-3)
 
 

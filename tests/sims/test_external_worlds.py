@@ -1,4 +1,6 @@
-"""Modules that build systems' worlds fulfil what the engines ask of them; others are refused."""
+"""Tests that modules which build worlds of systems have the functions the engines need; others are
+refused.
+"""
 
 import inspect
 import sys
@@ -32,7 +34,7 @@ CASES = [
 
 
 def types_of(function):
-    """Of its arguments, in order, and of what it returns."""
+    """Return the types of the arguments, in order, and of the result."""
     hints = typing.get_type_hints(function)
     return [
         hints[name] for name in (*inspect.signature(function).parameters, "return") if name in hints
@@ -115,7 +117,7 @@ def test_settings_are_given_by_name():
 
 @pytest.mark.parametrize(("engine", "name"), ENGINES.items())
 def test_an_engine_refuses_a_broken_module_by_name(engine, name, tmp_path, monkeypatch):
-    """Before anything is simulated: without a check the first run ends in an AttributeError."""
+    """The check runs before any simulation; without it the first run ends in an AttributeError."""
     package = tmp_path / "broken_system"
     package.mkdir()
     (package / "__init__.py").write_text("")

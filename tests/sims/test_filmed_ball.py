@@ -1,4 +1,4 @@
-"""The filmed ball: what the camera shows of it, and what a tracker makes of its film."""
+"""Tests of the filmed ball: its image in the camera, and the tracked film."""
 
 import importlib.util
 
@@ -17,7 +17,7 @@ vision = pytest.mark.skipif(
 
 
 def test_row_of_a_resting_ball_is_that_of_the_pinhole():
-    """A level camera in the distance d sees the ground contact's ball h - r below its axis at focal
+    """A level camera at distance d sees the centre of a resting ball h - r below its axis, at focal
     (h - r) / d.
     """
     far = FilmedBall(
@@ -61,7 +61,7 @@ def test_where_the_ball_is_out_of_the_picture_nothing_is_invented():
     fall = Scenario(TIMES, {"z": 5.0}, {}, place)
     true = FilmedBall(CONSTANTS).simulate(np.array([[0.6]]), fall)[0, :, 1]
     seen = FilmedBall(CONSTANTS, film="tracked").simulate(np.array([[0.6]]), fall)[0, :, 1]
-    outside = true < -15.0  # its radius is 10 px: no part of it shows
+    outside = true < -15.0  # its radius is 10 px: no part of it is visible
     assert outside.sum() >= 3
     assert np.isnan(seen[outside]).all()
     away = FilmedBall(CONSTANTS, film="tracked").simulate(

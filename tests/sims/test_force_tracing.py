@@ -1,4 +1,4 @@
-"""Which effects and systems become programs, and that they compute what the arrays do."""
+"""Tests of compiling effects and systems to programs, and that programs and array code agree."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ class Gusts(Force):
 
 
 class Written(Gusts):
-    """With much of what array code may hold."""
+    """An effect that uses many operations of array code."""
 
     def force(self, c, moment):
         wave = np.stack([np.tanh(moment.x[:, 0]), np.cos(3.0 * moment.t[:, 0])], axis=1)
@@ -84,11 +84,11 @@ def test_a_plugin_compiles_as_it_stands(monkeypatch):
     ],
 )
 def test_what_does_not_compile_is_said_once_and_stepped_in_numpy(effect, says, monkeypatch, capsys):
-    effect = type(effect.__name__, (effect,), {})  # which nobody has asked yet
+    effect = type(effect.__name__, (effect,), {})  # a new class, not yet compiled
     engine, lanes = alone(effect, monkeypatch)
     for _ in range(2):
         left = step_batch(lanes, engine._turn, np.inf, PLAIN)[1]
-        assert len(left) == 2  # those in which it acts
+        assert len(left) == 2  # the elements in which the effect acts
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
     assert "effect gusts" in told[0]

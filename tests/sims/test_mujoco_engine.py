@@ -1,4 +1,6 @@
-"""What is MuJoCo's own: lazy import, contact, the life of its worlds, silence, leaks."""
+"""Tests specific to MuJoCo: lazy import, contact, lifetime of its worlds, suppressed output, memory
+leaks.
+"""
 
 import subprocess
 import sys
@@ -40,7 +42,7 @@ def test_instability_is_silent_and_writes_no_file(tmp_path, monkeypatch):
             pendulum.simulate(np.array([[1e-3]]), Scenario(np.arange(1e4) / 10, {"qd": 1e300}))
         ).all()
         assert heard == []
-        assert mujoco.get_mju_user_warning() is not None  # the user's own is back
+        assert mujoco.get_mju_user_warning() is not None  # the user's own handler is restored
     finally:
         mujoco.set_mju_user_warning(before)
     assert list(Path(tmp_path).iterdir()) == []
@@ -118,7 +120,7 @@ def test_four_thousand_rollouts_leak_nothing(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [Ball, Pendulum])
 def test_rebuilding_worlds_leaks_nothing(kind):
-    # A world takes half a megabyte; what the allocator keeps comes and goes in a few.
+    # A world takes 0.5 MB; the allocator's own memory varies by a few MB.
     assert (
         growth(kind, 400, 2, [{"gravity": 9.8}, {"gravity": 9.81}], engine="mujoco") < 400 * 50_000
     )

@@ -23,7 +23,7 @@ def example(name, kind):
 
 
 class Block(OwnSimulator):
-    """A block that an input pushes along a level track, stepped exactly."""
+    """A block pushed along a level track by an input, stepped exactly."""
 
     name = "block"
     parameters = (Parameter("mass", "kg", 2.0, (0.5, 5.0)),)
@@ -104,7 +104,7 @@ def test_effects_through_the_force_hook():
     slowed = Block(fixed={"friction.coulomb": 4.0}).simulate(theta, coast)[0]
     np.testing.assert_allclose(
         slowed[:, 1], np.maximum(0.0, 1 - 2 * TIMES), atol=0.021
-    )  # a step of 0.01 s
+    )  # tolerance for a step of 0.01 s
     assert slowed[-1, 0] == pytest.approx(0.25, abs=0.011)
     np.testing.assert_allclose(slowed[30:, 1], 0.0, atol=1e-12, err_msg="it holds still")
 
@@ -120,7 +120,7 @@ def test_friction_holds_against_a_constant_pull_and_lets_go_of_a_greater_one():
 
 
 class Coupled(OwnSimulator):
-    """Two joints whose motion is coupled by their inertia, stepped exactly between forces."""
+    """Two joints coupled by their inertia, stepped exactly between forces."""
 
     name = "coupled"
     parameters = (Parameter("scale", "1", 1.0, (0.5, 2.0)),)
@@ -152,7 +152,7 @@ class Coupled(OwnSimulator):
 def test_dry_friction_of_coupled_joints_takes_the_inertia_matrix():
     (seen,) = Coupled(fixed={"friction.coulomb": 3.0}).simulate(np.array([[1.0]]), Scenario(TIMES))
     start = np.array([1.0, -2.0])
-    # The force has a constant size and acts against the momentum, whose direction it keeps.
+    # The force has constant magnitude and opposes the momentum, so it keeps the direction.
     momentum = Coupled.given @ start
     rest = np.linalg.norm(momentum) / 3.0
     np.testing.assert_allclose(seen[-1], start * rest / 2, rtol=2e-3)
@@ -184,7 +184,7 @@ def test_effects_at_zero_change_nothing_and_tuned_ones_are_parameters():
     gained = block.simulate(np.array([[2.0, 0, 0, 0.5, 0.25]]), PUSHED)
     np.testing.assert_allclose(
         gained[0, -1, 1] - plain[0, -1, 1], 0.25, rtol=1e-9
-    )  # half more of 2 N for 0.5 s on 2 kg
+    )  # 50 % more of 2 N for 0.5 s on 2 kg
     np.testing.assert_allclose(gained[0, 0, 0], 0.25, rtol=1e-12)
 
 
@@ -271,7 +271,7 @@ def test_puck_slides_as_the_closed_form_says(incline):
     np.testing.assert_allclose(seen[:, :, 1], expected * TIMES, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(
         seen[:, :, 0], expected * TIMES**2 / 2, atol=0.012
-    )  # half a step's way: Bullet's order
+    )  # distance covered in half a step, due to Bullet's integration order
     assert puck.simulate(np.array([[0.8]]), Scenario(TIMES))[0, -1, 0] < 2e-4, (
         "steep friction holds it"
     )
@@ -338,7 +338,7 @@ def test_an_exception_of_its_code_is_one_line_with_its_place(tmp_path, capsys):
 
 
 def extended_block(folder):
-    """The file of a block with a friction that explain may have found, and its plugin."""
+    """Write the file of a block with a friction as found by explain, and its plugin."""
     plugin = folder / "blocks.py"
     text = Path(__file__).read_text()
     body = text[text.index("class Block(") : text.index("\n\n\nTIMES = ")]

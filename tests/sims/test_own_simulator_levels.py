@@ -1,5 +1,5 @@
-"""Levels that spill over: against the closed form, refused where they cannot be, and at the place
-that is named.
+"""Tests of overflowing levels: against the closed form, refused where not possible, and at the
+named place only.
 """
 
 import math
@@ -19,7 +19,7 @@ THETA = np.array([[DRAIN]])
 
 
 class Pair(FirstOrderTank):
-    """Two tubs under one tap."""
+    """Two first-order tanks with the same inflow."""
 
     name = "pair"
     channels = (Channel("left", "K", 50.0), Channel("right", "m"))
@@ -41,7 +41,7 @@ class Pair(FirstOrderTank):
 
 
 def level(times, start, tap):
-    """Of a tub without a rim."""
+    """Return the level of a tank without a rim."""
     end = tap / DRAIN
     return end + (start - end) * np.exp(-DRAIN * times)
 

@@ -1,5 +1,5 @@
-"""The pendulum in Bullet and MuJoCo against closed forms, an accurate integrator, and its own used
-world.
+"""Tests of the pendulum in Bullet and MuJoCo against closed forms, an accurate integrator and a
+reused world.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ def engine(request, monkeypatch):
 
 
 def swing(scenario, inertia=INERTIA, damping=0.0, constants=None, fixed=None, **settings):
-    """q and qd, each (T,)."""
+    """Return q and qd, each (T,)."""
     fixed = {**(fixed or {}), **({"drag.linear": damping} if damping else {})}
     return (
         Pendulum(constants, fixed=fixed, **settings).simulate(np.array([[inertia]]), scenario)[0].T
@@ -40,7 +40,7 @@ def exact(times, q, qd, inertia=INERTIA, damping=DAMPING, torque=lambda _: 0.0, 
 
 
 def period(times, q):
-    """Mean period from the upward zero crossings, located by linear interpolation."""
+    """Return the mean period from the upward zero crossings, located by linear interpolation."""
     i = np.flatnonzero((q[:-1] < 0) & (q[1:] >= 0))
     crossings = times[i] - q[i] * (times[i + 1] - times[i]) / (q[i + 1] - q[i])
     return (crossings[-1] - crossings[0]) / (len(crossings) - 1)
@@ -132,7 +132,7 @@ def test_changing_torque_matches_an_accurate_integrator():
 @pytest.mark.parametrize("damping", [0.0, 2e-3])
 @pytest.mark.parametrize("torque", [0.0, 0.1])
 def test_second_order_in_the_step_with_damping_and_torque(damping, torque):
-    times = np.array([0.0, 0.13, 0.5, 1.0])  # uneven: the step differs from interval to interval
+    times = np.array([0.0, 0.13, 0.5, 1.0])  # uneven: the step differs between intervals
     scenario = Scenario(times, {"q": 1.5, "qd": -2.0}, {"u": np.full(4, torque)})
     reference = exact(times, 1.5, -2.0, damping=damping, torque=lambda _: torque)
     steps = np.array([8e-3, 4e-3, 2e-3, 1e-3])
@@ -163,8 +163,8 @@ def test_second_order_with_forces_from_outside(fixed):
 
 
 def test_damping_carried_by_the_joint_is_damping_put_in_from_outside():
-    # A second effect makes the engine ask for forces; one that is next to nothing changes nothing
-    # else.
+    # With a second effect the engine evaluates forces at every step; its coefficient is too small
+    # to change the motion.
     scenario = Scenario(
         np.arange(200) / 100, {"q": 1.5}, {"u": 0.05 * np.sign(np.sin(3.0 * np.arange(200) / 100))}
     )
@@ -176,7 +176,7 @@ def test_damping_carried_by_the_joint_is_damping_put_in_from_outside():
 
 
 def test_strong_damping_is_stable():
-    # 2.5 ms steps against a time constant of 0.33 ms: explicit damping would blow up.
+    # Steps of 2.5 ms at a time constant of 0.33 ms: explicit damping would diverge.
     times = np.arange(200) / 100
     q, qd = swing(Scenario(times, {"q": 1.0}), damping=10.0, fixed={"drag.quadratic": 1e-300})
     np.testing.assert_allclose(
@@ -238,7 +238,7 @@ def test_a_used_world_gives_the_same_bits_as_a_new_one(engine, effects):
         scenario = Scenario(times, {"q": rng.normal(), "qd": 5 * rng.normal()}, {"u": signal})
         theta = np.array([[rng.uniform(1e-3, 1e-2), *rng.choice([0.0, 1e-3], size=len(effects))]])
         if i % 20 and engine == "pybullet":
-            new.engine._world.invalidate()  # rebuilt, which is quicker than connecting anew
+            new.engine._world.invalidate()  # rebuilding is faster than reconnecting
         else:
             new.close()
         np.testing.assert_array_equal(used.simulate(theta, scenario), new.simulate(theta, scenario))

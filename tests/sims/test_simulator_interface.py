@@ -1,4 +1,6 @@
-"""The contracts: unit cube, parameters, scenarios, and what every simulator checks."""
+"""Tests of the simulator interface: unit cube, parameters, scenarios, and the checks of every
+simulator.
+"""
 
 import numpy as np
 import pytest

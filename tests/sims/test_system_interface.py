@@ -1,4 +1,4 @@
-"""What systems declare: their usual recordings."""
+"""Tests of the declarations of systems: their default recordings."""
 
 from dataclasses import replace
 
@@ -19,7 +19,9 @@ SYSTEMS = {name: kind.system for name, kind in SIMULATORS.items()}
 
 
 def missing(system):
-    """What the usual recording names that the system does not have, and what cannot be read."""
+    """Return the names in the default recording that the system lacks or that cannot be
+    evaluated.
+    """
     usual = system.usual_recording
     channels, inputs = ({c.name for c in there} for there in (system.channels, system.inputs))
     names = {
@@ -72,7 +74,7 @@ def test_nobody_writes_into_a_usual_recording():
 
 
 def test_a_recording_of_a_system_is_made_from_its_declaration(fresh_registries):
-    """Also of one that no list in the product knows."""
+    """A system works without an entry in any list of the product."""
 
     class TestedSystem(SliderSystem):
         name = "slider-tested"

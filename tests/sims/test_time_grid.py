@@ -1,6 +1,4 @@
-"""When lanes step, what they are sampled at, and what their plants feel: against numbers worked out
-by hand.
-"""
+"""Tests of step times, sample times and applied inputs against numbers computed by hand."""
 
 from dataclasses import replace
 
@@ -24,7 +22,7 @@ from sims.systems.slider import Slider
 
 
 def coefficients(*values):
-    """One coefficient (1, L, 1) for each lane."""
+    """Return one coefficient for each element, (1, L, 1)."""
     return np.array(values, dtype=float)[None, :, None]
 
 
@@ -48,7 +46,7 @@ def test_an_interval_that_is_an_exact_multiple_is_not_divided_once_more():
 def test_a_gap_costs_only_its_own_steps():
     plan = planned([0.0, 0.02, 0.04, 0.09, 0.11])
     assert plan.steps_per_sample == 2
-    steps = [0.01] * 4 + [0.01] * 5 + [0.0] + [0.01] * 2  # the last block of the gap is filled up
+    steps = [0.01] * 4 + [0.01] * 5 + [0.0] + [0.01] * 2  # the last block of the interval is padded
     np.testing.assert_allclose(plan.steps, [steps], atol=1e-15)
     assert plan.rows.tolist() == [[0, 1, 2, 5, 6]]
     np.testing.assert_allclose(plan.ends[0, 8:10], [0.09, 0.09], rtol=1e-15)
@@ -164,7 +162,7 @@ def test_waiting_feels_nothing_new():
     )
     steps = np.array(
         [[0.01, 0.0, 0.01, 0.0]]
-    )  # at the second step the command is 1 already, at the fourth 0 again
+    )  # the command is 1 at the second step and 0 at the fourth
     plan = TimeGrid(steps, np.cumsum(steps, axis=1), 1, np.array([[0, 2, 4]]))
     felt = compute_applied_inputs(plan, runs, commands, play)["u"]
     np.testing.assert_allclose(felt, [[0.0, 0.0, 0.9, 0.9]], atol=1e-15)
@@ -236,13 +234,13 @@ JUMPS = np.random.default_rng(5).uniform(-1, 1, 30).repeat(5)
 
 
 def part(first, last=None, **more):
-    """Some of a run, which knows what was commanded before."""
+    """Return a part of a run that knows the earlier commands."""
     whole = Run("1", STAMPS, {}, {"u": JUMPS}, {}, {}, False, **more)
     return whole.part(slice(first, last))
 
 
 def felt_in(run, name, step=0.005):
-    """What a drive with an effect feels over the steps of a run."""
+    """Return the applied input of a drive with an effect over the steps of a run."""
     scenario = Scenario(run.times, {}, run.inputs, {}, run.linear, run.offset, run.before)
     runs, acting = (
         group_scenarios([scenario]),
@@ -260,7 +258,7 @@ def felt_in(run, name, step=0.005):
 def test_a_part_of_a_run_feels_what_was_commanded_before_it(name, offset, linear):
     whole, later = part(0, linear=linear, offset=offset), part(111, linear=linear, offset=offset)
     wanted = felt_in(whole, name)[-(later.times.size - 1) * 4 :]
-    # within what it makes of steps of another length
+    # Tolerance for the effect's result with another step size.
     close = {"input.lag": 0.03, "servo.profile": 0.01}.get(name, 1e-9)
     assert felt_in(later, name) == pytest.approx(wanted, abs=close)
     forgets = felt_in(replace(later, before={}), name)

@@ -1,6 +1,4 @@
-"""The arm against the two-link equations of motion, written here from their textbook form and
-solved by scipy.
-"""
+"""Tests of the arm against the textbook equations of motion of a two-link arm, solved by SciPy."""
 
 import copy
 import importlib.util
@@ -23,7 +21,7 @@ START = {"q1": 1.0, "q2": -0.6, "qd1": 0.5, "qd2": -1.0}
 
 
 def matrix(theta, k, q2):
-    """Inertia matrix (Spong, Hutchinson, Vidyasagar 2006, equation 7.87)."""
+    """Return the inertia matrix (Spong, Hutchinson, Vidyasagar 2006, equation 7.87)."""
     m1, m2, c1, c2 = theta[:4]
     cross, second = m2 * k["length"] * c2 * np.cos(q2), k["inertia2"] + m2 * c2**2
     first = k["inertia1"] + m1 * c1**2 + m2 * k["length"] ** 2 + second + 2 * cross
@@ -104,7 +102,7 @@ def test_dry_friction_holds_what_pulls_less():
     start = {
         "q1": 0.05,
         "q2": 0.05,
-    }  # gravity pulls with at most 0.34 N m on joint 1, 0.13 on joint 2
+    }  # gravity torque is at most 0.34 N m on joint 1, 0.13 on joint 2
     seen = TwoLinkArm().simulate(theta[None], Scenario(TIMES, start))[0]
     np.testing.assert_allclose(seen[:, :2], 0.05, atol=1e-12)
     theta[6] = 0.3

@@ -1,5 +1,5 @@
-"""Gaps bridged through the map from a simulation to a sensor: exact for a camera, whatever the gap,
-and honest else.
+"""Tests of filling gaps with a map from a simulation to a sensor: exact for a camera, and NaN where
+data are insufficient.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def rows(camera):
 
 @pytest.mark.parametrize("gap", [slice(0, 30), slice(20, 60), slice(90, 120)])
 def test_a_gap_is_bridged_to_what_a_pinhole_camera_would_have_shown(gap):
-    """Also at the beginning, where the ball is above the picture and no sample is nearby."""
+    """This includes the beginning, where the ball is above the image and no sample is near."""
     true = rows(PinholeCamera.draw_published(np.random.default_rng(4)))
     seen = true.copy()
     seen[gap] = np.nan
@@ -30,7 +30,7 @@ def test_a_gap_is_bridged_to_what_a_pinhole_camera_would_have_shown(gap):
     held = np.interp(np.arange(120), np.flatnonzero(keep), seen[keep])
     assert (
         np.abs(held[gap] - true[gap]).max() > 5
-    )  # what holding or drawing a line through the gap would be off by
+    )  # error of a constant or linear interpolation across the gap
 
 
 def test_a_model_that_agrees_only_at_first_bridges_the_beginning():

@@ -1,4 +1,4 @@
-"""What learned tuners are told of scenarios, and what it is worth where scenarios differ."""
+"""Tests of scenario features of learned tuners, and of their benefit if scenarios differ."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,9 @@ STEP, SAMPLES = 0.05, 120
 
 
 def driven(points, force):
-    """(n, 120, 1): q'' = gain u - damping q' - 4 q from rest; damping 0.2 to 1.2, gain 0.5 to 2.5,
-    input (120, 1).
+    """Simulate q'' = gain u - damping q' - 4 q from rest; return (n, 120, 1).
+
+    Damping is 0.2 to 1.2, gain 0.5 to 2.5, and the input has shape (120, 1).
     """
     damping, gain = 0.2 + points[:, :1], 0.5 + 2.0 * points[:, 1:2]
     q, rate, out = np.zeros((len(points), 1)), np.zeros((len(points), 1)), []
@@ -30,7 +31,7 @@ def driven(points, force):
 
 
 class Driven(Toy):
-    """A spring and damper pushed by a force of random levels, another in each scenario."""
+    """A spring and damper driven by a force of random levels, different in each scenario."""
 
     def __init__(self, budget=1000):
         super().__init__(2, budget)
@@ -123,12 +124,12 @@ def test_missing_samples_leave_the_truth_where_it_was(told):
     ends = [errors(told, Driven(), seeds=[seed], spoil=spoil)[10] for seed in range(10)]
     assert (
         sorted(ends)[8] < 1e-6
-    )  # bridged gaps are new to the network: one of ten stays away from the root
+    )  # filled gaps are new to the network: one of ten runs does not converge
 
 
 def test_state_survives_and_is_checked(told, blind):
     state = told.state()
-    assert state["clean.inputs.chosen"].size == 0  # responses take the place of samples
+    assert state["clean.inputs.chosen"].size == 0  # response coefficients replace samples
     assert state["clean.told.centre"].shape == (6,)
     copy = TuneNet(points=60)
     copy.restore(state)
@@ -184,7 +185,7 @@ def test_experiments_tell_what_observations_do_not_show(name, initial, inputs):
     practice.simulate(np.random.default_rng(0), practice.sample(np.random.default_rng(1), 2))
     assert np.array_equal(
         practice.scene.inputs, scene.inputs
-    )  # told the scenario in which was simulated
+    )  # the features are those of the simulated scenario
     problem.close()
 
 

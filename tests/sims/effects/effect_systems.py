@@ -1,4 +1,6 @@
-"""Short ways to a moment for an effect's array function, and to a simulated run with effects."""
+"""Helpers to build state snapshots for array functions of effects, and to simulate runs with
+effects.
+"""
 
 import numpy as np
 
@@ -76,13 +78,13 @@ PAIRS = [
 
 
 def lanes(*values, count=1):
-    """Coefficients (K, L, 1), the same in every lane."""
+    """Return coefficients (K, L, 1), equal in every batch element."""
     return np.repeat(np.array(values, dtype=float)[:, None, None], count, axis=1)
 
 
 def moment(system, x, v, theta=None, inputs=(), t=0.0, **constants):
-    """A moment of `system` at positions and velocities (L, D); every lane has the same of
-    everything else.
+    """Return a state snapshot of `system` at positions and velocities (L, D); all other values are
+    equal in every batch element.
     """
     declared = SYSTEMS[system]
     x, v = np.array(x, dtype=float), np.array(v, dtype=float)
@@ -110,7 +112,7 @@ def moment(system, x, v, theta=None, inputs=(), t=0.0, **constants):
 def run(
     system, times, fixed=None, theta=None, inputs=None, constants=None, observe=None, **initial
 ):
-    """One run on the batch engine: observations (T, C)."""
+    """Simulate one run on the batch engine; return the observations (T, C)."""
     simulator = SIMULATORS[system](constants, observe, engine="batch", fixed=fixed or {})
     theta = [p.nominal for p in simulator.parameters] if theta is None else theta
     scenario = Scenario(times, initial, inputs or {})

@@ -1,4 +1,4 @@
-"""Effects on impacts through the batch engine."""
+"""Tests of effects on impacts, simulated with the batch engine."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,9 @@ G, RADIUS = 9.81, 0.5
 
 
 def first_rebound(heights, fixed, e):
-    """Speed of the first impact and of leaving it, from the drop height and the apex after it."""
+    """Return the speed before and after the first impact, from the drop height and the next
+    apex.
+    """
     times = np.arange(0, 2.4, 0.002)
     ball = Ball(observe=["z"], engine="batch", fixed=fixed)
     scenarios = [Scenario(times, {"z": RADIUS + h}) for h in heights]

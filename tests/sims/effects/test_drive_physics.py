@@ -1,4 +1,4 @@
-"""What drives do beside the simplest laws, through the batch engine, against closed forms."""
+"""Tests of drive effects other than the simplest laws: the batch engine against closed forms."""
 
 import numpy as np
 import pytest
@@ -6,17 +6,17 @@ import pytest
 from tests.sims.effects.effect_systems import moment, run
 from tests.sims.effects.test_force_laws import limit
 
-MASS, LENGTH, GRAVITY = 0.2, 0.5, 10.0  # of a pendulum that weighs sin q
+MASS, LENGTH, GRAVITY = 0.2, 0.5, 10.0  # of a pendulum with weight torque sin q
 HEAVY = {"mass": MASS, "length": LENGTH, "gravity": GRAVITY}
 
 
 def slide(times, fixed, mass=1.0, u=0.0, **initial):
-    """x and v, each (T,)."""
+    """Return x and v, each (T,)."""
     return run("slider", times, fixed, [mass], {"u": np.broadcast_to(u, times.shape)}, **initial).T
 
 
 def moved(fixed, u, q=0.5):
-    """By how much a pendulum that weighs 1 N m moves in a fifth of a second from rest, rad."""
+    """Return how far a pendulum with weight torque sin q moves in 0.2 s from rest, rad."""
     times = np.arange(21) * 0.01
     inputs = {"u": np.full(times.size, u)}
     return run("pendulum", times, fixed, [0.06], inputs, HEAVY, q=q)[-1, 0] - q
@@ -52,12 +52,12 @@ WEIGHT = float(np.sin(0.5))
 @pytest.mark.parametrize(
     ("fixed", "lifts", "sinks"),
     [
-        # up at u (1 - motor) > w (1 + external), down at u (1 + motor) < w (1 - external)
+        # moves up if u (1 - motor) > w (1 + external), down if u (1 + motor) < w (1 - external)
         ({"friction.load_direction": (0.3, 0.1)}, 1.1 / 0.7, 0.9 / 1.3),
         ({"friction.load_direction": (0.0, 0.4)}, 1.4, 0.6),
         ({"friction.load": 0.2}, 1.2 / 0.8, 0.8 / 1.2),
         ({"friction.load_direction": (0.2, 0.2)}, 1.2 / 0.8, 0.8 / 1.2),
-        # up at u - w > c (u + w) + d w^2; down at w - u > c (u + w) + d u^2, here for c = 0
+        # moves up if u - w > c (u + w) + d w^2, down if w - u > c (u + w) + d u^2, here with c = 0
         (
             {"friction.load_quadratic": (0.0, 0.5)},
             1 + 0.5 * WEIGHT,
@@ -92,7 +92,7 @@ def test_a_joint_that_warms_lets_go_of_what_it_rubbed():
 def test_what_a_cold_joint_holds_it_lets_go_when_it_is_warm():
     times, time = np.arange(0, 4, 0.01), 1.0
     x, _ = slide(times, {"friction.warming": (2.0, 0.0, time)}, 1.0, u=1.0)
-    begins = time * np.log(2.0)  # when what is left of 2 N is less than 1 N
+    begins = time * np.log(2.0)  # time at which friction falls from 2 N below 1 N
     assert not x[times < begins - 0.02].any()
     # v = (t - t0) - 2 (exp(-t0) - exp(-t))
     late = times[-1] - begins
@@ -102,7 +102,7 @@ def test_what_a_cold_joint_holds_it_lets_go_when_it_is_warm():
 
 @pytest.mark.parametrize("u", [0.5, -3.0, 40.0])
 def test_a_supply_that_sags_gives_what_its_voltage_leaves(u):
-    """F = U (1 - c |F|), and never as much as 1 / c."""
+    """The force follows F = U (1 - c |F|) and stays below 1 / c."""
     times, c, mass = np.arange(0, 1, 0.01), 0.1, 2.0
     _, v = slide(times, {"supply.sag": c}, mass, u)
     force = mass * v[-1] / times[-1]
@@ -121,7 +121,7 @@ def test_a_servo_whose_supply_sags_hangs_lower():
 
 @pytest.mark.parametrize("c", [0.3, 0.75, -0.5, 0.0])
 def test_a_drive_that_hardly_brakes_turns_round_late_and_starts_as_ever(c):
-    """Of a force against the motion 1 - c is left: the way back is as fast as without."""
+    """A force against the motion is reduced to the fraction 1 - c; the way back is not reduced."""
     times, mass, v0, u = np.arange(0, 6, 0.01), 2.0, 1.5, -2.0
     _, v = slide(times, {"supply.braking": c}, mass, u, v=v0)
     braked = u * (1 - max(c, 0.0)) / mass

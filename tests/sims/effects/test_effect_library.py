@@ -1,5 +1,5 @@
-"""The library as a whole: complete, small, declared for what it fits, off at zero, and its page is
-current.
+"""Tests of the effect library as a whole: complete, small, declared for systems it fits, without
+effect at zero, and with a current README page.
 """
 
 import ast
@@ -200,7 +200,7 @@ def test_zero_gives_nothing_and_shapes_are_those_of_the_lanes(name, system, coun
         e, speed = np.full((count, 1), 0.7), np.full((count, 1), 3.0)
         assert np.array_equal(effect.restitution(off, e, speed), e)
         assert effect.restitution(on, e, speed).shape == effect.friction(on).shape == (count, 1)
-    elif isinstance(effect, HiddenStateEffect):  # where it is off no engine asks it
+    elif isinstance(effect, HiddenStateEffect):  # engines do not evaluate it where it is off
         state = effect.begin(on, now)
         force, rate = effect.act(on, now, state)
         assert force.shape == (count, size)

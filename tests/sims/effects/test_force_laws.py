@@ -1,4 +1,4 @@
-"""Array functions of forces, frictions and contacts against numbers worked out by hand."""
+"""Tests of array functions of forces, frictions and contacts against numbers computed by hand."""
 
 import numpy as np
 import pytest
@@ -99,7 +99,7 @@ def test_load_counts_both_sides_of_the_transmission():
     assert limit("friction.load", moment("slider", **ROLL, inputs=[-3.0]), 0.1) == pytest.approx(
         0.3
     )
-    # Held still, the drive carries the weight: both sides of the gear feel it.
+    # At rest the drive carries the weight, so both sides of the gear are loaded.
     held = moment(
         "pendulum", [[0.5]], [[0.0]], inputs=[np.sin(0.5)], mass=0.2, length=0.5, gravity=10.0
     )
@@ -120,7 +120,7 @@ def test_restitution_is_a_power_of_speed_that_makes_no_energy():
     assert at(0.8, 16.0, -0.25) == pytest.approx(0.4)
     assert at(0.3, 4.0, 0.5) == pytest.approx(0.6)
     assert (at(0.8, 0.0, -0.25), at(0.8, 100.0, 0.5)) == (1.0, 1.0)
-    assert at(1.2, 3.0, 0.0) == 1.2  # off is off
+    assert at(1.2, 3.0, 0.0) == 1.2  # a coefficient of zero changes nothing
 
 
 def test_contact_friction_is_its_coefficient():

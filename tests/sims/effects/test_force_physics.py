@@ -1,4 +1,4 @@
-"""Forces through the batch engine, against closed forms and conservation laws."""
+"""Tests of forces on the batch engine against closed forms and conservation laws."""
 
 import numpy as np
 import pytest
@@ -14,24 +14,24 @@ WEIGHT = 0.15 * 9.81 * 0.15  # N*m, of the default pendulum at the horizontal
 
 
 def slide(times, fixed, mass=1.0, u=0.0, **initial):
-    """x and v, each (T,)."""
+    """Return x and v, each (T,)."""
     return run("slider", times, fixed, [mass], {"u": np.broadcast_to(u, times.shape)}, **initial).T
 
 
 def swing(times, fixed, inertia=3.3e-3, u=0.0, **initial):
-    """q and qd, each (T,)."""
+    """Return q and qd, each (T,)."""
     return run(
         "pendulum", times, fixed, [inertia], {"u": np.broadcast_to(u, times.shape)}, **initial
     ).T
 
 
 def fly(times, fixed, constants=None, **initial):
-    """x, y, z, accel_z, each (T,)."""
+    """Return x, y, z and accel_z, each (T,)."""
     return run("ball", times, fixed, constants=constants, **initial).T
 
 
 def period(times, x):
-    """Mean period from the upward zero crossings, located by linear interpolation."""
+    """Return the mean period from the upward zero crossings, located by linear interpolation."""
     i = np.flatnonzero((x[:-1] < 0) & (x[1:] >= 0))
     crossings = times[i] - x[i] * (times[i + 1] - times[i]) / (x[i + 1] - x[i])
     return (crossings[-1] - crossings[0]) / (len(crossings) - 1)
@@ -136,7 +136,7 @@ def test_stribeck_friction_holds_up_to_its_greatest_level():
     assert v[-1] > 0.3
     assert np.diff(v)[-10:] / 0.01 == pytest.approx(
         0.51, abs=1e-3
-    )  # only the Coulomb level is left
+    )  # only the Coulomb level remains
 
 
 def test_load_friction_takes_a_share_of_the_drive():
@@ -147,7 +147,7 @@ def test_load_friction_takes_a_share_of_the_drive():
 
 @pytest.mark.parametrize(("factor", "holds"), [(0.995, True), (1.005, False)])
 def test_load_friction_holds_in_the_band_of_equilibrium(factor, holds):
-    """|u - w| <= c (u + w): u is w (1 + c) / (1 - c) at most and w (1 - c) / (1 + c) at least."""
+    """It holds if |u - w| <= c (u + w): u between w (1 - c) / (1 + c) and w (1 + c) / (1 - c)."""
     times, c, w = np.arange(0, 1, 0.01), 0.2, WEIGHT * np.sin(0.5)
     for u in (w * (1 + c) / (1 - c) * factor, w * (1 - c) / (1 + c) / factor):
         q, _ = swing(times, {"friction.load": c}, u=u, q=0.5)
@@ -276,7 +276,9 @@ def test_friction_by_direction_decays_at_the_rate_of_its_way(way, rate):
 
 
 def test_what_rubs_one_way_alone_lets_a_spring_swing_back_freely():
-    """Half of each swing is damped, half keeps its energy: the amplitude falls once a period."""
+    """Half of each swing is damped, the other half conserves energy: amplitude falls once a
+    period.
+    """
     times, stiffness, damping = np.arange(0, 8, 0.005), 20.0, 1.0
     fixed = {"friction.direction": (damping, 0.0), "spring.linear": stiffness}
     x, v = slide(times, fixed, 1.0, x=-1.0)
@@ -291,7 +293,7 @@ def test_what_rubs_one_way_alone_lets_a_spring_swing_back_freely():
 
 
 def turn(times, fixed, goal, constants=None, theta=(0.5, 4.0, 2e-3), **initial):
-    """The angle of a servo, (T,)."""
+    """Return the angle of a servo, (T,)."""
     inputs = {"goal": np.broadcast_to(goal, times.shape), "torque_enable": np.ones(times.size)}
     return run("servo", times, fixed, list(theta), inputs, constants, **initial)[:, 0]
 
@@ -303,7 +305,7 @@ def test_a_servo_with_a_dead_zone_rests_where_it_first_comes_within_it(begin):
     if abs(begin - 1.0) < 0.06:
         assert q == pytest.approx(begin, abs=1e-12)
     else:
-        # at its edge it is pushed no more, and damped by its own voltage
+        # at the edge of the dead zone it is driven no further, and damped by its back EMF
         assert abs(q[-1] - 1.0) <= 0.06 + 1e-3
         assert abs(turn(times, {}, 1.0, FREE, q=begin)[-1] - 1.0) < 1e-3
 
@@ -320,7 +322,7 @@ def test_gravity_pulls_a_servo_by_the_dead_zone_further_down():
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_an_end_stop_without_loss_gives_back_what_it_takes(side):
-    """Into Hertz's contact k d^1.5 / 0.1 a motion of energy E goes d^2.5 = E / (4 k)."""
+    """A motion of energy E enters Hertz's contact k d^1.5 / 0.1 to d^2.5 = E / (4 k)."""
     times, mass, speed, k = np.arange(0, 1.5, 0.002), 2.0, 0.8, 900.0
     stop = {"state.limit": (side * k, side * 0.3, 0.0)}
     x, v = slide(times, stop, mass, 0.0, v=side * speed)
@@ -334,10 +336,10 @@ def test_an_end_stop_without_loss_gives_back_what_it_takes(side):
 @pytest.mark.parametrize("stiffness", [300.0, 3000.0])
 @pytest.mark.parametrize(("loss", "speed"), [(0.05, 0.4), (0.5, 0.8), (1.5, 0.8)])
 def test_what_an_end_stop_gives_back_hangs_on_loss_and_speed_alone(stiffness, loss, speed):
-    """From w dw / (1 + a w) = -F dd / m on the way in and out:
+    """The rebound speed follows from w dw / (1 + a w) = -F dd / m on the way in and out.
 
-    log((1 + a w) / (1 - a w')) = a (w + w'), with w' the speed that comes back; 1 - 2 a w / 3 of w
-    where that is small.
+    log((1 + a w) / (1 - a w')) = a (w + w'), with the rebound speed w'; for small a w, w' = w (1 -
+    2 a w / 3).
     """
     times = np.arange(0, 3, 0.002)
     _, v = slide(times, {"state.limit": (stiffness, 0.3, loss)}, 2.0, 0.0, v=speed)

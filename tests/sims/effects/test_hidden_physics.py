@@ -1,4 +1,4 @@
-"""Effects with a state of their own, against closed forms: two masses, play, what yields."""
+"""Tests of effects with a hidden state against closed forms: flexibility, backlash, hysteresis."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ MASS = 1.3
 
 
 def slide(effects, u=0.0, v=0.0, **settings):
-    """Position and velocity (T,) of a slider that is pushed by u."""
+    """Return position and velocity (T,) of a slider driven by the force u."""
     simulator = Slider(engine="batch", fixed=effects, **settings)
     run = Scenario(TIMES, {"x": 0.0, "v": v}, {"u": np.broadcast_to(u, TIMES.shape).copy()})
     return simulator.simulate(np.array([[MASS]]), run)[0].T
@@ -33,14 +33,14 @@ def test_two_masses_under_a_steady_push_swing_about_their_centre(compiled):
 
 
 def test_a_load_hangs_from_its_drive_where_the_run_begins():
-    # At 90 degrees the drive holds the whole weight; the load then stays where it hangs.
+    # At 90 degrees the drive holds the whole weight; the load stays at its deflected angle.
     mass, length, gravity = 0.2, 0.5, 9.81
     constants = {"mass": mass, "length": length, "gravity": gravity}
     simulator = Pendulum(constants, engine="batch", fixed={"joint.flexibility": (0.5, 60.0, 0.3)})
     inertia, torque = 0.06, mass * gravity * length
     run = Scenario(TIMES, {"q": np.pi / 2, "qd": 0.0}, {"u": np.full(TIMES.shape, torque)})
     q, _ = simulator.simulate(np.array([[inertia]]), run)[0].T
-    # The weight at the load's own angle is less by the square of how far it hangs.
+    # The weight torque at the load's angle is smaller by the square of its deflection.
     sag = torque / inertia / 60.0**2
     assert sag > 4e-3
     less = 0.5 * torque * (1 - np.cos(sag)) / inertia
@@ -50,7 +50,7 @@ def test_a_load_hangs_from_its_drive_where_the_run_begins():
 def test_a_damped_load_comes_to_rest_on_its_drive():
     pulse = np.where(TIMES < 0.2, 3.0, 0.0)
     _, v = slide({"joint.flexibility": (0.6, 30.0, 0.5)}, pulse)
-    # All that is left is the momentum of the pulse.
+    # Only the momentum of the pulse remains.
     np.testing.assert_allclose(v[150:], 3.0 * 0.2 / MASS, rtol=1e-6)
 
 
@@ -63,7 +63,7 @@ def test_through_a_gap_the_drive_moves_alone_until_it_meets_the_flank():
     assert 20 < apart.sum() < 40
     np.testing.assert_allclose(x[apart], alone[apart], rtol=1e-6, atol=1e-9)
     met = np.sqrt(gap * near / push)
-    # Nothing bounces: from there on both go together with the momentum that there is.
+    # The impact has no rebound: then both move together and momentum is conserved.
     together = x[met + 0.15 < TIMES] - (push / MASS * TIMES**2 / 2)[met + 0.15 < TIMES]
     assert np.ptp(together) < 2e-4
     np.testing.assert_allclose(v[-1], push * TIMES[-1] / MASS, rtol=1e-3)
@@ -85,11 +85,12 @@ def test_what_yields_little_rubs_as_dry_friction_does():
 
 
 def test_dry_friction_holds_the_drive_while_the_load_swings_on():
-    # A drive that nothing moves: its load was given no speed, and the push is less than friction.
+    # The drive does not move: its load starts at rest, and the push is less than friction.
     x, v = slide({"joint.flexibility": (0.5, 20.0, 0.1), "friction.coulomb": 2.0}, 1.0)
     assert not x.any()
     assert not v.any()
-    # Stopped in full swing it is held, with the load still on its way, until that pulls it loose.
+    # Friction stops the drive during fast motion while the load still moves, until the load pulls
+    # it out of sticking.
     knock = np.select([TIMES < 0.15, TIMES < 0.25], [12.0, -12.0])
     x, v = slide({"joint.flexibility": (0.6, 8.0, 0.01), "friction.coulomb": 4.0}, knock)
     still = v[1:] == 0.0

@@ -1,4 +1,4 @@
-"""Array functions of input and sensor effects against numbers by hand and closed forms."""
+"""Tests of array functions of input and sensor effects against numbers by hand and closed forms."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ RAMP = np.array([-2.0, -1.0, 0.0, 0.5, 1.0, 2.0])
         ("input.rate", -0.1, RAMP),
         ("servo.derivative", -0.1, RAMP),
         ("servo.profile", -0.1, RAMP),
-        # a value that is held arrives twice for as long as the rate is taken over
+        # a jump counts twice for the time c, over which the rate is computed
         ("servo.derivative", 0.1, [-4.0, 0.0, 1.0, 1.0, 1.5, 3.0]),
         ("servo.derivative", 0.2, [-4.0, -2.0, 2.0, 2.0, 2.0, 3.5]),
         ("servo.derivative", 0.05, [-3.0, -0.5, 0.5, 0.75, 1.25, 2.5]),
@@ -71,9 +71,9 @@ def test_backlash_plays_its_width():
     felt = through("backlash", 0.6, there_and_back)
     assert felt[:21] == pytest.approx(
         np.maximum(np.linspace(0, 2, 21) - 0.3, 0)
-    )  # starts in the middle
+    )  # starts in the middle of the play
     still = there_and_back[21:] > 2 - 0.6 - 1e-9
-    assert felt[21:][still] == pytest.approx(1.7)  # a reversal costs the whole width
+    assert felt[21:][still] == pytest.approx(1.7)  # a reversal costs the full width
     assert felt[21:][~still] == pytest.approx(there_and_back[21:][~still] + 0.3)
 
 
@@ -146,14 +146,14 @@ def test_a_d_term_on_the_error_leads_a_ramp_by_its_time(lead):
 
 
 def test_a_limit_of_the_rate_rises_straight_and_stays():
-    # at 5 a second a step of 0.1 s rises by half: from -0.5 on, its means are those of a ramp
+    # at 5 per second, a step of 0.1 s rises by 0.5; the means over the steps are those of a ramp
     assert through("input.rate", 5.0, [0.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.9]) == pytest.approx(
         [0.0, 0.25, 0.75, 1.25, 1.75, 2.0, 1.91]
     )
 
 
 def test_a_motion_profile_speeds_up_and_brakes_evenly():
-    """A jump of 1 at 16 a second and second takes 0.5 s: half of it each way."""
+    """A jump of 1 at 16 per s^2 takes 0.5 s: half to speed up, half to brake."""
     h, t = 0.002, 0.002 * (np.arange(400) + 0.5)
     left = np.maximum(0.5 - t, 0.0)
     wanted = np.where(t < 0.25, 8 * t**2, 1 - 8 * left**2)
@@ -164,7 +164,7 @@ def test_a_motion_profile_speeds_up_and_brakes_evenly():
 
 @pytest.mark.parametrize("limit", [3.0, 12.0, 60.0])
 def test_a_motion_profile_is_the_shortest_way_to_commands_that_change(limit):
-    """Against the double integrator's own solution, which is exact between commands."""
+    """Reference: the double integrator's own solution, exact between commands."""
     h = 0.001
     rng = np.random.default_rng(7)
     stamps, values = np.arange(0, 4, 0.125), np.repeat(rng.uniform(-1, 1, 8), 4)
@@ -181,7 +181,8 @@ def test_a_motion_profile_follows_what_asks_for_less_and_falls_behind_what_asks_
     slow, fast = 0.1 * np.sin(10 * t), 0.1 * np.sin(40 * t)
     within = through("servo.profile", 40.0, slow, 0.001) - slow
     beyond = through("servo.profile", 40.0, fast, 0.001) - fast
-    # it arrives at rest, and so is behind by the way that braking from the command's speed takes
+    # The profile can stop at any command, so it lags by the braking distance of the command's
+    # speed.
     assert np.abs(within[500:]).max() == pytest.approx(1.0**2 / (2 * 40.0), rel=0.03)
     assert np.abs(beyond[500:]).max() > 0.05
 

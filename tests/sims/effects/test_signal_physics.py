@@ -1,4 +1,4 @@
-"""Effects on inputs and sensors through the batch engine, against closed forms."""
+"""Tests of effects on inputs and sensors on the batch engine, against closed forms."""
 
 import numpy as np
 import pytest
@@ -8,16 +8,16 @@ from sims.systems.slider import Slider
 from tests.sims.effects.effect_systems import run
 
 TIMES = np.arange(0, 3, 0.02)
-STEP = np.where(TIMES >= 0.5 - 1e-9, 2.0, 0.0)  # N, from half a second on
+STEP = np.where(TIMES >= 0.5 - 1e-9, 2.0, 0.0)  # N, from 0.5 s on
 
 
 def slide(fixed, u=0.0, times=TIMES, mass=2.0, **initial):
-    """x and v, each (T,)."""
+    """Return x and v, each (T,)."""
     return run("slider", times, fixed, [mass], {"u": np.broadcast_to(u, times.shape)}, **initial).T
 
 
 def felt(fixed, u, times=TIMES):
-    """The input as a slider of 2 kg felt it between samples, from the velocity's differences."""
+    """Return the input applied to a slider of 2 kg between samples, from velocity differences."""
     return 2.0 * np.diff(slide(fixed, u, times)[1]) / np.diff(times)
 
 
@@ -25,8 +25,8 @@ def felt(fixed, u, times=TIMES):
     ("delay", "within"), [(0.1, 1e-9), (0.1234, 0.02**2 / 8), (0.003, 0.02**2 / 8)]
 )
 def test_input_delay_is_an_exact_shift(delay, within):
-    """Exact in the impulse; the position is off by how the step in which the jump arrives shares
-    out its mean.
+    """The impulse is exact; the position error comes from using the mean input over the step in
+    which the jump arrives.
     """
     x, v = slide({"input.delay": delay}, STEP)
     since = np.maximum(TIMES - 0.5 - delay, 0.0)
@@ -47,7 +47,9 @@ def test_input_gain_and_bias():
 
 
 def test_input_hold_goes_straight_from_sample_to_sample():
-    """A mean over each interval of half the ends' sum; a share of it mixes."""
+    """The input of each interval is the mean of its end samples; a coefficient of 0.3 mixes it with
+    the held input.
+    """
     wave = 2 * np.sin(4 * TIMES)
     middles = 0.5 * (wave[1:] + wave[:-1])
     assert felt({"input.hold": 1.0}, wave) == pytest.approx(middles, abs=1e-9)
@@ -56,7 +58,7 @@ def test_input_hold_goes_straight_from_sample_to_sample():
 
 
 def moved(effects=(), coefficients=(), **stated):
-    """A driven slider whose recording says more of its inputs."""
+    """Simulate a driven slider with additional properties of its inputs in the recording."""
     times = np.arange(0, 3, 0.02)
     given = Scenario(times, {}, {"u": 2 * np.sin(4 * times)}, **stated)
     return Slider(effects=list(effects)).simulate(np.array([[2.0, *coefficients]]), given)[0]
@@ -79,8 +81,8 @@ def test_a_straight_command_moves_a_slider_as_its_integral_says():
 
 
 def test_a_chain_starts_settled():
-    """A lag behind a gain and a bias begins at what they make of the first value, not at the
-    command's.
+    """A lag after a gain and a bias begins at their output for the first value, not at the
+    command.
     """
     fixed = {"input.gain": 0.5, "input.bias": 0.2, "input.lag": 0.3}
     assert felt(fixed, 2.0) == pytest.approx(3.2, abs=1e-9)
@@ -131,7 +133,9 @@ def test_sensor_delay_is_an_exact_shift(delay):
 def test_sensor_lag_follows_a_ramp_by_its_lag(lag):
     x, v = slide({"sensor.lag": lag}, x=1.0, v=3.0)
     assert x == pytest.approx(1 + 3 * (TIMES - lag * -np.expm1(-TIMES / lag)), abs=1e-9)
-    assert v == pytest.approx(3.0, abs=1e-9)  # every channel, settled at its first value
+    assert v == pytest.approx(
+        3.0, abs=1e-9
+    )  # every channel starts at its first value, in steady state
 
 
 def test_sensor_gain_bias_and_drift_change_one_channel():
@@ -148,7 +152,7 @@ def test_a_skewed_clock_stretches_the_record():
 
 
 def test_a_limit_of_the_rate_makes_a_ramp_of_a_step():
-    """2 N at 4 N/s take half a second; the impulse is that of the ramp, to rounding."""
+    """A step of 2 N at 4 N/s takes 0.5 s; the impulse is that of the ramp, to rounding error."""
     _, v = slide({"input.rate": 4.0}, STEP)
     since = np.maximum(TIMES - 0.5, 0.0)
     rising = np.minimum(since, 0.5)
@@ -182,7 +186,7 @@ def test_an_encoder_that_slipped_is_off_from_an_instant_of_the_clock_on():
     seen, other = run("pendulum", times, slip, [3.3e-3], inputs, q=0.8).T
     assert seen == pytest.approx(true + np.where(times > 5.705, 0.03, 0.0), abs=1e-12)
     assert np.array_equal(other, rate)
-    # what is put a quarter of a sample late or early shows in that sample alone
+    # An offset a quarter of a sample earlier or later changes only that sample.
     for late, share in ((0.0025, 0.75), (-0.0025, 0.25)):
         moved = {"sensor.slip": (0.03, 5.705 + late)}
         between = run("pendulum", times, moved, [3.3e-3], inputs, q=0.8)[:, 0] - true

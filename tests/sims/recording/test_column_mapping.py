@@ -1,4 +1,6 @@
-"""Logs as they lie: any layout, several files, their stamps joined and nothing resampled."""
+"""Tests of logs in their original layout: any columns, several files, joined time stamps, no
+resampling.
+"""
 
 import numpy as np
 import pytest
@@ -34,7 +36,8 @@ def written(folder, toml=TOML, **files):
 
 def test_two_files_are_joined_at_every_stamp_and_commands_hold(tmp_path):
     (run,) = read_recording(written(tmp_path), Slider, whole=True).runs
-    # From the first to the last sample of the sensor, seconds since the first stamp of all.
+    # From the first to the last sample of the sensor, in seconds since the first time stamp of all
+    # files.
     expected = np.array([100, 110, 112, 120, 130, 134, 140]) / 1e3 - 0.095
     np.testing.assert_allclose(run.times, expected, atol=1e-12)
     np.testing.assert_array_equal(run.inputs["u"], [0.5, 0.5, 1.5, 1.5, 1.5, -2, -2])
@@ -93,7 +96,7 @@ def test_archives_and_parquet_hold_the_same(tmp_path):
 
 
 def test_the_scale_and_the_offset_of_a_signal_are_applied_before_its_unit(tmp_path):
-    # A gear of 1:5 that turns the sign, and the zero of an encoder, in the unit of the column.
+    # A gear of 1:5 that inverts the sign, and the zero of an encoder, in the unit of the column.
     toml = TOML.replace('unit = "mm"', 'unit = "mm"\nscale = -0.2\noffset = 1.5\nnoise = 2')
     toml = toml.replace('unit = "N"', 'unit = "N"\nscale = 2\noffset = -1')
     recording = read_recording(written(tmp_path, toml), Slider, whole=True)
@@ -101,7 +104,7 @@ def test_the_scale_and_the_offset_of_a_signal_are_applied_before_its_unit(tmp_pa
     seen = np.array([0, 1.5, 4, 7, 9])
     np.testing.assert_allclose(x[np.isfinite(x)], 1e-3 * (1.5 - 0.2 * seen), atol=1e-15)
     assert recording.runs[0].inputs["u"].tolist() == [0, 0, 2, 2, 2, -5, -5]
-    # An offset does not change a noise.
+    # An offset does not change the noise.
     assert recording.noise["x"] == pytest.approx(0.4e-3)
 
 

@@ -1,4 +1,4 @@
-"""HDF5 files as logs: plain ones, and those of robomimic with a group for each run."""
+"""Tests of HDF5 files as logs: plain files, and robomimic files with a group for each run."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Datasets of LeRobot, versions 2 and 3, as folders of logs."""
+"""Tests of LeRobot datasets, versions 2 and 3, as folders of logs."""
 
 import json
 
@@ -25,7 +25,7 @@ ARM = """<mujoco><compiler autolimits="true"/><worldbody>
 
 
 def frames(episode, count=90):
-    """Rows of an episode, in degrees."""
+    """Return the rows of an episode, in degrees."""
     times = np.arange(count) / RATE
     goal = np.stack([40 * np.sin(2 * times + episode), 30 * np.cos(times + episode)], axis=1)
     seen = np.stack([40 * np.sin(2 * times + episode - 0.1), 30 * np.cos(times - 0.1 + episode)], 1)
@@ -43,7 +43,7 @@ def frames(episode, count=90):
 
 
 def dataset(folder, version, names=JOINTS, count=4):
-    """Four episodes: a file each, or three in one and the fourth in two."""
+    """Write four episodes: one file each, or three in one file and the fourth in two."""
     data = folder / "data" / "chunk-000"
     data.mkdir(parents=True)
     (folder / "meta").mkdir()

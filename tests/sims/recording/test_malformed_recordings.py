@@ -1,5 +1,5 @@
-"""Thousands of spoilt recordings: each gives one clear line or a sound recording; never a
-traceback, never a hang.
+"""Tests of thousands of malformed recordings: each gives one clear message or a valid recording,
+never a traceback or an endless loop.
 """
 
 import csv
@@ -20,7 +20,7 @@ from sims.recording.unit_conversion import compute_unit_scale
 EXAMPLES = 2000
 SETTINGS = settings(
     max_examples=EXAMPLES,
-    deadline=4000,  # milliseconds; a few are usual
+    deadline=4000,  # milliseconds; a few are normal
     derandomize=True,
     database=None,
     suppress_health_check=[
@@ -88,7 +88,7 @@ values = st.recursive(
 
 @st.composite
 def spoilt_tables(draw):
-    """A table with one to three things wrong with it, as bytes."""
+    """Return a table with one to three errors, as bytes."""
     header, rows = list(HEADER), [list(row) for row in ROWS]
     mark, end = ",", "\n"
     for _ in range(draw(st.integers(1, 3))):
@@ -132,7 +132,7 @@ def spoilt_tables(draw):
 
 
 def spoilt_bytes(draw, text):
-    """The text in some encoding, perhaps cut off, perhaps with bytes in it that do not belong."""
+    """Return the text in some encoding, possibly truncated or with wrong bytes."""
     encoding = draw(
         st.sampled_from(
             ["utf-8"] * 8 + ["utf-8-sig", "utf-16", "utf-16-le", "latin-1", "cp1252", "utf-32"]
@@ -157,7 +157,7 @@ def spoilt_bytes(draw, text):
 
 @st.composite
 def spoilt_descriptions(draw):
-    """A description with one to three things wrong with it, as bytes."""
+    """Return a description with one to three errors, as bytes."""
     document = {k: v if isinstance(v, str) else {**v} for k, v in TOML.items()}
     document["channels"] = {k: {**v} for k, v in TOML["channels"].items()}
     document["runs"] = {"2": {**TOML["runs"]["2"]}}
@@ -186,7 +186,7 @@ def spoilt_descriptions(draw):
             document["runs"] = {draw(st.sampled_from(["1", "2", "3", "9", ""])): draw(values)}
     try:
         text = tomli_w.dumps(without_none(document))
-    except (TypeError, ValueError):  # what TOML cannot hold
+    except (TypeError, ValueError):  # values that TOML cannot represent
         text = repr(document)
     return spoilt_bytes(draw, text)
 
@@ -199,12 +199,12 @@ def without_none(value):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    compute_unit_scale("deg", "rad")  # importing pint is not part of anyone's deadline
+    compute_unit_scale("deg", "rad")  # import pint here, outside the deadline of an example
     return tmp_path_factory.mktemp("spoilt")
 
 
 def outcome(folder, table_bytes, description_bytes):
-    """What reading gives: a message, or the recording's data as plain values."""
+    """Read the recording; return the error message, or the data as plain values."""
     (folder / "log.csv").write_bytes(table_bytes)
     (folder / "log.toml").write_bytes(description_bytes)
     try:

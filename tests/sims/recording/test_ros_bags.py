@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and 2 as folders of logs: written by rosbags, read topic by topic."""
+"""Tests of ROS 1 and ROS 2 bags as folders of logs: written by rosbags, read topic by topic."""
 
 import tracemalloc
 from array import array
@@ -33,14 +33,14 @@ def stamped(types, seconds):
 
 
 def messages(types):
-    """Joint states that are stamped, commands of the same joints that are not, and an image."""
+    """Yield joint states with time stamps, commands of the same joints without, and an image."""
     header = types.types["std_msgs/msg/Header"]
     state = types.types["sensor_msgs/msg/JointState"]
     numbers = types.types["std_msgs/msg/Float64MultiArray"]
     layout = types.types["std_msgs/msg/MultiArrayLayout"]
     extra = {} if "seq" not in header.__dataclass_fields__ else {"seq": 0}
     for i, t in enumerate(TIMES):
-        # The second joint comes first, as drivers have it.
+        # The second joint comes first, as in many drivers.
         q = np.array([0.5 * np.sin(0.1 * i), np.cos(0.1 * i)])
         v = np.array([2.5 * np.cos(0.1 * i), -5.0 * np.sin(0.1 * i)])
         head = header(stamp=stamped(types, t), frame_id="", **extra)
@@ -51,7 +51,7 @@ def messages(types):
 
 
 def written(path, storage="mcap"):
-    """A bag: a folder of ROS 2, or a file of ROS 1."""
+    """Write a bag: a folder of ROS 2, or a file of ROS 1."""
     if storage == "bag":
         types, writer = get_typestore(Stores.ROS1_NOETIC), Writer1(path)
     else:
@@ -82,7 +82,7 @@ def test_a_topic_is_a_log(bag):
     assert set(log.list_columns()) == {
         *("time", "position.knee", "position.hip", "velocity.knee", "velocity.hip")
     }
-    # Stamps of the header, not of writing.
+    # Stamps of the header, not of the write time.
     np.testing.assert_allclose(log.get_column("time"), TIMES, atol=5e-7)
     np.testing.assert_allclose(log.get_column("position.hip"), np.cos(0.1 * np.arange(200)))
     np.testing.assert_allclose(log.get_column("velocity.knee"), 2.5 * np.cos(0.1 * np.arange(200)))
@@ -153,13 +153,13 @@ def test_what_is_not_wanted_is_not_kept(tmp_path):
     log = read_log(path, frozenset({"time", "Position.hip"}))
     assert set(log.list_columns()) == {"time", "position.hip"}
     np.testing.assert_allclose(log.get_column("position.hip"), np.cos(0.1 * np.arange(200)))
-    # What is not there is said with all that there is.
+    # The error about an unknown column lists all columns.
     with pytest.raises(InputError, match=r"unknown column 'elbow'; there are: .*velocity\.knee"):
         read_log(path, frozenset({"time", "elbow"})).get_column("elbow")
 
 
 def test_a_topic_stands_in_memory_once(tmp_path):
-    """Columns of messages that come in order are given back as they are taken over."""
+    """Columns of messages in order are returned without a copy."""
     table, rows = ros_bags._Table(), 50_000
     for name in "abcdefgh":
         table.numbers[name] = array("d", bytes(8 * rows))
@@ -175,7 +175,7 @@ def test_a_topic_stands_in_memory_once(tmp_path):
 
 
 def test_a_large_bag_is_read_message_by_message(tmp_path):
-    """40 MB of images beside the joints: what is kept of them is nothing."""
+    """Memory for the 40 MB of images next to the joints is not retained."""
     types = get_typestore(Stores.ROS2_JAZZY)
     image = types.types["sensor_msgs/msg/Image"]
     header = types.types["std_msgs/msg/Header"]

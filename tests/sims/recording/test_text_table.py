@@ -1,5 +1,5 @@
-"""Tables of text of any layout: comments, units, decimal commas, names beside numbers; and faults
-in one line that says the row.
+"""Tests of text tables of any layout: comments, units, decimal commas, names next to numbers, and
+one-line errors with the row.
 """
 
 import re
@@ -112,7 +112,7 @@ def test_numbers_are_called_by_the_names_beside_them_row_by_row(tmp_path):
     log = read(tmp_path, text)
     assert log.get_column("field.position.knee").tolist() == [0.5, 0.75]
     assert log.get_column("field.position.hip").tolist() == [0.25, 0.125]
-    # The numbered columns are there for who asks for them.
+    # The numbered columns are available on request.
     assert "field.position0" not in log.list_columns()
     assert log.get_column("field.position0").tolist() == [0.5, 0.125]
     # One velocity of two has no name.

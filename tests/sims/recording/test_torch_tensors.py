@@ -1,4 +1,6 @@
-"""Tensors of PyTorch files: written by torch, read without it and without unpickling."""
+"""Tests of tensors in PyTorch files: written by torch, read without torch and without
+unpickling.
+"""
 
 import subprocess
 import sys
@@ -86,11 +88,11 @@ def test_what_is_no_archive_is_one_line(tmp_path):
         for place in rng.integers(0, len(data), 3):
             spoilt[place] = rng.integers(0, 256)
         (tmp_path / "bad.pt").write_bytes(bytes(spoilt))
-        # Whatever else is raised fails the test.
+        # Any other exception fails the test.
         with suppress(InputError):
             read_log(tmp_path / "bad.pt")
     with zipfile.ZipFile(tmp_path / "many.pt", "w") as archive:
-        # A list that holds another one a hundred times, and so on: small, and endless if unfolded.
+        # Lists nested a hundred times at each level: a small file that is endless when expanded.
         inner = b"](" + b"K\x01" * 2 + b"e"
         for level in range(1, 12):
             own = bytes([level])

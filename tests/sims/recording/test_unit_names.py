@@ -1,4 +1,4 @@
-"""Units in the names of columns, as spreadsheets and loggers write them."""
+"""Tests of units in column names, as spreadsheets and loggers write them."""
 
 import pytest
 

@@ -3,7 +3,7 @@ import pytest
 
 @pytest.fixture
 def write(tmp_path):
-    """Puts a text into a file and gives its path."""
+    """Return a function that writes a text to a file and returns its path."""
 
     def written(text, name="robot.xml"):
         path = tmp_path / name

@@ -1,4 +1,4 @@
-"""A robot for tests: two links that servos and a motor drive, and its file."""
+"""A robot for tests, and its model file: two links driven by servos and a motor."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ARM = """
 
 
 def robot(folder: Path, text: str = ARM) -> RobotModel:
-    """The robot of an MJCF, whose file is written."""
+    """Write an MJCF text to a file and return its robot."""
     path = folder / "arm.xml"
     path.write_text(text)
     return RobotModel(path, "mjcf", mujoco.MjSpec.from_file(str(path)))

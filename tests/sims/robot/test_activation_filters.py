@@ -1,4 +1,6 @@
-"""Filters before actuators: what their inputs mean, and the motion of plain MuJoCo's own loop."""
+"""Tests of activation filters of actuators: meaning of their inputs, and motion compared with plain
+MuJoCo.
+"""
 
 from pathlib import Path
 
@@ -43,7 +45,7 @@ def simulator(actuator, integrator="implicitfast"):
 
 
 def plain(kind, activation, command=COMMAND):
-    """Angles of MuJoCo's own loop, and the last state."""
+    """Return the angles of a plain MuJoCo loop, and its final data."""
     model = kind.robot.compiled
     data = mujoco.MjData(model)
     data.act[:] = activation
@@ -118,12 +120,12 @@ def test_lanes_of_one_command_keep_their_own_activations():
 
 
 def test_a_dead_zone_of_the_servo_acts_on_the_filtered_set_point():
-    """A dead zone that is wider than any error leaves the velocity gain alone."""
+    """A dead zone wider than any error leaves only the velocity gain."""
     kind = simulator(POSITION)
     wide = simulated(kind, Scenario(TIMES, {}, {"u.m": COMMAND}), fixed={"servo.deadband@m": 50.0})
     damped = simulator(GENERAL.format(dyntype="filterexact", gain=0, bias="0 0 -0.3", more=""))
     expected = simulated(damped, Scenario(TIMES, {}, {"u.m": COMMAND}))
-    # The effect is held over half a step, and the servo is not.
+    # The effect is constant over half a step, the servo is not.
     assert wide == pytest.approx(expected, abs=2e-3)
     assert np.ptp(simulated(kind, Scenario(TIMES, {}, {"u.m": COMMAND}))) > 0.3
 

@@ -1,4 +1,4 @@
-"""Actuators that a recording adds, and the engine's step and integrator."""
+"""Tests of actuators that a recording adds, and of its time step and integrator."""
 
 import pytest
 
@@ -13,7 +13,7 @@ Q, V, U, STATE = 0.3, 0.7, 1.1, 0.25
 
 
 def force(robot, rate=None):
-    """What the added actuator exerts on the joint at Q, V, with the control U, N m."""
+    """Return the force of the added actuator on the joint at Q, V with the control U, N m."""
     import mujoco
 
     model = robot.compiled

@@ -1,4 +1,4 @@
-"""Commands on their ways to several drives, looked at together."""
+"""Tests of computing the applied inputs of several drives together."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Forces of effects as one program: the same numbers as numpy's, or numpy itself."""
+"""Tests of effect forces compiled to one program: numbers equal numpy's, or numpy is used."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def arm(tmp_path):
 
 
 def asked(kind):
-    """Every effect of the library that is asked in every step, at each place that has it."""
+    """Return every effect of the library that is evaluated per step, at each place that has it."""
     placed = (
         one for name in library.list_names() for one in kind.system.placed(library.get_effect(name))
     )
@@ -75,7 +75,7 @@ def test_every_effect_moves_the_robot_as_it_does_without_the_compiler(arm, monke
 
 
 class Plain(Force):
-    """Of a plugin, at a joint."""
+    """An effect at a joint, as a plugin would define it."""
 
     name, noun, says = "plain", "plain push", "it pushes"
     at, needs, source = "joint", "", "none"
@@ -86,7 +86,7 @@ class Plain(Force):
 
 
 class Branching(Plain):
-    """What asks for numbers cannot be traced."""
+    """An effect that branches on numbers, which cannot be traced."""
 
     name = "branching"
 
@@ -95,7 +95,7 @@ class Branching(Plain):
 
 
 class Changing(Plain):
-    """What gives other numbers each time cannot be trusted to be what was traced."""
+    """An effect whose values change with each call, so that its trace cannot be trusted."""
 
     name = "changing"
     asked = 0

@@ -1,4 +1,6 @@
-"""Which models can have contacts: MuJoCo itself is asked, with all shapes put together."""
+"""Tests of detecting models that can have contacts; the reference is MuJoCo with overlapping
+shapes.
+"""
 
 import mujoco
 import numpy as np
@@ -41,7 +43,7 @@ def test_a_model_can_have_contacts_where_mujoco_finds_some(case):
     changes, wanted = CASES[case]
     model = mujoco.MjModel.from_xml_string(MODEL.format(**FREE | changes))
     data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)  # all shapes lie within each other
+    mujoco.mj_forward(model, data)  # all shapes overlap
     assert bool(data.ncon) == wanted
     assert can_collide(model) == wanted
 

@@ -1,5 +1,5 @@
-"""Drives that act on the joint before as well, and drives that share one battery: closed forms,
-where they are, and the file that holds what it can.
+"""Tests of drives that also act on the previous joint, and of drives that share one battery: closed
+forms, places, and the written file.
 """
 
 from pathlib import Path
@@ -57,7 +57,7 @@ def held(u):
 
 
 def test_a_coupled_motor_pushes_both_joints_by_its_gear():
-    """p'' = c U / (m + M), q'' = U / m, whatever limits U; and so both drives say."""
+    """p'' = c U / (m + M) and q'' = U / m, with U limited; the reported torques agree."""
     observe = (*BOTH, "tau.along", "tau.across")
     for u, force in ((0.5, 1.0), (9.0, 6.0)):
         seen = moved(table(MOTOR), ["joint.coupling@across"], [C], held(u), observe)
@@ -69,7 +69,7 @@ def test_a_coupled_motor_pushes_both_joints_by_its_gear():
 
 @pytest.mark.parametrize(("integrator", "close"), [("RK4", 1e-9), ("implicitfast", 1e-3)])
 def test_a_coupled_servo_follows_the_sum_that_its_shaft_turns(integrator, close):
-    """l = q + c p swings as a mass of 1 / (1 / m + c^2 / (m + M)) does on kp and kv."""
+    """l = q + c p moves like a mass of 1 / (1 / m + c^2 / (m + M)) with kp and kv."""
     observe = (*BOTH, "tau.along", "tau.across")
     kind = table(SERVO, integrator)
     seen = moved(kind, ["joint.coupling@across"], [C], held(0.1), observe)
@@ -87,7 +87,7 @@ def test_a_coupled_servo_follows_the_sum_that_its_shaft_turns(integrator, close)
 
 
 def test_a_coupled_servo_keeps_the_command_range_that_it_inherits_from_its_joint():
-    """A tendon has no range to inherit: MuJoCo refuses to compile the actuator as it stands."""
+    """A tendon has no range to inherit: MuJoCo does not compile the actuator unchanged."""
     inherits = SERVO.replace("/>", ' inheritrange="0.5"/>')
     text = TABLE.format(actuator=inherits, integrator="RK4")
     text = text.replace('name="across"', 'name="across" range="-0.2 0.2"')
@@ -100,7 +100,7 @@ def test_a_coupled_servo_keeps_the_command_range_that_it_inherits_from_its_joint
 
 
 def test_what_drives_say_between_samples_is_theirs_at_both_joints():
-    """A command on its way up: each torque is that of the command of the instant."""
+    """Each reported torque is that of the command at its sample time."""
     times = np.arange(50) / 100.0
     run = Scenario(times, {}, {"u.m": np.sin(20.0 * times)})
     seen = moved(table(MOTOR), ["joint.coupling@across"], [C], run, ("tau.along", "tau.across"))
@@ -125,7 +125,7 @@ def test_it_is_at_driven_joints_behind_one_of_their_kind():
 
 @pytest.mark.parametrize("u", [(4.0, 1.0), (-4.0, 1.0), (40.0, -20.0)])
 def test_one_battery_gives_each_drive_what_all_together_leave(u):
-    """F_i = U_i (1 - c (|F_1| + |F_2|)), and the sum never reaches 1 / c."""
+    """F_i = U_i (1 - c (|F_1| + |F_2|)), and the sum stays below 1 / c."""
     kind, c = table(MOTOR.replace('forcerange="-3 3"', "") + ALONG), 0.1
     first, second = (np.full(TIMES.size, one) for one in u)
     run = Scenario(TIMES, {}, {"u.m": first, "u.n": second})
@@ -170,7 +170,7 @@ def test_a_file_holds_a_tendon_and_moves_as_the_simulator_does(names, tmp_path):
     assert model.wrap_prm.tolist() == [1.0, -0.3]
     times = np.arange(200) * 0.001
     command = 0.8 * np.sin(9.0 * times)
-    # As a user steps it: each control is held from one step to the next.
+    # As a user steps the file: each control is constant over a step.
     data, path = mujoco.MjData(model), []
     for u in command:
         path.append([data.joint(name).qpos[0] for name in ("shoulder", "elbow", "spin")])
@@ -188,7 +188,7 @@ def test_a_file_holds_a_tendon_and_moves_as_the_simulator_does(names, tmp_path):
 
 
 def test_a_constant_force_is_no_bias_of_a_drive_that_is_coupled(tmp_path):
-    """It would push the joint before as well, so the file says that it cannot hold it."""
+    """It would also push the previous joint, so the file reports that it cannot represent it."""
     text = ARM.replace('stiffness="0.5"\n               springref="10"', "")
     text = text.replace('forcelimited="true" forcerange="-1 4"', "")
     robot = arm(tmp_path, text)

@@ -1,4 +1,4 @@
-"""Actuators that are switched off exert nothing: the motion is that of MuJoCo without them."""
+"""Tests that disabled actuators exert no force: the motion is that of MuJoCo without them."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def simulator(kind="position", integrator="implicitfast"):
 
 
 def plain(kind, off=OFF, friction=0.0):
-    """Angles of MuJoCo's own loop, with gain and bias of zero while the drive is off."""
+    """Return the angles of a plain MuJoCo loop, with zero gain and bias while the drive is off."""
     model = mujoco.MjSpec.from_string(kind.robot.spec.to_xml()).compile()
     gain, bias = model.actuator_gainprm[0].copy(), model.actuator_biasprm[0].copy()
     model.dof_frictionloss[0] = friction
@@ -94,12 +94,12 @@ def test_lanes_of_runs_switch_at_their_own_times_and_forget_it_afterwards():
 
 def test_effects_that_are_asked_in_every_step_see_the_drive_off():
     kind = simulator()
-    # A dead zone takes the proportional part away where there is one, and nothing where the
+    # A dead zone removes the proportional part of an active drive, and changes nothing while the
     # drive is off.
     wide = simulated(kind, off=np.ones_like(OFF), **{"servo.deadband@m": 50.0})
     expected, _ = plain(kind, off=np.ones_like(OFF))
     assert wide == pytest.approx(expected, abs=1e-9)
-    # Friction that is asked for is small enough to be none.
+    # The friction is evaluated per step, and too small to change the motion.
     almost = simulated(kind, **{"friction.load@shoulder": 1e-12})
     assert almost == pytest.approx(plain(kind)[0], abs=1e-6)
 

@@ -1,4 +1,4 @@
-"""Effects at places: names, units and ranges; scales of joints; what an effect sees of one joint;
+"""Tests of effects at places: names, units and ranges; scales of joints; the state of one joint;
 readings between steps.
 """
 
@@ -54,7 +54,7 @@ def arm():
 
 
 def numbers(effect):
-    """Units, ranges and least values of its coefficients."""
+    """Return names, units, ranges and minimum values of the effect's coefficients."""
     return [(c.name, c.units[0], c.plausible[0], c.least) for c in effect.coefficients]
 
 
@@ -161,7 +161,7 @@ def test_what_is_free_is_no_cause(word, names):
     assert [p.name for p in kind.parameters] == names
     there = effects.list_effects_for(kind.system)
     assert not there.keys() & {*names, f"{names[0].partition('@')[0]}@*"}
-    # Though a file may name it: the extended simulator of one where it was not free.
+    # A file may still name it: the extended simulator of a log for which it was not free.
     assert kind.system.effect(names[0]).name == names[0]
 
 
@@ -176,7 +176,7 @@ def test_a_family_contains_its_members_and_what_they_contain(arm):
 
 def test_scales_are_what_gravity_pulls_with_and_what_turns(rail):
     sizes = compute_joint_scales(rail.robot)
-    # At the joint alone: the cart with the pole on it, the pole about its hinge.
+    # For each joint alone: the cart with the pole on it, the pole about its hinge.
     np.testing.assert_allclose(sizes.inertia, [3.4, 0.01 + 0.01 + 0.4 * 0.5**2], rtol=1e-9)
     weight = 0.4 * 9.81 * 0.5
     assert 0.9 * weight < sizes.force[1] <= weight
@@ -209,7 +209,9 @@ def test_a_force_at_a_joint_pushes_that_joint(rail):
 
 
 def test_a_force_of_time_is_that_of_the_middle_of_each_step(rail):
-    """Each lane its own, along its joint, and nothing where it does not act."""
+    """The force is separate for each batch element, acts along its joint only, and is zero
+    elsewhere.
+    """
     shake, bias = rail.effect("force.periodic@hinge")(), rail.effect("force.bias@rail")()
     shaken = np.array([[0.0, 0.3], [0.0, 0.0], [0.0, 2.0]])[:, :, None]
     pushed = np.array([[4.0, 0.0]])[:, :, None]

@@ -1,4 +1,6 @@
-"""extended.toml of a robot: it names its model file, and loads back as the very simulator."""
+"""Tests of extended.toml for a robot: it names its model file, and loads as the identical
+simulator.
+"""
 
 import re
 from dataclasses import replace
@@ -54,7 +56,7 @@ NUMERICS = IntegratorSettings(0.0005, "RK4")
 
 @pytest.fixture
 def kind(tmp_path):
-    """The arm with a servo more, stepped more finely, its damping and a mass free."""
+    """Return the arm with an additional servo, a smaller step, and free damping and mass."""
     path = tmp_path / "robots" / "arm.xml"
     path.parent.mkdir()
     path.write_text(ARM)
@@ -178,7 +180,7 @@ def test_a_malformed_file_is_one_line(path, old, new, message):
 
 
 def test_it_conforms_as_a_plugin_does(model, path):
-    # In the checks' scenario nothing is commanded that could come later.
+    # Effects on inputs are left out: the scenario of the checks has no commands.
     shown = {name: own for name, own in EFFECTS.items() if not name.startswith("input.")}
     quick = replace(model.robot, numerics={"timestep": 0.005})
     write_extended(replace(model, effects=shown, robot=quick), path)
@@ -189,7 +191,7 @@ def test_it_conforms_as_a_plugin_does(model, path):
 
 
 def test_a_step_that_was_found_is_kept(model, path, kind, tmp_path):
-    """As explain hands it over: the robot is the file's, the step another."""
+    """As explain passes it: the robot reference is that of the file, only the time step differs."""
     finer = IntegratorSettings(0.002, "implicitfast")
     found = kind.with_integrator_settings(finer)
     fitted = replace(model, engine="mujoco", kind=found, robot=get_robot_reference(found))
@@ -225,7 +227,7 @@ def test_a_file_of_any_name_gives_one_that_registers(system, name):
 
 
 def recorded(folder, simulator, theta, name="log"):
-    """A recording of the arm, and its description."""
+    """Write a recording of the arm and its description."""
     seen = simulator.simulate(theta, SCENARIO)[0]
     names = [c.name for c in simulator.channels]
     inputs = list(SCENARIO.inputs)

@@ -1,5 +1,5 @@
-"""Bodies that float or turn on balls: where runs begin with them, and how they carry what is small
-away.
+"""Tests of bodies with free or ball joints: initial states of runs, and linearisation of their
+motion.
 """
 
 import numpy as np
@@ -86,7 +86,9 @@ def test_the_tangent_goes_through_what_floats(name):
 
 
 def test_a_run_begins_as_the_recording_states_it():
-    """No moment acts: the spin of a rigid body turns its pose by itself, and momentum is kept."""
+    """Without external torque the pose of a spinning rigid body changes, and its momentum is
+    conserved.
+    """
     simulator, scenario = moving(SATELLITE, "q.boom", "u.m_boom", SPUN)
     here = simulator.simulate(np.zeros((1, len(simulator.parameters))), scenario)[0, :, 0]
     at_rest = Scenario(TIMES, {}, scenario.inputs)
@@ -104,7 +106,7 @@ def test_a_free_body_that_a_sensor_shows_keeps_the_spin_it_was_given():
     begins = {"qd.base.wx": 0.4, "qd.base.wz": -0.3, "q.base.qw": 0.8, "q.base.qy": 0.6}
     seen = simulator.simulate(np.zeros((1, 0)), Scenario(TIMES, begins, {}))[0]
     first = Rotation.from_quat([0.0, 0.6, 0.0, 0.8])
-    # a heavy ball turns evenly about its spin, which is stated in its own axes
+    # a heavy ball turns uniformly about its spin, which is given in body axes
     turned = first * Rotation.from_rotvec(TIMES[:, None] * np.array([0.4, 0.0, -0.3]))
     apart = turned.inv() * Rotation.from_quat(seen[:, [1, 2, 3, 0]])
     assert apart.magnitude().max() < 2e-4

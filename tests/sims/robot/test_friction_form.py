@@ -1,4 +1,6 @@
-"""Dry friction in MuJoCo's soft form: effects move a robot as plain MuJoCo moves its file."""
+"""Tests of dry friction in MuJoCo's soft form: effects give the motion of MuJoCo with the same
+file.
+"""
 
 from pathlib import Path
 
@@ -58,7 +60,7 @@ def scenario():
 
 
 def plain(text):
-    """Positions (STEPS + 1, 2) by `mj_step`, of a model file."""
+    """Return the positions (STEPS + 1, 2) of a model file with `mj_step`."""
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     data.qpos[:] = START
@@ -71,14 +73,14 @@ def plain(text):
 
 
 def off(seen, true):
-    """RMS error as a share of the true change."""
+    """Return the RMS error as a fraction of the true change."""
     return np.sqrt(np.square(seen - true).sum() / np.square(true).sum())
 
 
 @pytest.mark.parametrize("integrator", INTEGRATOR_IDS)
 @pytest.mark.parametrize("stated", ["", 'solreffriction="0.05 1" solimpfriction="0.8 0.9 0.001"'])
 def test_soft_friction_is_that_of_the_file_with_the_same_frictionloss(tmp_path, integrator, stated):
-    """A native effect, and one whose limit is asked for in every step."""
+    """The motion agrees for a model-field effect and for an effect evaluated per step."""
     native = simulator(tmp_path, integrator, stated, effects=["friction.coulomb@elbow"])
     seen = native.simulate(np.array([[0.06]]), scenario())[0]
     wanted = plain(ARM.format(integrator=integrator, elbow=f'frictionloss="0.06" {stated}'))
@@ -93,7 +95,7 @@ def test_soft_friction_is_that_of_the_file_with_the_same_frictionloss(tmp_path, 
 
 
 def test_friction_damping_is_that_of_the_constraint(tmp_path):
-    """MuJoCo's own reference acceleration of a constraint for friction loss is -b v."""
+    """MuJoCo's reference acceleration of a friction loss constraint is -b v."""
     for stated in ("", 'solreffriction="0.001 1"', 'solreffriction="-3 -70"',
                    'solimpfriction="0.7 0.9 0"',
                    'solimpfriction="1 1 0.001"'):  # fmt: skip
@@ -125,7 +127,7 @@ def test_the_tangent_of_soft_friction_is_what_a_small_change_makes(tmp_path, int
 
 
 def test_each_form_has_a_tangent_of_its_own(tmp_path):
-    """The tangent of stiff friction does not follow soft friction, which reverses earlier."""
+    """The tangent of stiff friction does not fit soft friction, which reverses earlier."""
     small = np.array([0.002])
     seen, true = {}, {}
     for form in ("soft", "stiff"):
@@ -142,7 +144,7 @@ def test_each_form_has_a_tangent_of_its_own(tmp_path):
 
 @pytest.fixture
 def extended(tmp_path):
-    """An extended simulator with soft friction at the elbow."""
+    """Return an extended simulator with soft friction at the elbow."""
     kind = type(simulator(tmp_path))
     effects = {"friction.coulomb@elbow": {"coefficient": FittedValue(0.06, "N*m", 0.059, 0.061)}}
     observe = ["q.shoulder", "q.elbow"]

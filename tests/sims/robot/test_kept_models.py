@@ -1,4 +1,6 @@
-"""What is remembered of a robot goes with it: a process that explains many logs does not grow."""
+"""Tests that cached data of a robot are freed with it: explaining many logs does not increase
+memory.
+"""
 
 import gc
 import weakref
@@ -20,8 +22,10 @@ EFFECTS = ["friction.coulomb@shoulder", "drag.quadratic@elbow", "joint.flexibili
 
 
 def used(path):
-    """The class of a robot's file that was simulated with effects that are asked in every step,
-    with one in series with a joint, and with all places looked for; nothing else holds it.
+    """Return weak references to the simulator class of a file and its robot, after use.
+
+    The simulation had effects evaluated per step and one in series with a joint, and all places
+    were searched.
     """
     kind = make_robot_simulator(path)
     made = kind(effects=[*EFFECTS, "joint.coupling@elbow"])
@@ -61,7 +65,7 @@ def test_a_robot_is_asked_once_of_the_same(tmp_path, counted, asked):
 
 
 def robots():
-    """Systems of robots' files that are held now."""
+    """Return the number of robot systems in memory."""
     gc.collect()
     return len(RobotSystem.__subclasses__())
 
@@ -69,7 +73,7 @@ def robots():
 @pytest.mark.slow
 def test_what_was_explained_is_gone():
     before = robots()
-    # Long enough that places were searched and causes refitted.
+    # The budget is long enough to search places and refit causes.
     cut = simgap.explain(EXAMPLE / "log.csv", budget=2.0).answer.cut
     assert cut is not None
     assert robots() == before

@@ -1,4 +1,6 @@
-"""Forces that are asked for in every step act as in its middle: to second order in the step."""
+"""Tests that forces evaluated per step act at its midpoint: the error is of second order in the
+step.
+"""
 
 import numpy as np
 import pytest
@@ -24,7 +26,9 @@ PENDULUM = f"""
 TIMES = np.arange(0, 0.6, 0.02)
 BEGINS = {"q.hinge": 0.2, "qd.hinge": 1.0}
 COMMANDS = 2.5 + np.where(np.arange(TIMES.size) % 2, 0.8, -0.8)
-"""They jump with every sample, and never let it turn round: at a standstill no order is left."""
+"""Commands that jump at every sample without reversing the motion, since a standstill lowers the
+order.
+"""
 EFFECTS = {
     "friction.load@hinge": (0.2,),
     "friction.position@hinge": (0.1, 0.15, -0.1, 0.7),
@@ -33,7 +37,7 @@ EFFECTS = {
 
 
 def limit(name, c, t, q, v, u):
-    """Each of them as its source has it."""
+    """Return the friction limit of the effect, as its source states it."""
     if name.startswith("friction.load"):
         return c[0] * abs(u + MASS * 9.81 * LENGTH * np.sin(q))
     if name.startswith("friction.position"):
@@ -43,7 +47,7 @@ def limit(name, c, t, q, v, u):
 
 
 def exact(name, c):
-    """Angles at `TIMES`, by an ODE solver from command to command."""
+    """Return the angles at `TIMES`, from an ODE solver restarted at every command."""
 
     def rate(t, y, u):
         q, v = y
@@ -60,7 +64,7 @@ def exact(name, c):
 
 
 def off(name, c, step):
-    """Largest difference of the simulated angle, rad."""
+    """Return the largest error of the simulated angle, rad."""
     kind = kind_of(PENDULUM.replace("STEP", str(step)))
     simulator = kind(observe=["q.hinge"], effects=[kind.system.effect(name)])
     given = {c.name: np.zeros(TIMES.size) for c in simulator.inputs}
@@ -73,13 +77,13 @@ def off(name, c, step):
 @pytest.mark.parametrize("name", EFFECTS)
 def test_half_the_step_makes_a_quarter_of_the_error(name):
     coarse, fine = (off(name, EFFECTS[name], step) for step in (0.004, 0.002))
-    # Of first order it would be a half; nothing is left where the motion is followed exactly.
+    # First order would give one half; the error is near zero where the motion is followed exactly.
     assert fine < 0.3 * coarse
     assert coarse < 3e-4
 
 
 def test_what_a_drive_carries_in_the_middle_of_steps_knows_jumps_from_growth():
-    # end of step k: command plus what has grown by 2 a step
+    # end of step k: the command plus an increase of 2 per step
     commands = np.array([0.0, 0.0, 5.0, 5.0, 5.0])[:, None]
     ended = np.stack([commands + 2.0 * np.arange(1.0, 6.0)[:, None]] * 2)
     expected = commands + 2.0 * (np.arange(5.0)[:, None] + 0.5)

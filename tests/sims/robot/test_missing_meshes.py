@@ -1,4 +1,6 @@
-"""A candidate whose model MuJoCo does not compile is left out and named; the rest goes on."""
+"""Tests of candidates whose model MuJoCo does not compile: they are left out and named, and the
+search continues.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from tests.sims.robot.sample_arms import ARM
 TAKEN = ARM.replace('name="spin"', 'name="elbow_flexibility"').replace(
     'joint="spin"', 'joint="elbow_flexibility"'
 )
-"""An arm that has a joint already of the name that a candidate's second joint gets."""
+"""An arm in which the name for the second joint of a candidate already exists."""
 WHY = "MuJoCo does not compile the model with it: repeated name 'elbow_flexibility' in joint"
 
 
@@ -58,7 +60,7 @@ def test_a_broken_effect_of_a_user_is_left_out_alone(tmp_path, fresh_registries)
 def test_lanes_of_a_model_that_does_not_compile_are_nan_and_the_others_are_simulated(
     kind, capsys, monkeypatch
 ):
-    # As if it had passed: several elements in series compile or not together.
+    # The single check is disabled, since combinations of elements in series may fail to compile.
     monkeypatch.setattr(kind.system, "_compiles", lambda _: True)
     names = ["joint.flexibility@elbow", "drag.linear@shoulder"]
     simulator = kind(observe=["q.elbow"], effects=names)

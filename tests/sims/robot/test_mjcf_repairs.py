@@ -1,4 +1,4 @@
-"""What is mended in an MJCF, and where it takes what it includes from."""
+"""Tests of the automatic repairs of an MJCF, and of the folder of its included files."""
 
 import pytest
 

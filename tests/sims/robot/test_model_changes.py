@@ -1,4 +1,4 @@
-"""What causes make of a model: the numbers of native effects, and of commands."""
+"""Tests of causes applied to a model: numbers of model-field effects and of commands."""
 
 from pathlib import Path
 
@@ -16,23 +16,23 @@ from tests.sims.robot.test_model_field_effects import STATED
 
 
 def number(value: float, unit: str = "1") -> FittedValue:
-    """With an interval of a tenth to either side."""
+    """Return a fitted value with an interval of 10 % to either side."""
     return FittedValue(value, unit, 0.9 * value, 1.1 * value)
 
 
 def one(value: float) -> dict[str, FittedValue]:
-    """The numbers of an effect with one coefficient."""
+    """Return the numbers of an effect with one coefficient."""
     return {"coefficient": number(value)}
 
 
-# A coupling is an element of its own: `test_coupled` reads its number in the file.
+# A coupling adds an element of its own, which `test_coupled_drives` tests.
 @pytest.mark.parametrize(
     ("effect", "place", "c"), [one for one in STATED if one[0] != COUPLING_PLACEHOLDER[1]]
 )
 def test_a_cause_is_what_it_is_in_a_lane(
     effect: str, place: str, c: tuple[float, ...], tmp_path: Path
 ) -> None:
-    """The compiled model of a cause has the fields that a lane with it has."""
+    """The compiled model of a cause has the same fields as a batch element with the effect."""
     arm = robot(tmp_path)
     names = ("coefficient",) if len(c) == 1 else "xyz"
     numbers = {name: number(value) for name, value in zip(names, c, strict=False)}
@@ -58,7 +58,7 @@ DRIVEN = ARM.replace('name="m_elbow"', 'name="m_elbow" ctrllimited="true" ctrlra
 
 @pytest.mark.parametrize("control", [-2.5, -0.4, 0.3, 0.9, 4.0])
 def test_a_command_passes_gain_bias_and_limit(control: float, tmp_path: Path) -> None:
-    """The force is that of the command with its errors, within the control's range."""
+    """The force is that of the erroneous command, within the control range."""
     arm = robot(tmp_path, DRIVEN)
     causes = {
         "input.saturation@m_elbow": one(1.2),
@@ -72,7 +72,7 @@ def test_a_command_passes_gain_bias_and_limit(control: float, tmp_path: Path) ->
 
 @pytest.mark.parametrize("place", ["m_shoulder", "m_spin"])
 def test_a_servo_is_given_another_set_point(place: str, tmp_path: Path) -> None:
-    """A gain and a bias of the set point leave the servo's own gains."""
+    """A gain and a bias of the set point keep the servo's own gains."""
     arm = robot(tmp_path)
     causes = {
         f"input.bias@{place}": one(0.05),
@@ -121,7 +121,7 @@ def test_a_constant_force_is_a_spring_or_a_bias(place: str, force: float, tmp_pa
     ],
 )
 def test_what_a_file_cannot_say_is_said(name: str, why: str, tmp_path: Path) -> None:
-    """One line each, with the number, and the model as it was."""
+    """One line each with the number; the model is unchanged."""
     arm = robot(tmp_path)
     applied = apply_causes(arm, {name: one(-2.0)}, "log.csv")
     assert applied.held == ()
@@ -143,7 +143,7 @@ MOVING = """
 
 
 def test_what_a_mass_would_move_along_stays(tmp_path: Path) -> None:
-    """Gains and dampings that the compiler derives from masses stay what they were."""
+    """Gains and dampings that the compiler derives from masses keep their values."""
     arm = robot(tmp_path, MOVING)
     model, before = apply_causes(arm, {"mass.scale@b": one(0.2)}).model, arm.compiled
     np.testing.assert_allclose(model.body_mass, before.body_mass * [1.0, 1.0, 1.2], rtol=1e-12)
@@ -152,7 +152,7 @@ def test_what_a_mass_would_move_along_stays(tmp_path: Path) -> None:
 
 
 def test_the_robot_stays_as_it_is(tmp_path: Path) -> None:
-    """What was read is not changed by what is made of it."""
+    """Applying causes does not change the robot that was read."""
     arm = robot(tmp_path)
     before = arm.spec.to_xml()
     apply_causes(arm, {"mass.scale@fore": one(0.2), "drag.linear@elbow": one(0.1)})
@@ -160,7 +160,7 @@ def test_the_robot_stays_as_it_is(tmp_path: Path) -> None:
 
 
 def test_numerics_are_options(tmp_path: Path) -> None:
-    """The step and the integrator that mend a model stand in its options."""
+    """The step and the integrator that repair a model are in its options."""
     causes = {"numerics.step": {"coefficient": number(5e-4, "s")}, "numerics.integrator": one(1.0)}
     model = apply_causes(robot(tmp_path), causes).model
     assert model.opt.timestep == 5e-4

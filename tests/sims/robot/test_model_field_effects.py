@@ -1,4 +1,6 @@
-"""Effects that are written into model fields: lane by lane, the motion of a file that states it."""
+"""Tests of effects written into model fields: each batch element moves as a file with the same
+values.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -58,13 +60,13 @@ STATED = {
         TENDON + DRIVES.replace('joint="elbow"', 'tendon="t"'),
     ),
 }
-"""By effect, place and coefficients: what stands in the file, and what says the same."""
+"""By effect, place and coefficients: text in the file, and its equivalent replacement."""
 
 CONTROL = (0.7, 1.8, 6.0)
 
 
 def lanes(robot: RobotModel, effect: str, place: str, c: tuple[float, ...]) -> Any:
-    """(2, nq) positions after 0.4 s: a lane without the effect, one with it."""
+    """Return (2, nq) positions after 0.4 s: an element without the effect, and one with it."""
     of = model_field_effects.MODEL_FIELD_EFFECTS[effect]
     if effect == COUPLING_PLACEHOLDER[1]:
         robot = add_series_joints(robot, (COUPLING_PLACEHOLDER,))
@@ -77,7 +79,7 @@ def lanes(robot: RobotModel, effect: str, place: str, c: tuple[float, ...]) -> A
 
 
 def moved(batch: Batch) -> Any:
-    """Where it is after 0.4 s of motion."""
+    """Return the positions after 0.4 s of motion."""
     batch.bind("qpos")[:] = (0.3, -0.5, 0.1)
     batch.bind("ctrl")[:] = CONTROL
     batch.step(nstep=400)
@@ -88,8 +90,8 @@ def moved(batch: Batch) -> Any:
 def test_a_lane_moves_as_the_file_that_states_it(
     effect: str, place: str, c: tuple[float, ...], tmp_path: Path
 ) -> None:
-    """A lane with a coefficient moves as a model whose file says so; the lane beside it is still
-    what the file says.
+    """An element with a coefficient moves as a model whose file has the value; the element next to
+    it still moves as the original file.
     """
     arm = robot(tmp_path)
     found = lanes(arm, effect, place, c)
@@ -103,8 +105,8 @@ def test_a_lane_moves_as_the_file_that_states_it(
 
 
 def test_friction_is_stiff_in_the_lanes_where_it_acts_alone(tmp_path: Path) -> None:
-    """Where the file states friction, a lane with a coefficient of zero is what the file says,
-    though another lane has more of it.
+    """With friction in the file, an element with a zero coefficient moves as the file, although
+    another element has more friction.
     """
     arm = robot(tmp_path)
     found = lanes(arm, "friction.coulomb", "elbow", (1e-9,))
@@ -117,12 +119,12 @@ def test_friction_is_stiff_in_the_lanes_where_it_acts_alone(tmp_path: Path) -> N
 
 
 def test_every_native_effect_is_compared() -> None:
-    """None is left out of the table above."""
+    """The table above contains every model-field effect."""
     assert {effect for effect, _, _ in STATED} == set(model_field_effects.MODEL_FIELD_EFFECTS)
 
 
 def test_no_mass_becomes_negative(tmp_path: Path) -> None:
-    """However large the coefficient, something is left."""
+    """A coefficient of -3 leaves a positive mass."""
     arm = robot(tmp_path)
     fields = {name: np.array(getattr(arm.compiled, name))[None] for name in ("body_mass",)}
     fields["body_inertia"] = np.array(arm.compiled.body_inertia)[None]

@@ -1,4 +1,4 @@
-"""Each coefficient of a robot stands beside the number that its model file then has."""
+"""Tests of the resulting model file value given for each coefficient of a robot."""
 
 import mujoco
 import numpy as np
@@ -32,7 +32,7 @@ def system(tmp_path_factory):
     ("effect", "values", "expected"),
     [
         ("friction.coulomb@lift", [-0.05], [(0.2, 0.15, "N")]),
-        # No total is negative, whatever a coefficient says.
+        # No total is negative, whatever the coefficient.
         ("friction.coulomb@lift", [-0.5], [(0.2, 0.0, "N")]),
         ("drag.linear@elbow", [0.2], [(0.1, 0.3, "N*m*s/rad")]),
         ("drag.quadratic@elbow", [0.01], [(0.02, 0.03, "N*m*s^2/rad^2")]),
@@ -76,6 +76,6 @@ def test_the_total_is_what_the_extended_file_compiles_to(system):
     model = apply_causes(system.robot, causes).model
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "fore")
     assert np.isclose(model.body_mass[number], mass.total)
-    # A larger mass has a larger inertia: the file states what both make of it.
+    # A larger mass has a larger inertia: the file states the result of both.
     assert np.isclose(model.body_inertia[number].max(), inertia.total)
     assert np.isclose(inertia.total, 0.009 * 1.25 * 0.7)

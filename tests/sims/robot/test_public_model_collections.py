@@ -1,5 +1,5 @@
-"""Model files that others ship: all that PyBullet ships, some of gymnasium's and of
-example-robot-data's, the SO-101's.
+"""Tests with public model files: all of PyBullet, some of gymnasium and example-robot-data, and the
+SO-101.
 """
 
 import importlib.util
@@ -17,7 +17,7 @@ from sims.robot.parsing.read_model_file import read_robot
 
 ENDINGS = (".urdf", ".xml", ".mjcf")
 ROBOTS = Path(__file__).parents[4] / "shared" / "robots"
-"""Where robots with their logs lie on machines that have them."""
+"""Folder of robots with their logs, on machines that have it."""
 
 REFUSED = {
     "none of its N joints moves": 1051,
@@ -33,8 +33,8 @@ REFUSED = {
     "material 'geom' not found": 1,
     "Schema violation": 1,
 }
-"""How many of PyBullet's 3.2.7 are refused, by how the cause begins: single links without a joint;
-MJCFs of 2014 and numbers that nobody reads.
+"""Numbers of refused files of PyBullet 3.2.7, by the start of the reason: single links without a
+joint, MJCFs of 2014, and values that cannot be read.
 """
 
 
@@ -89,7 +89,7 @@ def test_gymnasiums(name, joints, mass, actuators):
 
 
 def described(name):
-    """A file of example-robot-data."""
+    """Read a file of example-robot-data."""
     folder = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix/share/example-robot-data/robots"
     if not (folder / name).is_file():
         pytest.skip(f"example-robot-data is not installed: no {name}")

@@ -1,4 +1,4 @@
-"""Model files read: what they state, plainly."""
+"""Tests of reading model files: the values they state."""
 
 import pytest
 
@@ -62,7 +62,9 @@ def test_an_mjcf_is_read_as_it_stands(write):
 
 
 def test_a_urdf_is_read_with_its_fixed_links_in_what_carries_them(write):
-    robot = read_robot(write(SWING, "swing.xml"))  # told apart by what is in it
+    robot = read_robot(
+        write(SWING, "swing.xml")
+    )  # the content determines the format, not the file name
     assert robot.format == "urdf"
     assert robot.aliases == {"base": "world", "plate": "rod", "bob": "rod"}
     (body,) = robot.bodies
@@ -73,7 +75,7 @@ def test_a_urdf_is_read_with_its_fixed_links_in_what_carries_them(write):
     model = robot.compiled
     assert model.dof_damping[0] == 0.3
     assert model.dof_frictionloss[0] == 0.05
-    # About the pivot: the rod's own and its lever of 0.5 m, the bob's and its lever of 1 m.
+    # About the pivot: the rod's inertia and lever of 0.5 m, the bob's inertia and lever of 1 m.
     inertia = 0.3 + 2 * 0.5**2 + 0.1 + 1 * 1**2
     assert model.dof_invweight0[0] == pytest.approx(1 / inertia)
     assert robot.actuators == ()

@@ -1,4 +1,6 @@
-"""The model that is simulated lacks what does not move it, and moves alike to the last bit."""
+"""Tests of the simulated model without elements that do not affect the motion: it moves
+bit-identically.
+"""
 
 import multiprocessing
 import resource
@@ -21,7 +23,7 @@ from tests.sims.robot.test_public_model_collections import described
 
 
 def bumps(count, seed):
-    """Vertices of a stone, and triangles whose hull has other ones."""
+    """Return the vertices of a stone, as text; some of them are not on its convex hull."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3))
     points *= (rng.uniform(0.05, 0.08, count) / np.linalg.norm(points, axis=1))[:, None]
@@ -64,7 +66,7 @@ def stones(tmp_path):
 
 
 def moved(robot, derived=False, series=()):
-    """Motion of eight lanes that begin anywhere, driven by noise."""
+    """Return the motion of eight batch elements from random states, driven by noise."""
     robot = add_series_joints(robot, series) if series else robot
     bench = MujocoBatch(robot, derived, read_integrator_settings(robot).to_model_options(), 8)
     rng = np.random.default_rng(1)
@@ -142,7 +144,7 @@ def test_without_shapes_a_robot_has_no_geom_left(stones):
 
 
 def resident():
-    """MB of memory of this process."""
+    """Return the resident memory of this process, MB."""
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * resource.getpagesize() / 2**20
 
@@ -163,7 +165,7 @@ def hold_candidates():
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_candidates_of_a_robot_with_large_meshes_take_little_memory():
-    """In a process of its own: memory that other tests have freed would not be asked for again."""
+    """The test needs a separate process, because memory freed by other tests would be reused."""
     described("so_arm_description/urdf/so101.urdf")
     process = multiprocessing.get_context("spawn").Process(target=hold_candidates)
     process.start()

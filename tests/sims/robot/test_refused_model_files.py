@@ -1,5 +1,5 @@
-"""What cannot be read is refused in one line, which names file, place and cause; nothing is printed
-and nothing is written.
+"""Tests of refused model files: one line names file, place and cause; nothing is printed or
+written.
 """
 
 import os

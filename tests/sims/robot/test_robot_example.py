@@ -1,4 +1,6 @@
-"""examples/robot: an arm by equations of its own, and the model that lacks its friction."""
+"""Tests of examples/robot: an arm with its own equations of motion, and a model without its
+friction.
+"""
 
 import csv
 import io
@@ -18,7 +20,7 @@ EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "robot"
 
 
 def rolled(model, initial, torques, rate):
-    """Positions (T, joints) by MuJoCo, each torque held to the next sample."""
+    """Return positions (T, joints) from MuJoCo, with each torque constant until the next sample."""
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = initial[:2], initial[2:]
     positions = [data.qpos.copy()]
@@ -47,7 +49,7 @@ def test_without_friction_it_moves_as_mujoco_moves_the_model(step, tolerance):
 
 
 def test_its_elbow_stops_where_dry_friction_stops_it():
-    """With the shoulder as good as held and no weight: a parabola, then rest."""
+    """With a practically fixed shoulder and no gravity: a parabola, then rest."""
     friction, speed = 0.03, 0.5
     arm = make_log.Arm(armature=(1e9, 0.005), damping=(0, 0), gravity=0.0, friction=friction)
     inertia = 0.009 + 0.8 * 0.15**2 + 0.005
@@ -65,7 +67,9 @@ def test_its_elbow_sticks_until_it_is_pushed_harder_than_it_rubs(torque, moves):
 
 
 def test_dry_friction_in_mujoco_sticks_as_it_does_there():
-    """At the model's own 2 ms; with MuJoCo's usual settings the error is ten times as large."""
+    """The model's own step is 2 ms; with MuJoCo's default settings the error is ten times as
+    large.
+    """
     kind = make_robot_simulator(read_robot(EXAMPLE / "arm2.xml"))
     effect = "friction.coulomb@elbow"
     simulator = kind(observe=["q.shoulder", "q.elbow"], effects=[effect])
@@ -81,7 +85,7 @@ def test_the_log_is_what_the_script_makes():
     head, made = numbers(make_log.table())
     shipped_head, shipped = numbers((EXAMPLE / "log.csv").read_text())
     assert head == shipped_head
-    np.testing.assert_allclose(shipped, made, rtol=0, atol=1.5e-5)  # a last digit
+    np.testing.assert_allclose(shipped, made, rtol=0, atol=1.5e-5)  # one unit of the last digit
 
 
 def test_the_log_says_what_the_script_did():

@@ -1,4 +1,6 @@
-"""Ranges of a robot's coefficients end at physical limits, and follow the whole robot."""
+"""Tests of the ranges of a robot's coefficients: they end at physical limits and scale with the
+robot.
+"""
 
 import mujoco
 import numpy as np
@@ -83,7 +85,7 @@ def test_a_centre_of_mass_stays_within_its_link(yaw, bounds):
     assert 0.15 < x[1] < 0.25
     assert max(*np.abs(y), *np.abs(z)) < 0.15
     assert np.all(reach(yaw, "upper")[:, 0] < 0.0)
-    # Neither geoms nor children: as long as the link that carries it.
+    # Without geoms and children it counts as long as its parent link.
     assert np.abs(reach(yaw, "last")).max() < 0.4
 
 
@@ -133,7 +135,7 @@ def test_a_link_without_inertia_does_not_shrink_the_ranges_of_its_joint(yaw, tmp
     system = make_robot_simulator(yaw).system
     ((low, high),) = system.effect("inertia.armature@roll").coefficients[0].plausible[:1]
     assert (low, high > 1e-4) == (0.0, True)
-    # Set free, too: within 1e-8 kg m^2 it could only end at a bound.
+    # Also as a free parameter: with bounds of 1e-8 kg m^2 it could only end at a bound.
     (free,) = make_robot_simulator(yaw, ["armature@roll"]).system.parameters
     assert free.bounds[1] > 4e-4
 

@@ -1,4 +1,4 @@
-"""A robot moves as mechanics says and as MuJoCo's own loop does, effect by effect."""
+"""Tests of robot motion against mechanics and a plain MuJoCo loop, effect by effect."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -33,7 +33,7 @@ NONE = np.empty((1, 0))
 
 
 def kind_of(text, **given):
-    """The simulator of an MJCF."""
+    """Return the simulator class of an MJCF text."""
     spec = mujoco.MjSpec.from_string(text)
     return make_robot_simulator(RobotModel(Path("robot.xml"), "mjcf", spec, digest=text), **given)
 
@@ -48,13 +48,13 @@ def arm(integrator="Euler", text=ARM):
 
 
 def one(kind, scenario, observe=("q.hinge",), **effects):
-    """(T, C) with effects and their coefficients."""
+    """Simulate with effects given by coefficients; return (T, C)."""
     fixed = {name.replace("__", ".").replace("_at_", "@"): c for name, c in effects.items()}
     return kind(observe=observe, fixed=fixed).simulate(NONE, scenario)[0]
 
 
 def swing(times, initial, damping=0.01, force=lambda t: 0.0):
-    """The pendulum's motion by scipy, to 1e-12."""
+    """Return the pendulum's motion from SciPy, with a tolerance of 1e-12."""
 
     def slopes(t, state):
         weight = -0.5 * 9.81 * 0.3 * np.sin(state[0])
@@ -73,7 +73,8 @@ def test_a_pendulum_swings_as_its_equation_says_wherever_samples_lie(jitter):
     seen = one(pendulum(), scenario, ["q.hinge", "qd.hinge"])
     expected = swing(times, [2.0, -1.0])
     np.testing.assert_allclose(seen[:, 0], expected[:, 0], rtol=0, atol=1e-8)
-    # Between the ends of steps a velocity is linear: its error is that of h^2 / 8 times its bend.
+    # Velocity is interpolated linearly between steps: the error is h^2 / 8 times its second
+    # derivative.
     np.testing.assert_allclose(seen[:, 1], expected[:, 1], rtol=0, atol=1e-4 if jitter else 1e-8)
 
 
@@ -86,7 +87,7 @@ def test_a_command_is_held_and_felt_as_its_mean_over_a_step():
     for a, b in pairwise(times):
         middle = held((a + b) / 2)
         parts.append(swing(np.array([a, b]), parts[-1], force=lambda _, f=middle: f)[-1])
-    # A command changes within a step: its momentum is right, its moment is off by some h^2.
+    # For a command that changes within a step the impulse is exact; its time is off by order h^2.
     np.testing.assert_allclose(seen[:, 0], np.array(parts)[:, 0], rtol=0, atol=2e-5)
 
 
@@ -99,7 +100,7 @@ JOINTS = ("q.shoulder", "q.elbow", "q.spin")
 
 
 def looped(kind, text=ARM, applied=(0, 0, 0), ahead=0):
-    """(T, 3) positions by MuJoCo's own loop."""
+    """Return (T, 3) positions of a plain MuJoCo loop."""
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.integrator = kind.robot.compiled.opt.integrator
     data = mujoco.MjData(model)
@@ -175,7 +176,7 @@ LIFT = """
 
 @pytest.mark.parametrize("speed", [3.0, -3.0])
 def test_friction_grows_with_what_the_transmission_carries(speed):
-    """A mass that is pushed against its weight: friction is c times both together."""
+    """A mass is driven against its weight: friction is c times the sum of both forces."""
     force, weight, c = 30.0, 2 * 9.81, 0.1
     run = Scenario(TIMES, {"qd.lift": speed}, {"u.motor": np.full(TIMES.size, force)})
     seen = one(kind_of(LIFT), run, ["q.lift"], friction__load_at_lift=c)[:, 0]
@@ -184,7 +185,7 @@ def test_friction_grows_with_what_the_transmission_carries(speed):
     there = np.sign(speed + acceleration * TIMES) == np.sign(speed)
     assert there.sum() > 20
     expected = speed * TIMES + acceleration * TIMES**2 / 2
-    # The solver's softness and what the first step does not know yet.
+    # Tolerance for the solver's softness, and for the first step, which has no previous forces.
     np.testing.assert_allclose(seen[there], expected[there], rtol=0, atol=0.02 * np.abs(seen).max())
     free = speed * TIMES + (force - weight) / 4.0 * TIMES**2
     assert np.abs(seen - free)[there].max() > 0.1
@@ -207,7 +208,7 @@ PUSH = 2 * 0.3 / INERTIA
     ids=["on time", "late", "early", "a slow clock", "a fast clock"],
 )
 def test_a_late_sensor_shows_what_was_the_case(effects, felt):
-    """Pushed evenly without weight and damping it follows a parabola, to its very end."""
+    """A constant force without gravity and damping gives a parabola, up to the last sample."""
     text = PENDULUM.format(step=0.002, integrator="RK4", gravity=0).replace('damping="0.01"', "")
     seen = one(kind_of(text), Scenario(TIMES, {}, PUSHED), **effects)[:, 0]
     np.testing.assert_allclose(seen, PUSH * felt(TIMES) ** 2 / 2, rtol=0, atol=1e-10)
@@ -222,7 +223,7 @@ def test_a_lag_of_one_sensor_leaves_the_others_as_they_are():
     seen = one(kind_of(text), run, observe, **{"sensor__lag_at_q.hinge": lag})
     left = lag**2 * -np.expm1(-times / lag)
     expected = PUSH * (times**2 / 2 - lag * times + left)
-    # It takes what it reads for linear over each step, and is read so between their ends.
+    # The lag takes its signal as linear over each step, and is interpolated between step ends.
     np.testing.assert_allclose(seen[:, 0], expected, rtol=0, atol=2 * PUSH * 0.002**2 / 8)
     np.testing.assert_array_equal(seen[:, 1], one(kind_of(text), run, observe)[:, 1])
 
@@ -284,7 +285,7 @@ def test_lanes_give_the_same_bits_in_any_order_and_company():
 
 
 def test_another_step_is_that_of_a_file_that_states_it():
-    """With all that hangs on the step, as how stiff dry friction is."""
+    """All values that depend on the step change, such as the stiffness of dry friction."""
     finer = IntegratorSettings(0.0004, "RK4")
     other = kind_of(ARM.replace('timestep="0.001"', 'timestep="0.0004" integrator="RK4"'))
     effects = {"friction__coulomb_at_elbow": 0.2, "mass__scale_at_fore": 0.3}

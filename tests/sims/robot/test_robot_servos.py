@@ -1,4 +1,4 @@
-"""The law of a servo in a robot: dead zone, D term on the error, limited rate, motion profile."""
+"""Tests of the servo law in a robot: dead zone, D term on the error, rate limit, motion profile."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ TIMES = np.arange(0, 3, 0.01)
 
 
 def seen(effects, command, text=ARM, **initial):
-    """The joint's angle, (T,), by coefficients of effects."""
+    """Simulate effects, given by coefficients; return the joint's angle, (T,)."""
     kind = kind_of(text)
     placed = [kind.system.effect(name) for name in effects]
     simulator = kind(observe=["q.hinge"], effects=placed)
@@ -39,7 +39,7 @@ def seen(effects, command, text=ARM, **initial):
 
 @pytest.mark.parametrize("begin", [0.0, 0.03, -0.049])
 def test_within_its_dead_zone_a_servo_leaves_the_joint_where_it_is(begin):
-    # the control is that of the geared length: q is half of it
+    # the control is the length of the transmission with gear 2: q is half of it
     q = seen({"servo.deadband@m": 0.1}, 0.0, FREE, q=begin)
     assert q == pytest.approx(begin, abs=1e-9)
     assert seen({"servo.deadband@m": 0.0}, 0.0, FREE, q=begin)[-1] == pytest.approx(0.0, abs=1e-3)
@@ -55,10 +55,10 @@ def test_an_arm_hangs_lower_by_the_dead_zone_with_the_gain_that_the_servo_has(st
 
 
 def test_a_d_term_on_the_error_takes_the_lag_of_a_ramp_away():
-    """A servo lags a ramp by kv / kp of its time; the lead makes up for it."""
+    """A servo lags a ramp by the time kv / kp; the lead compensates it."""
     ramp = 0.5 * TIMES
     plain, led = (seen({"servo.derivative@m": c}, ramp, FREE)[-50:] for c in (0.0, KV / KP))
-    # what is held from sample to sample is late by half of one
+    # a zero-order hold delays by half a sample
     held = 0.25 * 0.005
     assert ramp[-50:] / 2 - plain == pytest.approx(0.25 * KV / KP + held, rel=1e-2)
     assert ramp[-50:] / 2 - led == pytest.approx(held, abs=2e-4)
@@ -68,12 +68,12 @@ def test_a_limit_of_the_rate_makes_the_servo_follow_a_ramp():
     step = np.where(TIMES >= 0.5, 1.0, 0.0)
     ramp = np.clip(TIMES - 0.5, 0.0, 0.5) * 2.0
     limited = seen({"input.rate@m": 2.0}, step, FREE)
-    # the command of the ramp is held from sample to sample: late by half of one
+    # the command of the ramp is held from sample to sample: a delay of half a sample
     assert limited == pytest.approx(seen({"input.delay@m": -0.005}, ramp, FREE), abs=2e-4)
 
 
 def test_a_motion_profile_makes_the_servo_follow_a_ramp_that_bends():
-    """A jump of 1 at 4 a second and second: half a second of speeding up, half of braking."""
+    """A jump of 1 at 4 per s^2: 0.5 s to speed up, 0.5 s to brake."""
     begun = np.clip(TIMES - 0.5, 0.0, 1.0)
     bent = np.where(begun < 0.5, 2 * begun**2, 1 - 2 * (1 - begun) ** 2)
     profiled = seen({"servo.profile@m": 4.0}, np.where(TIMES >= 0.5, 1.0, 0.0), FREE)
@@ -89,7 +89,7 @@ TENTH, FIFTH = 1.1, 1.1**2 - 1
 @pytest.mark.parametrize(
     ("text", "other", "effects"),
     [
-        # a gear ratio that is a tenth larger: of a motor, and of a servo whose set point is geared
+        # a gear ratio larger by 10 %: of a motor, and of a servo with a geared set point
         (PUSHED.replace('gear="2"', 'gear="2.2"'), PUSHED, {"input.gain@m": 0.1}),
         (
             ARM.replace('gear="2"', 'gear="2.2"'),
@@ -100,11 +100,11 @@ TENTH, FIFTH = 1.1, 1.1**2 - 1
                 "actuator.damping@m": FIFTH,
             },
         ),
-        # a proportional law that droops, and a D term on the velocity
+        # a smaller proportional gain, and a D term on the velocity
         (ARM.replace(f'kp="{KP}"', f'kp="{0.8 * KP}"'), ARM, {"actuator.stiffness@m": -0.2}),
         (ARM.replace(f'kv="{KV}"', f'kv="{1.5 * KV}"'), ARM, {"actuator.damping@m": 0.5}),
         (ARM.replace(f'kv="{KV}"', f'kv="{1.5 * KV}"'), ARM, {"drag.linear@hinge": 0.5 * KV * 4}),
-        # a current that is limited
+        # a current limit
         (ARM.replace("gear=", 'forcerange="-0.2 0.2" gear='), ARM, {"actuator.limit@m": 0.2}),
     ],
 )
@@ -115,7 +115,7 @@ def test_what_needs_no_effect_of_its_own(text, other, effects):
 
 
 def test_a_speed_limit_of_back_emf_is_a_limit_of_force_and_a_drag():
-    """Voltage clip(kp e, -V, V) less what motion induces: stall force S, no-load speed S / drag."""
+    """Voltage clip(kp e, -V, V) minus back EMF: stall force S, no-load speed S / drag."""
     from scipy.integrate import solve_ivp
 
     stall, speed, inertia = 1.5, 2.0, 0.001 + MASS * LENGTH**2
@@ -136,7 +136,9 @@ def test_a_speed_limit_of_back_emf_is_a_limit_of_force_and_a_drag():
 
 @pytest.mark.parametrize("phase", [0, 1, 3])
 def test_a_set_point_that_is_taken_in_now_and_then_is_a_delay_on_average(phase):
-    """Every 40 ms, of a command that changes every 10 ms: what is felt is 0 to 30 ms old."""
+    """The set point is read every 40 ms from a command that changes every 10 ms, so it is 0 to 30
+    ms old.
+    """
     taken = np.maximum((np.arange(TIMES.size) - phase) // 4 * 4 + phase, 0)
     seldom, plain = seen({}, WAVE[taken]), seen({}, WAVE)
     delayed = seen({"input.delay@m": 0.015}, WAVE)
@@ -150,7 +152,9 @@ def test_a_set_point_that_is_taken_in_now_and_then_is_a_delay_on_average(phase):
     [({}, 1e-3), ({"servo.deadband@m": 0.06}, 1e-3), ({"supply.sag@m": 0.05}, 1e-3)],
 )
 def test_a_sensor_of_the_drive_shows_what_it_exerts_and_not_what_it_would(effects, within):
-    """What a dead zone or a weak supply takes is taken from the drive: at rest it holds the arm."""
+    """A dead zone or a weak supply reduces the measured torque: at rest it equals the arm's
+    weight.
+    """
     kind = kind_of(ARM)
     placed = [kind.system.effect(name) for name in effects]
     simulator = kind(observe=["q.hinge", "tau.hinge"], effects=placed)
@@ -159,6 +163,6 @@ def test_a_sensor_of_the_drive_shows_what_it_exerts_and_not_what_it_would(effect
     theta = np.array([[*effects.values()], [0.0] * len(effects)])
     q, tau = simulator.simulate(theta, Scenario(TIMES, {"q.hinge": 0.7}, given))[0, -1]
     assert tau == pytest.approx(MASS * 9.81 * LENGTH * np.sin(q), rel=within)
-    # and what the law without them says is another number
+    # the law without the effects gives another number
     plain = 2 * KP * (1.6 - 2 * q)
     assert (plain == pytest.approx(tau, rel=0.01)) == (not effects)

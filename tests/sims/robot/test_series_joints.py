@@ -1,5 +1,5 @@
-"""Joints that give or have play, and friction that remembers: closed forms, where runs begin, what
-a tangent about them says, and the file that holds them.
+"""Tests of joints with compliance, backlash or hysteresis: closed forms, initial states,
+linearisation, and the written file.
 """
 
 from pathlib import Path
@@ -44,7 +44,7 @@ def made(text, **given):
 
 
 def moved(kind, effects, coefficients, scenario, observe=("q.axle",)):
-    """(T, C) of one lane; coefficients one after another."""
+    """Return (T, C) of one batch element; coefficients are concatenated."""
     simulator = kind(observe=list(observe), effects=list(effects))
     return simulator.simulate(np.array([coefficients]), scenario)[0]
 
@@ -63,7 +63,7 @@ def test_a_drive_on_a_spring_swings_as_two_masses_do():
 
 
 def test_a_drive_goes_alone_through_its_gap_and_then_takes_the_link_along():
-    """In the gap x'' = u / J; behind it, struck without rebound, (J + M) x'' = u."""
+    """In the gap x'' = u / J; after an impact without rebound (J + M) x'' = u."""
     gap, torque = 0.05, 0.1
     seen = moved(made(WHEEL), ["joint.backlash@axle"], [gap], pushed(torque))[:, 0]
     meets = np.sqrt(2 * DRIVE * gap / 2 / torque)
@@ -72,14 +72,14 @@ def test_a_drive_goes_alone_through_its_gap_and_then_takes_the_link_along():
     together, later = DRIVE + LINK, np.maximum(TIMES - meets, 0.0)
     speed = torque * meets / together
     after = gap / 2 + speed * later + 0.5 * torque / together * later**2
-    # The blow takes some milliseconds, in which the flank gives a little.
+    # The impact takes some milliseconds, in which the flank yields slightly.
     late = meets + 0.03 < TIMES
     np.testing.assert_allclose(seen[late], after[late], atol=2e-4)
     assert alone.sum() > 8
 
 
 def test_friction_that_builds_up_takes_the_energy_that_it_takes_over_its_way():
-    """(J + M) v^2 / 2 = u x - F (x - d (1 - exp(-x / d))) from rest, without a reversal."""
+    """From rest, without a reversal: (J + M) v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
     torque, dry, way = 0.3, 0.2, 0.05
     q, v = moved(
         made(WHEEL), ["friction.hysteresis@axle"], [dry, way], pushed(torque), ("q.axle", "qd.axle")
@@ -90,7 +90,7 @@ def test_friction_that_builds_up_takes_the_energy_that_it_takes_over_its_way():
 
 
 def test_the_drive_that_a_file_does_not_state_is_a_number():
-    """With J = 0.25 M of its own the common motion is that of 1.25 M."""
+    """With a drive inertia of J = 0.25 M the common motion is that of 1.25 M."""
     kind = made(WHEEL.replace(f'armature="{DRIVE}"', ""))
     names = [c.name for c in kind.system.effect("joint.flexibility@axle").coefficients]
     assert names == ["compliance", "damping", "rotor"]
@@ -124,10 +124,10 @@ PENDULUM = """
     ],
 )
 def test_links_hang_on_their_springs_and_flanks_when_a_run_begins(effects, c):
-    """A servo that holds what the link weighs holds it at rest: nothing moves."""
+    """A servo that holds the weight of the link keeps it at rest."""
     held = {"u.m_axle": np.full(TIMES.size, -9.81 * 0.3 / 60.0)}
     seen = moved(made(PENDULUM), effects, c, Scenario(TIMES, {}, held))
-    # Not hung, it would fall by some 5 mrad.
+    # Without initial deflection the link would fall by about 5 mrad.
     np.testing.assert_allclose(seen, 0.0, atol=2e-4)
 
 
@@ -148,11 +148,13 @@ PLANAR = """
   <actuator><motor name="m_elbow" joint="elbow"/></actuator>
 </mujoco>
 """
-GIVES, RATIO, GAP = 0.02, 0.1, 0.06  # rad/(N m), share of the critical damping, rad
+GIVES, RATIO, GAP = 0.02, 0.1, 0.06  # rad/(N m), fraction of critical damping, rad
 
 
 def through(apart, speed, stiffness, damping, gap):
-    """What passes on: gap first, then spring and damper, whose flanks push and never pull."""
+    """Return the transmitted torque: gap first, then spring and damper; the flanks push and never
+    pull.
+    """
     beyond = apart - min(max(apart, -gap / 2), gap / 2)
     force = stiffness * beyond + damping * speed
     if gap == 0.0:
@@ -161,10 +163,12 @@ def through(apart, speed, stiffness, damping, gap):
 
 
 def planar(times, torque, gap, compliance=GIVES):
-    """(T, 2) of the arm's joints, the elbow's on its drive's side, by scipy; begun at rest."""
+    """Return (T, 2) joint angles of the arm from SciPy, the elbow's on the drive side; it starts at
+    rest.
+    """
     moved = 0.008 + 0.8 * 0.15**2
     stiffness = 1 / compliance
-    # Counted by what the file states of the joint: links and drive.
+    # With the inertias that the file states for the joint: links and drive.
     damping = 2 * RATIO * np.sqrt(stiffness * (moved + 0.02))
 
     def rates(t, s):
@@ -183,7 +187,7 @@ def planar(times, torque, gap, compliance=GIVES):
 
 
 def test_a_gap_before_a_spring_moves_an_arm_as_scipy_does():
-    """One element: through the gap nothing passes, behind it the spring and the damper do."""
+    """Both form one element: no torque within the gap, spring and damper behind it."""
     times = np.arange(81) / 100.0
     run = Scenario(times, {}, {"u.m_elbow": np.where(times < 0.4, 0.6, -0.6)})
     spring, play, both = (
@@ -211,7 +215,9 @@ SWUNG = Scenario(
 
 
 def about(kind, effects, c):
-    """The neighbourhood of a motion in which effects act, and the simulator with others besides."""
+    """Return a simulator with the effects, its parameters, and the linearisation about its
+    motion.
+    """
     simulator = kind(observe=["q.shoulder", "q.elbow", "qd.elbow"], effects=list(effects))
     theta = np.array(c)
     x, v = np.array([0.0, 0.3, 0.0]), np.array([0.5, 0.0, 0.0])
@@ -243,7 +249,7 @@ def test_the_tangent_about_such_a_motion_is_that_of_the_simulation(effect, c):
     begun = linear.compute_initial_state_responses()
     nudged = Scenario(SWUNG.times, {**SWUNG.initial, "q.elbow": 0.3 + 1e-5}, SWUNG.inputs)
     exact = (simulator.simulate(theta[None], nudged)[0] - seen[0]) / 1e-5
-    # How links hang when a run begins changes with its pose, which is left out of it.
+    # The initial deflection of links changes with their pose; the tangent neglects this.
     assert np.abs(begun[1] - exact).max() < 0.1 * np.abs(exact).max()
 
 
@@ -304,7 +310,7 @@ def test_a_file_holds_a_gap_before_a_spring_as_flanks_that_give(tmp_path):
 
 @pytest.mark.parametrize("causes", [CAUSES, LOOSE], ids=["spring", "gap before it"])
 def test_a_rollout_of_the_file_moves_as_the_simulator_does(tmp_path, causes):
-    """Where nothing hangs, what is in series begins in the simulator where it does in the file."""
+    """Without gravity, elements in series have equal initial states in simulator and file."""
     robot = arm(tmp_path, ARM.replace("0 0 -9.81", "0 0 0"))
     model = mujoco.MjSpec.from_string(write_model_files(robot, causes).xml).compile()
     data = mujoco.MjData(model)
@@ -329,8 +335,8 @@ def test_keyframes_that_lack_coordinates_are_left_out_and_said(tmp_path):
 
 
 def test_a_spring_behind_a_drive_that_was_found_before_takes_its_inertia_over():
-    """J c of the armature that the model has is the rotor, whatever rotor is asked about: what
-    hardly gives then changes hardly anything.
+    """An armature identified before becomes the rotor inertia, and the given rotor coefficient is
+    ignored. An almost rigid spring therefore hardly changes the motion.
     """
     kind = made(WHEEL.replace(f'armature="{DRIVE}"', ""))
     run = Scenario(TIMES, {}, {"u.m_axle": 0.4 * np.sin(9.0 * TIMES)})

@@ -24,7 +24,9 @@ def servo(where="joint", integrator="implicitfast", kv=KV):
 
 
 def moved(model, share):
-    """Position after one step from rest, the command being for this share of the limit."""
+    """Return the position after one step from rest, with a command for this fraction of the
+    limit.
+    """
     data = mujoco.MjData(model)
     data.ctrl[:] = share * LIMIT / KP
     mujoco.mj_step(model, data)

@@ -1,4 +1,4 @@
-"""Few lanes have a batch of their own, and move as they would among many."""
+"""Tests that few elements use a batch of their own and move as in a large batch."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What small changes make of a robot's motion is what simulating each of them gives."""
+"""Tests that linearised responses of a robot's motion to small changes agree with simulations."""
 
 import numpy as np
 import pytest
@@ -44,11 +44,11 @@ ALIKE = {
     "spring.linear": 1e-4,
     "supply.braking": 1e-3, "supply.sag": 1e-3,
 }  # fmt: skip
-"""Shares of plausible ranges that are small."""
+"""Fractions of plausible ranges that are small changes."""
 
 
 def moving(integrator="implicitfast", step=0.002, channels=("q.shoulder", "q.elbow", "tau.elbow")):
-    """An arm on its way, its simulator with all effects at hand."""
+    """Return a simulator of a moving arm with all effects, and its scenario."""
     kind = kind_of(ARM).with_integrator_settings(IntegratorSettings(step, integrator))
     effects = list(library.list_effects_for(kind.system).values())
     simulator = kind(observe=list(channels), effects=effects)
@@ -62,7 +62,7 @@ def moving(integrator="implicitfast", step=0.002, channels=("q.shoulder", "q.elb
 
 
 def probes(simulator):
-    """Effects with one small coefficient each, and the parameters that have it."""
+    """Return effects with one small coefficient each, and the corresponding parameters."""
     added, thetas, place = [], [], 0
     for effect in simulator.effects:
         count = len(effect.coefficients)
@@ -92,7 +92,7 @@ def test_the_tangent_is_what_each_small_change_makes(integrator):
         simulator, np.zeros(thetas.shape[1]), scenario, np.zeros(2), np.zeros(2)
     )
     np.testing.assert_allclose(about.observed, still, atol=1e-12)
-    # Torque has another scale than angles: each reading counts by its own.
+    # Torque and angle have different scales, so each channel is scaled by its own.
     scale = np.sqrt(np.square(changed).mean(axis=1, keepdims=True).max(axis=0, keepdims=True))
     seen = about.compute_effect_responses(added)[0] / scale
     true = changed / scale
@@ -108,7 +108,9 @@ def test_the_tangent_is_what_each_small_change_makes(integrator):
 
 @pytest.mark.parametrize("name", ["supply.sag@m_elbow", "friction.load@elbow"])
 def test_what_hangs_on_the_drive_moves_with_the_servo(name):
-    """About an arm whose drive falls short: with the drive held still it would be 7 to 10 % off."""
+    """The linearisation includes a weak drive's response; with a fixed drive force the error would
+    be 7 to 10 %.
+    """
     simulator, scenario = moving(channels=("q.shoulder", "q.elbow"))
     names = [p.name for p in simulator.parameters]
     about = np.zeros(len(names))
@@ -128,7 +130,7 @@ def test_what_hangs_on_the_drive_moves_with_the_servo(name):
                   ("friction.position@elbow.least", "friction.load@elbow")],
 )  # fmt: skip
 def test_frictions_at_one_joint_add_up(frictions):
-    """The motion about which it is linear has all of them."""
+    """The linearisation is about the motion with all frictions."""
     simulator, scenario = moving(channels=("q.shoulder", "q.elbow"))
     names = [p.name for p in simulator.parameters]
     about = np.zeros(len(names))
@@ -156,7 +158,7 @@ def test_initial_states_move_a_run_as_their_derivatives_say():
 
 
 def test_a_command_that_changes_within_a_step_is_neither_early_nor_late():
-    """The sum over steps, and the sum of them times their times, are those of the command."""
+    """The sum over steps, and the sum weighted with time, equal those of the command."""
     rng = np.random.default_rng(5)
     parts = rng.normal(size=(3, 20, 4))
     seen = np.zeros(21, dtype=bool)
@@ -167,7 +169,7 @@ def test_a_command_that_changes_within_a_step_is_neither_early_nor_late():
     np.testing.assert_allclose(given.sum(axis=1), parts.mean(axis=2).sum(axis=1))
     wanted = (parts.reshape(3, 80) * quarters).sum(axis=1) / 4
     np.testing.assert_allclose((given * steps).sum(axis=1), wanted)
-    # And so between any two samples, where nobody looks from one to the next.
+    # Between any two recorded samples the sums are equal, too.
     for begin in range(0, 20, 5):
         own = slice(begin, begin + 5)
         np.testing.assert_allclose(given[:, own].sum(1), parts[:, own].mean(axis=2).sum(1))
@@ -175,7 +177,9 @@ def test_a_command_that_changes_within_a_step_is_neither_early_nor_late():
 
 @pytest.mark.parametrize("late", [0.0013, 0.003, 0.0127])
 def test_a_delay_of_a_part_of_a_step_is_right_to_the_third_order(late):
-    """Against a step a hundred times as fine; a mean over the step alone is 20 times as far off."""
+    """Reference: a step a hundred times smaller. The mean over the step alone would have 20 times
+    the error.
+    """
     apart = []
     for step in (0.002, 0.00002):
         kind = kind_of(ARM).with_integrator_settings(IntegratorSettings(step, "RK4"))

@@ -1,4 +1,4 @@
-"""What is mended in a URDF, each by its smallest model, and what is said of it."""
+"""Tests of each automatic repair of a URDF with a minimal model, and of its note."""
 
 import itertools
 
@@ -14,7 +14,7 @@ FUSED = "links on fixed joints are part of what carries them: base of world"
 
 @pytest.fixture
 def mended(write):
-    """Reads a text; gives the robot and what is said besides that the base is fused."""
+    """Return a function that reads a text and returns the robot and its non-default notes."""
 
     def read_it(text):
         robot = read_robot(write(text, "robot.urdf"))
@@ -75,7 +75,7 @@ def test_links_without_a_mass_between_links_that_have_one(mended):
 
 
 def robot_text(*links):
-    """Links one upon the other."""
+    """Return a robot text of links in a chain."""
     names = [text.split('"')[1] for text in links]
     pairs = itertools.pairwise(names)
     return robot(*links, *(joint(f"to_{b}", a, b) for a, b in pairs))
@@ -145,7 +145,9 @@ def test_mimics_follow(mended):
 
 
 def test_mimics_follow_rigidly(mended):
-    """A torque at one joint moves both alike; by MuJoCo's default equality 0.2 mrad apart."""
+    """A torque at one joint moves both joints equally; MuJoCo's default equality gives 0.2 mrad
+    difference.
+    """
     follower = joint("k", "arm", "tip", "revolute", '<mimic joint="j"/>')
     tied, _ = mended(
         robot(link("base", None), link("arm"), link("tip"), joint("j", "base", "arm"), follower)

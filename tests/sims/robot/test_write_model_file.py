@@ -1,4 +1,6 @@
-"""A robot's own file with causes in it: it stays the author's, and moves as it was meant."""
+"""Tests of writing causes into a robot's own file: the author's text is kept, and the motion is
+right.
+"""
 
 import difflib
 from dataclasses import replace
@@ -31,7 +33,7 @@ CAUSES: CauseCoefficients = {
 
 
 def test_an_mjcf_stays_its_authors(tmp_path: Path) -> None:
-    """Only lines that say something else have changed; each has its comment before it."""
+    """Only lines with other values change; each change has a comment before it."""
     arm = robot(tmp_path)
     done = write_model_files(arm, CAUSES, "log.csv")
     assert done.xml is not None
@@ -54,7 +56,7 @@ def test_an_mjcf_stays_its_authors(tmp_path: Path) -> None:
 
 
 def test_nothing_found_leaves_the_file(tmp_path: Path) -> None:
-    """Without a cause the file is itself, with a line that says where it is from."""
+    """Without causes the text is unchanged, except for a line about its origin."""
     arm = robot(tmp_path)
     text = write_model_files(arm, {}, "log.csv").xml
     assert text is not None
@@ -63,7 +65,7 @@ def test_nothing_found_leaves_the_file(tmp_path: Path) -> None:
 
 
 def test_what_one_writes_a_rollout_moves(tmp_path: Path) -> None:
-    """The file on disk moves as the causes do, not as the file before."""
+    """The written file moves with the causes, not as the original file."""
     arm = robot(tmp_path)
     done = write_model_files(arm, CAUSES)
     assert done.xml is not None
@@ -111,8 +113,8 @@ PARTS = {
 
 
 def test_files_of_a_file_are_found_from_anywhere(tmp_path: Path) -> None:
-    """What is included stays so where nothing changes in it; meshes are found; lines end as they
-    did; classes and elements without names are no hindrance.
+    """Unchanged includes stay includes, meshes are found, line ends are kept, and classes and
+    unnamed elements are supported.
     """
     home = tmp_path / "home"
     for name, text in PARTS.items():
@@ -146,7 +148,7 @@ REPEATED = """
 
 
 def test_where_elements_are_repeated_mujoco_writes(tmp_path: Path) -> None:
-    """One of several that one element stands for changes alone, with its comment."""
+    """Only one of the elements that a repeated element stands for changes, with its comment."""
     arm = robot(tmp_path, REPEATED)
     causes = {"drag.linear@j1": one(0.123456789012345)}
     done = write_model_files(arm, causes, "log.csv")
@@ -159,7 +161,7 @@ def test_where_elements_are_repeated_mujoco_writes(tmp_path: Path) -> None:
 
 
 def test_what_moves_along_is_stated(tmp_path: Path) -> None:
-    """A damping ratio becomes the damping that it was, with a comment that says so."""
+    """A damping ratio becomes the damping that it gave before, with a comment."""
     arm = robot(tmp_path, MOVING)
     done = write_model_files(arm, {"mass.scale@b": one(0.2)})
     check_written_files(arm, {"mass.scale@b": one(0.2)}, done)
@@ -172,7 +174,7 @@ def test_what_moves_along_is_stated(tmp_path: Path) -> None:
 
 
 def test_another_motion_is_a_fault_of_the_program(tmp_path: Path) -> None:
-    """A file that does not say what was meant is not written; the field is named."""
+    """A file that does not match the model is not written; the error names the field."""
     arm = robot(tmp_path)
     done = write_model_files(arm, CAUSES)
     assert done.xml is not None
@@ -182,7 +184,7 @@ def test_another_motion_is_a_fault_of_the_program(tmp_path: Path) -> None:
 
 
 def test_two_hyphens_end_no_comment(tmp_path: Path) -> None:
-    """A recording may be called as it likes."""
+    """A recording may have any name."""
     arm = robot(tmp_path)
     done = write_model_files(arm, {"drag.linear@elbow": one(0.1)}, "a--b-->-")
     check_written_files(arm, {"drag.linear@elbow": one(0.1)}, done)
@@ -211,7 +213,9 @@ URDF = """<robot name="arm">
 
 
 def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
-    """Links on fixed joints move with their body; the rest is said, and stands in the MJCF."""
+    """Links on fixed joints change with their body; other causes are noted and are in the MJCF
+    only.
+    """
     path = tmp_path / "arm.urdf"
     path.write_text(URDF)
     arm = read_robot(path)
@@ -267,7 +271,7 @@ MASSLESS = """<robot name="arm">
 
 @pytest.mark.parametrize("inertial", ["/>", '><inertial><mass value="0"/></inertial></link>'])
 def test_a_urdf_says_what_massless_links_carry(tmp_path: Path, inertial: str) -> None:
-    """A body whose mass is on a link behind fixed joints is changed there."""
+    """If the mass of a body is on a link behind fixed joints, that link is changed."""
     path = tmp_path / "arm.urdf"
     path.write_text(MASSLESS.replace("INERTIAL", inertial))
     arm = read_robot(path)
@@ -286,7 +290,7 @@ def test_a_urdf_says_what_massless_links_carry(tmp_path: Path, inertial: str) ->
 
 
 def test_a_urdf_body_without_any_inertial_is_said(tmp_path: Path) -> None:
-    """Mass that follows from shapes has no number in the file."""
+    """A mass computed from shapes has no number in the file."""
     shape = '><collision><geometry><sphere radius="0.1"/></geometry></collision></link>'
     path = tmp_path / "arm.urdf"
     path.write_text(MASSLESS.replace("INERTIAL", shape))
@@ -299,7 +303,7 @@ def test_a_urdf_body_without_any_inertial_is_said(tmp_path: Path) -> None:
 
 
 def test_a_delay_is_that_of_the_simulator(tmp_path: Path) -> None:
-    """A control that is delayed by a part of a step is the mean over the step, in both."""
+    """In both, a control delayed by a fraction of a step is the mean over the step."""
     from sims.core.simulator import Scenario
     from sims.robot.robot_simulator import make_robot_simulator
 
@@ -338,7 +342,7 @@ NAMELESS = """<mujoco>
 
 
 def test_an_actuator_without_a_name_keeps_none(tmp_path: Path) -> None:
-    """What is called after its joint where it is read stays as it is in the file."""
+    """An unnamed actuator, read under the name of its joint, stays unnamed in the file."""
     path = tmp_path / "leg.xml"
     path.write_text(NAMELESS)
     arm = read_robot(path)
@@ -357,7 +361,7 @@ def test_an_actuator_without_a_name_keeps_none(tmp_path: Path) -> None:
 
 
 def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path: Path) -> None:
-    """Where MuJoCo's filter begins at the first command, the motion is nearly the simulator's."""
+    """If MuJoCo's filter begins at the first command, the motion is close to the simulator's."""
     from sims.core.simulator import Scenario
     from sims.robot.robot_simulator import make_robot_simulator
 
@@ -376,7 +380,8 @@ def test_a_lag_settled_at_its_first_command_is_that_of_the_simulator(tmp_path: P
         data.ctrl[1] = u
         mujoco.mj_step(model, data)
     place = [channel.name for channel in simulator.channels].index("q.elbow")
-    # The simulator gives the mean over each step, MuJoCo what is there when it begins: half a step.
+    # The simulator uses the mean over each step, MuJoCo the value at its start: half a step
+    # difference.
     effect = abs(shown[-1, place] - direct[-1, place])
     assert effect > 0.1
     assert abs(data.qpos[1] - shown[-1, place]) < 0.02 * effect
@@ -408,7 +413,7 @@ def test_compensated_gravity_is_written_as_such(tmp_path):
     assert model.opt.gravity.tolist() == [0.0, 0.0, -9.81]
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    # What gravity pulls with is taken away again.
+    # Gravity compensation cancels the weight.
     np.testing.assert_allclose(data.qfrc_gravcomp, data.qfrc_bias, rtol=1e-9, atol=1e-12)
     assert np.abs(data.qfrc_bias).max() > 1.0
     assert any("gravity is compensated" in line for line in done.notes)

@@ -1,4 +1,6 @@
-"""The tracker against the renderer's truth, and films that are not what they should be."""
+"""Tests of the ball tracker against the true positions of the renderer, and with defective
+films.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ TIMES = np.arange(60) / 60
 
 
 def fall(top=3.8, rebound=0.8):
-    """Heights of a ball that falls and rebounds, in closed form."""
+    """Return heights of a ball that falls and rebounds, in closed form."""
     touch = np.sqrt(2 * (top - 0.5) / 9.81)
     speed = 9.81 * touch * rebound
     later = TIMES - touch
@@ -53,7 +55,7 @@ def test_centres_are_within_half_a_pixel_of_the_truth_after_compression(seed, tm
 
 
 def bouncing(times, top=4.4, restitution=0.55):
-    """Heights of a ball that bounces until it rests, flight by flight in closed form."""
+    """Return heights of a ball that bounces until it rests, flight by flight in closed form."""
     touch = np.sqrt(2 * (top - 0.5) / 9.81)
     z = np.where(times < touch, top - 4.905 * times**2, 0.5)
     begin, speed = touch, 9.81 * touch * restitution
@@ -67,7 +69,9 @@ def bouncing(times, top=4.4, restitution=0.55):
 
 @pytest.mark.parametrize("seed", [1, 4, 23])
 def test_a_ball_that_comes_to_rest_is_seen_to_the_end(seed, tmp_path):
-    """It lies beside its shadow for half of the film; both get into the median of its frames."""
+    """The ball rests next to its shadow for half of the film; both enter the median of the
+    frames.
+    """
     times = np.arange(240) / 60
     camera, scene = stage(seed)
     points = upright(bouncing(times))
@@ -82,7 +86,9 @@ def test_a_ball_that_comes_to_rest_is_seen_to_the_end(seed, tmp_path):
 
 
 def test_the_same_frames_make_the_same_file(tmp_path):
-    """Whatever the memory held before: with x264's own choices one file in twenty differs."""
+    """The bytes do not depend on earlier memory content; with x264's own settings one file in
+    twenty differs.
+    """
     _, scene = stage(5)
     frames, made = list(scene.render_frames(upright(fall()))), set()
     rng = np.random.default_rng(0)
@@ -133,7 +139,7 @@ def test_the_background_is_the_median_of_what_is_seen():
     rng = np.random.default_rng(0)
     values = rng.uniform(0, 255, (9, 50, 3)).astype(np.float32)
     values[rng.uniform(size=(9, 50)) < 0.6] = np.nan
-    values[0] = 7.0  # each pixel is seen at least once
+    values[0] = 7.0  # each pixel is observed at least once
     np.testing.assert_array_equal(
         background_model._median_of_seen(values), np.nanmedian(values, axis=0)
     )

@@ -1,4 +1,6 @@
-"""Circles through edges: of known middle and radius, with a side that is a shadow's."""
+"""Tests of fitting circles to edges of known centre and radius, partly replaced by a shadow's
+edge.
+"""
 
 import numpy as np
 import pytest
@@ -10,8 +12,8 @@ TRUE = (21.3, 17.8, 7.4)
 
 
 def edge(spoilt=0, seed=0):
-    """Points of the true circle, the first `spoilt` of them on a larger one beside it, as at a
-    shadow's rim.
+    """Return points of the true circle, the first `spoilt` of them on a larger, shifted circle, as
+    at a shadow's edge.
     """
     points = np.array(TRUE[:2]) + TRUE[2] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     points += 0.05 * np.random.default_rng(seed).standard_normal(points.shape)

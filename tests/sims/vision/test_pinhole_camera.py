@@ -8,8 +8,8 @@ from sims.vision.pinhole_camera import PinholeCamera
 
 
 def level(**changes):
-    """A camera 5 m along x from the target's vertical and at the target's height: all distances are
-    plain to see.
+    """Return a camera 5 m along x from the target's vertical and at the target's height, so that
+    all distances are simple.
     """
     return PinholeCamera(
         **{"azimuth": 0.0, "distance": 5.0, "height": 2.0, "size": (201, 101), **changes}
@@ -57,7 +57,7 @@ def test_outline_of_a_sphere_by_hand_and_by_its_surface():
     centre, axes = camera.project_sphere([0.0, 0.0, 2.0], 0.5)
     radius = (
         camera.focal * 0.5 / math.sqrt(25 - 0.25)
-    )  # straight ahead: a circle, tangents from the camera
+    )  # on the optical axis: a circle, tangents from the camera
     np.testing.assert_allclose(centre, [100, 50], atol=1e-12)
     np.testing.assert_allclose(axes, [radius, radius], rtol=1e-12)
     assert camera.compute_apparent_radius([0.0, 0.0, 2.0], 0.5) == pytest.approx(radius, rel=1e-12)
