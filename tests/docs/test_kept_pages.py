@@ -36,8 +36,8 @@ def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
             # Tables written before tuners were isolated have one column fewer.
             common = [column for column in beside if column in shown]
             assert len(common) >= len(beside.columns) - 1
-            # A chart's table may have additional lines at the end for comparison, such as the
-            # ideal.
+            # A chart's table may have additional lines at the end for comparison, such as an ideal
+            # curve.
             shown = shown[common].head(len(beside))
             pd.testing.assert_frame_equal(shown, beside[common], rtol=1e-5, check_dtype=False)
             compared += 1
