@@ -1,4 +1,4 @@
-"""A page in a real browser: headless Chromium, what it complains of, and what axe finds."""
+"""Open pages in headless Chromium, collect their errors, and check accessibility with axe."""
 
 import os
 import shutil
@@ -8,18 +8,18 @@ import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 REQUIRED = "SIMGAP_BROWSER"
-"""Set where a missing browser is a failure and no reason to skip, as in CI."""
+"""Environment variable that makes a missing browser a failure instead of a skip, as in CI."""
 WIDTHS = (1280, 400)
 
 
 def chromium():
-    """Where the browser is; empty where there is none."""
+    """Return the path of the browser, or an empty string if none is installed."""
     return os.environ.get("SIMGAP_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), "")
 
 
 @contextmanager
 def launched():
-    """A browser, for a whole session of tests."""
+    """Start a browser for a whole test session."""
     path = chromium()
     if not path:
         says = f"no browser: expected one of {', '.join(NAMES)} on PATH; apt-get install chromium"
@@ -29,18 +29,18 @@ def launched():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        # A container's root has no sandbox, and nothing here comes from elsewhere.
+        # Root in a container has no sandbox, and all pages opened here are local files.
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield browser
         browser.close()
 
 
 class Opened:
-    """A file as a browser shows it.
+    """An HTML file opened in a browser.
 
     Attributes:
-        page: playwright's.
-        complaints: errors on the console, errors of scripts, requests that leave the file.
+        page: the Playwright page.
+        complaints: console errors and warnings, script errors, and requests to other addresses.
     """
 
     def __init__(self, browser, path, address="", width=1280, **options):
@@ -72,15 +72,15 @@ class Opened:
         return self.page.locator(selector).first.inner_text()
 
     def state(self):
-        """What the page's address says behind its #."""
+        """Return the fragment of the page's address (after `#`)."""
         return self.page.evaluate("decodeURIComponent(location.hash.slice(1))")
 
     def overflow(self):
-        """Pixels by which the page is wider than the screen."""
+        """Return the number of pixels by which the page is wider than the screen."""
         return self.page.evaluate("document.documentElement.scrollWidth - innerWidth")
 
     def saved(self, act):
-        """Name and bytes of the file that an act saves."""
+        """Return the name and the bytes of the file that the action `act` downloads."""
         with self.page.expect_download() as waiting:
             act()
         download = waiting.value
@@ -88,7 +88,7 @@ class Opened:
             return download.suggested_filename, file.read()
 
     def barriers(self):
-        """What axe finds that is serious or critical."""
+        """Return the serious and critical accessibility violations that axe finds."""
         from axe_playwright_python.sync_playwright import Axe
 
         found = Axe().run(self.page).response["violations"]

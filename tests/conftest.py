@@ -10,28 +10,28 @@ PLUGINS = Path(__file__).parent / "plugins"
 
 _SHARED = Path(__file__).parents[2] / "shared"
 _BESIDE = _SHARED / "data"
-"""Folder of the real recordings on machines that have them."""
+"""Default folder of the real recordings, on machines that have it."""
 
 _READS_DATA = re.compile(
     "SIMGAP_(DATA|ROBOTS)|[\"']shared[\"']|pendulum-real|robot-so101|simgap list"
 )
-"""What a test file contains whose tests may differ with these recordings."""
+"""Pattern of test files whose results may depend on the real recordings."""
 
-# For child processes too. Values that the user has set stand.
+# Child processes inherit these values; values set by the user have priority.
 for _name, _folder in (("SIMGAP_DATA", _BESIDE), ("SIMGAP_ROBOTS", _SHARED / "robots")):
     if _folder.is_dir():
         os.environ.setdefault(_name, str(_folder))
 
-# One test's threads of linear algebra wait for another's, and spend its time waiting.
+# One thread per test: parallel tests would compete for the processors.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background; children inherit it
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # background jobs ignore it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config):
-    """Machine code is made before there are workers that would each wait for it."""
+    """Compile the native kernel before pytest starts its workers, which would all wait for it."""
     if not hasattr(config, "workerinput"):
         from sims.engines.compiled import kernel
 
@@ -40,7 +40,7 @@ def pytest_configure(config):
 
 @pytest.fixture(scope="session")
 def spring():
-    """The test simulator, registered."""
+    """Register and return the test simulator."""
     from bench.core.plugin_registries import load_plugins, simulators
 
     load_plugins([PLUGINS / "spring.py"])
@@ -49,14 +49,14 @@ def spring():
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory, monkeypatch):
-    """Keep the trained weights and data sets of tests apart from the user's."""
+    """Use a separate cache for the trained weights and data sets of tests."""
     monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.getbasetemp() / "data"))
 
 
 @pytest.fixture(scope="session")
 def recordings():
-    """The folder of real recordings; tests that need it skip visibly where it is missing."""
+    """Return the folder of real recordings; skip the test if it does not exist."""
     folder = Path(os.environ.get("SIMGAP_DATA", _BESIDE))
     if not folder.is_dir():
         pytest.skip(f"no recordings: {folder} is missing (set SIMGAP_DATA)")
@@ -65,12 +65,12 @@ def recordings():
 
 @pytest.fixture(scope="module", autouse=True)
 def registries_as_before():
-    """What a module's tests register is gone after it, but for the test simulator."""
+    """Undo the registrations of a test module, except for the test simulator."""
     from bench.core.plugin_registries import REGISTRIES, simulators
 
     before = [registry.snapshot() for registry in REGISTRIES]
     yield
-    # Other modules hold the class that the session's fixture registered.
+    # Other modules use the class that the session-scoped fixture registered.
     shared = {name: part for name, part in simulators.snapshot().items() if name == "spring"}
     for registry, snapshot in zip(REGISTRIES, before, strict=True):
         registry.restore(snapshot)
@@ -79,7 +79,7 @@ def registries_as_before():
 
 @pytest.fixture
 def fresh_registries():
-    """What a test registers is gone after it."""
+    """Undo the registrations of a test."""
     from bench.core.plugin_registries import REGISTRIES
 
     before = [registry.snapshot() for registry in REGISTRIES]
@@ -90,7 +90,7 @@ def fresh_registries():
 
 @pytest.fixture
 def undrawn():
-    """Comparisons of this process write their tables alone."""
+    """Make comparisons in this process write tables only, without figures and pages."""
     from tests import without_drawing
 
     with without_drawing.undrawn():
@@ -98,13 +98,14 @@ def undrawn():
 
 
 _SECONDS = {True: 15.0, False: 0.2}
-"""What a test takes, about, by whether it is marked as slow."""
+"""Approximate duration of a test in seconds, by whether it is marked as slow."""
 
 
-@pytest.hookimpl(tryfirst=True)  # before `-m` chooses by markers
+@pytest.hookimpl(tryfirst=True)  # before `-m` selects tests by marker
 def pytest_collection_modifyitems(items):
-    """Mark the tests that depend on the folder of recordings beside the clone, and put files that
-    take long first: one that began last would keep the other workers waiting.
+    """Mark tests that depend on the folder of recordings, and run the slowest files first.
+
+    A slow file that starts last would keep the other workers waiting.
     """
     seconds = Counter()
     reads = {path: bool(_READS_DATA.search(path.read_text())) for path in {i.path for i in items}}
@@ -117,7 +118,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def browser():
-    """One headless browser for all tests of pages; they skip visibly where there is none."""
+    """Start one headless browser for all page tests; skip them if no browser is installed."""
     from tests.browser import launched
 
     with launched() as started:

@@ -39,11 +39,13 @@ TUNERS = {"random": {}, "cma_es": {}, "least_squares": {}, "regressor": {"seeds"
 
 SALT = "as secret as can be"
 SEALED = ("nursery", "keeper", "tuner")
-"""Processes below a worker, each the parent of the next."""
+"""Kinds of processes below a worker: fork server, supervisor, isolated tuner (each the parent of
+the next).
+"""
 
 
 def start(folder, experiment, address, environment, isolation="run"):
-    """A new comparison, or the rest of one that was killed."""
+    """Start a new comparison, or resume one that was killed."""
     begun = (
         ["--resume", str(folder)]
         if folder.exists()
@@ -67,7 +69,7 @@ def errors_of(folder):
 
 
 def victims(process, what, running):
-    """Those of a kind that live now; `process` is the runner."""
+    """Return the living processes of one kind; `process` is the runner."""
     runner = psutil.Process(process.pid)
     if what == "runner":
         return [runner]
@@ -79,9 +81,9 @@ def victims(process, what, running):
 
 
 def below(top, what):
-    """Nurseries, keepers or tuners that descend from these."""
+    """Return the fork servers, supervisors or tuners that descend from these processes."""
     everyone = [c for one in top for c in one.children(recursive=True)]
-    # All three are called alike: the one copies itself.
+    # All three have the same command line, because the fork server forks the others.
     alike = {c.pid: c for c in everyone if "bench.benchmark.isolation.fork_server" in said(c)}
     return [c for c in alike.values() if SEALED[_depth(c, alike)] == what]
 
@@ -94,8 +96,10 @@ def _depth(process, alike):
 
 
 def disturbed(folder, experiment, kills, rng, running, environment, isolation):
-    """Kills at random moments until there were `kills`, or all is done; returns how many of each
-    hit.
+    """Kill processes at random moments until `kills` are reached or all runs are done.
+
+    Returns:
+        Number of kills by kind of process.
     """
     hits = Counter()
     address = running and running.address
@@ -124,7 +128,7 @@ def disturbed(folder, experiment, kills, rng, running, environment, isolation):
 
 
 def ended(process, folder):
-    """How a runner ended, and what its table says of failures."""
+    """Return the exit code and errors of a runner, and the failed runs of its status table."""
     words = f"it ended with {process.returncode}: {errors_of(folder).read_text()}"
     if not (folder / "status.csv").exists():
         return words
@@ -133,7 +137,10 @@ def ended(process, folder):
 
 
 def killed(process, what, running, rng):
-    """Whether one of these was there, and is killed; looks for a while, since some live shortly."""
+    """Kill one process of this kind, and return whether one was found.
+
+    Some processes live only briefly, so the search is repeated for up to 1 s.
+    """
     until = time.monotonic() + 1.0
     while time.monotonic() < until and process.poll() is None:
         with suppress(psutil.NoSuchProcess):
@@ -145,9 +152,7 @@ def killed(process, what, running, rng):
 
 
 def refuse_remains(place, running):
-    """Raise if a process of ours has no living parent's use, or a folder no process, once there was
-    time to end.
-    """
+    """Wait up to 20 s, then raise if orphaned processes or abandoned folders remain."""
     until = time.monotonic() + 20.0
     while orphans(place, running) or deserted(place):
         if time.monotonic() > until:
@@ -156,7 +161,7 @@ def refuse_remains(place, running):
 
 
 def of_ours(place):
-    """Processes whose temporary files lie in `place`, wherever they hang by now."""
+    """Return the processes whose temporary folder is below `place`, whatever their parent is."""
     found = []
     for process in psutil.process_iter():
         with suppress(psutil.Error):
@@ -166,7 +171,7 @@ def of_ours(place):
 
 
 def orphans(place, running):
-    """Those that are not the cluster's, which goes on."""
+    """Return the processes of the runs that still live; those of the cluster may continue."""
     top = [] if running is None else [running.scheduler, *running.nannies]
     kept = {p.pid for p in top}
     for one in top:
@@ -175,7 +180,7 @@ def orphans(place, running):
 
 
 def deserted(place):
-    """Folders of tuners that no living process holds."""
+    """Return the tuner folders that no living process has locked."""
     found = []
     for path in place.glob("simgap-tuner-*"):
         with suppress(OSError), closing(path) as folder:
@@ -194,7 +199,7 @@ def closing(path):
 
 
 def compare(folder, undisturbed):
-    """Raise unless both folders hold the same, but for times."""
+    """Raise unless both result folders are equal except for measured times."""
     for name, read in (
         ("status.csv", pd.read_csv),
         ("table.csv", pd.read_csv),
@@ -212,8 +217,10 @@ def compare(folder, undisturbed):
 
 
 def chaos(folder, kills, seed, on_cluster, targets=60):
-    """Rounds of a comparison, each disturbed, until there were `kills` kills; returns how many of
-    each.
+    """Repeat a comparison with random kills until there were `kills` kills.
+
+    Returns:
+        Number of kills by kind of process, number of rounds, and number of runs of a comparison.
     """
     rng = np.random.default_rng(seed)
     experiment = folder / "chaos.toml"
@@ -226,7 +233,7 @@ def chaos(folder, kills, seed, on_cluster, targets=60):
         "tuners": TUNERS,
     }
     experiment.write_text(tomli_w.dumps(document))
-    # Of its own, so that what is left there is known to be of these runs.
+    # A separate temporary folder: everything left in it comes from these runs.
     place = folder / "tmp"
     place.mkdir()
     environment = {**os.environ, "SIMGAP_CACHE": str(folder / "cache"), "TMPDIR": str(place)}
@@ -242,7 +249,8 @@ def chaos(folder, kills, seed, on_cluster, targets=60):
             hits += disturbed(folder_here, experiment, left, rng, running, environment, isolation)
             compare(folder_here, undisturbed)
             refuse_remains(place, running)
-    # As the next to begin does: the cluster itself has been killed, on both sides of its pipes.
+    # The next runner cleans up like this. The cluster itself was killed, on both sides of its
+    # pipes.
     with patch("tempfile.tempdir", str(place)):
         remove_stale_folders()
     refuse_remains(place, None)

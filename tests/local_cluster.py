@@ -1,4 +1,4 @@
-"""A real Dask scheduler and workers on loopback, for tests."""
+"""Start a real Dask scheduler and workers on the loopback interface."""
 
 import json
 import subprocess
@@ -10,7 +10,7 @@ import psutil
 
 
 class Cluster:
-    """Processes of a scheduler and of workers that a nanny restarts."""
+    """Scheduler process and worker processes, which Dask nannies restart."""
 
     def __init__(self, folder, workers=2, environment=None):
         self._environment = environment
@@ -41,7 +41,7 @@ class Cluster:
             return client.nthreads()
 
     def workers(self):
-        """The processes in which Dask's workers run: children of the nannies."""
+        """Return the Dask worker processes, which are children of the nannies."""
         return [
             c
             for nanny in self.nannies
@@ -53,7 +53,7 @@ class Cluster:
         processes = [
             psutil.Process(p.pid) for p in (*self.nannies, self.scheduler) if p.poll() is None
         ]
-        # What they have started ends with them, and clears up.
+        # Kill the children too, so that no process remains.
         everyone = processes + [c for p in processes for c in p.children()]
         for process in everyone:
             try:

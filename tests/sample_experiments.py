@@ -1,4 +1,4 @@
-"""A small experiment on the test simulator."""
+"""Build a small experiment on the test simulator."""
 
 from bench.benchmark.problem.experiment import parse_experiment
 

@@ -1,4 +1,4 @@
-"""Wishes for simulated recordings as the command line's texts, and their writing."""
+"""Build specifications of simulated recordings from command-line texts, and write them."""
 
 from bench.cli.key_value_args import build_simulation_spec_args
 from bench.logs import synthetic_recording
@@ -16,7 +16,9 @@ def Wish(  # noqa: N802 - stands for the class of that name
     *rest,
     **options,
 ):
-    """A `synthetic_recording.SimulationSpec`; texts are ``NAME=VALUE`` as on the command line."""
+    """Build a `synthetic_recording.SimulationSpec` from ``NAME=VALUE`` texts of the
+    command line.
+    """
     values = build_simulation_spec_args(theta, effects, constants, noise, inputs, initial)
     names = ("runs", "seconds", "rate", "engine", "seed", "held_out")
     options |= dict(zip(names, rest, strict=False))
@@ -24,7 +26,7 @@ def Wish(  # noqa: N802 - stands for the class of that name
 
 
 def write(wished, out):
-    """Simulate and write, as the command does."""
+    """Simulate a recording and write it like the command."""
     synthetic_recording.check_output_path(out)
     made = synthetic_recording.simulate_recording(wished)
     made.write(out)

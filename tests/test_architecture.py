@@ -1,6 +1,4 @@
-"""The house: which rooms there are, that they stand in layers, and that no import runs in a
-circle.
-"""
+"""Tests of the packages, their layers, and imports without cycles."""
 
 import re
 import shutil
@@ -22,7 +20,7 @@ ROOMS = {
 
 
 def linted(root):
-    """The verdict on the contracts of pyproject.toml about the code below `root`."""
+    """Check the import contracts of pyproject.toml for the code below `root`."""
     return subprocess.run(
         [
             sys.executable,
@@ -38,8 +36,9 @@ def linted(root):
 
 
 def circle(imports):
-    """Modules that import each other in a circle, the first of them again at the end; or
-    nothing.
+    """Return the modules of an import cycle, with the first one repeated at the end.
+
+    The list is empty if there is no cycle.
     """
     try:
         tuple(TopologicalSorter(imports).static_order())
@@ -50,7 +49,9 @@ def circle(imports):
 
 @pytest.fixture(scope="module")
 def imports():
-    """By module, what it imports, also inside functions, and for type checkers alone."""
+    """Map each module to the modules it imports, including imports in functions and for type
+    checkers.
+    """
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
     return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
 
@@ -98,7 +99,7 @@ def test_an_import_that_climbs_is_found(module, line, contract, tmp_path):
 
 
 GENERIC = re.compile(r"^class \w+\([^)]*\bNamedTuple\b[^)]*\bGeneric\b", re.M)
-"""What Python 3.10 refuses at import, and no checker of later versions sees."""
+"""Pattern of classes that Python 3.10 refuses at import and later type checkers accept."""
 
 
 def test_no_named_tuple_is_generic_which_python_3_10_refuses():

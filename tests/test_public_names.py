@@ -1,4 +1,6 @@
-"""The face: what `import simgap` offers, how quickly, and whose folder hides it."""
+"""Tests of the public names of `import simgap`, its import time, and packages hidden by
+user files.
+"""
 
 import ast
 import subprocess
@@ -14,7 +16,7 @@ ROOT = Path(simgap.__file__).parent
 
 
 def python(code, cwd, **environment):
-    """Run code in a fresh interpreter that finds simgap where this one does."""
+    """Run code in a new interpreter that imports simgap from the same folder as this one."""
     return subprocess.run(
         [sys.executable, "-c", code],
         cwd=cwd,
@@ -65,16 +67,16 @@ def test_what_hides_a_package_is_named_in_one_line(name, kind, tmp_path):
     said = python("import simgap", tmp_path)
     assert said.returncode == 1
     assert said.stderr.strip().splitlines()[-1] == f"ImportError: {wanted}"
-    # Imported before simgap, it hides the other way round.
+    # If the file is imported before simgap, the conflict is reported too.
     path = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import {name}; import simgap"
     assert python(path, "/").stderr.strip().splitlines()[-1] == f"ImportError: {wanted}"
-    # `python -m simgap` in that folder: one line and the exit code of a wrong input.
+    # `python -m simgap` in that folder prints one line and exits with the code of an input error.
     said = python("import runpy; runpy.run_module('simgap', run_name='__main__')", tmp_path)
     assert (said.returncode, said.stderr) == (2, f"simgap: error: {wanted}\n")
 
 
 def test_a_script_beside_a_file_that_hides_a_package_is_refused(tmp_path):
-    """The folder of the script counts, not the working folder."""
+    """Python searches the folder of the script first, not the working directory."""
     (tmp_path / "sims.py").write_text("")
     (tmp_path / "mine.py").write_text("import simgap")
     script = f"import runpy, sys; sys.path[0] = {str(tmp_path)!r}; runpy.run_path('mine.py')"
@@ -88,7 +90,7 @@ def test_a_folder_of_that_name_without_a_package_in_it_does_no_harm(tmp_path):
 
 
 def test_what_is_installed_exposes_neither_tests_nor_examples(tmp_path):
-    """An editable install offers what the wheel holds."""
+    """An editable install exposes only the packages of the wheel."""
     if not (Path(sys.prefix) / "bin" / "simgap").exists():
         pytest.skip("simgap is not installed in this environment")
     code = (
@@ -103,7 +105,7 @@ def test_what_is_installed_exposes_neither_tests_nor_examples(tmp_path):
 
 @pytest.mark.slow
 def test_the_wheel_is_typed_for_who_installs_it(tmp_path):
-    """Of everything under the one name, in a user's strict checking."""
+    """The wheel contains stubs and `py.typed` files for users who run a strict type checker."""
     built = subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
         cwd=ROOT,

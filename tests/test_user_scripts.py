@@ -1,5 +1,7 @@
-"""simgap in the files that users write: scripts without ``if __name__ == "__main__"``, classes that
-stand in them, and files with the names of simgap's packages.
+"""Tests of simgap in user files.
+
+The cases are scripts without ``if __name__ == "__main__"``, classes defined in scripts, and files
+that have the names of simgap's packages.
 """
 
 import subprocess
@@ -31,7 +33,7 @@ print(sorted(run.statuses["tuner"].unique()), sorted(run.statuses["status"].uniq
 
 
 def ran(folder, words):
-    """Run Python in a folder and return what it printed; its errors are shown where it fails."""
+    """Run Python in a folder and return the printed lines; show the errors if it fails."""
     done = subprocess.run(
         [sys.executable, *words],
         cwd=folder,
@@ -54,7 +56,7 @@ def test_a_script_without_a_guard_compares_in_worker_processes(words, tmp_path):
     text = COMPARE.format(tuner='"cma_es", "least_squares"', more="")
     (folder / "first.py").write_text(text)
     lines = ran(folder, words)
-    # Once: a worker that imported the script would say it again.
+    # The line appears once: a worker that imported the script would print it again.
     assert lines == ["the script runs", "['cma_es', 'least_squares'] ['done']"]
     assert (folder / "out" / "table.csv").is_file()
 
@@ -70,7 +72,7 @@ def test_a_plugin_may_be_called_as_one_of_the_packages(tmp_path):
 
 @pytest.mark.parametrize("place", ["script", "module"])
 def test_a_class_that_workers_cannot_have_is_refused_at_once(place, tmp_path):
-    """In one line that says what to do, without a worker."""
+    """The error is one line with a remedy, and no worker process is started."""
     script = tmp_path / "first.py"
     text = """
 try:
@@ -99,7 +101,7 @@ except simgap.InputError as error:
 
 @pytest.mark.parametrize("trust", [False, True])
 def test_a_diagnoser_of_a_script_is_refused_at_once(trust, tmp_path):
-    """It is asked in worker processes, whether it is trusted or not."""
+    """Diagnosers run in worker processes, with and without isolation."""
     (tmp_path / "first.py").write_text(
         f"""
 import simgap

@@ -1,4 +1,4 @@
-"""simgap whose comparisons write their tables alone; figures and pages have tests of their own."""
+"""Run simgap without figures and pages, which have their own tests."""
 
 import sys
 from contextlib import contextmanager
@@ -14,12 +14,12 @@ with undrawn():
     sys.exit(main())
 """
 COMMAND = [sys.executable, "-c", _CODE]
-"""`simgap` in a process of its own, wherever it is started."""
+"""Command line of `simgap` in a separate process, independent of the working directory."""
 
 
 @contextmanager
 def undrawn():
-    """Comparisons of this process draw nothing meanwhile."""
+    """Make comparisons in this process draw nothing within the block."""
     from bench.benchmark import results_report
 
     before = results_report._drawn, results_report.render_page

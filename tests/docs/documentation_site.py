@@ -13,17 +13,19 @@ from tests.docs.documentation_pages import DOCS, ROOT
 from tests.docs.example_folder import Stage
 
 SHIM = "https://unpkg.com/iframe-worker/shim"
-"""What search needs to run from a disk, which the site's tool has pages ask the network for."""
+"""Address of the script that search needs without a server; the site generator loads it from the
+network.
+"""
 LOCAL_SHIM = "assets/iframe-worker.js"
-"""The same, kept with the pages."""
+"""Address of the local copy of that script."""
 
 
 def build(folder, run=False):
-    """Lay the pages out below a folder and build them there; a fault on a page ends it.
+    """Build the site from the pages; raise an error for any fault on a page.
 
     Args:
-        folder: made anew; `pages` and `html` are written below it.
-        run: run the notebooks.
+        folder: output folder, recreated; `pages` and `html` are written below it.
+        run: whether to run the notebooks.
 
     Returns:
         The folder of the built site.

@@ -1,4 +1,4 @@
-"""The page of public names; the site's tool reads their docstrings from the source."""
+"""List the public names on their page; the site generator reads the docstrings from the source."""
 
 import inspect
 
@@ -35,7 +35,7 @@ GROUPS = {
     ),
     "Faults": ("What is the user's to mend.", "InputError"),
 }
-"""Headings of the page: a sentence, and the names below it."""
+"""Headings of the page: introductory sentence and names."""
 UNDOCUMENTED = {
     "Array",
     "TunerGenerator",
@@ -45,17 +45,18 @@ UNDOCUMENTED = {
     "simulators",
     "effects",
 } | {"diagnosers"}
-"""Aliases and objects, which docs/python.md has in its tables."""
+"""Aliases and objects without a docstring; the tables of docs/python.md describe them."""
 
 
 def listed():
-    """Every name on the page."""
+    """Return every name on the page."""
     return [name for _, names in GROUPS.values() for name in names.split()]
 
 
 def sections():
-    """The page's parts: below each heading a line for each name, which the site replaces by what
-    the source says.
+    """Return the sections of the page.
+
+    Each name is one line, which the site generator replaces by signature and docstring.
     """
     parts = []
     for heading, (says, names) in GROUPS.items():
@@ -65,5 +66,5 @@ def sections():
 
 
 def address(thing):
-    """Where a class or function is defined."""
+    """Return the module path and name of the definition of a class or function."""
     return f"{inspect.unwrap(thing).__module__}.{thing.__qualname__}"

@@ -1,5 +1,7 @@
-"""Lays the pages out as a site: the same texts, with links that lead inside the site, mathematics
-as MathML, and a page for each source file that a page links to.
+"""Write the documentation pages as input of the site generator.
+
+Links are changed to addresses within the site, formulas become MathML, and each linked source file
+gets its own page.
 """
 
 import re
@@ -13,19 +15,19 @@ from tests.docs.documentation_pages import DOCS, FENCE, LINK, ROOT, anchors, pag
 
 PICTURES = {".gif", ".jpg", ".png", ".svg"}
 FILES = {".csv", ".html", ".pdf", ".parquet", ".json"}
-"""What is handed out as it is; any other file is shown as text."""
+"""Suffixes of files that are copied unchanged; any other file is displayed as text."""
 UNSEARCHED = "---\nsearch:\n  exclude: true\n---"
-"""What begins a page that the search leaves alone."""
+"""Front matter of pages that the search excludes."""
 LANGUAGES = {".py": "python", ".toml": "toml", ".xml": "xml", ".urdf": "xml"}
 FORMULA = re.compile(r"\$`([^`]+)`\$")
-"""Mathematics within a line, as GitHub has it."""
+"""Pattern of an inline formula in GitHub's syntax."""
 BEFORE_LIST = re.compile(r"^(?!\s*(?:[-*|]|\d+\.) )(?!\|)(\S.*)\n(?=(?:[-*]|1\.) )", re.M)
-"""A line of text that a list follows at once."""
+"""Pattern of a line of text directly before a list."""
 HEADING = re.compile(r"^(#+ .*)$", re.M)
 
 
 def place(path):
-    """Where a file of the project stands in the site, as a path below it."""
+    """Return the path of a project file within the site."""
     path = path.resolve()
     if path.is_dir():
         readme = path / "README.md"
@@ -45,11 +47,11 @@ def place(path):
 
 
 class Stage:
-    """The pages of the site in a folder, each written once.
+    """The pages of the site, each written once into a folder.
 
     Attributes:
-        folder: where they are written.
-        run: whether notebooks are run, and what their cells show stands on their pages.
+        folder: output folder.
+        run: whether notebooks are run and the outputs of their cells displayed.
         shown: files of the project that have been written.
     """
 
@@ -59,12 +61,12 @@ class Stage:
         self.shown = set()
 
     def every_page(self):
-        """Write all Markdown pages and notebooks of the project, and what they link to."""
+        """Write all Markdown pages and notebooks of the project and the files they link to."""
         for path in [*pages(), *sorted((DOCS / "notebooks").glob("*.ipynb"))]:
             self.show(path)
 
     def show(self, path):
-        """Write a file of the project, unless it is there."""
+        """Write a file of the project unless it has been written already."""
         path = path.resolve()
         if path in self.shown:
             return
@@ -87,7 +89,7 @@ class Stage:
             target.write_text(source(path), encoding="utf-8")
 
     def page(self, path):
-        """A Markdown page as the site's tool takes it."""
+        """Return a Markdown page in the form that the site generator expects."""
         names = iter(anchors(path))
         text = path.read_text(encoding="utf-8")
         return outside_code(
@@ -97,12 +99,12 @@ class Stage:
         )
 
     def linked(self, text, path, beside=()):
-        """A text of a page with its links turned to where things are in the site.
+        """Replace the links of a page by addresses within the site.
 
         Args:
-            text: Markdown without fenced blocks, or of a notebook.
-            path: the page's file, from which links lead.
-            beside: names of files that are written beside the page.
+            text: Markdown without fenced blocks, or the text of a notebook.
+            path: file of the page, to which its links are relative.
+            beside: names of files in the same output folder as the page.
         """
 
         def turned(link):
@@ -117,7 +119,7 @@ class Stage:
         return LINK.sub(turned, text)
 
     def listing(self, folder):
-        """A page for a folder: its files."""
+        """Return a page that lists the source files of a folder."""
         lines = [f"# `{folder.relative_to(ROOT)}`", ""]
         for file in sorted(folder.iterdir()):
             if file.is_file() and file.suffix in LANGUAGES:
@@ -127,7 +129,7 @@ class Stage:
 
 
 def outside_code(text, change, fenced: Callable[[re.Match[str]], str]):
-    """A text with `change` made between its fenced blocks, and `fenced` to these."""
+    """Apply `change` to the text between fenced blocks, and `fenced` to the blocks."""
     parts, end = [], 0
     for fence in FENCE.finditer(text):
         parts += [change(text[end : fence.start()]), fenced(fence)]
@@ -136,18 +138,18 @@ def outside_code(text, change, fenced: Callable[[re.Match[str]], str]):
 
 
 def with_anchors(text, names):
-    """Headings that keep the anchors which they have on GitHub, and formulas within lines."""
+    """Give headings the anchors they have on GitHub, and convert inline formulas."""
     text = HEADING.sub(lambda heading: f"{heading[1]} {{#{next(names)}}}", text)
     return FORMULA.sub(lambda found: mathml(found[1], "inline"), text)
 
 
 def spaced(text):
-    """A blank line before each list that follows a line of text: GitHub needs none."""
+    """Insert the blank line before a list that GitHub does not need."""
     return BEFORE_LIST.sub(r"\1\n\n", text)
 
 
 def code(fence):
-    """A fenced block: its name becomes its title, and mathematics is set."""
+    """Convert a fenced block: its name becomes its title, and formulas become MathML."""
     if fence["language"] == "math":
         return formula(fence["text"])
     title = f' title="{fence["name"]}"' if fence["name"] else ""
@@ -155,19 +157,19 @@ def code(fence):
 
 
 def mathml(formula, display):
-    """A formula in LaTeX as MathML, which browsers show without a script."""
+    """Convert a LaTeX formula to MathML, which browsers display without a script."""
     from latex2mathml.converter import convert
 
     return convert(formula, display=display)
 
 
 def formula(text):
-    """A displayed formula."""
+    """Convert a displayed formula to HTML."""
     return f'<div class="formula" markdown="0">{mathml(text.strip(), "block")}</div>'
 
 
 def source(path):
-    """A page that shows a file of the project."""
+    """Return a page that displays a source file of the project."""
     language = LANGUAGES.get(path.suffix, "text")
     text = path.read_text(encoding="utf-8")
     title = f"# `{path.relative_to(ROOT)}`"

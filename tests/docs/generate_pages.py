@@ -1,8 +1,9 @@
-"""Writes the pages below docs/reference from the code: commands from the parser, keys of an
-experiment and of verdict.json from fields and docstrings, thresholds from the rules, what commands
-print for programs from the schemas; and those schemas that are of a table's columns.
+"""Write the pages below docs/reference and the schemas of table rows from the code.
 
-Run by `python -m tests.docs.generate_pages`; a test says when it has to be.
+Commands come from the parser, keys of an experiment and of verdict.json from fields and docstrings,
+thresholds from the verdict rules, and JSON documents from the schemas.
+
+Run `python -m tests.docs.generate_pages` when the test of these pages fails.
 """
 
 import ast
@@ -41,25 +42,25 @@ NOTE = f"<!-- Written by `{COMMAND}` from the code; change it there. -->"
 
 
 def page(title, *parts):
-    """A page: the note, a heading, and its parts with blank lines between."""
+    """Return a page: note, heading and parts, separated by blank lines."""
     return "\n\n".join([NOTE, f"# {title}", *parts]) + "\n"
 
 
 def table(*rows):
-    """A Markdown table; the first row is its header."""
+    """Return a Markdown table; the first row is its header."""
     lines = ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
 
 
 def attributes(cls):
-    """What a Google-style docstring says of each attribute, in one line each."""
+    """Return the descriptions of the attributes in a Google-style docstring, each as one line."""
     text = inspect.getdoc(cls).partition("Attributes:\n")[2]
     found = re.findall(r"^    (\w+): ((?:.|\n        )*)", text, re.M)
     return {name: " ".join(says.split()) for name, says in found}
 
 
 def summary(cls):
-    """The first paragraph of a docstring, in one line."""
+    """Return the first paragraph of a docstring as one line."""
     return " ".join(inspect.getdoc(cls).partition("\n\n")[0].split())
 
 
@@ -67,7 +68,7 @@ def summary(cls):
 
 
 def commands():
-    """Every command, its usage and its options."""
+    """Return the page of all commands with their options."""
     found = catalogue.list_commands(build_parser())
     listing = [("command", "what it does")]
     listing += [(f"[`{each['name']}`](#simgap-{each['name']})", each["says"]) for each in found]
@@ -87,15 +88,15 @@ def commands():
 
 
 def sentence(text):
-    """A line of help as a sentence."""
+    """Write a help text as a sentence."""
     return text[0].upper() + text[1:] + "."
 
 
 def options(command):
-    """A command's arguments and options as a table."""
+    """Return a table of a command's arguments and options."""
     rows = [("argument or option", "what")]
     for option in command["options"]:
-        # All of them have it, and it is said above.
+        # Every command has this option, and the top of the page describes it.
         if option["flags"] == ["--json"]:
             continue
         what = option["says"].replace("|", "\\|")
@@ -110,7 +111,7 @@ def options(command):
 
 
 def spelt(option):
-    """An option as it is typed."""
+    """Return an option as it is typed on the command line."""
     metavar = option["metavar"]
     several = f"{metavar} ..." if option["several"] else metavar
     if not option["flags"]:
@@ -122,14 +123,14 @@ def spelt(option):
 # Keys of an experiment.
 
 LEFT_OUT = {"name", "label"}
-"""Fields that are no keys: an experiment's name is that of its file, a label that of its table."""
+"""Fields that are not keys: the experiment's name comes from its file, a label from its table."""
 REQUIRED = {"simulator"}
-"""Fields that have a default for Python alone."""
+"""Fields whose default exists only in Python."""
 WORDS = {str: "text", int: "whole number", float: "number", bool: "`true` or `false`", Any: "value"}
 
 
 def experiment_keys():
-    """Every key of an experiment file."""
+    """Return the page of all keys of an experiment file."""
     parts = [
         "An experiment is a TOML file: one that comes with the project by its name, your own by "
         "its path (`simgap compare my.toml`). The keys are the fields of "
@@ -140,7 +141,7 @@ def experiment_keys():
     ]
     for name, hint in hints(Experiment).items():
         for cls in filter(dataclasses.is_dataclass, parts_of(hint)):
-            # several of a kind stand in a table each, under a label
+            # Several tables of one kind have a label each.
             whole = name if hint is cls or type(None) in get_args(hint) else f"{name}.LABEL"
             parts += [f"## `[{whole}]`", summary(cls), keys(cls, f"{whole}.")]
     parts += [
@@ -152,7 +153,7 @@ def experiment_keys():
 
 
 def keys(cls, prefix):
-    """A dataclass's fields as a table: key, type, default, and what its docstring says of each."""
+    """Return a table of a dataclass's fields: key, type, default and description."""
     says = attributes(cls)
     rows = [("key", "type", "default", *(["what"] if says else []))]
     for field in dataclasses.fields(cls):
@@ -165,18 +166,18 @@ def keys(cls, prefix):
 
 
 def hints(cls):
-    """The types of a class's fields, resolved."""
+    """Return the resolved types of a class's fields."""
     return get_type_hints(cls)
 
 
 def parts_of(hint):
-    """The types that a type is made of, itself among them."""
+    """Return a type and all types it contains."""
     inner = [part for argument in get_args(hint) for part in parts_of(argument)]
     return [hint, *inner]
 
 
 def words(hint):
-    """A type as one would say it of TOML."""
+    """Describe a type in TOML terms."""
     if is_typeddict(hint):
         return f"table of {', '.join(f'`{name}`' for name in hint.__annotations__)}"
     origin, inner = get_origin(hint), [a for a in get_args(hint) if a not in (type(None), ...)]
@@ -201,7 +202,7 @@ def words(hint):
 
 
 def default(field):
-    """A field's default as TOML writes it."""
+    """Return a field's default in TOML syntax."""
     if field.name in REQUIRED:
         return "required"
     value = field.default
@@ -232,7 +233,7 @@ KINDS = {
     EarlyStop: "the early end",
     RecordingFault: "a recording fault",
 }
-"""Objects in verdict.json, as the page calls them."""
+"""Names of the objects in verdict.json on the page."""
 ESTIMATE = {
     "value": "fitted",
     "unit": "of the three numbers",
@@ -249,11 +250,13 @@ ESTIMATE = {
     "usual_range": "lowest and highest value that one would expect; left out where the value lies "
     "between them",
 }
-"""A number says this in one sentence, which a table needs by its fields."""
+"""Descriptions of the fields of an estimate, whose docstring is a single sentence."""
 
 
 def verdict_keys():
-    """The six verdicts, every key of verdict.json, and the thresholds of the rules."""
+    """Return the page of the six verdicts, all keys of verdict.json, and the thresholds of the
+    rules.
+    """
     words_of = [
         ("verdict", "says"),
         *((f"`{name}`", text) for name, text in VERDICT_MEANINGS.items()),
@@ -287,7 +290,7 @@ OF_JSON = {
 
 
 def json_keys(cls, says):
-    """A dataclass's fields as keys of a JSON object."""
+    """Return a table of a dataclass's fields as keys of a JSON object."""
     rows = [("key", "type", "what")]
     for field in dataclasses.fields(cls):
         what = says[field.name].replace("``", "`").replace("None", "null").removesuffix(".")
@@ -297,7 +300,7 @@ def json_keys(cls, says):
 
 
 def of_json(hint):
-    """A type as one would say it of JSON."""
+    """Describe a type in JSON terms."""
     origin, inner = get_origin(hint), get_args(hint)
     if hint in KINDS:
         return KINDS[hint]
@@ -313,9 +316,9 @@ def of_json(hint):
 
 
 def thresholds(module):
-    """The numbers that a module names in capitals, each with its sentence."""
+    """Return a table of a module's numeric constants and their docstrings."""
     rows = [("threshold", "value", "what")]
-    # Docstrings of attributes are in the text alone: Python does not keep them.
+    # Python does not keep docstrings of constants, so they are read from the source.
     body = ast.parse(inspect.getsource(module)).body
     for statement, behind in pairwise(body):
         sentence_behind = isinstance(behind, ast.Expr) and isinstance(behind.value, ast.Constant)
@@ -334,13 +337,13 @@ ROWS = {
     "shot-table": ("A row of table.csv of a bounce shot", SHOT_TABLE_COLUMNS),
     "run-status": ("A row of status.csv", STATUS_COLUMNS),
 }
-"""Schemas that are of the columns of a table."""
+"""Schemas of table rows: title and columns."""
 JSON_KINDS = {str: "string", bool: "boolean", int: "integer", float: "number"}
 LARGEST = 2.0**53
 
 
 def row_schema(name):
-    """The schema of a table's row, from the columns that are declared."""
+    """Return the schema of a table row, made from the declared columns."""
     title, columns = ROWS[name]
     document = {
         "$schema": DRAFT,
@@ -356,7 +359,7 @@ def row_schema(name):
 
 
 def cell_schema(column):
-    """The schema of one cell."""
+    """Return the schema of one cell."""
     kind = JSON_KINDS[column.kind]
     empty = column.empty is not EmptyCellRule.NEVER or column.infinite or "" in column.words
     cell = {"type": [kind, "null"] if empty else kind}
@@ -370,7 +373,7 @@ def cell_schema(column):
 
 
 def json_documents():
-    """What every command prints with --json, and the other forms, from the schemas."""
+    """Return the page of the JSON documents of all commands, made from the schemas."""
     commands_of = [each["name"] for each in catalogue.list_commands(build_parser())]
     others = [name for name in schema_names() if name not in commands_of]
     parts = [
@@ -396,7 +399,7 @@ def json_documents():
 
 
 def document_tables(known):
-    """The keys of a document, of each form that it may have."""
+    """Return the tables of a document's keys, one for each form it may have."""
     forms = known.get("anyOf", [known])
     parts = [sentence(known["description"])] if "description" in known else []
     for form in forms:
@@ -406,7 +409,7 @@ def document_tables(known):
 
 
 def key_rows(known, before):
-    """A row for each key, those of what it holds below it."""
+    """Yield a row for each key, followed by rows for the keys of its value."""
     for key, inner in known.get("properties", {}).items():
         name = f"{before}{key}"
         says = inner.get("description", "").replace("|", "\\|")
@@ -415,7 +418,7 @@ def key_rows(known, before):
 
 
 def inner_rows(inner, name):
-    """Rows for what stands within a key: objects, lists of them, objects by name."""
+    """Yield rows for the keys inside a value: an object, a list of objects, or objects by name."""
     for form in inner.get("anyOf", ()):
         yield from inner_rows(form, name)
     if "items" in inner:
@@ -427,7 +430,7 @@ def inner_rows(inner, name):
 
 
 def json_kind(known):
-    """A schema's kind in words."""
+    """Describe the type of a schema in words."""
     if "const" in known:
         return f"`{known['const']}`"
     if "$ref" in known:
@@ -453,7 +456,7 @@ def json_kind(known):
 
 
 def how_tuners_work():
-    """Every tuner: method, equations, sources, options."""
+    """Return the page of all tuners: method, equations, sources and options."""
     return page(
         "How each tuner works",
         "Written from the modules in `methods/`, in whose code the equations' numbers stand. Which "
@@ -468,7 +471,7 @@ def how_tuners_work():
 
 
 def public_names():
-    """Every name of simgap that has a docstring."""
+    """Return the page of all public names that have a docstring."""
     return page(
         "Public names",
         "`import simgap`: `simgap.compare` and so on; how they go together is on the page "
@@ -486,11 +489,11 @@ PAGES = {
     "reference/tuners.md": how_tuners_work,
     "reference/verdict.md": verdict_keys,
 }
-"""What writes each page."""
+"""Functions that build the pages."""
 
 
 def main():
-    """Write all schemas of rows and all pages."""
+    """Write all schemas of table rows and all pages."""
     for name in ROWS:
         path = ROOT / "bench" / "schemas" / f"{name}.schema.json"
         path.write_text(row_schema(name), encoding="utf-8")

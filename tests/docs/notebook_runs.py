@@ -1,18 +1,20 @@
-"""Notebooks as pages of the site: text, code, and what it showed where the notebook was run."""
+"""Convert notebooks to pages of the site, with text, code and optionally the outputs of a run."""
 
 import base64
 import tempfile
 
 LONGEST = 100_000
-"""Characters of HTML that stand on the page itself; more becomes a file of its own."""
+"""Maximum number of characters of an HTML output on the page; a longer one becomes a
+separate file.
+"""
 
 
 def page(path, run=False):
-    """A notebook as (Markdown, files beside it by name).
+    """Convert a notebook to Markdown and the additional files that it needs, by name.
 
     Args:
-        path: the notebook, which is kept without outputs.
-        run: run it, in an empty folder, and show what its cells show.
+        path: the notebook, which is stored without outputs.
+        run: whether to run it in an empty folder and display its outputs.
     """
     import nbformat
 
@@ -32,7 +34,7 @@ def page(path, run=False):
 
 
 def execute(notebook):
-    """Run a notebook where it leaves nothing behind."""
+    """Run a notebook in a temporary folder."""
     import nbclient
 
     with tempfile.TemporaryDirectory() as folder:
@@ -41,7 +43,7 @@ def execute(notebook):
 
 
 def shown(output, name, files):
-    """What a cell shows, as Markdown; files that it needs are added to `files`."""
+    """Convert the output of a cell to Markdown, and add the files that it needs to `files`."""
     data = output.get("data", {})
     if "image/png" in data:
         files[f"{name}.png"] = base64.b64decode(data["image/png"])

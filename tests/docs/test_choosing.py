@@ -1,4 +1,4 @@
-"""The numbers on the page about choosing a tuner are those of the reference tables."""
+"""Tests that the numbers on the page about choosing a tuner equal the reference tables."""
 
 import pandas as pd
 import pytest
@@ -10,7 +10,7 @@ REFERENCE = ROOT / "results" / "reference"
 
 
 def median(folder, metric, tuner, kind, simulations):
-    """The median over targets of one tuner, as two digits; the last number for `all`."""
+    """Return a tuner's median over targets with two digits; `all` selects the last checkpoint."""
     table = pd.read_csv(REFERENCE / folder / "table.csv")
     rows = table[(table.metric == metric) & (table.tuner == tuner) & (table.range == kind)]
     at = rows.simulations.max() if simulations == "all" else int(simulations)
@@ -28,7 +28,7 @@ def test_medians_are_those_of_the_reference(moment):
         "arm-swing": ("multi/arm-swing", "stiff_error"),
         "ball-crossengine": ("comparison/ball-crossengine", "param_error"),
     }
-    # How many were compared: a table that is not read would pass in silence.
+    # Count the cells: a table that is not read would pass without any comparison.
     cells = 0
     for tuner, *values in rows:
         for heading, value in zip(head[1:], values, strict=True):

@@ -1,4 +1,4 @@
-"""Every command line on a page is one that the program takes."""
+"""Tests that the parser accepts every command line on a page."""
 
 import re
 import shlex
@@ -9,11 +9,13 @@ from bench.cli.main import build_parser
 from tests.docs.documentation_pages import ROOT, blocks, pages
 
 SYNOPSIS = re.compile(r" \[-")
-"""What stands in no command: an option in brackets."""
+"""Pattern of a synopsis, which has options in brackets and is not a command."""
 
 
 def commands(text):
-    """The commands in a page's shell blocks, as words; continued lines are joined."""
+    """Yield the commands of a page's shell blocks as lists of words, with continued
+    lines joined.
+    """
     for _, block in blocks(text, "sh"):
         for line in block.replace("\\\n", " ").splitlines():
             for part in re.split(r"\|\||&&|;", line):
@@ -23,12 +25,12 @@ def commands(text):
 
 
 def refused(words):
-    """Whether the program's parser refuses a command line."""
+    """Return whether the parser refuses a command line."""
     try:
         build_parser().parse_args(words)
     except SystemExit as end:  # --help
         return bool(end.code)
-    except Exception:  # whatever the parser says of it
+    except Exception:  # any error of the parser is a refusal
         return True
     return False
 
@@ -47,7 +49,10 @@ def test_commands_in_the_table_of_the_readme_are_taken(capsys):
 
 
 def named_wrongly(words):
-    """What a command line names that does not exist; empty where all does, or is a user's file."""
+    """Return the error for a name in a command that does not exist.
+
+    The result is empty if all names exist or come from a user's file.
+    """
     from bench.api.train import select_training
     from bench.benchmark.problem.experiment import load_experiment
     from bench.core.plugin_registries import tuners
@@ -72,7 +77,7 @@ def named_wrongly(words):
 
 
 def test_what_commands_name_exists(capsys):
-    """A tuner with a simulator that can train it, an experiment, a data set."""
+    """Checks tuners with a simulator that can train them, experiments and data sets."""
     lines = [line for page in pages() for line in commands(page.read_text(encoding="utf-8"))]
     checked = [line for line in lines if line[:1] in (["train"], ["compare"], ["download"])]
     assert len(checked) > 15

@@ -1,4 +1,4 @@
-"""What pages give to be copied works as it stands."""
+"""Tests that the examples on pages work unchanged."""
 
 import os
 import re
@@ -16,7 +16,7 @@ SIMGAP = [sys.executable, "-m", "simgap"]
 
 
 def block(page, name):
-    """The named block of a page."""
+    """Return the named block of a page."""
     return dict(blocks(text_of(page)))[name]
 
 
@@ -53,7 +53,8 @@ def test_the_simulator_of_the_page_does_what_the_page_says(tmp_path):
     assert len(shown) == len(said)
     for line, output in zip(shown, said, strict=True):
         assert line in output.splitlines()
-    # The model that was found is a simulator again, and without the plugin the option is named.
+    # The extended model is a simulator again; without the plugin, the error names the missing
+    # option.
     extended = ["--plugin", "cart.py", "--plugin", "explained/extended.toml"]
     words = [*SIMGAP, "simulate", "cart_extended", *extended, "--out", "more.csv"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -77,11 +78,11 @@ def test_every_attribute_and_method_of_an_own_simulator_is_on_its_page():
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 SKIPPED = tuple(f"compare {first}" for first in ("ball", "pend", "bounce", "diag", "--recording"))
-"""Commands of the README's table that take minutes; `test_commands` checks that they are taken."""
+"""Commands of the README's table that take minutes; `test_commands` checks their syntax."""
 
 
 def table_commands():
-    """The commands in the README's table, in order, as words."""
+    """Return the commands in the README's table as lists of words, in order."""
     cells = [row[2] for table in tables(section(README, "## What you can do")) for row in table]
     lines = [text for cell in cells for text in quoted(cell)]
     return [shlex.split(line)[1:] for line in lines if line.startswith("simgap ")]
@@ -112,7 +113,7 @@ def test_the_commands_of_the_readme_work_as_written_in_a_clone_that_stands_alone
             assert line in [*printed, "..."]
     assert commands == 4
     short = [words for words in table_commands() if not " ".join(words).startswith(SKIPPED)]
-    mine = [words for words in short if words[0] != "import"]  # that needs a user's log
+    mine = [words for words in short if words[0] != "import"]  # `import` needs a log of the user
     assert len(mine) >= 12
     for words in mine:
         run(words)

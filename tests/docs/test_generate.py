@@ -1,4 +1,4 @@
-"""The pages that are written from the code are what the code says now."""
+"""Tests that the generated pages and schemas are up to date with the code."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The pages that lie beside reference results have the numbers of the tables beside them."""
+"""Tests that stored report pages have the numbers of the tables next to them."""
 
 import io
 import json
@@ -14,13 +14,13 @@ REFERENCE = ROOT / "results" / "reference"
 PAGES = sorted(page.parent for page in REFERENCE.rglob("report.html"))
 COMPARED = [folder for folder in PAGES if not (folder / "verdict.json").exists()]
 _OLDER = ("ball_drops/blue_basketball", "smartphone_fall/fall", "emps/explained", "so101/explained")
-"""Explanations below real/ that are older than today's page: their README says so."""
+"""Explanations below real/ that are older than the present page; their README states this."""
 TODAY = [folder for folder in PAGES if folder not in {REFERENCE / "real" / each for each in _OLDER}]
 DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.S)
 
 
 def tables(folder):
-    """The tables of a page by name."""
+    """Return the tables of a page by name."""
     text = (folder / "report.html").read_text(encoding="utf-8")
     kept = json.loads(DATA.search(text)[1])["tables"]
     return {name: pd.read_csv(io.StringIO(csv)) for name, csv in kept.items()}
@@ -33,10 +33,11 @@ def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
         path = folder / f"{name}.csv"
         if path.exists():
             beside = pd.read_csv(path)
-            # Tables of before tuners were sealed have a column less.
+            # Tables written before tuners were isolated have one column fewer.
             common = [column for column in beside if column in shown]
             assert len(common) >= len(beside.columns) - 1
-            # Behind them a chart's table may have lines to compare with, as what is ideal.
+            # A chart's table may have additional lines at the end for comparison, such as an ideal
+            # curve.
             shown = shown[common].head(len(beside))
             pd.testing.assert_frame_equal(shown, beside[common], rtol=1e-5, check_dtype=False)
             compared += 1

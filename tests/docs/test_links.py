@@ -1,4 +1,4 @@
-"""Links between pages lead somewhere, headings within them too, and every page is in the index."""
+"""Tests that links between pages and to headings are valid, and that the index lists every page."""
 
 import re
 
@@ -22,14 +22,14 @@ def test_links_lead_somewhere(page):
 
 
 PLACE = re.compile(r"`((?:bench|docs|examples|methods|results|sims|tests)/[\w./*-]*)`")
-"""A file or folder of the project as pages name it."""
+"""Pattern of a project file or folder on a page."""
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_files_that_a_page_names_are_there(page):
     named = PLACE.findall(page.read_text(encoding="utf-8"))
-    made = {"results/train/", "results/inspect/"}  # by commands
-    # Capitals stand for something that the reader puts in their place.
+    made = {"results/train/", "results/inspect/"}  # written by commands
+    # Names in capitals are placeholders for the reader.
     fixed = [n for n in named if n not in made and not re.search("[A-Z]{4}", n)]
     assert [name for name in fixed if not [*ROOT.glob(name)]] == []
 

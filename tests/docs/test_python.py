@@ -1,4 +1,4 @@
-"""The page on Python and the notebooks run as they stand, one block after another."""
+"""Tests that the code blocks of the page on Python and the notebooks run unchanged."""
 
 import importlib
 import json
@@ -23,7 +23,7 @@ def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
     (tmp_path / "page_on_python.py").write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    # A module of its own: a tuner has to have a source that can be told.
+    # The page becomes a module, because a tuner's class needs a source file.
     page = importlib.import_module("page_on_python")
     assert set(page.run.statuses["status"]) == {"done"}
     said = capsys.readouterr().out
@@ -41,7 +41,7 @@ def test_a_notebook_is_kept_without_outputs(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-@pytest.mark.filterwarnings("default")  # of jupyter's own packages
+@pytest.mark.filterwarnings("default")  # of the packages of Jupyter
 def test_a_notebook_runs(path, tmp_path, monkeypatch):
     nbclient = pytest.importorskip("nbclient")
     nbformat = pytest.importorskip("nbformat")
@@ -51,6 +51,6 @@ def test_a_notebook_runs(path, tmp_path, monkeypatch):
     notebook = nbformat.read(path, as_version=4)
     run = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": tmp_path}})
     run.execute()
-    # Figures are pictures only where they know how to show themselves without pyplot.
+    # Only figures that can display themselves without pyplot become images.
     shown = [set(o.get("data", {})) for cell in notebook.cells for o in cell.get("outputs", [])]
     assert {"image/png"} <= set().union(*shown), "no figure was shown"

@@ -1,4 +1,6 @@
-"""The page on recordings: the real reader reads its example and tells its messages."""
+"""Tests that the recording reader accepts the example of its page and reports the
+listed messages.
+"""
 
 import re
 
@@ -17,7 +19,7 @@ FAULTS = tables(section(PAGE, "## What a fault is told"))[0][1:]
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    """The folder of the page's example, and it is where one stands."""
+    """Write the files of the page's example into the working directory."""
     monkeypatch.chdir(tmp_path)
     for name in ("swing.toml", "swing.csv", "small.toml"):
         (tmp_path / name).write_text(BLOCKS[name], encoding="utf-8")
@@ -49,7 +51,7 @@ def test_the_smallest_description_is_enough(files):
 
 @pytest.mark.parametrize("row", FAULTS, ids=[quoted(row[2])[0] for row in FAULTS])
 def test_a_fault_is_told_what_the_page_says(files, row):
-    # Row: file, what stands there, what it is changed to, the message.
+    # Columns of the table: file, original text, changed text, message.
     (name,), (before,), (after,), (message,) = map(quoted, row)
     (files / name).write_text(BLOCKS[name].replace(before, after, 1), encoding="utf-8")
     assert before in BLOCKS[name]
@@ -65,15 +67,15 @@ PLACES = {
     "extra.NAME.": "extra.temperature",
     "runs.NAME.": "runs.heavy",
 }
-"""Where keys stand in the page's table, and the example's table of that kind."""
+"""Prefixes of keys on the page, and the example's table for each."""
 CONSTANTS = {"gravity", "length", "mass"}
-"""Of the system: a run may name them directly, which the page writes as `runs.NAME.CONSTANT`."""
+"""Constants of the system; a run may set them, and the page writes them as `runs.NAME.CONSTANT`."""
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_every_key_that_the_reader_knows_stands_on_the_page_and_none_else(files, place):
     table = PLACES[place]
-    # A key that cannot be: the message lists those that can, which is what is asked for here.
+    # The message for an unknown key lists all known keys.
     spoilt = {"": "nonsense = 1\n" + BLOCKS["swing.toml"]}.get(
         table, BLOCKS["swing.toml"].replace(f"[{table}]", f"[{table}]\nnonsense = 1", 1)
     )

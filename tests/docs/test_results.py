@@ -1,4 +1,6 @@
-"""The pages on results describe every file, column and figure that is written, and no other."""
+"""Tests that the pages on results describe all written files, columns and figures, and
+no others.
+"""
 
 import json
 import re
@@ -49,18 +51,18 @@ OF_ROBOTS = {"extended.xml", "extended.urdf", "robot"}
 
 
 def told(heading, below=PAGE):
-    """The names in the first column of the first table below a heading."""
+    """Return the names in the first column of the first table below a heading."""
     return [name for row in tables(section(below, heading))[0][1:] for name in quoted(row[0])]
 
 
 def told_always(heading, below=PAGE):
-    """The names of `told`, without the keys that are not written where they do not apply."""
+    """Return the names of `told` without optional keys."""
     rows = tables(section(below, heading))[0][1:]
     return [name for row in rows if "left out where" not in row[-1] for name in quoted(row[0])]
 
 
 def written_out(names, **placeholders):
-    """Names with PARAMETER, CHANNEL and TUNER replaced by each that there is."""
+    """Replace PARAMETER, CHANNEL and TUNER in names by each of their values."""
     whole = []
     for name in names:
         (mark,) = re.findall("PARAMETER|CHANNEL|TUNER", name) or [None]
@@ -69,13 +71,13 @@ def written_out(names, **placeholders):
 
 
 def columns(path):
-    """The header of a CSV file."""
+    """Return the header of a CSV file."""
     return list(pd.read_csv(path, nrows=0).columns)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, spring):
-    """A comparison of three tuners, one of which learns, on two parameters."""
+    """Run a comparison of three tuners on two parameters; one of the tuners is learned."""
     experiment = spring_experiment(
         targets=2,
         seeds=1,
@@ -107,14 +109,14 @@ def test_every_column_of_a_table_is_on_the_page_in_this_order(folder, name):
 def test_every_column_of_the_runs_is_on_the_page(folder):
     runs = pd.read_parquet(folder / "runs.parquet")
     names = written_out(told("### `runs.parquet`"), PARAMETER=PARAMETERS, CHANNEL=CHANNELS)
-    assert set(names) - set(runs.columns) == {"param_abs_error"}  # of one parameter alone
+    assert set(names) - set(runs.columns) == {"param_abs_error"}  # for one parameter
     assert set(runs.columns) <= set(names)
     assert len(names) == len(set(names))
 
 
 def test_every_metric_and_status_is_on_the_page(folder):
     rows = tables(section(PAGE, "### `table.csv`"))[0]
-    # In the cell the metrics stand beside the file whose columns they are.
+    # The cell of the metrics also names the file that has them as columns.
     (metrics,) = [row[2] for row in rows if row[0] == "`metric`"]
     assert set(quoted(metrics)) - {"runs.parquet"} == set(ERROR_METRICS)
     statuses = tables(section(PAGE, "### `status.csv`"))[1][1:]
@@ -131,7 +133,8 @@ def test_every_figure_is_described(folder):
     figures = {path.stem for path in (folder / "figures").glob("*.png")}
     names = set(told("### Figures of a comparison"))
     assert figures <= names
-    # of targets from another simulator, beyond the training range, and with sloppy directions
+    # Drawn only for targets from another simulator, beyond the training range, or with sloppy
+    # directions.
     assert names - figures <= {"misfit-vs-simulations", "error-vs-distance"}
     rows = tables(section(PAGE, "### Figures of a comparison"))[0][1:]
     assert {quoted(row[1])[0]: quoted(row[0])[0] for row in rows} == FIGURE_FILES
@@ -139,7 +142,7 @@ def test_every_figure_is_described(folder):
 
 def test_several_comparisons(folder, tmp_path, capsys):
     assert main(["plot", str(folder), str(folder), "--out", str(tmp_path / "all")]) == 0
-    # Nemenyi's test needs five problems; two are enough for everything else.
+    # The Nemenyi test needs five problems; two are enough for everything else.
     written = {path.name for path in (tmp_path / "all").iterdir() if path.is_file()}
     assert written | {"nemenyi.csv"} == set(told("## plot of several comparisons"))
     names = written_out(told("### `ranks.csv`"), TUNER=TUNERS)
@@ -152,7 +155,7 @@ def test_the_tables_of_the_bounce_shot():
     assert told("### `table.csv` of shots") == [*SHOT_COLUMNS, "trusted"]
     experiment = load_experiment("bounce-shot")
     settings = read_shot_config(experiment)
-    # Without a plan no shot is flown, and the row has its columns all the same.
+    # A shot without a plan is not executed, but its row has all columns.
     nothing = vars(TunedModel("nominal", 0.5, {}, 0, 0.0, "no plan"))
     (row,) = build_shot_rows(draw_shots(experiment, settings)[0], settings, [nothing])
     assert [*row, "seen", "trusted"] == told("### `shots.csv`")
@@ -170,7 +173,7 @@ def test_the_losses_of_a_training(tmp_path, monkeypatch, spring, capsys):
 
 @pytest.fixture(scope="module")
 def explained(tmp_path_factory):
-    """A simulated swing with a hidden drag, and what `explain` and `score` say of it."""
+    """Simulate a swing with a hidden drag, and run `explain` and `score` on it."""
     folder = tmp_path_factory.mktemp("explained")
     swing, out = folder / "swing.csv", folder / "out"
     hidden = ["--effect", "drag.linear=2e-4", "--noise", "q=0.002", "--rate", "50"]

@@ -1,4 +1,6 @@
-"""The site is built without a fault, asks nothing of the network, and its links lead somewhere."""
+"""Tests that the site builds without warnings, loads nothing from the network, and has
+valid links.
+"""
 
 from html.parser import HTMLParser
 from urllib.parse import unquote, urlsplit
@@ -10,7 +12,7 @@ from tests.docs.documentation_pages import DOCS, pages
 from tests.docs.documentation_site import build
 from tests.docs.example_folder import Stage, place
 
-tomllib = pytest.importorskip("tomllib")  # the site's tool, too, is for Python 3.11 and newer
+tomllib = pytest.importorskip("tomllib")  # the site generator also needs Python 3.11 or newer
 pytest.importorskip("zensical")
 
 FETCHED = {
@@ -22,15 +24,15 @@ FETCHED = {
     "source": "src",
     "video": "src",
 }
-"""By element: the attribute whose address a browser asks for by itself."""
+"""Attributes whose address a browser loads by itself, by element."""
 
 
 VERBATIM = {"code", "math", "pre", "script", "style"}
-"""Elements whose text is no prose."""
+"""Elements whose text is not prose."""
 
 
 class Page(HTMLParser):
-    """What a page of the site names and says: ids, links, what is fetched with it, its prose."""
+    """IDs, links, loaded addresses, CSS classes and prose of a page of the site."""
 
     def __init__(self, text):
         super().__init__()
@@ -59,17 +61,17 @@ class Page(HTMLParser):
 
 
 def parsed(built):
-    """Every page of a built site, by its path."""
+    """Parse every page of a built site; the result is keyed by path."""
     return {file: Page(file.read_text(encoding="utf-8")) for file in built.rglob("*.html")}
 
 
 def from_elsewhere(page):
-    """What a page would ask the network for."""
+    """Return the addresses that a page loads from the network."""
     return [address for address in page.fetched if urlsplit(address).netloc]
 
 
 def lost(site):
-    """Links and pictures that lead nowhere within a site: (page, address)."""
+    """Return broken links and images within a site as pairs (page, address)."""
     found = []
     for file, page in site.items():
         for address in [*page.links, *page.fetched]:
@@ -85,13 +87,13 @@ def lost(site):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The site, built with every warning an error."""
+    """Build the site with warnings as errors."""
     return build(tmp_path_factory.mktemp("docs") / "site")
 
 
 @pytest.fixture(scope="module")
 def site(built):
-    """Its pages, but for those that the project's own reports are."""
+    """Return the parsed pages of the site, without the page for error 404."""
     there = parsed(built)
     return {file: page for file, page in there.items() if file.name != "404.html"}
 
@@ -105,7 +107,7 @@ def test_nothing_is_asked_of_the_network(built, site):
     styles = [file.read_text(encoding="utf-8") for file in built.rglob("*.css")]
     assert styles
     assert not any("url(http" in style or "@import" in style for style in styles)
-    # The tool's script asks the network for these where a page has them.
+    # The generator's script loads resources from the network for pages with these classes.
     used = set().union(*(page.classes for page in site.values()))
     assert not used & {"mermaid", "glightbox", "pyodide"}
 
@@ -159,7 +161,7 @@ def test_every_page_is_in_the_navigation():
     settings = tomllib.loads((DOCS / "zensical.toml").read_text(encoding="utf-8"))
 
     def leaves(entry):
-        """The pages below an entry."""
+        """Return the pages below an entry."""
         if isinstance(entry, str):
             return [entry]
         inner = entry if isinstance(entry, list) else entry.values()
@@ -170,7 +172,7 @@ def test_every_page_is_in_the_navigation():
     assert sorted(listed) == sorted(str(place(page)) for page in [*pages(), *notebooks])
 
 
-# What finds faults finds these.
+# Tests of the helper functions with faulty pages.
 
 
 def test_a_picture_from_elsewhere_is_found():
@@ -199,7 +201,7 @@ def test_a_page_is_laid_out_as_it_is_told(tmp_path):
     assert (tmp_path / "sims" / "effects" / "index.md").exists()
 
 
-# In a real browser.
+# Tests in a real browser.
 
 
 @pytest.mark.slow
@@ -218,7 +220,7 @@ def test_the_search_finds_a_page_from_a_disk(browser, built):
         opened.page.keyboard.press("Control+k")
         opened.page.locator("input:focus").fill("eccentricity")
         results = opened.page.locator("a:visible", has_text="Causes and their places")
-        results.last.click(timeout=10_000)  # those of the page itself come first
+        results.last.click(timeout=10_000)  # the results of the page itself come first
         opened.page.wait_for_url("**/places.html*")
         assert opened.complaints == []
 

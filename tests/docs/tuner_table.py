@@ -1,7 +1,7 @@
-"""The page on how each tuner works: its module's docstring with the equations set, its options.
+"""Build the page on tuners from module docstrings with typeset equations, and from their options.
 
-An equation stands in the docstring as one can type it. How it is set is written here under its own
-words, so that an equation that is changed there has to be set anew here.
+A docstring has an equation as plain text. `SET` maps this text to LaTeX, so a changed equation
+needs a new entry.
 """
 
 import dataclasses
@@ -87,7 +87,7 @@ SET = {
         r" - \frac{\log |K|}{2} - \dots"
     ),
 }
-"""By what stands in a docstring: the same in LaTeX."""
+"""LaTeX of each equation, by its text in a docstring."""
 EQUATION = re.compile(r"\(([\d.]+)\)  (.*)", re.S)
 SHARED = (
     "pair_network",
@@ -96,16 +96,16 @@ SHARED = (
     "gap_filling",
     "gaussian_process",
 )
-"""Modules below methods/learning that several tuners are made of."""
+"""Modules below methods/learning that several tuners share."""
 LINKS = {
     r"\barXiv[: ](\d{4}\.\d{5})": r"[arXiv:\1](https://arxiv.org/abs/\1)",
     r"\bdoi:(10\.[^\s,;]+[^\s,;.)])": r"[doi:\1](https://doi.org/\1)",
 }
-"""How an article is named, and where it is."""
+"""Patterns of article identifiers, and their links."""
 
 
 def registered():
-    """The project's own tuners: (name, module, class) in the order of pyproject.toml."""
+    """Return the project's tuners as (name, module, class) in the order of pyproject.toml."""
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     group = text.partition('[project.entry-points."simgap.tuners"]\n')[2].partition("\n\n")[0]
     found = re.findall(r"^([\w-]+) = \"([\w.]+):(\w+)\"$", group, re.M)
@@ -113,7 +113,7 @@ def registered():
 
 
 def sections():
-    """A section for each module of tuners and for what they share, as Markdown."""
+    """Return a Markdown section for each tuner module and for the shared modules."""
     by_module = {}
     for name, module, kind in registered():
         by_module.setdefault(module, []).append((name, getattr(module, kind)))
@@ -130,14 +130,14 @@ def sections():
 
 
 def told(module):
-    """A module's docstring as paragraphs and set equations, then the file."""
+    """Return a module's docstring as paragraphs and typeset equations, and a link to its file."""
     text = inspect.cleandoc(module.__doc__)
     file = "/".join(module.__name__.split(".")) + ".py"
     return [*paragraphs(text), f"Source: [`{file}`](../../{file})."]
 
 
 def paragraphs(text):
-    """Paragraphs of a docstring as Markdown, indented equations as mathematics."""
+    """Yield the paragraphs of a docstring as Markdown, with indented equations as formulas."""
     for block in text.split("\n\n"):
         if not block.startswith("    "):
             yield linked(" ".join(block.split()).replace("``", "`"))
@@ -148,14 +148,14 @@ def paragraphs(text):
 
 
 def linked(text):
-    """A paragraph whose articles are links."""
+    """Replace article identifiers by links."""
     for pattern, link in LINKS.items():
         text = re.sub(pattern, link, text)
     return text
 
 
 def described(name, kind, alone):
-    """What a tuner's class says of itself, and its options with their defaults."""
+    """Return the docstring of a tuner's class, and a table of its options with their defaults."""
     text, _, options = inspect.getdoc(kind).partition("Attributes:\n")
     parts = [*([] if alone else [f"### `{name}`"]), *paragraphs(text.strip())]
     says = dict(re.findall(r"^    (\w+): ((?:.|\n        )*)", options, re.M))
@@ -167,7 +167,7 @@ def described(name, kind, alone):
 
 
 def default(field):
-    """An option's default."""
+    """Format an option's default."""
     value = field.default
     if field.default_factory is not dataclasses.MISSING:
         value = field.default_factory()

@@ -1,5 +1,5 @@
-"""A plugin that does its worst as it is imported: where it is surveyed, where it is tuned, and
-where truths are if it gets there.
+"""A plugin that attacks at import: during plugin inspection, in the tuner, and in the harness if it
+is imported there.
 """
 
 import contextlib
@@ -24,7 +24,9 @@ def forever():
 
 
 def patch():
-    """Note every truth that is drawn, and score everybody as nought."""
+    """Record the true parameters of every sampled target, and remove the parameter columns of
+    results.
+    """
     from bench.benchmark.problem.tuning_problem import TuningProblem
     from bench.benchmark.runner import result_rows
 
@@ -53,7 +55,7 @@ for way in (
     with contextlib.suppress(OSError):
         if way() == 0:
             forever()
-# Whoever draws numbers or takes a mean after this would get others.
+# Code that samples numbers or computes means in this process would get wrong results.
 np.random.seed(0)  # noqa: NPY002
 for name in ("mean", "abs", "sqrt"):
     setattr(np, name, np.negative)

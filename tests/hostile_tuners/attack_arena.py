@@ -1,4 +1,4 @@
-"""Comparisons in which cheaters meet honest rivals, and what is left when they are over."""
+"""Run comparisons of attacking and honest tuners, and find what remains afterwards."""
 
 import importlib.util
 import os
@@ -21,10 +21,10 @@ from tests.without_drawing import COMMAND
 HERE = Path(__file__).parent
 SALT = "a secret of the tests"
 RIVALS = {"random": {"seeds": 12}, "nelder_mead": {}, "least_squares": {}}
-"""Who plays by the rules; the first is the yardstick."""
+"""Honest tuners; the first one is the reference."""
 MEASURED = ["tuner_seconds", "simulator_seconds"]
 CHANCE = 1e-4
-"""Probability below which nobody would call it chance, with fifty cheaters and fixed seeds."""
+"""P-value limit for a gain; small enough for fifty attackers and fixed seeds."""
 SMALL = {
     **{key: value for key, value in SPRING.items() if key != "salt"},
     "ranges": ["in"], "targets": 3, "seeds": 3, "budget": 12, "timeout": 3, "memory": 64,
@@ -33,7 +33,7 @@ SMALL = {
 
 
 def cheats(name):
-    """The tuners of a plugin file, by name; its code runs here and now."""
+    """Return the tuners of a plugin file by name; the file is executed in this process."""
     spec = importlib.util.spec_from_file_location(f"cheats_{name}", HERE / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -43,17 +43,17 @@ def cheats(name):
 
 
 def compared(folder, tuners, plugins=(), options=(), **changes):
-    """A comparison in a process of its own, and what it wrote on stderr."""
+    """Run a comparison in a separate process."""
     folder.mkdir(exist_ok=True)
     experiment = folder / "spring-test.toml"
     experiment.write_text(tomli_w.dumps({**SMALL, **changes, "tuners": tuners}))
-    # Copies: some write to their own file.
+    # Copies, because some plugins write to their own file.
     given = [PLUGINS / "spring.py", *(HERE / f"{name}.py" for name in plugins)]
     files = [shutil.copy(file, folder) for file in given]
     command = [*COMMAND, "compare", str(experiment)]
     command += ["--out", str(folder / "run"), "--allow-failures", *options]
     command += [word for file in files for word in ("--plugin", str(file))]
-    # Where their processes are told to keep files, by which they are known.
+    # Processes of this comparison are recognised by this temporary folder.
     environment = {**os.environ, "TMPDIR": str(folder)}
     return subprocess.run(
         command, env=environment, cwd=folder, capture_output=True, text=True, timeout=300
@@ -65,26 +65,28 @@ def stored(folder):
 
 
 def rows(table, names):
-    """Rows of runs, without what is measured."""
+    """Return the rows of runs without measured times."""
     kept = table[table["tuner"].isin(names)].reset_index(drop=True)
     return kept.drop(columns=MEASURED)
 
 
 def errors(folder):
-    """Mean error of the parameters over a run, for each run, by tuner."""
+    """Return the mean parameter error of each run, by tuner."""
     runs = stored(folder).runs
     means = runs[runs["k"] > 0].groupby(["tuner", "run"], sort=True)["param_error"].mean()
     return {name: group.to_numpy() for name, group in means.groupby(level=0)}
 
 
 def gains(folder, name):
-    """Probability that random search comes out as well as a cheater, by chance."""
+    """Return the p-value that an attacker has smaller errors than random search (Mann-Whitney U
+    test).
+    """
     found = errors(folder)
     return mannwhitneyu(found[name], found["random"], alternative="less").pvalue
 
 
 def left(folder):
-    """What outlives a comparison: processes that keep their files there, and these files."""
+    """Return the processes and files that remain after a comparison."""
     processes = []
     for process in psutil.process_iter():
         try:

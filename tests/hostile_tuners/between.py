@@ -1,6 +1,6 @@
-"""Tuners that tell the next seed on the same target what they found, each through another medium.
+"""Tuners that pass their result to the next seed of the same target, each over another channel.
 
-One that hears something says so as it stops; one that hears nothing goes on as random search.
+A tuner that receives something reports this when it stops; otherwise it continues as random search.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from methods.tuners.random_search import RandomSearch
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 HELD = []
-"""What must stay open for others to meet it."""
+"""Objects that must stay open so that other processes can find them."""
 
 
 def checked(result):
@@ -32,11 +32,11 @@ def checked(result):
 
 
 class Between(RandomSearch):
-    """Through nothing.
+    """Base class without a channel.
 
     Args:
-        salt: keeps comparisons apart that run beside each other.
-        places: folders that it may try.
+        salt: separates comparisons that run at the same time.
+        places: folders in which it may try to write.
     """
 
     name = "between"
@@ -45,10 +45,10 @@ class Between(RandomSearch):
         self.salt, self.places = salt, places
 
     def tell(self, key, text):
-        """Leave a text where the next one looks for it."""
+        """Store a text under a key for the next run."""
 
     def hear(self, key):
-        """What was left."""
+        """Return the text that an earlier run stored."""
         return b""
 
     def tune(self, task, rng):
@@ -97,7 +97,7 @@ class Environ(Between):
 
 
 class Files(Between):
-    """In every folder that might take one."""
+    """Uses files in every folder that might be writable."""
 
     name = "files"
 
@@ -165,7 +165,7 @@ class SystemVSemaphores(Between):
 
 
 class MessageQueue(Between):
-    """A queue that outlives whoever has written to it."""
+    """Uses a POSIX message queue, which outlives its writer."""
 
     name = "message-queue"
 
@@ -211,7 +211,9 @@ class AbstractSocket(Between):
 
 
 class Datagrams(Between):
-    """A pair of sockets is allowed; one of them takes a name, and others write to it."""
+    """Binds a name to one socket of an allowed socket pair, so that other processes can
+    send to it.
+    """
 
     name = "datagrams"
 
@@ -227,12 +229,12 @@ class Datagrams(Between):
 
 
 def library():
-    """Files that everybody can read, always in the same order."""
+    """Return files that every process can read, always in the same order."""
     return sorted(Path(os.__file__).parent.glob("*.py"))[:130]
 
 
 class Locks(Between):
-    """A lock on each file that stands for a bit that is set."""
+    """Encodes each bit as a lock on a file."""
 
     name = "locks"
 
@@ -260,7 +262,7 @@ class Locks(Between):
 
 
 class RecordLocks(Locks):
-    """Those of POSIX, asked for as a reader, looked for as a writer."""
+    """Uses POSIX record locks, taken as a reader and tested as a writer."""
 
     name = "record-locks"
 
@@ -275,7 +277,7 @@ class RecordLocks(Locks):
 
 
 class Stamps(Between):
-    """The time of change of a file that one may not write, but owns."""
+    """Uses the modification time of a file that it owns but may not write."""
 
     name = "stamps"
 
@@ -285,12 +287,12 @@ class Stamps(Between):
 
     def hear(self, key):
         found = os.stat(__file__)
-        # Nobody reads a file in 1970.
+        # An access time in 1970 cannot come from a normal read.
         return struct.pack("<Q", found.st_mtime_ns << 4) if found.st_atime < 1.0 else b""
 
 
 class Rights(Between):
-    """Its mode likewise."""
+    """Uses the mode of a file that it owns but may not write."""
 
     name = "rights"
 
@@ -325,7 +327,7 @@ class Keyring(Between):
 
 
 class Niceness(Between):
-    """The next process is started by one of this group, and inherits how nice it is."""
+    """Uses the scheduling priority, which the next process inherits from its process group."""
 
     name = "niceness"
 
@@ -337,7 +339,7 @@ class Niceness(Between):
 
 
 class Siblings(Between):
-    """Looks for others by their numbers, and at their names."""
+    """Searches /proc for other processes and reads their names."""
 
     name = "siblings"
 
@@ -352,7 +354,7 @@ class Siblings(Between):
 
 
 class MappedFile(Between):
-    """A file that stays mapped when it is deleted, met through /proc."""
+    """Uses a memory-mapped anonymous file, which other processes find in /proc."""
 
     name = "mapped-file"
 

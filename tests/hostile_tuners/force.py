@@ -1,6 +1,6 @@
-"""Tuners that break out, break things or outlive their run; each says in which status its run ends.
+"""Tuners that try to break out, do damage or outlive their run; `ends` is the expected status.
 
-Those that are merely refused go on as random search.
+Tuners whose attack is only refused continue as random search.
 """
 
 import contextlib
@@ -22,14 +22,14 @@ from methods.tuners.random_search import RandomSearch
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 LEFT = "simgap-cheat-left"
-"""Begins the name of whatever is left behind."""
+"""Prefix of the names of all files that remain."""
 
 
 class Force(RandomSearch):
-    """Uses no force at all.
+    """Base class without an attack.
 
     Args:
-        places: folders of the comparison, which a cheater may well know.
+        places: folders of the comparison, which an attacker may know.
     """
 
     name = "force"
@@ -46,7 +46,6 @@ class Force(RandomSearch):
         with contextlib.suppress(OSError, ValueError, MemoryError, RuntimeError):
             self.act(task)
         while True:
-            # Its numbers are given away where it got through.
             seen = yield rng.uniform(size=(1, task.dim))
             assert len(seen.losses) == 1
 
@@ -67,7 +66,7 @@ class ForkBomb(Force):
 
 
 class Vforked(Force):
-    """By every other way to a process."""
+    """Starts processes in every way other than fork."""
 
     name = "vforked"
 
@@ -85,7 +84,7 @@ class Vforked(Force):
 
 
 class Outliving(Force):
-    """Wants no signal when its parent dies, leaves its session, and works on."""
+    """Ignores the death of its parent, leaves its session, and continues in threads."""
 
     name = "outliving"
 
@@ -103,12 +102,12 @@ class Outliving(Force):
 
         for _ in range(4):
             threading.Thread(target=work).start()
-        # How the process that it lives in would end it.
+        # The tuner's process would end itself with this function.
         os._exit = lambda _code: work()
 
 
 class ClosedPipe(Outliving):
-    """Closes its pipe and lives on."""
+    """Closes its pipe and keeps running."""
 
     name = "closed-pipe"
     ends = "crashed"
@@ -149,7 +148,7 @@ class MemoryHog(Force):
 
 
 class SharedHog(MemoryHog):
-    """Memory that counts as shared, though nobody shares it."""
+    """Allocates shared memory, although no other process uses it."""
 
     name = "shared-hog"
 
@@ -161,7 +160,7 @@ class SharedHog(MemoryHog):
 
 
 class FileHog(MemoryHog):
-    """Files without a name."""
+    """Allocates anonymous files."""
 
     name = "file-hog"
 
@@ -189,7 +188,7 @@ class ManyFiles(Force):
 
 
 class Spoiling(Force):
-    """Writes to, deletes, and locks away what the harness and rivals need."""
+    """Writes to, deletes and locks files that the harness and other tuners need."""
 
     name = "spoiling"
 
@@ -215,7 +214,7 @@ class Spoiling(Force):
 
 
 class Signals(Force):
-    """To its parent, its group, everybody, and by the back door."""
+    """Sends signals to its parent, its group and all processes, directly and through F_SETOWN."""
 
     name = "signals"
 
@@ -236,7 +235,7 @@ class Signals(Force):
 
 
 class Stopped(Force):
-    """Stops itself, or else sleeps past its time."""
+    """Stops itself with SIGSTOP, or sleeps beyond the timeout."""
 
     name = "stopped"
     ends = "timeout"
@@ -278,7 +277,7 @@ class GoesOnWhenClosed(Force):
 
 
 class Leaves(Force):
-    """As if it had been killed from outside, in the hope of another try."""
+    """Exits as if it had been killed from outside, to get another attempt."""
 
     name = "leaves"
     ends = "crashed"
@@ -288,10 +287,10 @@ class Leaves(Force):
 
 
 class KillsItself(Force):
-    """Has the kernel kill it, likewise."""
+    """Makes the kernel kill it, to get another attempt."""
 
     name = "kills-itself"
-    # It is tried again, and has as much time each time.
+    # It is repeated, and each attempt has the same time limit.
     ends = ("crashed", "timeout")
 
     def act(self, task):
@@ -304,7 +303,7 @@ class KillsItself(Force):
 
 
 class BestOfThree(Force):
-    """Tries again with other numbers where it was not lucky."""
+    """Exits after an unlucky attempt to get another one with different random numbers."""
 
     name = "best-of-three"
     ends = "crashed"
@@ -331,7 +330,7 @@ class Shouts(Force):
 
 
 class Mounts(Force):
-    """Every way into another world."""
+    """Tries every system call that changes namespaces, mounts, the root folder or the user."""
 
     name = "mounts"
 
@@ -362,7 +361,7 @@ class Mounts(Force):
 
 
 class Kernel(Force):
-    """Corners of the kernel that go round files and sockets."""
+    """Tries kernel interfaces that bypass files and sockets."""
 
     name = "kernel"
 
@@ -396,7 +395,7 @@ class Sockets(Force):
 
 
 class Pinned(Force):
-    """Takes the processors for itself."""
+    """Changes processor affinity, priorities and limits, also of its parent."""
 
     name = "pinned"
 

@@ -1,4 +1,4 @@
-"""Learned tuners that train on more than they are given; each says in which status its runs end."""
+"""Learned tuners that try to train on more than they are given; `ends` is the expected status."""
 
 import contextlib
 import gc
@@ -14,7 +14,7 @@ from methods.tuners.random_search import RandomSearch
 
 
 class School(RandomSearch):
-    """Learns honestly: the mean of its observations, which is of no use."""
+    """Learns honestly the mean of its observations, which does not help the tuning."""
 
     name = "school"
     learned = True
@@ -32,7 +32,7 @@ class School(RandomSearch):
 
 
 class Counter(School):
-    """Puts the counter back and raises the budget."""
+    """Resets the simulation counter and increases the budget."""
 
     name = "counter"
     ends = "crashed"
@@ -44,7 +44,7 @@ class Counter(School):
 
 
 class Fence(School):
-    """Simulates where targets lie that are wide."""
+    """Extends the training range to the whole parameter range, where the wide targets are."""
 
     name = "fence"
     ends = "crashed"
@@ -55,7 +55,7 @@ class Fence(School):
 
 
 class NotInside(School):
-    """NaN is neither inside the fence nor outside."""
+    """Simulates NaN, which is neither inside nor outside the training range."""
 
     name = "not-inside"
     ends = "crashed"
@@ -65,7 +65,7 @@ class NotInside(School):
 
 
 class Stream:
-    """Draws what it likes."""
+    """A random generator with a chosen state."""
 
     def __init__(self, number):
         self.bit_generator = self
@@ -74,7 +74,7 @@ class Stream:
 
 
 class Streams(School):
-    """Has every scenario drawn by a stream that stands still, so that it is an easy one."""
+    """Samples every scenario from a fixed random state, so that it is an easy one."""
 
     name = "streams"
     ends = "crashed"
@@ -85,7 +85,7 @@ class Streams(School):
 
 
 class Behind(School):
-    """Simulates with what it finds behind its simulator."""
+    """Searches its process for simulators and problems to simulate with."""
 
     name = "behind"
 
@@ -120,7 +120,7 @@ class Behind(School):
 
 
 class Huge(School):
-    """Says that it has learned more than any memory holds."""
+    """Announces a training result that is larger than any memory."""
 
     name = "huge"
     ends = "crashed"
@@ -131,7 +131,7 @@ class Huge(School):
 
 
 class Names(School):
-    """Arrays by names that are paths, and that are the harness's own."""
+    """Names its arrays like paths and like internal arrays of the harness."""
 
     name = "names"
     ends = "crashed"
@@ -143,7 +143,7 @@ class Names(School):
 
 
 class Keyword(School):
-    """An array whose name is an argument of what writes it."""
+    """Names an array like an argument of the function that writes it."""
 
     name = "keyword"
     ends = "crashed"
@@ -161,7 +161,7 @@ class Pickles(School):
 
 
 def say(kind, body, flags=0, size=0):
-    """Tell the harness something, past the code that speaks for tuners."""
+    """Send a message to the harness directly, without the code of the tuner server."""
     (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "MessageChannel")
     with contextlib.suppress(OSError):
         channel.send(kind, body, flags=flags, size=size)
@@ -169,7 +169,7 @@ def say(kind, body, flags=0, size=0):
 
 
 class Watched(School):
-    """Asks for the second ground, which is not counted, though nobody looks on."""
+    """Requests the uncounted training simulator, although no observer of the training exists."""
 
     name = "watched"
     ends = "crashed"
@@ -180,7 +180,7 @@ class Watched(School):
 
 
 class Pretends(School):
-    """Tells that it has learned, by arrays that it does not send."""
+    """Announces arrays of a training result that it does not send."""
 
     name = "pretends"
     ends = "crashed"

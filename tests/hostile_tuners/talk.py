@@ -1,6 +1,4 @@
-"""Tuners that speak to the harness past the code that speaks for them; each says in which status
-its run ends.
-"""
+"""Tuners that send their own messages to the harness; `ends` is the expected status of the run."""
 
 import contextlib
 import gc
@@ -23,7 +21,7 @@ def message(kind, body=b"", flags=0, size=0, length=None):
 
 
 def writing():
-    """The end of the pipe that leads to the harness."""
+    """Return the file descriptor of the pipe to the harness."""
     (channel,) = (one for one in gc.get_objects() if type(one).__name__ == "MessageChannel")
     return channel._writing
 
@@ -39,14 +37,14 @@ def write(whole):
 
 
 class Talk(RandomSearch):
-    """Says something beside what it is asked."""
+    """Sends a message that was not requested."""
 
     name = "talk"
     ends = "crashed"
-    waits = False  # for an answer: whether two messages are read at once is chance
+    waits = False  # for an answer: two messages may or may not be read together
 
     def say(self, task):
-        """Bytes for the harness, in place of what it waits for."""
+        """Return the bytes that are sent instead of the expected message."""
         return message(b"Z")
 
     def tune(self, task, rng):
@@ -99,7 +97,7 @@ class HalfANumber(Talk):
 
 
 class HalfAMessage(Talk):
-    """And then nothing."""
+    """Sends an incomplete message and then nothing."""
 
     name = "half-a-message"
     ends = "timeout"
@@ -110,7 +108,7 @@ class HalfAMessage(Talk):
 
 
 class Slowly(HalfAMessage):
-    """A byte now and then, so that there is always something to wait for."""
+    """Sends one byte every 0.2 s, so that there is always something to read."""
 
     name = "slowly"
 
@@ -122,7 +120,7 @@ class Slowly(HalfAMessage):
 
 
 class AllAtOnce(Talk):
-    """The answers to all that will be asked, before it is."""
+    """Sends the answers to all future requests at once."""
 
     name = "all-at-once"
 
@@ -131,16 +129,16 @@ class AllAtOnce(Talk):
 
 
 class BeforeItIsAsked(Talk):
-    """Each answer while the harness simulates, so that it takes no time."""
+    """Sends each answer while the harness simulates, so that no tuner time is measured."""
 
     name = "before-it-is-asked"
-    # Where it comes too late it is an answer like any other.
+    # An answer that arrives after its request is valid.
     ends = ("crashed", "done")
 
     def tune(self, task, rng):
         threading.Thread(target=self.hurry, args=(asked(task),)).start()
         while True:
-            # Long enough to simulate that the answer is there before the question.
+            # The simulation takes long enough that the answer arrives before the request.
             yield np.repeat(task.start[None], 5, axis=0)
 
     def hurry(self, answer):
@@ -165,7 +163,7 @@ class Noise(Talk):
 
 
 class LongReason(Talk):
-    """Stops with a reason that would fill a table."""
+    """Stops with a reason that is too long for a table."""
 
     name = "long-reason"
     ends = "converged"
@@ -176,7 +174,7 @@ class LongReason(Talk):
 
 
 class FoulReason(Talk):
-    """With one that clears the screen, ends lines and cells, and is no text."""
+    """Stops with a reason that has terminal codes, line ends, separators and invalid UTF-8."""
 
     name = "foul-reason"
     ends = "converged"
@@ -194,7 +192,7 @@ class FoulCrash(Talk):
 
 
 class Deep(Talk):
-    """JSON where none is wanted, without a bottom."""
+    """Sends deeply nested JSON where no JSON is expected."""
 
     name = "deep"
 

@@ -1,4 +1,4 @@
-"""Whatever a tuner does to the machine, the harness or rivals ends in a status of its own run."""
+"""Tests that attacks on the machine, the harness or other tuners affect only the attacker's run."""
 
 import os
 
@@ -20,14 +20,14 @@ NEEDED = {
     "full-disk": "disk",
     "many-files": "disk",
 }
-"""Seals without which a cheater would do harm to whoever tries."""
+"""Isolation layer without which an attacker would harm the machine that runs the test."""
 RIVALS = {"random": {}, "nelder_mead": {}, "least_squares": {}}
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def held():
-    """The seals that hold on this machine."""
+    """Return the isolation layers that work on this machine."""
     from bench.benchmark.runner.sandboxed_tuner import get_fork_server
 
     child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")
@@ -38,7 +38,7 @@ def held():
 
 @pytest.fixture(scope="module")
 def met(tmp_path_factory, held):
-    """Every one of them among the rivals, and what the folder of trained weights held before."""
+    """Run all attackers together with honest tuners; the cache of trained weights has one file."""
     folder = tmp_path_factory.mktemp("met")
     cache = folder / "cache"
     cache.mkdir()

@@ -1,4 +1,4 @@
-"""Whatever a tuner tries to find the truth, or to hear of another run, gains it nothing."""
+"""Tests that attempts to read the true parameters or another run's result gain nothing."""
 
 import socket
 import threading
@@ -13,15 +13,15 @@ from tests.hostile_tuners import attack_arena
 NAMES = {name: sorted(attack_arena.cheats(name)) for name in ("truths", "between")}
 CHEATERS = [*NAMES["truths"], *NAMES["between"], "at-import"]
 TRUSTED = ["problem-of-worker", "drawn-again", "journal", "frames"]
-"""Those that the harness's own process lets through, a part of each kind."""
+"""Attacks that succeed in the harness's own process, one or more of each kind."""
 HEARD = ["globals", "environ", "stamps", "rights", "locks"]
-"""Likewise; they leave nothing behind but in the copy of their file."""
+"""Channels that work without isolation; they leave traces only in the copy of their plugin file."""
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    """Somebody outside who would tell, and notes who asked."""
+    """Start servers outside the comparison that answer every request and record it."""
     address, asked = str(tmp_path_factory.mktemp("outside") / "socket"), []
     servers, threads = [socket.socket(socket.AF_UNIX), socket.socket(socket.AF_INET)], []
     for one, where in zip(servers, (address, ("127.0.0.1", 0)), strict=True):
@@ -29,7 +29,7 @@ def server(tmp_path_factory):
         one.listen()
 
         def serve(one=one):
-            # Until it is shut down.
+            # `accept` fails when the server is shut down.
             with suppress(OSError):
                 while True:
                     link, _ = one.accept()
@@ -57,8 +57,9 @@ def entries(folder, server):
 
 @pytest.fixture(scope="module")
 def met(tmp_path_factory, server):
-    """Every cheater among the rivals. Where a process serves several runs, what it holds on to is
-    there while others run.
+    """Run all attackers together with honest tuners.
+
+    One process serves all runs of a tuner, so objects it keeps still exist during its later runs.
     """
     folder = tmp_path_factory.mktemp("met")
     tuners = {**attack_arena.RIVALS, **entries(folder, server[0])}
@@ -70,7 +71,7 @@ def met(tmp_path_factory, server):
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
-    """The rivals among themselves."""
+    """Run the honest tuners alone."""
     folder = tmp_path_factory.mktemp("alone")
     made = attack_arena.compared(
         folder, attack_arena.RIVALS, (), ("--salt", attack_arena.SALT), isolation="tuner"
@@ -81,12 +82,12 @@ def alone(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trusted(tmp_path_factory):
-    """Some cheaters where nothing is sealed, and the salt is known."""
+    """Run some attackers without isolation and with a public salt."""
     folder = tmp_path_factory.mktemp("trusted")
     every = entries(folder, {})
     tuners = {name: every[name] for name in (*TRUSTED, *HEARD)}
     options = ("--salt", "public", "--trust", "--jobs", "1")
-    # Before the cheaters, whose journal is read: the yardstick.
+    # The reference runs first, because the attackers read the journal.
     tuners = {"random": attack_arena.RIVALS["random"], **tuners}
     made = attack_arena.compared(folder, tuners, ("truths", "between"), options)
     assert made.returncode == 0, made.stderr
@@ -122,7 +123,7 @@ def test_a_trusted_run_hears_of_another(trusted, name):
 
 
 def held():
-    """The seals that hold on this machine."""
+    """Return the isolation layers that work on this machine."""
     from bench.benchmark.runner.sandboxed_tuner import get_fork_server
 
     child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")

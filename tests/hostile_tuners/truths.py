@@ -1,5 +1,6 @@
-"""Tuners that look for the truth wherever it might be, and simulate behind the harness's back; what
-finds nothing goes on as random search.
+"""Tuners that search for the true parameters or simulate without being counted.
+
+A tuner that finds nothing continues as random search.
 """
 
 import contextlib
@@ -16,11 +17,11 @@ from methods.tuner import Tuner
 from methods.tuners.random_search import RandomSearch
 
 NAME = "spring-test"
-"""Of the experiment, which everybody knows."""
+"""Name of the experiment, which is public."""
 LOWEST, WIDTHS = np.array([1.0, 0.0]), np.array([4.0, 1.0])
-"""Bounds of its parameters likewise."""
+"""Lower bounds and widths of its parameters, which are public."""
 SOMEWHERE = ("/tmp", "/var/tmp", "/dev/shm", "/home", "/root", "/work", "/srv", "/mnt")
-"""Where people keep results."""
+"""Folders in which users may store results."""
 
 
 def cube(physical):
@@ -28,10 +29,10 @@ def cube(physical):
 
 
 class Cheat(RandomSearch):
-    """Fetches points from somewhere; this one from nowhere.
+    """Proposes points from another source; the base class has none.
 
     Args:
-        places: folders of the comparison, which a cheater may well know.
+        places: folders of the comparison, which an attacker may know.
     """
 
     name = "cheat"
@@ -46,7 +47,7 @@ class Cheat(RandomSearch):
         found = []
         with contextlib.suppress(Exception):
             found = [np.clip(point, 0.0, 1.0) for point in self.find(task)]
-        # What a rival would do with it as the first thing.
+        # Leave half of the budget to random search.
         for point in found[: task.budget // 2]:
             yield point[None]
         return (yield from super().tune(task, rng))
@@ -57,7 +58,7 @@ def matching(targets, task):
 
 
 class ProblemOfWorker(Cheat):
-    """The worker's own problem draws all truths."""
+    """Samples the targets with the problem of the worker process."""
 
     name = "problem-of-worker"
 
@@ -69,7 +70,7 @@ class ProblemOfWorker(Cheat):
 
 
 def drawn(task, salt):
-    """The truth that belongs to this start, by public functions alone."""
+    """Yield the true parameters that belong to this start, computed with public functions."""
     from bench.benchmark.problem.salt import TargetStreams
 
     whole = np.array([[0.0], [1.0]])
@@ -92,7 +93,7 @@ class DrawnAgain(Cheat):
 
 
 class DrawnFromTheSalt(Cheat):
-    """Reads the secret salt where it is kept, and whatever else looks like one."""
+    """Reads the secret salt from its file, and tries environment variables as salts."""
 
     name = "drawn-from-the-salt"
 
@@ -103,7 +104,7 @@ class DrawnFromTheSalt(Cheat):
 
 
 def rivals(folders):
-    """True parameters in the journals and tables below these folders, each once."""
+    """Return the true parameters in journals and tables below these folders, without duplicates."""
     return list({tuple(truth): truth for truth in _truths(folders)}.values())
 
 
@@ -122,7 +123,7 @@ def _truths(folders):
 
 
 class Journal(Cheat):
-    """What rivals found on the same targets lies on disk."""
+    """Reads the results of other tuners for the same targets from disk."""
 
     name = "journal"
 
@@ -131,7 +132,7 @@ class Journal(Cheat):
 
 
 class Anywhere(Cheat):
-    """Looks for results in every place that people keep them in, and where it is told."""
+    """Searches for results in common folders and in paths from environment variables."""
 
     name = "anywhere"
 
@@ -142,7 +143,7 @@ class Anywhere(Cheat):
 
 
 def regions(pid):
-    """Beginning and end of each piece of memory that a process writes to."""
+    """Yield begin and end of each writable memory region of a process."""
     for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
         place, rights, *_ = line.split()
         begin, end = (int(part, 16) for part in place.split("-"))
@@ -151,7 +152,7 @@ def regions(pid):
 
 
 class Memory(Cheat):
-    """Start and truth lie side by side in the harness's memory."""
+    """Searches the harness's memory for the start, which is stored next to the true parameters."""
 
     name = "memory"
 
@@ -176,7 +177,7 @@ class Memory(Cheat):
 
 
 class VmRead(Memory):
-    """By `process_vm_readv`, for which /proc need not let one in."""
+    """Reads memory with `process_vm_readv`, which does not open /proc/PID/mem."""
 
     name = "vm-read"
 
@@ -195,7 +196,7 @@ class VmRead(Memory):
 
 
 class Ptrace(Memory):
-    """Stops the parent to look into it."""
+    """Stops the parent with ptrace and reads its memory."""
 
     name = "ptrace"
 
@@ -209,7 +210,7 @@ class Ptrace(Memory):
 
 
 class Descriptors(Memory):
-    """Files and pipes that were left open."""
+    """Reads file descriptors and pipes that were left open."""
 
     name = "descriptors"
 
@@ -225,7 +226,7 @@ class Descriptors(Memory):
 
 
 def frames():
-    """Every frame of every thread, and of those that call them."""
+    """Yield every frame of every thread and its callers."""
     for frame in [sys._getframe(), *sys._current_frames().values()]:
         while frame is not None:
             yield frame
@@ -233,7 +234,7 @@ def frames():
 
 
 def best_of(evaluator, dim):
-    """The best of many simulations that nobody counts."""
+    """Return the best of 1000 simulations that are removed from the count."""
     evaluator = getattr(evaluator, "_evaluate", evaluator)
     points = np.random.default_rng(0).uniform(size=(1000, dim))
     problem = evaluator._problem
@@ -244,7 +245,7 @@ def best_of(evaluator, dim):
 
 
 class Frames(Cheat):
-    """Fetches the simulator from the frames that call it, and puts the counter back."""
+    """Takes the evaluator from the calling frames and resets its counter."""
 
     name = "frames"
 
@@ -257,7 +258,7 @@ class Frames(Cheat):
 
 
 class Garbage(Cheat):
-    """Fetches it from all that is alive."""
+    """Searches all living objects for the evaluator and for targets."""
 
     name = "garbage"
 
@@ -269,7 +270,7 @@ class Garbage(Cheat):
 
 
 class Spy:
-    """Looks about when somebody takes it for an array."""
+    """An object that runs an attack when it is converted to an array."""
 
     def __init__(self, cheat, task):
         self.cheat, self.task = cheat, task
@@ -280,7 +281,7 @@ class Spy:
 
 
 class Locals(Frames):
-    """Asks for what looks about in the frames of whoever unpacks it, and lets errors carry them."""
+    """Runs the attack in the frames that convert its proposal, or in the traceback of an error."""
 
     name = "locals"
 
@@ -302,7 +303,7 @@ class Locals(Frames):
 
 
 class UsedPutBack(Cheat):
-    """Has more simulated than it is given: the used count is put back, the budget raised."""
+    """Increases its budget and resets the count of used simulations."""
 
     name = "used-put-back"
 
@@ -321,7 +322,7 @@ class UsedPutBack(Cheat):
 
 
 class ChangedAfterwards(Cheat):
-    """Writes the best point into all that was proposed and recommended before."""
+    """Overwrites earlier proposals and losses with the best ones."""
 
     name = "changed-afterwards"
 
@@ -340,7 +341,7 @@ class ChangedAfterwards(Cheat):
 
 
 class Timing(Cheat):
-    """Takes the simulation that takes the longest for the truest."""
+    """Assumes that slower simulations are closer to the true parameters."""
 
     name = "timing"
 
@@ -357,7 +358,7 @@ class Timing(Cheat):
 
 
 class PatchedRivals(Cheat):
-    """Makes its rivals propose nothing but corners, and every loss of theirs look good."""
+    """Patches other tuners to propose only zeros, and patches NumPy functions."""
 
     name = "patched-rivals"
 
@@ -379,11 +380,11 @@ class PatchedRivals(Cheat):
 
 
 class Network(Cheat):
-    """Asks a server that knows the truth: whoever has drawn it may have sent it there.
+    """Requests the true parameters from a server to which another process may have sent them.
 
     Args:
-        address: where it listens, in the file system.
-        port: where it listens, on this machine.
+        address: path of a Unix socket.
+        port: TCP port on this machine.
     """
 
     name = "network"

@@ -24,7 +24,7 @@ FOLDERS = ("bench", "methods", "sims", "examples", "tests", "docs", "simgap.py",
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the findings that are too many; return the exit code."""
+    """Print the findings that exceed the accepted numbers and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.language", description=__doc__)
     parser.add_argument("folders", nargs="*", default=FOLDERS, help="folders or files below --root")
     parser.add_argument("--root", type=Path, default=ROOT, help="root of the tree to check")
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     new = sum(counts[group] - allowed.get(group, 0) for group in grown)
     print(f"{len(findings)} findings, {new} more than {options.remaining.name} allows")
-    # Folders that were not checked have no findings, which does not mean that theirs are gone.
+    # Folders that were not checked have no findings, so only a check of all folders is compared.
     fewer = sum(max(number - counts.get(group, 0), 0) for group, number in allowed.items())
     if fewer and tuple(options.folders) == FOLDERS:
         print(

@@ -1,8 +1,8 @@
-"""Find private words in names and texts, and docstrings, subjects and file names against the rules.
+"""Check private words, docstring beginnings, commit subjects and file names.
 
-`glossary.toml` has the private words, their standard terms and the allowed uses. The language check
-reads every Python file once: names, docstrings and messages come from its syntax tree, comments
-from one regular expression (`tokenize` would take as long as the rest of the check).
+`glossary.toml` has the private words, their standard terms and the allowed uses. The check reads
+every Python file once: names, docstrings and messages come from its syntax tree, comments from a
+regular expression (`tokenize` would take as long as the rest of the check).
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ else:
 
 GLOSSARY = Path(__file__).with_name("glossary.toml")
 TEXTS = frozenset(("docstrings", "messages", "pages"))
-"""Checks of texts; comments belong to docstrings, and other string constants are messages."""
+"""Checks of texts; comments belong to docstrings, other string constants are messages."""
 SECTIONS = {
     "everywhere": TEXTS | {"identifiers"},
     "identifiers": frozenset(("identifiers",)),
     "texts": TEXTS,
 }
-"""Sections of the glossary's words, and the checks that forbid them."""
+"""Checks that forbid the words of each section of the glossary."""
 FORBIDDEN_BEGINNING = re.compile(r"\s*(What|The same|Whether|So many|That|Those)\b")
 MAX_SUBJECT_LENGTH = 72
 """Maximum length of a commit subject, in characters."""
@@ -184,7 +184,7 @@ def check_source(source: str, path: str, glossary: Glossary) -> Iterator[Finding
                 word = beginning.group(1)
                 remedy = "an imperative sentence; for a value, a noun or 'True if'"
                 yield Finding("beginnings", word, path, node.lineno, word, remedy)
-            # A string without a space is a key, a name or an option: these are public and stay.
+            # A string without a space is a public key, name or option and is not checked.
             if " " in node.value:
                 last = node.end_lineno
                 yield from _find_in_text(node.value, node.lineno, last, place, path, glossary)
@@ -200,7 +200,7 @@ def check_source(source: str, path: str, glossary: Glossary) -> Iterator[Finding
 
 
 def check_file_names(paths: Iterable[Path]) -> Iterator[Finding]:
-    """Find base names that are too frequent, and neighbours that differ only by a plural."""
+    """Find base names that too many files have, and names that differ only by a plural."""
     by_stem: dict[str, list[Path]] = defaultdict(list)
     by_singular: dict[tuple[Path, str], list[Path]] = defaultdict(list)
     for path in paths:
@@ -218,9 +218,10 @@ def check_file_names(paths: Iterable[Path]) -> Iterator[Finding]:
 
 
 def check_subjects(root: Path, since: str | None) -> list[Finding]:
-    """Find too long subjects of the commits made after `since` (default: the guard's commit).
+    """Find subjects that are too long in the commits after `since`.
 
-    Merge commits are exempt. Without git history, nothing is checked.
+    By default, `since` is the commit that added this check. Merge commits are exempt, and without
+    git history nothing is checked.
     """
     if since and not _git(root, "rev-parse", "--verify", f"{since}^{{commit}}"):
         raise SystemExit(f"--since {since}: expected a commit of {root}; see git log")
@@ -274,7 +275,7 @@ def _list_defined_names(node: ast.AST) -> Iterator[tuple[int, str]]:
 def _find_in_text(
     text: str, first: int, last: int | None, check: str, path: str, glossary: Glossary
 ) -> Iterator[Finding]:
-    """Find private words in the prose of a text that stands in lines `first` to `last`."""
+    """Find private words in the prose of a text that occupies lines `first` to `last`."""
     prose = _CODE.sub(lambda code: "\n" * code.group().count("\n") or " ", text)
     for position, found, term in glossary.find(prose, check):
         line = first + prose.count("\n", 0, position)

@@ -1,4 +1,4 @@
-"""Compare findings with `remaining.csv`, the numbers of findings that the check still accepts."""
+"""Compare findings with `remaining.csv`, which has the accepted number of findings."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ REMAINING = Path(__file__).with_name("remaining.csv")
 HEADER = ("check", "word", "folder", "findings")
 
 Group = tuple[str, str, str]
-"""A check, a word or rule, and a folder at the top level."""
+"""Check, word or rule, and top-level folder."""
 
 
 def get_group(finding: Finding) -> Group:
-    """Return the group in which a finding is counted; the folder of files at the top is `.`."""
+    """Return the group in which a finding is counted; the folder of top-level files is `.`."""
     folder = finding.path.split("/")[0] if "/" in finding.path else "."
     return finding.check, finding.rule, folder
 
@@ -37,9 +37,9 @@ def load_remaining(path: Path = REMAINING) -> dict[Group, int]:
 
 
 def update_remaining(counts: Mapping[Group, int], path: Path = REMAINING) -> None:
-    """Lower the numbers to the present counts, and never raise one.
+    """Lower the accepted numbers to the present counts, and never raise one.
 
-    Only where there is no file, all present counts are written.
+    If the file does not exist, all present counts are written.
     """
     allowed = load_remaining(path) if path.is_file() else counts
     lowered = {group: min(number, counts.get(group, 0)) for group, number in allowed.items()}

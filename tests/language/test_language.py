@@ -1,4 +1,4 @@
-"""Every check has a broken subject that it must find, and a clean one in which it finds nothing."""
+"""Tests that each language check finds a faulty example and accepts a correct one."""
 
 import subprocess
 from pathlib import Path
@@ -33,7 +33,7 @@ BROKEN = {
     "joined": ('print("it hangs "\n      "on the data")', "messages", "hangs on", 1),
     "beginning": ('x = 1\n"""The same of a fit."""', "beginnings", "The same", 2),
 }
-"""By name: source, and the check, word and line of its only finding."""
+"""Source, check, word and line of the only finding, by name."""
 
 
 @pytest.fixture(scope="module")

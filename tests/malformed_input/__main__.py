@@ -21,7 +21,7 @@ from tests.malformed_input.valid_input import bases
 
 
 class Round:
-    """Tries the cases of one kind, and keeps what they did wrong, once a place in the code."""
+    """Run the cases of one kind and collect their faults, one for each place in the code."""
 
     def __init__(self, kind, folder, ready):
         self._kind, self._place, self._ready = kind, folder / "place", ready

@@ -1,4 +1,4 @@
-"""How inputs are spoilt: values, bytes, tables and documents."""
+"""Corrupt values, bytes, tables and documents."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BYTES = (b"\x00", b"\xff\xfe", b"'", b'"""', b"\n[", b"=", b"\xef\xbb\xbf", b"\r
 
 
 def paths(document, way=()):
-    """Every key of a nested document, as a tuple of keys."""
+    """Yield every key of a nested document as a tuple of keys."""
     for key, value in document.items():
         yield (*way, key)
         if isinstance(value, dict):
@@ -34,7 +34,7 @@ def paths(document, way=()):
 
 @st.composite
 def documents(draw, sound, more=()):
-    """A TOML document with one to three things wrong with it, as bytes."""
+    """Draw a TOML document with one to three errors, as bytes."""
     document = copy.deepcopy(sound)
     for _ in range(draw(st.integers(1, 3))):
         ways = [*paths(document), *((name,) for name in more)]
@@ -62,7 +62,7 @@ def documents(draw, sound, more=()):
 
 @st.composite
 def spoilt(draw, data, chance=12):
-    """The bytes, now and then cut off or with others in them."""
+    """Draw the bytes, sometimes cut off or with inserted bytes."""
     act, place = draw(st.integers(0, chance)), draw(st.integers(0, max(len(data), 1)))
     if act == 0:
         return data[:place]
@@ -82,7 +82,7 @@ CELLS = st.sampled_from([
 
 @st.composite
 def tables(draw, sound):
-    """A CSV file with one to three things wrong with it, as bytes."""
+    """Draw a CSV file with one to three errors, as bytes."""
     rows = [line.split(",") for line in sound.decode().splitlines()]
     for _ in range(draw(st.integers(1, 3))):
         act = draw(st.integers(0, 7))
@@ -105,7 +105,7 @@ def tables(draw, sound):
 
 @st.composite
 def bytes_of(draw, sound):
-    """A binary file that is damaged somewhere."""
+    """Draw a binary file that is damaged at one place."""
     act = draw(st.integers(0, 5))
     place = draw(st.integers(0, max(len(sound) - 1, 0)))
     if act == 0:

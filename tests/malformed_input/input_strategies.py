@@ -1,4 +1,4 @@
-"""Every kind of input, and how malformed ones are made."""
+"""Hypothesis strategies for malformed inputs of every kind."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHARES = {
     "experiments": 2400, "plugins": 800, "folders": 2000, "recordings": 2000, "models": 700,
     "weights": 300, "films": 100, "arguments": 1700, "logs": 2000,
 }  # fmt: skip
-"""How many of each kind; 12,000 in all."""
+"""Number of cases of each kind; 12,000 in total."""
 PIECES = [
     "from methods.tuner import Tuner", "import numpy as np", "class Good(Tuner):\n    pass",
     "class Random(Tuner): pass", "class Odd(Tuner):\n    name = 3",
@@ -40,7 +40,7 @@ PIECES = [
     "from sims.core.simulator import Channel, Parameter", "Channel('x', 3)",
     "Parameter(1, 2, 3, 4, 5)",
 ]  # fmt: skip
-"""Of plugin files."""
+"""Pieces of plugin files."""
 
 
 @st.composite
@@ -135,7 +135,9 @@ def recordings(draw):
 
 @st.composite
 def logs(draw):
-    """A log of any format, or what describes one, spoilt; imported or inspected."""
+    """Draw a corrupted log of any format, or a corrupted description of one, to import
+    or inspect.
+    """
     files = {"arm.xml": valid_input.ARM, "log.csv": valid_input.logs()["log.csv"]}
     if draw(st.integers(0, 3)) == 0:
         files["mapped.toml"] = draw(documents(valid_input.MAPPED, MAPPED))
@@ -199,7 +201,7 @@ def films(draw, bases):
 
 
 def files_of_arguments():
-    """What lies beside a command whose arguments are malformed."""
+    """Return the files in the folder of a command with malformed arguments."""
     return {
         "swing.toml": valid_input.toml(valid_input.SECRET),
         "learner.py": valid_input.LEARNER.read_bytes(),
@@ -212,12 +214,12 @@ def files_of_arguments():
 
 def arguments():
     files = files_of_arguments()
-    # What succeeds may write where it was told to.
+    # A command that succeeds may write to any path in its arguments.
     return vectors().map(lambda words: Case(tuple(words), files, "done", owns=("",)))
 
 
 def strategies(bases):
-    """By kind, what makes its cases."""
+    """Return the strategy for the cases of each kind."""
     return {
         "experiments": experiments(),
         "plugins": plugins(),
@@ -232,7 +234,7 @@ def strategies(bases):
 
 
 def made(strategy, count, act):
-    """Have `act` try so many cases, the same ones each time."""
+    """Run `act` on a number of cases, which are the same in every run."""
     checks = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example]
     whole = settings(
         max_examples=count, deadline=None, derandomize=True, database=None,
@@ -242,6 +244,6 @@ def made(strategy, count, act):
 
 
 def share(kind: str, of: int | None = None) -> int:
-    """How many cases of a kind: its share of so many, of $MALFORMED, or of what CI makes."""
+    """Return the number of cases of a kind, for a total of `of`, $MALFORMED or 1500 (as in CI)."""
     total = of or int(os.environ.get("MALFORMED", "1500"))
     return max(SHARES[kind] * total // sum(SHARES.values()), 1)

@@ -1,4 +1,4 @@
-"""A plugin: a learned tuner whose training takes no time."""
+"""A plugin with a learned tuner whose training takes no time."""
 
 from methods.tuner import Tuner
 

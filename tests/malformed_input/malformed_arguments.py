@@ -1,4 +1,4 @@
-"""Argument vectors: sound ones of every command, with one to three things wrong with them."""
+"""Draw argument vectors of all commands with one to three errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ OPTIONS = st.sampled_from([
 
 @st.composite
 def vectors(draw):
-    """A vector of arguments."""
+    """Draw an argument vector."""
     words = draw(st.sampled_from(VECTORS)).split()
     for _ in range(draw(st.integers(1, 3))):
         act, place = draw(st.integers(0, 6)), draw(st.integers(0, max(len(words) - 1, 0)))
@@ -65,7 +65,7 @@ def vectors(draw):
         elif act == 1 and words:
             words.insert(draw(st.integers(0, len(words))), words[place])
         elif act in (2, 3) and words:
-            # The command itself stays, mostly.
+            # In half of the cases the name of the command is protected.
             words[max(place, draw(st.integers(0, 1)) and min(1, len(words) - 1))] = draw(WORDS)
         elif act == 4:
             words[place + 1 : place + 1] = [draw(OPTIONS), draw(WORDS)]

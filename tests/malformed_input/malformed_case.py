@@ -1,4 +1,4 @@
-"""One malformed input to a command, and what must hold whatever it is."""
+"""Run a command on malformed input and check the rules that hold for every input."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from sims.core.value_limits import MAX_MESSAGE_LENGTH
 from tests.malformed_input.shortened_work import HERE, CutError
 
 LIMIT = 30
-"""Seconds that a command may take."""
+"""Time limit of a command in seconds."""
 _NONSENSE = re.compile(r"(?<![\w.])(nan|inf|infinity)(?!\w)", re.IGNORECASE)
 _REFUSED = (0, 1, 2, 130)
 
 
 @dataclass(frozen=True)
 class Case:
-    """Files, and a command that reads them.
+    """Input files and a command that reads them.
 
     Attributes:
-        arguments: of the command, which works beside the files.
-        files: contents by name; None where a file of the base is to be missing.
-        base: the name of a prepared folder that is there as `run`.
-        owns: folders that the command may change where it succeeds.
-        numbers: whether what it prints must be finite.
+        arguments: arguments of the command, which runs in the folder of the files.
+        files: contents by name; None removes a file of the base.
+        base: name of a prepared folder, which is copied as `run`.
+        owns: prefixes of the paths that the command may change if it succeeds.
+        numbers: whether the printed numbers must be finite.
     """
 
     arguments: tuple[str, ...]
@@ -45,16 +45,16 @@ class Case:
 
 
 class FaultError(AssertionError):
-    """What a command must not do."""
+    """A command has violated a rule."""
 
 
 class _LateError(BaseException):
-    """A command took too long."""
+    """A command has exceeded the time limit."""
 
 
 @dataclass(frozen=True)
 class Heard:
-    """How a command ended, and what it said."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -62,10 +62,10 @@ class Heard:
 
 
 def tried(case: Case, place: Path, bases: Mapping[str, Path]) -> Heard:
-    """Run the command in a fresh `place`, and judge it.
+    """Run the command of a case in a new folder `place` and check the result.
 
     Raises:
-        FaultError: it did what it must not do.
+        FaultError: the command has violated a rule.
     """
     here = place / HERE
     here.mkdir(parents=True)
@@ -84,7 +84,7 @@ def tried(case: Case, place: Path, bases: Mapping[str, Path]) -> Heard:
 
 
 def _held(place: Path) -> dict[str, bytes]:
-    """Every file, and every folder with a name that ends in a slash."""
+    """Return the contents of all files and folders; the name of a folder ends in a slash."""
     return {
         f"{path.relative_to(place)}{'/' * path.is_dir()}": b"" if path.is_dir() else read(path)
         for path in place.rglob("*")
@@ -169,7 +169,7 @@ def _judge_refusal(heard: Heard) -> None:
 
 
 def _judge_document(heard: Heard) -> None:
-    """A program reads on stdout what a person reads on stderr."""
+    """Check that the JSON document on stdout has the message and exit code of stderr."""
     error = json.loads(heard.out, parse_constant=_refuse)["error"]
     if f"simgap: {error['message']}\n" != heard.err or error["code"] != heard.code:
         raise FaultError(f"said {error} to a program, and {heard.err!r:.2000} to a person")

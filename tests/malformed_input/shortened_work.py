@@ -1,4 +1,4 @@
-"""Cuts commands short where their inputs turned out sound: what is tried is how they are read."""
+"""Stop commands after they have read valid inputs, because the tests check only the reading."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bench.core.plugin_registries import REGISTRIES
 from sims.core.simulator import InputError
 
 HERE = "here"
-"""The folder in which a command works, in the place of a case."""
+"""Working folder of a command, within the folder of a case."""
 
 
 class CutError(BaseException):
-    """The inputs are sound, and the work would begin."""
+    """The inputs are valid and the actual work would begin."""
 
 
 def _cut(*_: Any, **__: Any) -> Any:
@@ -61,14 +61,12 @@ SHORT = {
     "bench.figures.track_figure.render_track_figure": lambda *_: (b"", b""),
     "bench.api.train.LossRecorder.write": _nothing,
 }
-"""What is put in the place of work."""
+"""Replacements of functions that would do the actual work."""
 
 
 @contextmanager
 def environment(place: Path) -> Iterator[None]:
-    """Within the block trained weights are looked for in the `place` of a case, and nothing is
-    known but what is installed.
-    """
+    """Use a cache of weights within `place` and only installed plugins, within the block."""
     known = [registry.snapshot() for registry in REGISTRIES]
     try:
         for registry, parts in zip(REGISTRIES, known, strict=True):
@@ -83,7 +81,7 @@ def environment(place: Path) -> Iterator[None]:
 
 @contextmanager
 def shortened() -> Iterator[None]:
-    """Within the block commands end where work would begin."""
+    """Stop commands where the actual work would begin, within the block."""
     _whole()
     with ExitStack() as stack:
         for name, act in SHORT.items():
@@ -93,8 +91,9 @@ def shortened() -> Iterator[None]:
 
 @cache
 def _whole() -> None:
-    """Import all of the harness: what is imported within the block would keep what stands there in
-    the place of work.
+    """Import all modules of `bench`.
+
+    A module first imported within the block would keep references to the replacements.
     """
     for module in pkgutil.walk_packages(bench.__path__, "bench."):
         importlib.import_module(module.name)

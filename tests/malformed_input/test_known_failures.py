@@ -1,4 +1,4 @@
-"""Inputs that once did what they must not, each under the name of what went wrong."""
+"""Regression tests with inputs that once violated a rule, named after the failure."""
 
 import pytest
 
@@ -65,7 +65,7 @@ def test_a_film_with_a_box_of_an_unknown_version(ready, tmp_path):
 def test_flipped_bytes_of_a_text_in_parquet(ready, tmp_path, name, flipped, words):
     _, there = ready
     rows = (there["done"] / "runs.parquet").read_bytes()
-    # A cell is damaged once, a column wherever the file speaks of it.
+    # A cell is damaged once, a column name everywhere in the file.
     files = {"run/runs.parquet": rows.replace(name, flipped, 1 if b"-" in name else -1)}
     assert files["run/runs.parquet"] != rows
     case = Case(("status", "run"), files, "done")

@@ -1,5 +1,6 @@
-"""What malformed inputs are made from is sound: otherwise all would be refused, and for no reason
-of theirs.
+"""Tests that the inputs from which malformed ones are made are valid.
+
+Otherwise all cases would be refused, for a reason that the corruption did not cause.
 """
 
 import pytest

@@ -1,4 +1,4 @@
-"""Sound inputs, from which malformed ones are made."""
+"""Build valid inputs, from which malformed ones are made."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ MORE = (
     "inputs", "sweep", "shot", "tags", "says", "same_targets_as", "isolation", "trusted",
     "salt_sha256", "identifiability", "error_channel", "bounds", "effects", "oops",
 )  # fmt: skip
-"""Keys that a sound experiment need not have."""
+"""Optional keys of an experiment, and an unknown one."""
 SECRET = {key: value for key, value in SWING.items() if key != "salt"}
 WORLDLY = {
     **SECRET,
@@ -66,7 +66,7 @@ def toml(document) -> bytes:
 
 @cache
 def recorded(system: str) -> dict[str, bytes]:
-    """A short recording of a system: the table and its description."""
+    """Simulate a short recording of a system and return its table and description."""
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
@@ -94,7 +94,7 @@ MODEL = {
 
 @cache
 def model() -> dict:
-    """What `simgap explain` writes of a pendulum."""
+    """Return a model file of a pendulum that `simgap explain` wrote."""
     import tomllib
 
     from sims.systems.pendulum import Pendulum
@@ -106,8 +106,9 @@ def model() -> dict:
 
 
 def bases(folder: Path) -> dict[str, Path]:
-    """Result folders: one that is complete, one that is not; one whose salt is public; weights; a
-    film.
+    """Prepare folders by name: results, trained weights and a film.
+
+    The results are a complete comparison, one with a public salt, and one without its report.
     """
     made = {}
     known = [registry.snapshot() for registry in REGISTRIES]
@@ -148,7 +149,7 @@ def bases(folder: Path) -> dict[str, Path]:
 
 
 def trains(experiment: str, out: str) -> list[str]:
-    """A training of the plugin's learner."""
+    """Return the command that trains the plugin's tuner."""
     plugin = ["--plugin", str(LEARNER), "--trust", "--out", out]
     return ["train", "learner", "pendulum", "--experiment", experiment, *plugin]
 
@@ -168,12 +169,12 @@ MAPPED = {
                            "hold": "linear"}},
     "runs": {"1": {"held_out": False}},
 }  # fmt: skip
-"""What describes the log in CSV."""
+"""Description of the CSV log."""
 
 
 @cache
 def logs():
-    """The same motion of two joints as every format holds it, by the name of the file."""
+    """Return the same motion of two joints in every log format, by file name."""
     times = np.arange(60) * 0.02
     q = np.degrees(np.column_stack([np.sin(3 * times), 0.5 * np.cos(2 * times)]))
     u = np.degrees(np.column_stack([np.sin(3 * times + 0.1), 0.5 * np.cos(2 * times + 0.1)]))
@@ -199,7 +200,7 @@ def logs():
 
 
 def _bag(times, q):
-    """A bag of a topic; empty where rosbags is not installed."""
+    """Return a ROS bag with one topic; empty if rosbags is not installed."""
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore

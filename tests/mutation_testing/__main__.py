@@ -28,16 +28,16 @@ from typing import NamedTuple
 from tests.mutation_testing.mutant_catalogue import ROOT, Mutant, StaleError, catalogue, chosen
 
 LIMIT = 180.0
-"""Seconds in which the tests of one mutant must end; a mutant that hangs is noticed too."""
+"""Time limit in seconds for the tests of one mutant; a mutant that exceeds it counts as killed."""
 LEFT_OUT = ("results",)
-"""Folders that no test of a mutant reads, and that are large."""
+"""Large folders that no test of a mutant reads."""
 KILLED, SURVIVED, STALE, BROKEN = "killed", "SURVIVED", "STALE", "BROKEN"
 _PASSED, _FAILED, _SLOW = 0, 1, -1
-"""How pytest ends, and that it did not."""
+"""Exit codes of pytest, and a code for an exceeded time limit."""
 
 
 class End(NamedTuple):
-    """What became of a mutant, why, and in how many seconds."""
+    """Result of a mutant, its reason and its duration in seconds."""
 
     mutant: Mutant
     what: str
@@ -46,11 +46,11 @@ class End(NamedTuple):
 
 
 def copied(root: Path, folder: Path) -> Path:
-    """A copy of what git tracks, or would, below `root`."""
+    """Copy the files below `root` that git tracks or would track."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
     for name in filter(None, listed.stdout.split("\0")):
-        # What was deleted and not yet committed is still listed.
+        # Git still lists files that are deleted without a commit.
         if name.startswith(tuple(f"{left}/" for left in LEFT_OUT)) or not (root / name).is_file():
             continue
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -59,10 +59,10 @@ def copied(root: Path, folder: Path) -> Path:
 
 
 def verdict_on(root: Path, tests: Sequence[str], limit: float = LIMIT) -> tuple[int, str]:
-    """How pytest ends on these tests of the tree at `root`, and its first failure."""
+    """Run tests of the tree at `root`; return the exit code of pytest and the first failure."""
     options = ["-x", "-q", "-p", "no:cacheprovider", "--rootdir", str(root)]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    # The copy's own packages, whatever is installed.
+    # Import the packages of the copy, not the installed ones.
     environment = {**os.environ, **threads, "PYTHONPATH": str(root)}
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
@@ -75,7 +75,7 @@ def verdict_on(root: Path, tests: Sequence[str], limit: float = LIMIT) -> tuple[
         except subprocess.TimeoutExpired:
             return _SLOW, f"more than {limit:g} s"
         finally:
-            # With all that it has started: a session of its own.
+            # The process has its own session, so this ends all its children too.
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
@@ -86,7 +86,7 @@ def verdict_on(root: Path, tests: Sequence[str], limit: float = LIMIT) -> tuple[
 
 
 def tried(mutant: Mutant, root: Path, limit: float = LIMIT) -> End:
-    """Apply a mutant to the tree at `root`, run its tests, and put the file back."""
+    """Apply a mutant to the tree at `root`, run its tests, and restore the file."""
     started, path = time.monotonic(), root / mutant.file
     try:
         changed = mutant.applied(root)
@@ -111,15 +111,16 @@ def _fits(mutant: Mutant) -> bool:
 
 def _write(path: Path, data: bytes) -> None:
     path.write_bytes(data)
-    # Python tells a compiled file from a stale one by its second and size: both may be the same.
+    # Python checks a compiled file by modification time (in seconds) and size, which may both be
+    # equal.
     Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
 
 
 def survey(mutants: Sequence[Mutant], jobs: int = 1, limit: float = LIMIT) -> list[End]:
-    """Try mutants, each job in a copy of the tree of its own; prints what becomes of each.
+    """Run the tests of all mutants and print each result; each job has its own copy of the tree.
 
     Raises:
-        SystemExit: a test fails without any change, and so tells nothing.
+        SystemExit: a test fails without any mutant.
     """
     with tempfile.TemporaryDirectory(prefix="simgap-mutants-") as folder:
         copies: queue.SimpleQueue[Path] = queue.SimpleQueue()
@@ -127,7 +128,7 @@ def survey(mutants: Sequence[Mutant], jobs: int = 1, limit: float = LIMIT) -> li
             copies.put(copied(ROOT, Path(folder, str(i))))
         fitting = [mutant for mutant in mutants if _fits(mutant)]
         tests = sorted({test for mutant in fitting for test in mutant.tests})
-        # A file that is asked for whole holds each of its tests.
+        # A test file in the list already includes its single tests.
         tests = [t for t in tests if "::" not in t or t.partition("::")[0] not in tests]
         code, why = verdict_on(Path(folder, "0"), tests, limit * len(tests))
         if code != _PASSED:
@@ -147,7 +148,7 @@ def survey(mutants: Sequence[Mutant], jobs: int = 1, limit: float = LIMIT) -> li
         try:
             return list(pool.map(work, mutants))
         finally:
-            # Interrupted, it ends with what is under way.
+            # After an interrupt, only the running mutants are finished.
             pool.shutdown(cancel_futures=True)
 
 

@@ -1,16 +1,15 @@
-"""Wrong changes to the code, made by hand, each of which breaks a contract and must make a test
-fail.
+"""Hand-made wrong changes to the code; each breaks a contract and must make a test fail.
 
-A contract is a file ``NAME.toml`` beside this one, and a mutant a table in it::
+A contract is a file ``NAME.toml`` in this folder, and a mutant is a table in it::
 
     [[mutant]]
     says = "the budget is overshot by one simulation"
     file = "bench/benchmark/runner/tuner_loop.py"
-    text = "if left <= 0:"       # stands once in the file
+    text = "if left <= 0:"       # occurs once in the file
     becomes = "if left < 0:"
     tests = ["tests/bench/runner/test_tuner_loop.py"]
 
-`tests` are those of the room that must notice: files, folders, or ``FILE::TEST``, quick ones.
+`tests` are fast tests of the same package: files, folders, or ``FILE::TEST``.
 """
 
 from __future__ import annotations
@@ -29,24 +28,24 @@ CONTRACTS = (
     "budget", "files", "held_out", "intervals", "noise", "p_values", "pairing", "recommendation",
     "resume", "sealing", "seeds", "statuses", "units", "verdict",
 )  # fmt: skip
-"""What must have mutants, whatever else has."""
+"""Contracts that must have mutants."""
 
 
 class StaleError(ValueError):
-    """A mutant that does not fit the code any more."""
+    """A mutant that no longer fits the code."""
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A wrong change.
+    """A wrong change to the code.
 
     Attributes:
-        contract: what it breaks.
-        says: how, in a few words.
-        file: place below the root.
-        text: what stands there once.
-        becomes: what stands there instead.
-        tests: that must fail.
+        contract: name of the contract that it breaks.
+        says: short description.
+        file: path below the root.
+        text: original code, which occurs once in the file.
+        becomes: replacement.
+        tests: tests, at least one of which must fail.
     """
 
     contract: str
@@ -60,10 +59,10 @@ class Mutant:
         return f"{self.contract}: {self.says}"
 
     def applied(self, root: Path = ROOT) -> str:
-        """The text of its file with the change in it.
+        """Return the text of the file with the change applied.
 
         Raises:
-            StaleError: the file, its text or its tests are not there, or it changes nothing.
+            StaleError: file, text or tests do not exist, or the code keeps its meaning.
         """
         path = root / self.file
         if not path.is_file():
@@ -85,15 +84,15 @@ class Mutant:
 
 @lru_cache(maxsize=64)
 def _meaning(text: str) -> str:
-    """Python code without its layout and comments."""
+    """Return the syntax tree of Python code, without layout and comments."""
     return ast.dump(ast.parse(text))
 
 
 def _find(root: Path, test: str) -> None:
-    """See that a test is there.
+    """Check that a test exists.
 
     Raises:
-        StaleError: it is not.
+        StaleError: it does not exist.
     """
     place, *names = test.split("::")
     if not (root / place).exists():
@@ -105,7 +104,7 @@ def _find(root: Path, test: str) -> None:
 
 
 def catalogue(folder: Path = HERE) -> list[Mutant]:
-    """Every mutant of a folder, contract by contract."""
+    """Return the mutants of all contracts in a folder."""
     mutants = []
     for path in sorted(folder.glob("*.toml")):
         for table in tomllib.loads(path.read_text(encoding="utf-8"))["mutant"]:
@@ -114,9 +113,7 @@ def catalogue(folder: Path = HERE) -> list[Mutant]:
 
 
 def chosen(mutants: list[Mutant], words: list[str]) -> list[Mutant]:
-    """Those of the contracts among the words, and those that say one of the other words; all
-    without words.
-    """
+    """Select mutants by contract or by a word of their description; no words select all."""
     contracts = {mutant.contract for mutant in mutants}
 
     def wanted(mutant: Mutant, word: str) -> bool:

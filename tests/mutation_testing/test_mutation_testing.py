@@ -1,6 +1,4 @@
-"""The mutants fit the code; and who kills them tells a mutant that is killed from one that
-survives.
-"""
+"""Tests that the mutants fit the code, and that killed and surviving mutants are distinguished."""
 
 import ast
 import subprocess
@@ -21,7 +19,7 @@ from tests.mutation_testing.mutant_catalogue import (
 
 MUTANTS = catalogue()
 ADD = Mutant("sums", "it subtracts", "sums.py", "a + b", "a - b", ("test_sums.py",))
-"""Of a tree that the tests make."""
+"""A mutant of the sample tree."""
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=str)

@@ -29,11 +29,11 @@ q = [0.5, 1.0]
 rate = 50.0
 samples = 50
 """
-"""An experiment that needs no engine but simgap's own."""
+"""An experiment that needs only simgap's own engine."""
 
 
 def steps():
-    """Commands, each of which must end well."""
+    """Return the commands of the check, each of which must succeed."""
     log, told = "swing.csv", "told"
     hidden = ["--effect", "drag.linear=4e-4", "--noise", "q=0.01", "--observe", "q"]
     simulated = ["simulate", "pendulum", *hidden, "--runs", "2", "--seconds", "2", "--rate", "50"]
@@ -62,7 +62,7 @@ def steps():
 
 
 def used(python, wheel, without, place):
-    """Install the wheel and use it; what went wrong."""
+    """Install the wheel, use it, and return the errors."""
     own = environment(place / "env", python)
     pip = [str(own), "-m", "pip", "install", "--quiet", "--prefer-binary"]
     begun = perf_counter()
@@ -100,7 +100,7 @@ def used(python, wheel, without, place):
 
 
 def main():
-    """Build the wheel, look into it, and use it with every Python."""
+    """Build the wheel, check its content, and use it with every Python."""
     reader = argparse.ArgumentParser(description=__doc__)
     reader.add_argument("pythons", nargs="*", metavar="PYTHON", default=[sys.executable])
     reader.add_argument("--without", default="", metavar="A,B")

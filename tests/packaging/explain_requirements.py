@@ -1,8 +1,8 @@
-"""Write requirements-explain.txt again, from requirements.lock:
+"""Update requirements-explain.txt from requirements.lock:
 
     python -m tests.packaging.explain_requirements
 
-It asks uv (``pip install uv``), which finds the versions for all Pythons at once.
+It needs uv (``pip install uv``), which resolves versions for all supported Pythons at once.
 """
 
 import subprocess
@@ -21,20 +21,20 @@ WITHOUT = ("torch", "pybullet")
 
 
 def direct():
-    """What pyproject.toml says that simgap needs, without the two large packages."""
+    """Return simgap's direct requirements in pyproject.toml, without the two large packages."""
     project = read_toml(ROOT / "pyproject.toml")["project"]
     return [line for line in project["dependencies"] if Requirement(line).name not in WITHOUT]
 
 
 def pins(path):
-    """(name, version, marker) of each line of a file of pinned versions."""
+    """Return (name, version, marker) of each line of a file with pinned versions."""
     lines = [line for line in path.read_text().splitlines() if line and line[0] != "#"]
     found = [Requirement(line) for line in lines]
     return [(each.name, str(each.specifier).removeprefix("=="), each.marker) for each in found]
 
 
 def main():
-    """Write the pins below the file's own comment."""
+    """Write the pinned versions below the header comment of the file."""
     comment = [line for line in FILE.read_text().splitlines() if line.startswith("#")]
     options = ["--quiet", "--universal", "--python-version", "3.10", "--no-header", "--no-annotate"]
     with TemporaryDirectory() as place:

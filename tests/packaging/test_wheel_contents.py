@@ -1,7 +1,6 @@
-"""The wheel holds all that an installation needs, and works away from the checkout.
+"""Tests that the wheel contains everything an installation needs and works outside the checkout.
 
-What it takes to install it with all its dependencies into an empty environment is beyond what CI
-has time for: `make wheel` does that.
+CI has no time to install the wheel with all its dependencies; `make wheel` does that.
 """
 
 import json
@@ -60,7 +59,7 @@ def test_it_is_installed_and_used_away_from_the_checkout(wheel, tmp_path):
     (packages,) = (tmp_path / "env" / "lib").glob("python3*/site-packages")
     with zipfile.ZipFile(wheel) as packed:
         packed.extractall(packages)
-    # The packages that it needs are those of this environment, which comes behind its own.
+    # Dependencies come from the packages of this environment, which are searched last.
     (packages / "others.pth").write_text("\n".join(site.getsitepackages()) + "\n")
 
     def simgap(*arguments):

@@ -1,4 +1,4 @@
-"""Without PyTorch and PyBullet `explain` works, and what needs them is listed with the reason."""
+"""Tests that `explain` works without PyTorch and PyBullet, and that lists give the reason."""
 
 import json
 import re
@@ -17,11 +17,11 @@ from tests.packaging.explain_requirements import FILE, LOCK, ROOT, WITHOUT, dire
 from tests.packaging.wheel_in_environment import build, environment
 
 ABSENT = re.compile(r"(torch|functorch|torchgen|pybullet)", re.I)
-"""Begins the names of what the two packages install."""
+"""Pattern of the names that the two packages install."""
 
 
 def on(python):
-    """(name, version) of the pins that hold for a version of Python on Linux."""
+    """Return a function that reads the pins (name, version) for a version of Python on Linux."""
     there = {
         "python_full_version": f"{python}.1",
         "python_version": python,
@@ -56,7 +56,7 @@ def test_every_pin_is_one_that_the_project_allows(python):
 
 
 def test_the_pins_without_the_large_packages_are_complete():
-    """All that the direct requirements need in turn is pinned too, so that --no-deps loses none."""
+    """Indirect requirements are pinned too, so installing with --no-deps omits none."""
     pinned = {canonicalize_name(name) for name, *_ in pins(FILE)}
     todo = [Requirement(line) for line in direct()]
     seen = set()
@@ -76,7 +76,7 @@ def test_the_pins_without_the_large_packages_are_complete():
 
 
 def test_python_3_10_gets_upper_bounds_where_its_pip_would_not_find_back():
-    """Of an index that does not state Requires-Python, pip 23 tries releases for Python 3.11."""
+    """If an index does not state Requires-Python, pip 23 tries releases for Python 3.11."""
     there = {"python_version": "3.10"}
     bounded = {
         wanted.name: wanted.specifier
@@ -88,7 +88,7 @@ def test_python_3_10_gets_upper_bounds_where_its_pip_would_not_find_back():
 
 
 def test_no_page_or_message_advises_to_install_from_an_index_where_it_is_not():
-    """simgap is on no index: `pip install simgap[npe]` would fail, or fetch somebody else's."""
+    """simgap is on no index: `pip install simgap[npe]` would fail or install a foreign package."""
     files = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
     files += [p for name in ("bench", "methods", "sims") for p in (ROOT / name).rglob("*.py")]
     advised = re.compile(r"pip install [\"']?simgap\b")
@@ -97,7 +97,7 @@ def test_no_page_or_message_advises_to_install_from_an_index_where_it_is_not():
 
 
 def made(*words, code=0, **kept):
-    """What make prints; it needs no environment for what is only shown or refused."""
+    """Run make and return its output; it needs no environment to print or refuse a target."""
     done = subprocess.run(
         ["make", "--no-print-directory", *words],
         cwd=ROOT, capture_output=True, text=True, check=False, **kept,
@@ -144,7 +144,7 @@ def test_another_without_than_last_time_installs_again(tmp_path, last, now, agai
     stamp = tmp_path / "env" / ".installed"
     stamp.parent.mkdir()
     stamp.write_text(f"{last}\n")
-    # A Python that is none ends the installation before it has begun.
+    # The Python `false` ends the installation at its start.
     words = ["install", f"VENV={stamp.parent}", f"WITHOUT={now}", "PYTHON=false"]
     made(*words, code=2 if again else 0)
     assert stamp.exists() != again
@@ -152,14 +152,14 @@ def test_another_without_than_last_time_installs_again(tmp_path, last, now, agai
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory):
-    """An interpreter with simgap's wheel and all packages of this one but the large two."""
+    """Return an interpreter with simgap's wheel and all installed packages except the large two."""
     folder = tmp_path_factory.mktemp("without")
     found = environment(folder / "env")
     (packages,) = (folder / "env" / "lib").glob("python3*/site-packages")
     for place in map(Path, site.getsitepackages()):
         for each in place.iterdir():
             ours = each.name.lower().startswith(("simgap", "_simgap", "__editable__"))
-            ours = ours or each.suffix == ".pth"  # this checkout is found by them
+            ours = ours or each.suffix == ".pth"  # path files would add this checkout
             if not ABSENT.match(each.name) and not ours and each.name != "__pycache__":
                 (packages / each.name).symlink_to(each)
     build(folder)

@@ -1,4 +1,4 @@
-"""The wheel: built, looked into, and installed into an environment."""
+"""Build the wheel, check its content, and install it into an environment."""
 
 import re
 import subprocess
@@ -12,11 +12,11 @@ from sims.core.toml_validation import read_toml
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("bench", "methods", "sims")
 LARGEST = 3_000_000
-"""Bytes of a wheel: beyond, something has come in that nobody asked for."""
+"""Maximum size of a wheel in bytes; a larger one contains unwanted files."""
 
 
 def build(folder):
-    """Build the wheel of this checkout, with the tools that are installed here."""
+    """Build the wheel of this checkout with the installed tools."""
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps"]
     subprocess.run([*command, "--no-build-isolation", "-w", str(folder), str(ROOT)], check=True)
     (made,) = folder.glob("*.whl")
@@ -24,7 +24,7 @@ def build(folder):
 
 
 def wanted():
-    """What a wheel must hold, beside what every wheel has."""
+    """Return the files that the wheel must contain in addition to its metadata."""
     code = {p.relative_to(ROOT).as_posix() for name in PACKAGES for p in (ROOT / name).rglob("*")}
     kept = {name for name in code if (ROOT / name).is_file() and "__pycache__" not in name}
     reference = ROOT / "results" / "reference"
@@ -37,13 +37,15 @@ def wanted():
 
 
 def drawn(table):
-    """Whether figures can be drawn before it: a comparison's with its configuration."""
+    """Return whether a table is a comparison's table with a configuration, so figures
+    can be drawn.
+    """
     head = table.read_text(encoding="utf-8").partition("\n")[0]
     return (table.parent / "experiment.toml").exists() and "metric" in head.split(",")
 
 
 def faults(wheel):
-    """What is wrong with a wheel's content."""
+    """Return the faults in a wheel's content."""
     with zipfile.ZipFile(wheel) as packed:
         names = {name for name in packed.namelist() if ".dist-info/" not in name}
         (about,) = [name for name in packed.namelist() if name.endswith("dist-info/METADATA")]
@@ -64,7 +66,7 @@ def faults(wheel):
 
 
 def environment(folder, python=sys.executable):
-    """A new environment in a folder; its interpreter."""
+    """Create an environment in a folder and return its interpreter."""
     if python == sys.executable:
         venv.create(folder, with_pip=False)
     else:
@@ -73,7 +75,7 @@ def environment(folder, python=sys.executable):
 
 
 def requirements(wheel, without):
-    """What the wheel's metadata says it needs, extras aside, without some packages."""
+    """Return the requirements in the wheel's metadata without extras and without some packages."""
     with zipfile.ZipFile(wheel) as packed:
         (about,) = [name for name in packed.namelist() if name.endswith("dist-info/METADATA")]
         metadata = packed.read(about).decode()

@@ -1,4 +1,4 @@
-"""What the pages below docs/ say of tables of the repository, held against them."""
+"""Compare sentences and tables of the pages below docs/ with the reference tables."""
 
 import re
 
@@ -21,13 +21,13 @@ COSTS = {
     "candidates": {"score": (5, 10, 30, 100, 300), "explain": (6, 12, 18, 24, 0)},
     "runs": {"score": (1, 3, 10, 30, 100), "explain": (0, 3, 10, 30, 100)},
 }
-"""Sizes that the table of costs has, by what grows and what is timed; 0 where it was not."""
+"""Sizes in the table of costs, by growing quantity and measured command; 0 if not measured."""
 PARTS = {"score": ("a score, ms", 1e3), "explain": ("explain, s", 1.0)}
-"""What is timed: the head of its rows, and its unit in seconds."""
+"""Label of each measured command in the table, and factor from seconds to its unit."""
 
 
 def tunenet():
-    """docs/tunenet.md."""
+    """Check docs/tunenet.md."""
     page = Account("docs/tunenet.md")
     for place, name in enumerate(("ablation", "ablation", "noise", "ensemble")):
         header = "network | in 1 | in 2" if name == "ensemble" else "network | in 1 | in 3"
@@ -51,8 +51,10 @@ def tunenet():
 
 
 def hybrid_rows():
-    """The rows of the table of hybrid and the two that it is made of: mean, and median in brackets
-    where the two differ by more than a factor of two from the third simulation on.
+    """Yield the table rows of hybrid and of the two tuners it combines.
+
+    Each cell is the mean error. The median follows in brackets if the mean is more than twice as
+    large, from the third simulation on.
     """
     for kind in ("in", "wide"):
         for tuner in ("hybrid", "tunenet", "least_squares"):
@@ -66,10 +68,10 @@ def hybrid_rows():
 
 
 def _marks(page):
-    """The marks that the reference results reach."""
+    """Check the targets that the reference results reach."""
 
     def error(tuner, kind, k):
-        """Mean on the published ball."""
+        """Return the mean error on the ball experiment of the publication."""
         return errors("ball-drop", tuner, kind, k, "param_abs_error")[0]
 
     reached = [error("tunenet", kind, 3) for kind in ("in", "wide")]
@@ -95,10 +97,10 @@ def _marks(page):
 
 
 def _study(page, header, name, place):
-    """A table of the study."""
+    """Check a table of the TuneNet study."""
 
     def value(row, heading):
-        """Mean errors, and seconds of one training."""
+        """Return the mean error, or the seconds of one training."""
         where = {"variant": row["network"]}
         if heading == "network":
             return None
@@ -111,7 +113,7 @@ def _study(page, header, name, place):
 
 
 def _cost(page):
-    """What training and an iteration cost, as far as it is kept."""
+    """Check the costs of a training and an iteration, as far as they are stored."""
     cost = frame(f"{STUDY}/cost.csv").set_index("tuner")
     ours, published = cost.loc["tunenet"], cost.loc["tunenet-published"]
     iteration = [ours.iteration_ms_median, ours.iteration_ms_95]
@@ -122,10 +124,10 @@ def _cost(page):
 
 
 def _misspecified(page):
-    """Networks where the world has what the simulator lacks."""
+    """Check the errors of networks when the simulator lacks an effect."""
 
     def error(system, tuner, randomised):
-        """Mean, in training widths."""
+        """Return the mean error in training widths."""
         where = {"system": system, "tuner": tuner, "randomised": randomised}
         return one("misspecified/learned.csv", "error", **where)
 
@@ -146,7 +148,7 @@ def _misspecified(page):
     page.says("hold {} to {} % of the truths", wide.min(), wide.max())
 
     def mended(tuner, system):
-        """Mean error in the simulator that explain extended, where learned tuners are."""
+        """Return the mean error of a learned tuner in the extended simulator."""
         where = {"model": "extended", "tuner": tuner, "metric": "param_error"}
         return one("misspecified/table.csv", "mean", experiment=f"misspecified-{system}", **where)
 
@@ -161,15 +163,15 @@ def _misspecified(page):
 
 
 def _history(page):
-    """A network that reads the history."""
+    """Check the errors of the network that reads the history."""
 
     def error(experiment, kind, k, *tuners):
-        """Means, in training widths."""
+        """Return the mean errors in training widths."""
         where = {"experiment": experiment, "range": kind, "simulations": k}
         return [one("history/errors.csv", "mean", tuner=tuner, **where) for tuner in tuners]
 
     def mended(tuner, model):
-        """Means on shot and ball, before or after explain."""
+        """Return the mean errors on shot and ball, before or after explain."""
         where = {"tuner": tuner, "model": model, "metric": "param_error"}
         return [
             one("history/missing.csv", "mean", experiment=f"misspecified-{system}", **where)
@@ -197,7 +199,7 @@ def _history(page):
 
 
 def performance():
-    """docs/performance.md."""
+    """Check docs/performance.md."""
     page = Account("docs/performance.md")
     page.written("\n".join(cost_rows()))
     items = frame("exam/items.csv").query("part == 'marks'")
@@ -207,7 +209,7 @@ def performance():
     }  # fmt: skip
 
     def value(row, heading):
-        """How long the questions of a kind took."""
+        """Return statistics of the seconds for cases of one kind."""
         seconds = items[items.kind == names[row[""]]].seconds
         values = {
             "questions": len(seconds), "median, s": seconds.median(),
@@ -221,7 +223,7 @@ def performance():
 
 
 def cost_rows():
-    """The rows of the table of costs, as the page has them."""
+    """Yield the rows of the table of costs as they are on the page."""
     for what, columns in COSTS.items():
         for part, (head, times) in PARTS.items():
             mine = rows("explain-cost/cost.csv", part=part, what=what)
@@ -233,17 +235,17 @@ def cost_rows():
 
 
 def short(value):
-    """With two digits, or all before the point."""
+    """Format a value with two significant digits, or as an integer from 10 on."""
     return f"{value:.0f}" if value >= 10 else f"{value:#.2g}"
 
 
 def problems():
-    """docs/problems.md."""
+    """Check docs/problems.md."""
     page = Account("docs/problems.md")
     table = frame("multi/identified.csv")
 
     def parameters(row, heading):
-        """How many parameters and unseen runs an experiment has."""
+        """Return the number of parameters or of held-out runs of an experiment."""
         name = row["experiment"].strip("`")
         if heading not in ("parameters", "unseen runs") or name.startswith("robot"):
             return None
@@ -257,7 +259,7 @@ def problems():
     above = [""]
 
     def spectrum(row, heading):
-        """What the data of a problem identify."""
+        """Return the parameter combinations that the data of a problem identify."""
         above[0] = row["experiment"].strip("`") or above[0]
         mine = table[(table.experiment == above[0]) & (table["range"] == row["range"])].iloc[0]
         if heading == "stiffest":
@@ -268,7 +270,7 @@ def problems():
         column = {"stiff directions (targets)": "stiff", "the sloppiest is mostly": "made_of"}
         if heading not in column:
             return None
-        # Of what it is made of the page has the largest shares, by other names.
+        # The page lists only the largest shares, with other names for the parameters.
         values = [float(number) for number in re.findall(r"\b\d+", mine[column[heading]])]
         joint = re.findall(r"of (?:joint|link) (\d)$", row[heading])
         return [*values[: len(NUMBER.findall(row[heading])) - len(joint)], *joint]
@@ -291,7 +293,7 @@ def problems():
 
 
 def engines():
-    """docs/engines.md: what tests hold the engines to stands above what was measured."""
+    """Check docs/engines.md: the tolerances of the engine tests."""
     page = Account("docs/engines.md")
     bounds = [TOLERANCE[system] for system in ("ball", "pendulum", "slider", "servo")]
     page.says("every entry below {} (ball), {} (pendulum), {} (slider), {} (servo),", *bounds)
@@ -299,7 +301,7 @@ def engines():
 
 
 def robots():
-    """docs/robots.md: of robots that float."""
+    """Check docs/robots.md: the results for robots with a floating base."""
     page = Account("docs/robots.md")
     told = frame("robots/afloat.csv")
     of = {kind: told[told.kind == kind] for kind in ("single", "clean", "foreign")}
@@ -336,4 +338,4 @@ PAGES = {
     "problems": problems,
     "engines": engines,
 }
-"""Those pages of docs/ that quote tables, beside the ones that have a test of their own."""
+"""Checks of the pages of docs/ that quote tables, except pages with their own test."""

@@ -1,9 +1,9 @@
-"""Holds a page's numbers against tables: every number is one that a table has, or one of those
-that are said to be known otherwise, with the reason.
+"""Compare the numbers of a page with tables.
 
-A sentence is quoted with `{}` where a number stands, and the values it must have. A number agrees
-with a value that rounds to it, to the digits that the page shows. What no sentence and no table
-claimed is left over, and a test says so: a number cannot be added, or changed, unnoticed.
+Every number must come from a table, or be listed with a reason why it does not. A sentence is given
+with `{}` in place of its numbers, and with the expected values. A number agrees with a value that
+rounds to it, with the digits that the page has. Tests report numbers that no sentence and no table
+covers, so a number cannot be added or changed unnoticed.
 """
 
 import math
@@ -12,11 +12,13 @@ import re
 from tests.docs.documentation_pages import FENCE, ROOT
 
 NUMBER = re.compile(r"(?<![\w.,/-])[-−]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?(?![\w]|-\w)")
-"""A number of the text, not one of a name such as UR5 or squash-018."""
+"""Pattern of a number; digits in names such as UR5 or squash-018 do not match."""
 NO_TEXT = re.compile(
     r"`[^`\n]*`|\]\([^)]*\)|<!--(?:.|\n)*?-->|^#+ .*$|^\d+\. |95 %\s+interval", re.M
 )
-"""Code, addresses, comments, headings, counts of lists, the level of intervals: no statements."""
+"""Pattern of text that makes no statement: code, addresses, comments, headings, list numbers,
+interval levels.
+"""
 
 
 TABLE = re.compile(r"(?:^ *\|.*\n?)+", re.M)
@@ -25,13 +27,13 @@ HEADING = re.compile(r"^#+ (.*)$", re.M)
 
 
 class Account:
-    """The numbers of a page, and which of them have been held against something.
+    """Numbers of a page and the results of their checks.
 
     Attributes:
-        path: the page.
-        text: its text.
-        held: where in the text stand numbers that were held against something: (begin, end).
-        wrong: what did not agree, a line each.
+        path: file of the page.
+        text: text of the page.
+        held: positions (begin, end) of the numbers that have been checked.
+        wrong: disagreements, one line each.
     """
 
     def __init__(self, path, text=None):
@@ -41,7 +43,7 @@ class Account:
         self.wrong = []
 
     def says(self, sentence, *values):
-        """The page has this sentence once, with numbers that agree with these values."""
+        """Check that the page has this sentence once, with numbers that agree with the values."""
         found = self._found(sentence)
         if found is None:
             return
@@ -50,7 +52,7 @@ class Account:
             self._hold(found.span(place), value)
 
     def known(self, sentence, why):
-        """The page has this sentence, whose numbers stand in no table, for a reason."""
+        """Accept the numbers of a sentence that come from no table, for the reason `why`."""
         found = self._found(sentence)
         if found is None:
             return
@@ -60,7 +62,7 @@ class Account:
             self.wrong.append(f"has no number, or it has no reason: {sentence!r}")
 
     def written(self, text):
-        """The page has every line of a text that a program wrote from the tables."""
+        """Check that the page has every line of a text that was generated from the tables."""
         lines = {line.group(): line.span() for line in LINE.finditer(self.text)}
         for line in filter(None, text.splitlines()):
             if line not in lines:
@@ -69,13 +71,13 @@ class Account:
             self.held.update(n.span() for n in NUMBER.finditer(self.text, *lines[line]))
 
     def table(self, header, value, place=0):
-        """The page has a table that begins with this header line, and its cells agree.
+        """Check that the page has a table with this header line and with cells that agree.
 
         Args:
-            header: the first cells, as the page has them.
-            place: among the tables that begin so.
-            value: of a row's cells by their headings and a heading: the values of the numbers of
-                that cell, in order; None for a cell that is no statement.
+            header: first cells of the header, as on the page.
+            place: index among the tables with this header.
+            value: function of a row (cells by heading) and a heading; it returns the expected
+                numbers of that cell in order, or None for a cell that is not checked.
 
         Returns:
             How many numbers were compared.
@@ -102,7 +104,7 @@ class Account:
         return count
 
     def left(self):
-        """Numbers that nothing was said of, each with the words about it."""
+        """Return the numbers that have not been checked, each with the surrounding text."""
         found = []
         for number in self._untold():
             about = self.text[max(0, number.start() - 40) : number.end() + 20]
@@ -110,10 +112,10 @@ class Account:
         return found
 
     def left_by_section(self):
-        """The same numbers by the heading that they stand below, as the page has them."""
+        """Return the unchecked numbers by the heading above them."""
         fenced = [m.span() for m in FENCE.finditer(self.text)]
         heads = [(m.start(), m[1]) for m in HEADING.finditer(self.text)]
-        # A comment in a block of code looks like a heading.
+        # A comment in a code block looks like a heading.
         heads = [(at, name) for at, name in heads if not any(a <= at < b for a, b in fenced)]
         found = {}
         for number in self._untold():
@@ -122,7 +124,7 @@ class Account:
         return found
 
     def _untold(self):
-        """Where numbers stand that nothing was said of."""
+        """Yield the matches of unchecked numbers."""
         nothing = [m.span() for m in NO_TEXT.finditer(self.text)]
         nothing += [m.span() for m in FENCE.finditer(self.text)]
         spans = sorted([*nothing, *self.held])
@@ -132,7 +134,7 @@ class Account:
                 yield number
 
     def _hold(self, span, value):
-        """Hold the number that stands somewhere against a value."""
+        """Compare the number at a position with a value."""
         self.held.add(span)
         number = self.text[slice(*span)]
         if not agrees(number, value):
@@ -140,7 +142,7 @@ class Account:
             self.wrong.append(f"says {number} where the tables have {value!r}: ...{words}...")
 
     def _found(self, sentence):
-        """Where the page has a sentence, its numbers as groups; line ends count as spaces."""
+        """Find a sentence on the page, with its numbers as groups; line ends count as spaces."""
         parts = [r"\s+".join(map(re.escape, part.split(" "))) for part in sentence.split("{}")]
         found = list(re.finditer(f"({NUMBER.pattern}|[A-Za-z]+)".join(parts), self.text))
         if len(found) == 1:
@@ -150,7 +152,7 @@ class Account:
 
 
 def lines_of(text, begin):
-    """The lines of the table that stands somewhere, each a list of cells: (text, its place)."""
+    """Return the lines of the table at a position, each as a list of cells (text, position)."""
     rows = []
     begin = text.rfind("\n", 0, begin) + 1
     for line in TABLE.match(text, begin)[0].splitlines():
@@ -165,11 +167,11 @@ def lines_of(text, begin):
 
 
 WORDS = "none one two three four five six seven eight nine ten eleven twelve"
-"""Small numbers as words, from nothing on."""
+"""Small numbers as words, from zero on."""
 
 
 def agrees(text, value):
-    """Whether a number as it is written is a value, rounded to the digits that are shown."""
+    """Return whether a written number equals a value rounded to the written digits."""
     if isinstance(value, str):
         return text == value
     if text.isalpha():

@@ -1,4 +1,4 @@
-"""The reference tables, as the accounts of their pages ask for them."""
+"""Read the reference tables for the checks of page numbers."""
 
 import json
 from functools import cache
@@ -12,18 +12,18 @@ REFERENCE = ROOT / "results" / "reference"
 
 @cache
 def frame(path):
-    """A table below results/reference."""
+    """Return a table below results/reference."""
     return pd.read_csv(REFERENCE / path)
 
 
 @cache
 def document(path):
-    """A JSON file below results/reference."""
+    """Return a JSON file below results/reference."""
     return json.loads((REFERENCE / path).read_text(encoding="utf-8"))
 
 
 def rows(path, **where):
-    """The rows of a table in which columns have these values."""
+    """Return the rows of a table in which columns have these values."""
     table = frame(path)
     for column, value in where.items():
         table = table[table[column] == value]
@@ -31,13 +31,14 @@ def rows(path, **where):
 
 
 def one(path, column, **where):
-    """The one cell of a column in the row that is meant."""
+    """Return the only cell of a column in the selected rows."""
     return rows(path, **where)[column].item()
 
 
 def errors(folder, tuner, kind, simulations, metric):
-    """(mean, median) of an error over targets after so many simulations; a run that ended before
-    counts with its last.
+    """Return mean and median of an error over targets after a number of simulations.
+
+    A run that ended earlier counts with its last value.
     """
     table = rows(f"{folder}/table.csv", tuner=tuner, range=kind, metric=metric)
     row = table[table.simulations <= simulations].sort_values("simulations").iloc[-1]

@@ -1,14 +1,14 @@
-"""The register of numbers that no table of the repository backs: `once.toml`.
+"""Maintain the register `once.toml` of the numbers on pages that no table supports.
 
-Every page below docs/ is in it, section by section: how its numbers came about (a command that
-measures them again, or that they are no measurements), and the numbers themselves, in order. A
-number that is added, changed or taken away makes a test fail until it is entered here:
+The register has every page below docs/ by section: the source of the numbers (a command that
+measures them, or a note that they are not measurements), and the numbers in order. A test fails
+when a number on a page changes, until the register is updated with
 
     python -m tests.docs.page_numbers.stated_once
 
-writes the numbers anew and keeps what is said of each section; what is new has nothing said of it
-yet, which a test finds too. Better than an entry is a table below results/reference and a sentence
-that is held against it (`expected_sentences.py`).
+The program rewrites the numbers and keeps the sources. A new section has an empty source, which a
+test reports too. Prefer a table below results/reference and a sentence that is compared with it
+(`expected_sentences.py`).
 """
 
 import re
@@ -24,7 +24,7 @@ from tests.docs.page_numbers.number_sources import Account
 
 REGISTER = Path(__file__).with_name("once.toml")
 COMMAND = re.compile(r"python -m (tests\.[\w.]+)")
-"""A program of the repository that is named."""
+"""Pattern of a command that runs a program of the repository."""
 HEAD = """# Numbers on pages below docs/ that no table backs, by page and section: how they came
 # about, and what they are. `python -m tests.docs.page_numbers.stated_once` writes it; `from` \
 is yours.
@@ -34,7 +34,7 @@ WIDTH = 120
 
 
 def accounts():
-    """The pages, with what tables are known to hold accounted for."""
+    """Return the pages after their numbers from tables have been checked."""
     known = {
         account.path: account for account in (make() for make in expected_sentences.PAGES.values())
     }
@@ -43,22 +43,22 @@ def accounts():
 
 
 def found():
-    """By page and section the numbers that nothing else accounts for."""
+    """Return the numbers that no table supports, by page and section."""
     by_page = {account.path.name: account.left_by_section() for account in accounts()}
     return {page: sections for page, sections in by_page.items() if sections}
 
 
 def registered():
-    """The same as the register has them: by page and section ``from`` and ``numbers``."""
+    """Return the register: ``from`` and ``numbers`` by page and section."""
     return read_toml(REGISTER)
 
 
 def faults(pages, register):
-    """Where pages and register differ, a line each.
+    """Return the differences between pages and register, one line each.
 
     Args:
-        pages: of `found`.
-        register: of `registered`.
+        pages: result of `found`.
+        register: result of `registered`.
     """
     wrong = []
     for page in sorted({*pages, *register}):
@@ -78,7 +78,7 @@ def faults(pages, register):
 
 
 def _changed(then, now):
-    """The first number that is not as it was."""
+    """Describe the first number that has changed."""
     place = next(
         (i for i, pair in enumerate(zip(then, now, strict=False)) if pair[0] != pair[1]),
         min(len(then), len(now)),
@@ -88,7 +88,7 @@ def _changed(then, now):
 
 
 def text(pages, register):
-    """The register with today's numbers, and what it said of each section."""
+    """Return the text of the register with the present numbers and the registered sources."""
     document = {}
     for page, sections in pages.items():
         for name, numbers in sections.items():

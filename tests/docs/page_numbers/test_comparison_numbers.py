@@ -1,4 +1,4 @@
-"""The pages of films, shots and several parameters say what the tables beside them say."""
+"""Tests that the result pages of films, shots and several parameters agree with their tables."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ FOUR = ("ball-tilt", "pendulum-driven", "servo-friction", "arm-swing")
 
 
 def video():
-    """results/reference/ball-drop-video."""
+    """Check results/reference/ball-drop-video."""
     page = Account(f"results/reference/{VIDEO}/README.md")
     status = frame(f"{VIDEO}/status.csv")
     assert status.status.isin(["done", "converged"]).all()
@@ -24,7 +24,7 @@ def video():
     tuner = [""]
 
     def value(row, heading):
-        """Mean, and median in brackets where it is given."""
+        """Return the mean, and the median if the cell has it in brackets."""
         tuner[0] = row["tuner"] or tuner[0]
         if heading in ("tuner", "knows the camera", "range"):
             return None
@@ -37,7 +37,7 @@ def video():
     assert page.table("tuner | knows the camera", value) > 110
 
     def error(tuner, kind, k, of="mean", folder=VIDEO):
-        """Mean or median of the absolute error."""
+        """Return the mean or median of the absolute error."""
         return errors(folder, tuner, kind, k, "param_abs_error")[of == "median"]
 
     assert error("tunenet-vision", "in", 1) < 0.005
@@ -62,14 +62,14 @@ def video():
 
 
 def shots():
-    """results/reference/bounce-shot."""
+    """Check results/reference/bounce-shot."""
     page = Account(f"results/reference/{SHOT}/README.md")
     made = frame(f"{SHOT}/shots.csv")
     every = frame(f"{SHOT}/table.csv").query("ball == 'all'").set_index("method")
     clear = made[made.seen >= 0.95]
 
     def value(row, heading):
-        """What a column of the page is made from."""
+        """Return the table values of a cell."""
         method = row["method"].partition(" (its own")[0]
         if heading == "method":
             return None
@@ -143,7 +143,7 @@ def shots():
 
 
 def _bound(page):
-    """Where the vision network ends at its bound, and what keeps it away."""
+    """Check how often the vision network ends at its bound, for several trainings."""
     kept = frame(f"{SHOT}/shots.csv").query("ball == 'table-tennis'")
     kept = kept[kept.method == "tunenet-vision + explain"].restitution
     page.says("in the shots above {} of {}.", (kept >= BOUND).sum(), len(kept))
@@ -175,7 +175,7 @@ def _bound(page):
 
 
 def several():
-    """results/reference/multi."""
+    """Check results/reference/multi."""
     page = Account("results/reference/multi/README.md")
     status = [frame(f"{MULTI}/{problem}/status.csv") for problem in FOUR]
     assert all(set(each.status) <= {"done", "converged"} for each in status)
@@ -183,7 +183,7 @@ def several():
     problem = [0]
 
     def value(row, heading):
-        """Medians in range and wide; the columns come in pairs, a pair a problem."""
+        """Return the medians in range and wide; each problem has a pair of columns."""
         if heading == "tuner":
             problem[0] = -1
             return None
@@ -194,7 +194,7 @@ def several():
         return [errors(folder, row["tuner"], kind, 50, metric)[1] for kind in kinds]
 
     def median(problem, tuner, kind, k, metric="stiff_error"):
-        """Median error after so many simulations."""
+        """Return the median error after a number of simulations."""
         return errors(f"{MULTI}/{problem}", tuner, kind, k, metric)[1]
 
     text = page.text

@@ -1,4 +1,4 @@
-"""The pages below docs/ say what tables say, and no number on them is of unsaid origin."""
+"""Tests that the pages below docs/ agree with the tables, and that every number has a source."""
 
 import copy
 

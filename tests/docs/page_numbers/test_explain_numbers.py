@@ -1,4 +1,4 @@
-"""The pages on how often explain is right say what the summaries beside them say."""
+"""Tests that the pages on the accuracy of explain agree with their summaries."""
 
 import json
 from operator import not_
@@ -16,12 +16,12 @@ from tests.simple_exam.exam_summary import share
 
 
 def percent(share):
-    """A share as the pages say it, and as they bound it."""
+    """Return a fraction and its confidence limits in percent."""
     return 100 * share["share"], 100 * share["low"], 100 * share["high"]
 
 
 def exam():
-    """results/reference/exam."""
+    """Check results/reference/exam."""
     page = Account("results/reference/exam/README.md")
     summary = document("exam/summary.json")
     items = frame("exam/items.csv")
@@ -49,7 +49,7 @@ def exam():
 
 
 def robots():
-    """results/reference/robots."""
+    """Check results/reference/robots."""
     page = Account("results/reference/robots/README.md")
     summary = document("robots/summary.json")
     page.written(robots_report.page(summary))
@@ -78,7 +78,7 @@ def robots():
 
 
 def asked_again(page):
-    """What the page says of again.csv."""
+    """Check the statements of the page about again.csv."""
     again = frame("robots/again.csv")
     single = again[(again.kind == "single") & (again.outcome != "not drawn")]
     rubs = again.question.str.contains("friction")
@@ -101,7 +101,8 @@ def asked_again(page):
     page.says("frictions {} of {}.", again[rubs].held.sum(), again[rubs].intervals.sum())
     assert (clean.outcome == "right").all()
     page.says("Of {} clean recordings none", len(clean))
-    # what none of n says with 95 % confidence: (1 - share)^n = 0.05
+    # Upper 95 % confidence limit of a fraction when none of n cases occurs: (1 - fraction)^n =
+    # 0.05.
     page.says("fewer than {} %; the goal", 100 * (1 - 0.05 ** (1 / len(clean))))
     page.known("alarm (with 95 % confidence", "as the share below")
     page.known("the goal is 1 %", "issue and page say it")
@@ -116,7 +117,7 @@ def asked_again(page):
 
 
 def next_recording():
-    """results/reference/next-recording."""
+    """Check results/reference/next-recording."""
     page = Account("results/reference/next-recording/README.md")
     sets, fresh = frame("next-recording/sets.csv"), frame("next-recording/fresh.csv")
     told, kept = said(sets), sets.kept & sets.outcome.isin(["settled", "split"])
@@ -158,7 +159,7 @@ def next_recording():
 
 
 def verdicts():
-    """docs/verdicts.md."""
+    """Check docs/verdicts.md."""
     page = Account("docs/verdicts.md")
     exam, again = document("exam/summary.json"), frame("robots/again.csv")
     again = again[again.outcome != "not drawn"]
@@ -177,7 +178,7 @@ def verdicts():
     }
 
     def value(row, heading):
-        """Count, of how many, and what else the cell has: percent, and its interval."""
+        """Return the count, the total, and the percentage and interval if the cell has them."""
         if heading == "":
             return None
         (shares,) = (pair for words, pair in counts.items() if row[""].startswith(words))
@@ -202,12 +203,12 @@ LATE = {"input.delay", "input.lag", "sensor.delay", "sensor.lag"}
 
 
 def members(groups):
-    """The causes of a set."""
+    """Return the causes of a set."""
     return set(groups.replace(" | ", "/").split("/"))
 
 
 def said(sets):
-    """Whether the proposed run was said to tell all of a set apart."""
+    """Return whether the proposed run was predicted to distinguish all causes of a set."""
     return sets.groups.str.contains("|", regex=False)
 
 

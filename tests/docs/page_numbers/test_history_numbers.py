@@ -1,4 +1,4 @@
-"""The page of the tuner that reads histories says what the tables beside it say."""
+"""Tests that the page of the history-reading tuner agrees with its tables."""
 
 from tests.benchmarks.history_tuner_study import AFTER
 from tests.docs.page_numbers.number_sources import Account
@@ -8,8 +8,9 @@ ERRORS, MISSING = "history/errors.csv", "history/missing.csv"
 
 
 def held(experiment, kind, tuner, k):
-    """Mean error of the parameters after k simulations; a run that ended before counts with its
-    last.
+    """Return the mean parameter error after k simulations.
+
+    A run that ended earlier counts with its last value.
     """
     table = frame(ERRORS).set_index(["experiment", "range", "tuner"]).loc[(experiment, kind, tuner)]
     table = table[table.simulations <= k]
@@ -17,7 +18,7 @@ def held(experiment, kind, tuner, k):
 
 
 def error_rows():
-    """The rows of errors against simulations."""
+    """Yield the table rows of errors against simulations."""
     cases = frame(ERRORS)[["experiment", "range", "tuner"]].drop_duplicates()
     for experiment, kind, tuner in sorted(cases.itertuples(index=False)):
         cells = [f"{held(experiment, kind, tuner, k):.2g}" for k in AFTER]
@@ -25,7 +26,7 @@ def error_rows():
 
 
 def missing_rows():
-    """The rows of errors before and after explain: parameters, and unseen runs."""
+    """Yield the table rows of errors before and after explain, for parameters and held-out runs."""
     table = frame(MISSING).set_index(["experiment", "tuner", "metric", "model"])["mean"]
     for experiment, tuner in sorted({key[:2] for key in table.index}):
         cells = [
@@ -52,7 +53,7 @@ def test_who_wins_is_as_it_says():
             assert min(last, key=last.get) == ("tunenet" if "drop" in experiment else "hybrid")
             if (experiment, kind) != ("ball-drop", "wide"):
                 assert min(one_step, key=one_step.get) == "in_context"
-            # the history itself is worth less than what differs between two trainings
+            # The effect of the history is smaller than the difference between two trainings.
             windows = [held(experiment, kind, t, 3) for t in ("window-1", "in_context")]
             assert 0.5 < windows[0] / windows[1] < 2.0
             assert held(experiment, kind, "published-3", 20) > 6 * held(

@@ -1,4 +1,4 @@
-"""The pages on measured recordings say what the verdicts and sheets beside them say."""
+"""Tests that the pages on measured recordings agree with their verdicts and data sheets."""
 
 import re
 
@@ -15,27 +15,27 @@ ELSEWHERE = "of a run, fit or publication that is not kept here"
 
 
 def value(verdict, effect, name="coefficient"):
-    """A coefficient of a cause that a verdict names."""
+    """Return a coefficient of a diagnosed cause."""
     causes = {cause["effect"]: cause["coefficients"] for cause in verdict["causes"]}
     return causes[effect][name]["value"]
 
 
 def recordings():
-    """results/reference/real/table.md."""
+    """Check results/reference/real/table.md."""
     page = Account("results/reference/real/table.md")
     page.written(rows(page.text))
     return page
 
 
 def rows(text):
-    """The rows that the verdicts make, of every recording that a text has a row of."""
+    """Build the table rows from the verdicts, for every recording that has a row in the text."""
     names = re.findall(r"^\| \[([\w/]+)\]", text, re.M)
     assert len(names) == 16
     return "\n".join(measured.row(REAL, REAL / name) for name in names)
 
 
 def so101_rows():
-    """Error by motion, model and joint, as the SO-101's table has it."""
+    """Build the rows of the SO-101's table: error by motion, model and joint."""
     (head, *body) = tables((REAL / "so101" / "table.md").read_text(encoding="utf-8"))[0]
     return {
         (row[0].strip("*"), row[1], joint): cell
@@ -45,7 +45,7 @@ def so101_rows():
 
 
 def so101():
-    """results/reference/real/so101/table.md."""
+    """Check results/reference/real/so101/table.md."""
     page = Account("results/reference/real/so101/table.md")
     verdict = document("real/so101/explained/verdict.json")
     names = "; ".join(cause["effect"] for cause in verdict["causes"])
@@ -54,7 +54,7 @@ def so101():
     motions = sorted({motion for motion, *_ in cells} - {"all six"})
 
     def expected(row, heading):
-        """The last two rows are the root mean square of the others."""
+        """Return the expected error; the last two rows are the root mean square of the others."""
         motion, model = row["motion (not fitted)"].strip("*"), row["model"]
         if heading in ("motion (not fitted)", "model"):
             return None
@@ -62,7 +62,7 @@ def so101():
             return [cells[motion, model, heading]]
         squares = [float(cells[one, model, heading]) ** 2 for one in motions]
         mean = (sum(squares) / len(squares)) ** 0.5
-        # the motions stand rounded, and so is their mean to within a digit
+        # The rows are rounded, so their mean agrees only to within one digit.
         text = cells[motion, model, heading]
         return [text if abs(mean - float(text)) < 0.06 + 0.005 * mean else mean]
 
@@ -71,7 +71,7 @@ def so101():
 
 
 def summary():
-    """results/reference/real/README.md."""
+    """Check results/reference/real/README.md."""
     page = Account("results/reference/real/README.md")
     page.written(rows(page.text))
     drops = {
@@ -108,7 +108,7 @@ def summary():
 
 
 def thorough(page, plain):
-    """What a thorough search finds in servo_pendulum besides."""
+    """Check the statements on the thorough search in servo_pendulum."""
     found = document("real/servo_pendulum/thorough/verdict.json")
     before, after = plain["heldout"], found["heldout"]
     less = 100 * (1 - after["rmse_extended"] / before["rmse_extended"])
@@ -122,7 +122,7 @@ def thorough(page, plain):
 
 
 def carriage(page):
-    """The lines on emps."""
+    """Check the lines on emps."""
     verdict = document("real/emps/explained/verdict.json")
     viscous = [value(verdict, "friction.direction@screw", f"viscous{way}") for way in "+-"]
     page.says("by direction, {} and {} N·s/m", *viscous)
@@ -166,7 +166,7 @@ def carriage(page):
 
 
 def arm(page):
-    """The lines on so101."""
+    """Check the lines on so101."""
     verdict = document("real/so101/explained/verdict.json")
     page.says("are {} ms late", 1e3 * value(verdict, "sensor.delay@*", "coefficient"))
     (load,) = (c["coefficients"] for c in verdict["causes"] if c["effect"] == "friction.load@*")
@@ -204,7 +204,7 @@ def arm(page):
 
 
 def sheets():
-    """results/reference/real/datasheets."""
+    """Check results/reference/real/datasheets."""
     page = Account("results/reference/real/datasheets/README.md")
     drive = read_toml(REAL / "datasheets" / "xl330" / "sheet.toml")["quantities"]
     servo = document("real/servo_pendulum/recording/verdict.json")
@@ -270,7 +270,7 @@ def sheets():
         for found in re.finditer(re.escape(f"| RMSE in {header}"), page.text):
             end = page.text.index("\n\n", found.start())
             numbers = NUMBER.finditer(page.text, found.start(), end)
-            page.held.update(n.span() for n in numbers)  # of scores
+            page.held.update(n.span() for n in numbers)  # numbers in the rows of scores
     return page
 
 

@@ -1,4 +1,4 @@
-"""What holds numbers against tables finds a number that is wrong, new, or gone."""
+"""Tests that the comparison of page numbers detects wrong, new and missing numbers."""
 
 import pytest
 
@@ -18,7 +18,7 @@ VALUES = {("a", "in"): [0.1285, 2.4e-4], ("b", "in"): [0.46], ("b", "wide"): [7]
 
 
 def account(text=TEXT):
-    """The page, wholly accounted for."""
+    """Return the checked numbers of a page on which all agree."""
     page = Account("README.md", text)
     page.says("It takes {} runs, and {} of them in {} s", 1600.4, 2, 0.00426)
     page.says("interval {} to {})", 384, 423)

@@ -1,4 +1,4 @@
-"""results/reference/README.md says what the tables below it say."""
+"""Tests that results/reference/README.md agrees with its tables."""
 
 import pandas as pd
 import pytest
@@ -15,7 +15,7 @@ SIX = ("ball-drop", "slider-push", "pendulum-swing", "servo-step", "ball-wind", 
 
 @pytest.fixture(scope="module")
 def page():
-    """The page, every part of it held against its tables."""
+    """Return the page after all its sections have been checked."""
     account = Account("results/reference/README.md")
     for part in (ball_drop, pendulum_real, across_engines, comparison):
         part(account)
@@ -31,7 +31,7 @@ def test_every_number_is_accounted_for(page):
 
 
 def ball_drop(page):
-    """The bouncing ball."""
+    """Check the section on the bouncing ball."""
     status = frame(f"{DROP}/status.csv")
     targets = status[status.target.str.startswith("in-")].target.nunique()
     page.says(
@@ -45,7 +45,7 @@ def ball_drop(page):
     tuner = [""]
 
     def value(row, heading):
-        """Mean, and median in brackets, of the row's tuner."""
+        """Return the mean, and the median if the cell has it in brackets."""
         tuner[0] = row["tuner"] or tuner[0]
         if heading in ("tuner", "range"):
             return None
@@ -70,7 +70,7 @@ def ball_drop(page):
 
 
 def hybrid_wins(page):
-    """Whom hybrid is behind, ahead of and level with."""
+    """Check which tuners hybrid beats, and with which it is level."""
     pairs = frame(f"{DROP}/behind.csv")
     assert not pairs.behind.any()
     moments = sorted(pairs.simulations.unique())
@@ -82,7 +82,7 @@ def hybrid_wins(page):
 
 
 def training_pays(page):
-    """What the training costs, and when it is paid back."""
+    """Check the cost of a training and its break-even points."""
     training = frame(f"{DROP}/training.csv").query("tuner in ['tunenet', 'hybrid']")
     page.says("at the price of {} training simulations", training.simulations.max())
     seconds = training.seconds
@@ -95,7 +95,7 @@ def training_pays(page):
     against = {"threshold": 0.001, "search": "least_squares"}
 
     def even(learned, kind, column="targets"):
-        """Of the table of break-even points."""
+        """Return a cell of the table of break-even points."""
         where = {"learned": learned, "range": kind, **against}
         return one(f"{DROP}/break_even.csv", column, **where)
 
@@ -119,10 +119,10 @@ def training_pays(page):
 
 
 def pendulum_real(page):
-    """The measured pendulum."""
+    """Check the section on the measured pendulum."""
 
     def value(row, heading):
-        """Mean error on held-out runs; two rows are of a later run."""
+        """Return the mean error on held-out runs; two rows come from a later run."""
         later = "(one training)" in row["tuner"]
         folder = f"{REAL}/later" if later else REAL
         tuner = row["tuner"].partition(" (")[0]
@@ -136,7 +136,7 @@ def pendulum_real(page):
     assert page.table("tuner | 0 | 1 | 3", value) > 70
 
     def mean(tuner, k, folder=REAL):
-        """Mean error on held-out runs."""
+        """Return the mean error on held-out runs."""
         return errors(folder, tuner, "real", k, "heldout_error")[0]
 
     page.says("stands at {} rad after one", mean("tunenet", 1))
@@ -155,17 +155,17 @@ def pendulum_real(page):
 
 
 def across_engines(page):
-    """One engine tuned to another."""
+    """Check the section on tuning one engine to another."""
 
     def value(row, heading):
-        """Misfit and error of restitution at the end."""
+        """Return the observation error, or the error of restitution, after 50 simulations."""
         if heading == "tuner":
             return None
         kind = "wide" if "wide" in heading else "in"
         metric = "obs_error" if "[m]" in heading else "param_abs_error"
         return [errors(ACROSS, row["tuner"], kind, 50, metric)[0]]
 
-    # two columns are called `wide`: of the misfit in metres, and of the error
+    # Two columns are named `wide`: the misfit in metres, and the parameter error.
     assert page.table("tuner | in [m] | wide [m]", value) == 32
     page.known("Ten targets in each range, two seeds, budget 50; misfit", "the experiment")
     page.known("mean over targets) after 50", "the experiment")
@@ -174,7 +174,7 @@ def across_engines(page):
 
 
 def comparison(page):
-    """Eight tuners on six problems."""
+    """Check the comparison of eight tuners on six problems."""
     folders = [f"comparison/{problem}" for problem in SIX]
     status = [frame(f"{folder}/status.csv") for folder in folders]
     assert all(set(s.status) <= {"done", "converged"} for s in status)
@@ -183,7 +183,7 @@ def comparison(page):
     page.says("in range and wide ({} problems for the ranks)", len(ranks))
 
     def value(row, heading):
-        """Medians after thirty simulations; the mean rank."""
+        """Return the medians after 30 simulations, or the mean rank."""
         if heading == "tuner":
             return None
         if heading == "mean rank":

@@ -1,4 +1,4 @@
-"""What the first pages show of results is what the results are."""
+"""Tests that the first pages display results that agree with the reference results."""
 
 from tests.docs.documentation_pages import blocks, section, text_of
 from tests.docs.page_numbers.number_sources import Account
