@@ -49,12 +49,12 @@ class Mark:
 
     @property
     def strict(self):
-        """Whether the cause is named alone with the right number."""
+        """True if the cause is named alone with the right number."""
         return self.outcome == "right"
 
     @property
     def fair(self):
-        """Whether the cause is named alone, or in a set of at most `MAX_SET` equal members."""
+        """True if the cause is named alone, or in a set of at most `MAX_SET` equal members."""
         if self.strict:
             return True
         equal = all(ratio is not None and ratio <= EQUAL_RATIO for ratio in self.ratios.values())

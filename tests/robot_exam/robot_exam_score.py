@@ -48,22 +48,22 @@ class Mark:
 
     @property
     def strict(self):
-        """Whether the causes are named alone."""
+        """True if the causes are named alone."""
         return self.outcome == "right"
 
     @property
     def few(self):
-        """Whether the causes are named alone, or in a set of at most `FEW`."""
+        """True if the causes are named alone, or in a set of at most `FEW`."""
         return self.strict or (self.outcome == "set" and self.members <= FEW)
 
     @property
     def any(self):
-        """Whether the causes are named alone, or in any set."""
+        """True if the causes are named alone, or in any set."""
         return self.outcome in ("right", "set")
 
     @property
     def fair(self):
-        """Whether the causes are named alone, or all other members have an equal held-out error."""
+        """True if the causes are named alone, or all other members have an equal held-out error."""
         ratios = self.equal.values()
         alike = bool(ratios) and all(ratio is not None and ratio < SAME for ratio in ratios)
         return self.strict or (self.outcome == "set" and alike)
