@@ -1,11 +1,10 @@
 """Test learned tuners if the true system has an effect that the simulator lacks.
 
 They are trained in the base simulator, and over effects that the true system may have.
-Split-conformal
-intervals (H. Papadopoulos et al., ECML 2002; J. Lei et al., JASA 113, 2018, arXiv 1604.04173) are
-tested for coverage: the absolute errors of each parameter on n simulations outside the training
-data are sorted; the ceil((n + 1) 0.9)-th smallest is the half width of the interval. It covers 90 %
-of the targets that have the same distribution as these simulations.
+Split-conformal intervals (H. Papadopoulos et al., ECML 2002; J. Lei et al., JASA 113, 2018, arXiv
+1604.04173) are tested for coverage: the absolute errors of each parameter on n simulations outside
+the training data are sorted; the ceil((n + 1) 0.9)-th smallest is the half width of the interval.
+It covers 90 % of the targets that have the same distribution as these simulations.
 
 python -m tests.benchmarks.domain_randomisation results/reference/misspecified/learned.csv ball
 servo shot

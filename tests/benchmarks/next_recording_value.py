@@ -3,8 +3,8 @@ tests.benchmarks.next_recording_value [--sets 20] [--seed 0] [--out DIR]``.
 
 From the exam questions with one hidden cause (tests/simple_exam), sets of causes that explain
 cannot distinguish are drawn by seed; the causes of a set are not all equivalent by
-`items.EQUIVALENT`. The proposed run is recorded once by the exam's own simulators, with the hidden
-cause and new noise, and everything is explained together. A set is
+`find_equivalent_effects`. The proposed run is recorded once by the exam's own simulators, with the
+hidden cause and new noise, and everything is explained together. A set is
 
 * settled, if all remaining causes are equivalent in any data to the truth, or, according to the
   design, cannot be distinguished from it by any run of this kind; one of these causes remains,

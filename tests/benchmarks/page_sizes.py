@@ -2,9 +2,9 @@
 
 Run: `python -m tests.benchmarks.page_sizes`. Prints one JSON line per measurement; seconds are
 processor time, except those of the browser and where the clock is named. The response to a click is
-complete when the next frame is painted: the `duration` of the browser's Event Timing, in steps of
-8 ms. cocopp comes from the Python in $PEERS, or is installed into a temporary environment; it gets
-the same number of runs of the same length (`tests.benchmarks.coco_bbob`).
+complete when the next frame is painted: the `duration` of the browser's Event Timing (8 ms steps).
+cocopp comes from the Python in $PEERS, or is installed into a temporary environment; it gets the
+same number of runs of the same length (`tests.benchmarks.coco_bbob`).
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ ANSWERED = """
 
 
 def invented(targets, budget):
-    """Return a comparison of six tuners with random errors, on `targets` targets in each of two
-    ranges.
-    """
+    """Return a comparison of six tuners with random errors on targets of two ranges."""
     rng = np.random.default_rng(0)
     k = np.arange(budget + 1)
     parts = []

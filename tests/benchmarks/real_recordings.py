@@ -73,9 +73,7 @@ def main():
 
 
 def open_loop(model, path):
-    """Return the error over the held-out runs, simulated as the one run of 25 s from which they
-    were cut.
-    """
+    """Return the error over the held-out runs, joined to the original run of 25 s."""
     recording = read_recording(path, Pendulum, whole=True)
     parts, begin = recording.held_out(), 0.0
     times, channels = [], {name: [] for name in parts[0].channels}

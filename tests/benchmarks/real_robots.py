@@ -5,9 +5,8 @@
 The arm needs two commands from its folder to a verdict, which are run as by a user. Then three
 models predict the six held-out motions from their initial states: the initial model, the model with
 tuned gains, and the extended one. The result is the RMSE by joint and motion, in mrad. For the
-drive,
-estimates are printed with published values. With ``--explained DIR`` an existing folder is used;
-otherwise explain runs, which takes a quarter of an hour.
+drive, estimates are printed with published values. With ``--explained DIR`` an existing folder is
+used; otherwise explain runs, which takes a quarter of an hour.
 """
 
 import argparse
@@ -148,8 +147,7 @@ def emps_slide(out, explained):
     """Explain the drive as the system `slider`, which may have a flexible transmission.
 
     It is fitted once on the first run, and once on the second with its pulses, in segments, with
-    forces
-    in units of 50 N.
+    forces in units of 50 N.
     """
     unit, length = 50.0, 500
     with (ROBOTS / "emps" / "recording.csv").open() as file:

@@ -3,10 +3,9 @@
 ``python -m tests.benchmarks.so101_base``; twenty minutes.
 
 Stiffness, damping and the dead zone of the servo are fitted to the first 80 s of `chirp_sweep`,
-with
-initial states from each run, with a D term on the error, or a leading command, fixed at several
-sizes. The output is the RMSE of every motion in mrad, and the residual of the later chirp by
-interval. Then the same three numbers are fitted to the whole chirp, without and with a motion
+with initial states from each run, with a D term on the error, or a leading command, fixed at
+several sizes. The output is the RMSE of every motion in mrad, and the residual of the later chirp
+by interval. Then the same three numbers are fitted to the whole chirp, without and with a motion
 profile, whose fit begins near the acceleration limit of the firmware. Finally, chirp,
 `prbs_excitation` and steps are fitted together: the dead zone alone, with a profile, and a drive
 that hardly brakes, with friction and a force limit.

@@ -71,8 +71,11 @@ def timed(world, task, *item):
 
 
 def measured(path, jobs):
-    """Return wall seconds, seconds of the critical path and the main process, shared rounds,
-    verdict.
+    """Explain a recording and measure the times.
+
+    Returns:
+        Wall seconds, seconds of the critical path, processor seconds of the main process, the meter
+        of the shared rounds, and the verdict.
     """
     begun, clock = time.process_time(), time.perf_counter()
     with Meter() as meter:

@@ -85,8 +85,7 @@ def is_right(log, differences):
     """Return whether the answer to a log is right.
 
     The broken convention must be first or among the equally likely ones, with its joints and
-    offset.
-    For a correct log there must be no answer.
+    offset. For a correct log there must be no answer.
     """
     if log.broken is None:
         return not differences

@@ -115,8 +115,7 @@ def test_the_corrected_description_reads_as_the_change_says(tmp_path):
     """The new keys make -1 times the old value, plus 0.5 rad.
 
     The log has degrees with a scale and an offset. The joint counts in the opposite direction from
-    0.5
-    rad.
+    0.5 rad.
     """
     log = write_log(tmp_path / "log", 2001, None)
     path = log.path.with_suffix(".toml")

@@ -91,9 +91,8 @@ class Item:
         draw: number of the draw.
         place: joint, body or actuator.
         size: see `Change`.
-        gap: RMS discrepancy over all samples and channels with fitted initial states, in
-            multiples of
-            the noise.
+        gap: RMS discrepancy over all samples and channels with fitted initial states, in multiples
+            of the noise.
         plain_gap: RMS discrepancy without fitted initial states, in multiples of the noise.
         noise: standard deviation of positions, rad or m.
         with_velocities: whether velocities are channels.
@@ -233,9 +232,7 @@ class Experiment:
 
     @cached_property
     def state_responses(self):
-        """Derivatives (SAMPLES, C, nq + nv) of the channels with respect to the initial state, by
-        run.
-        """
+        """Derivatives (SAMPLES, C, nq + nv) of the channels by the initial state, for each run."""
         runs, _ = self.performed(None)
         simulator = self.simulator()
         responses = {}
@@ -254,8 +251,7 @@ class Experiment:
         """Return the growth of a deviation of the initial positions.
 
         The initial positions deviate by 1e-4 rad. Later deviations (root mean square after the
-        first tenth
-        of a second) are counted in units of 1e-4 rad and, for velocities, 2e-3 rad/s.
+        first tenth of a second) are counted in units of 1e-4 rad and, for velocities, 2e-3 rad/s.
         """
         runs, states = self.performed(change)
         simulator, largest = self.simulator(change), 0.0
@@ -371,8 +367,7 @@ def _force_limits(experiment, peaks):
     """Return limits (N m or N, by joint) that only the faster runs reach.
 
     A servo at its limit chatters from step to step if kv * timestep / inertia is large, so joints
-    with
-    little inertia have no limit.
+    with little inertia have no limit.
     """
     model = experiment.model
     dofs, joints = experiment.operator.dofs, model.actuator_trnid[:, 0]

@@ -32,12 +32,10 @@ class Mark:
         causes: causes of the answer, alternatives joined by "|".
         number: coefficient of the planted cause; None if the answer contains none.
         is_number_right: whether it is within 5 % or its 95 % interval holds the truth; None if
-            there
-            is no number.
+            there is no number.
         members: count of causes in the set that holds the planted cause.
-        ratios: by other member of a set, its held-out error, refitted with plain MuJoCo,
-            divided by the
-            error of the planted cause; None if plain MuJoCo cannot express it.
+        ratios: by other member of a set, its held-out error, refitted with plain MuJoCo, divided by
+            the error of the planted cause; None if plain MuJoCo cannot express it.
     """
 
     outcome: str

@@ -48,10 +48,10 @@ def changed_xml(path, item):
 
 
 def errors(model, item, path):
-    """Return the difference between a recorded table and a simulation of this test, in units of
-    noise.
+    """Return the RMS of recorded minus simulated positions in units of the noise.
 
-    The recorded commands are held between rows. Runs begin in the initial state of the case.
+    This test makes the simulation itself. The recorded commands are held between rows. Runs begin
+    in the initial state of the case.
     """
     joints, differences = item.experiment.joints, []
     runs, _ = item.truth

@@ -123,8 +123,7 @@ def sized(gap, wanted, first=0.03):
     """Return (strength, gap) at which `gap(strength)` is `wanted`, or None.
 
     `gap` grows from zero. The result is None if the strength would be `LARGEST` or more. The method
-    is
-    the secant method on logarithmic scales, inside a bracket once there is one.
+    is the secant method on logarithmic scales, inside a bracket once there is one.
     """
     low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(12):

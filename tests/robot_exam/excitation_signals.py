@@ -20,8 +20,7 @@ class Felt:
 
     The order of the effects is: gain, power, bias, dead band, saturation, rate limit, delay, motion
     profile of a servo, its D term, lag. The command is constant between time stamps; before the
-    first
-    stamp it has its first value.
+    first stamp it has its first value.
     """
 
     times: np.ndarray
@@ -134,12 +133,10 @@ class Drives:
     """Forces of all actuators by joint, (N,).
 
     The force is clip(gain u - kp q - kv v, within +-limit). A servo does not react to an error u -
-    q
-    smaller than `dead`. A supply of its own reduces a force U to U / (1 + sag |U|); a shared
-    battery
-    reduces it to U_i / (1 + battery (|U_1| + |U_2| + ...)). With coupling, the shaft of a drive
-    turns
-    with q_i + sum of `shafts`_ij q_j and exerts its force on those joints by the same factors.
+    q smaller than `dead`. A supply of its own reduces a force U to U / (1 + sag |U|); a shared
+    battery reduces it to U_i / (1 + battery (|U_1| + |U_2| + ...)). With coupling, the shaft of a
+    drive turns with q_i + sum of `shafts`_ij q_j and exerts its force on those joints by the same
+    factors.
     """
 
     gain: np.ndarray

@@ -23,8 +23,7 @@ def held(coupling, free, limits):
     """Return friction forces (S,) and accelerations (S,) of the joints at rest.
 
     With a = free + coupling f: |f| <= limits, a = 0 where |f| < limits, and a has the opposite sign
-    of
-    f where f is at its limit.
+    of f where f is at its limit.
 
     Args:
         coupling: acceleration per force, symmetric and positive definite, (S, S).

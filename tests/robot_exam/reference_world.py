@@ -204,9 +204,7 @@ class _Course:
         return next((h for h in span * 0.5 ** np.arange(1, 20) if speed(h) > 0), None)
 
     def _overloaded(self, t, state):
-        """Return the largest excess of needed over available friction of held joints; -1 without
-        any.
-        """
+        """Return the largest excess of needed over available friction; -1 if no joint is held."""
         if not self.stuck.any():
             return -1.0
         need = np.abs(self._holding(t, state)[0])

@@ -17,12 +17,14 @@ from tests.robot_exam.exam_settings import setting as drawn_setting
 
 KINDS = ("clean", "single", "family", "double", "foreign", "numerics")
 APART = 1.0
-"""Smallest residual in units of the noise with only one of two causes in the model, or, for an
-unmodelled cause, with any one effect at the same joint.
+"""Smallest residual without the full truth in the model, in units of the noise.
+
+The model has only one of two causes or, for an unmodelled cause, one effect at the same joint.
 """
 TELLING = 0.4
-"""Smallest residual in units of the noise with the simpler form of an effect; below it, the simpler
-form is the right answer.
+"""Smallest residual with the simpler form of an effect, in units of the noise.
+
+Below it, the simpler form is the right answer.
 """
 
 
@@ -37,10 +39,8 @@ class Item:
         effects: hidden coefficients by effect@place; for an unmodelled cause, its own numbers.
         family: whether all effects are one family with one coefficient per place.
         size: RMS discrepancy in the fitted runs with refitted initial states, in units of the
-            noise.
-            For two causes it is the smaller one; for backlash and joint flexibility, the effect of
-            the
-            drive inertia alone is subtracted.
+            noise. For two causes it is the smaller one; for backlash and joint flexibility, the
+            effect of the drive inertia alone is subtracted.
         noise: white, ar1 or quantised.
         channels: names of the recorded channels.
         beyond: residual in units of the noise with the nearest tested alternatives, to first order;

@@ -251,8 +251,7 @@ def test_drives_of_the_library_move_as_those_of_this_world_do(robot, effect, c, 
     """The library agrees with the reference world for coupling, a shared battery and braking loss.
 
     The tolerances are larger where the library uses values of the previous step, which is accurate
-    to
-    first order in the step length.
+    to first order in the step length.
     """
     machine = robot_models.machine(robot, np.random.default_rng(5))
     last = {"joint.coupling": machine.joints[-1], "supply.braking": machine.drives[-1].name}
@@ -264,8 +263,10 @@ def test_drives_of_the_library_move_as_those_of_this_world_do(robot, effect, c, 
 
 
 def differs(machine, name, c, moves, folder):
-    """Return the largest difference of the library as a fraction of the effect's change, and the
-    change.
+    """Compare the library with the reference world.
+
+    Returns:
+        The difference of the motions as a fraction of the effect's change, and the RMS change.
     """
     run = driven(machine, moves, stamps=np.arange(101) / 100)
     bare, hidden = (World(machine, of).move(run, run.times).q for of in ({}, {name: c}))

@@ -69,12 +69,11 @@ def lost(question, known, error):
 
 
 def _rivals(item, verdict, mark):
-    """Return the residual RMS in units of the noise and its significance in sigmas for wrong
-    effects.
+    """Test effects that were diagnosed but not hidden.
 
-    Keys are effects that were diagnosed but not hidden. A small number of sigmas means that the
-    effect
-    explains the data as well as the truth does.
+    Returns:
+        By effect, the RMS residual in units of the noise and the sigmas of evidence against the
+        effect. A small number of sigmas means that it explains the data as well as the truth does.
     """
     if item.kind != "single" or mark.found or not verdict or len(verdict["causes"]) != 1:
         return {}

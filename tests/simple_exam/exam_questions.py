@@ -37,8 +37,7 @@ class Question:
     """Specification of a case.
 
     `part` is "marks", or "power" for the power curve only; `index` distinguishes questions of the
-    same
-    kind.
+    same kind.
     """
 
     part: str

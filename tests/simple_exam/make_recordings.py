@@ -24,9 +24,7 @@ from sims import effects as library
 
 
 def candidates(kind, system):
-    """Return the causes of this kind that can be hidden in this system; [None] for clean
-    recordings.
-    """
+    """Return the names of causes of this kind in this system; [None] for clean recordings."""
     if kind == "clean":
         return [None]
     return (

@@ -48,10 +48,8 @@ class Floater:
     """A robot whose first link has a free joint or a ball joint.
 
     The coordinates in this folder are those of the hinges, followed by those of the floating base.
-    The
-    latter are padded so that there are as many velocities as positions: a pose (x, y, z and) qx,
-    qy,
-    qz, qw, a velocity in the body's axes, and a zero.
+    The latter are padded so that there are as many velocities as positions: a pose (x, y, z and)
+    qx, qy, qz, qw, a velocity in the body's axes, and a zero.
 
     Attributes:
         name: name of the model.
