@@ -77,7 +77,7 @@ def read_rows(path):
 
 
 def write_rows(path, rows):
-    """Replace the table as a whole, so that an interruption leaves no half row."""
+    """Replace the whole table, so that an interruption leaves no incomplete row."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     with part.open("w", newline="") as file:
@@ -121,7 +121,7 @@ def measure(name, expected, shared, simgap, cpu_limit):
 
 
 def prepared(expected, folder, simgap, work):
-    """(path of the recording, why there is none): write or import a description where needed."""
+    """Write or import a description where needed; return (path of the recording, error message)."""
     if "description" in expected:
         (work / "log.toml").write_text(expected["description"].replace("{folder}", str(folder)))
         if "model" in expected:
@@ -159,7 +159,7 @@ def line(row):
 
 
 def totals(rows):
-    """Right answers and processor time, a line a version."""
+    """Return right answers and processor time, one line per version."""
     lines = []
     for version in dict.fromkeys(row["version"] for row in rows):
         own = [row for row in rows if row["version"] == version]

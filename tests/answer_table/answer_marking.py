@@ -1,4 +1,4 @@
-"""Compares an answer of `simgap explain` with what recordings.toml states of the recording."""
+"""Compare an answer of `simgap explain` with the expected one in recordings.toml."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 
 
 def faults(expected, outcome):
-    """What is wrong with an answer; empty for a right one, None where nothing is known.
+    """Return the errors of an answer; empty for a right one, None if no answer is expected.
 
     Args:
         expected: table of a recording in recordings.toml.

@@ -1,4 +1,4 @@
-"""The table of measured recordings: known answers, and answers that differ from them."""
+"""Tests of the table of measured recordings with right and wrong answers."""
 
 import dataclasses
 import os

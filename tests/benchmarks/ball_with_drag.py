@@ -1,9 +1,9 @@
-"""How densely the code is written: ``python -m tests.benchmarks.ball_with_drag [FOLDER ...]``.
+"""Measure the density of code: ``python -m tests.benchmarks.ball_with_drag [FOLDER ...]``.
 
-For each folder of Python files: the share of lines that bear a comment (those to tools, as `noqa`,
-do not count), tokens a line of code (a docstring is no code), comprehensions for each hundred lines
-of code, lines of more than 100 characters, and the lengths of functions (median, 95th percentile,
-longest).
+For each folder of Python files, print the share of lines with a comment (without comments to tools,
+such as `noqa`), tokens per line of code (without docstrings), comprehensions per hundred lines of
+code, lines of more than 100 characters, and the lengths of functions (median, 95th percentile,
+maximum).
 """
 
 import ast
@@ -20,7 +20,7 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 
 def measured(files):
-    """The figures over all `files`, by name."""
+    """Return the figures over all `files`, by name."""
     lines = comments = code = tokens = wide = comprehensions = 0
     lengths = []
     for file in files:
@@ -57,7 +57,7 @@ def measured(files):
 
 
 def _docstrings(tree):
-    """Lines on which a string that stands alone begins: a docstring of whatever it follows."""
+    """Return the first lines of strings that are statements, that is, docstrings."""
     return {
         node.lineno
         for node in ast.walk(tree)
@@ -68,7 +68,7 @@ def _docstrings(tree):
 
 
 def files_of(folders):
-    """Every Python file below folders with spaces between."""
+    """Return all Python files in folders, which are separated by spaces."""
     return [file for folder in folders.split() for file in sorted(Path(folder).rglob("*.py"))]
 
 

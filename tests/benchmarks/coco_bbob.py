@@ -1,7 +1,7 @@
-"""cocopp on runs of known length, in the two shapes in which 720 runs are met there: two
-algorithms on 24 functions with 15 instances, and one in COCO's six dimensions with 5 instances.
+"""Measure cocopp on runs of known length, in two arrangements of 720 runs.
 
-Part of `python -m tests.benchmarks.page_sizes`.
+They are two algorithms on 24 functions with 15 instances, and one algorithm in COCO's six
+dimensions with 5 instances. Part of `python -m tests.benchmarks.page_sizes`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SHAPES = {
     "two algorithms": ({"quick": 0.05, "slow": 0.01}, (2,), 15),
     "six dimensions": ({"quick": 0.05}, (2, 3, 5, 10, 20, 40), 5),
 }
-"""Algorithms with how fast each one's error falls, dimensions, instances."""
+"""By name: algorithms with the rates at which their errors fall, dimensions, instances."""
 POSTPROCESSING = """
 import sys
 import cocopp
@@ -34,7 +34,7 @@ cocopp.main(sys.argv[1:])
 
 
 def measured(folder, budget):
-    """Print what cocopp's page of each shape costs, where cocopp can be had."""
+    """Print the cost of cocopp's page for each arrangement, if cocopp can be installed."""
     python = environment(folder, ("cocopp", "six"))
     if python is None:
         return
@@ -63,13 +63,13 @@ def measured(folder, budget):
 
 
 def _seconds():
-    """Processor time of all children that have ended."""
+    """Return the processor time of all ended child processes."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def _algorithm(folder, name, rate, dimensions, instances, budget):
-    """Data of one algorithm in COCO's old format, as its postprocessing reads it."""
+    """Write the data of one algorithm in COCO's old format, which its postprocessing reads."""
     rng = np.random.default_rng(1)
     for function in range(1, FUNCTIONS + 1):
         below = folder / f"data_f{function}"
@@ -88,7 +88,7 @@ def _algorithm(folder, name, rate, dimensions, instances, budget):
 
 
 def _runs(rng, rate, instances, budget):
-    """The log of some runs whose errors fall with every evaluation, and how each ended."""
+    """Return the log and the final values of runs whose errors fall with every evaluation."""
     k = np.arange(1, budget + 1)
     lines, ends = [], []
     for instance in range(1, instances + 1):

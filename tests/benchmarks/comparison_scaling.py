@@ -1,7 +1,7 @@
-"""What size costs: bytes, seconds and memory by number of runs and rows. Run: `python -m
-tests.benchmarks.comparison_scaling`.
+"""Measure bytes, seconds and memory by number of runs and rows.
 
-Prints one JSON line a measurement; `docs/scale.md` rests on the slopes.
+Run: `python -m tests.benchmarks.comparison_scaling`. Prints one JSON line per measurement;
+`docs/scale.md` uses the slopes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TUNERS = {"random": {}, "cma_es": {}, "least_squares": {}, "nelder_mead": {"seed
 
 
 def outcome(job, rng, budget):
-    """What a worker would have given back: random numbers of the right shapes."""
+    """Return random numbers of the shapes that a worker returns."""
     steps = np.arange(1, budget + 1)
     points = np.clip(0.5 + rng.normal(size=(budget, 2)) / steps[:, None], 0, 1)
     trace = RunTrace(
@@ -98,14 +98,15 @@ def measure(targets, budget, figures):
 
 
 def nap(seconds):
-    """Stands for a run: it keeps a worker busy and no core, so that other work on the machine does
-    not count.
+    """Replace a run by a wait, which uses a worker but no core.
+
+    Other work on the machine then has no influence.
     """
     time.sleep(seconds)
 
 
 def speed_up(calls=80, seconds=0.25):
-    """How much sooner two workers are done than one, started workers both."""
+    """Print how many times faster two started workers are than one."""
     took = {}
     for jobs in (1, 2):
         with LocalPool(jobs) as pool:

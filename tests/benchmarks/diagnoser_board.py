@@ -1,8 +1,8 @@
 """The page of the reference board: ``python -m tests.benchmarks.diagnoser_board FOLDER``.
 
-Takes a finished folder of ``simgap compare diagnosis-full``, copies what the board keeps of it to
-results/reference/diagnosis and writes the parts of its page that are numbers. What is said about
-them stands between marks in the page itself and is kept as it is.
+Reads a finished folder of ``simgap compare diagnosis-full``, copies the tables of the board to
+results/reference/diagnosis and writes the numeric parts of its page. Text between other marks of
+the page is not changed.
 """
 
 import argparse
@@ -30,14 +30,14 @@ METRICS = {
 
 
 class Board:
-    """The tables of a folder."""
+    """Tables of a results folder."""
 
     def __init__(self, folder):
         self.table = pd.read_csv(folder / "table.csv")
         self.items = pd.read_csv(folder / "items.csv")
         self.pairs = pd.read_csv(folder / "pairs.csv")
         self.costs = pd.read_csv(folder / "costs.csv").set_index("diagnoser")
-        # Who names most stands first.
+        # Sort diagnosers by the count of diagnosed causes, after simgap.
         named = self.table[self.table["metric"] == "the same, up to equivalence"]
         order = named.sort_values("count", ascending=False)["diagnoser"].tolist()
         self.order = ["simgap", *(name for name in order if name != "simgap")]
@@ -108,7 +108,7 @@ class Board:
 
 
 def written(page, parts):
-    """The page with each part between its marks, <!-- NAME --> and <!-- /NAME -->."""
+    """Return the page with each part between its marks, <!-- NAME --> and <!-- /NAME -->."""
     for name, text in parts.items():
         pattern = rf"(<!-- {name} -->\n).*?(\n<!-- /{name} -->)"
         page, count = re.subn(

@@ -1,11 +1,10 @@
-"""Learned tuners where the world has an effect that the simulator lacks: trained in the simulator
-as it is, and over effects that the world may have; and whether intervals that a conformal
-calibration gives them cover the truth.
+"""Test learned tuners if the true system has an effect that the simulator lacks.
 
+They are trained in the base simulator, and over effects that the true system may have.
 Split-conformal intervals (H. Papadopoulos et al., ECML 2002; J. Lei et al., JASA 113, 2018, arXiv
-1604.04173): on n simulations that the training has not seen, the size of the error in each
-parameter is sorted; the ceil((n + 1) 0.9)-th smallest is the interval's half width. It covers 90 %
-of the targets that come from where these simulations come from.
+1604.04173) are tested for coverage: the absolute errors of each parameter on n simulations outside
+the training data are sorted; the ceil((n + 1) 0.9)-th smallest is the half width of the interval.
+It covers 90 % of the targets that have the same distribution as these simulations.
 
 python -m tests.benchmarks.domain_randomisation results/reference/misspecified/learned.csv ball
 servo shot
@@ -34,7 +33,7 @@ COVERED = 0.9
 
 
 def halves(errors, covered=COVERED):
-    """(dim,) half widths of split-conformal intervals, of sizes of errors (n, dim)."""
+    """Return half widths (dim,) of split-conformal intervals from absolute errors (n, dim)."""
     n = len(errors)
     place = int(np.ceil((n + 1) * covered))
     if place > n:
@@ -43,7 +42,7 @@ def halves(errors, covered=COVERED):
 
 
 def rehearsed(problem, randomised, index):
-    """A target from where the tuner trains, and its truth (dim,) in the unit cube."""
+    """Draw a target from the training distribution, and its truth (dim,) in physical units."""
     rng = make_rng("randomised", problem.experiment.name, index)
     scenarios = problem.draw_scenarios(rng)
     low, high = problem.cube.training
@@ -65,7 +64,7 @@ def rehearsed(problem, randomised, index):
 
 
 def measured(name):
-    """Rows of the table for one system."""
+    """Return the rows of the table for one system."""
     experiment = load_experiment(f"misspecified-{name}")
     experiment = replace(experiment, calibration=None, trusted=True, salt="public", budget=BUDGET)
     problem = TuningProblem(experiment)

@@ -1,7 +1,8 @@
-"""What a rollout costs in each engine, side by side in one process on one core.
+"""Measure the cost of a rollout in each engine, in one process on one core.
 
-Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.engine_speed``; prints JSON. Processor time
-is measured, the best of some repetitions of each engine in turn, so that both see the same machine.
+Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.engine_speed``; prints JSON. The number is
+the minimum processor time of some repetitions. The engines alternate, so that changes of the
+machine affect all of them.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ def once(work):
 
 
 def ball():
-    """Seconds a rollout, 400 samples at 60 Hz: many lanes at once in batch, one after the other in
-    PyBullet.
+    """Return seconds per rollout of 400 samples at 60 Hz.
+
+    The batch engine simulates many elements at once, PyBullet one after the other.
     """
     scenario = Scenario(np.arange(400) / 60, {"z": 4.5})
     theta = np.random.default_rng(1).uniform(0.3, 0.7, (LANES, 1))
@@ -49,7 +51,7 @@ def ball():
 
 
 def recording(cls, effects):
-    """Seconds for 64 parameter vectors on each of 4 runs of 4 s at 100 Hz, in one call."""
+    """Return seconds for 64 parameter vectors on each of 4 runs of 4 s at 100 Hz, in one call."""
     rng = np.random.default_rng(2)
     t = np.arange(400) / 100
     simulator = cls(engine="batch", effects=effects)

@@ -1,11 +1,12 @@
-"""The cost of `simgap explain` for a simple system, stage by stage and as a command:
-``python -m tests.benchmarks.explain_command_time [--recording FILE.csv] [--against PYTHON]``.
+"""Measure the cost of `simgap explain` for a simple system, by stage and as a command.
+
+``python -m tests.benchmarks.explain_command_time [--recording FILE.csv] [--against PYTHON]``
 
 The default recording is that of the README's first example: a pendulum, 4 runs of 4 s at 100 Hz.
-Every number is processor time (user and system, child processes too), the least of `--repeats`
-processes, with its ratio to importing NumPy on the same machine. With ``--against`` the
-whole command is run in turns with this Python and with another one, whose environment has another
-version of simgap, and the ratio of the two minima is printed: a busy machine changes both alike.
+Every number is processor time (user and system, with child processes), the minimum of `--repeats`
+processes, with its ratio to importing NumPy on the same machine. With ``--against``, runs of the
+whole command alternate between this Python and another one, whose environment has another version
+of simgap, and the ratio of the two minima is printed: a busy machine affects both in the same way.
 """
 
 import argparse
@@ -50,21 +51,21 @@ end("figures as PNG, PDF and SVG")
 print(json.dumps({b[0]: b[1] - a[1] for a, b in zip([("", 0.0), *ends], ends)}))
 """
 NOT_PART = ("diagnosis again, everything loaded", "figures as PNG, PDF and SVG")
-"""Stages that the command does not have."""
+"""Stages that are not part of the command."""
 
 
 def stages(recording):
-    """Measure the stages of one process; seconds by name."""
+    """Measure the stages of one process; return seconds by name."""
     command = [sys.executable, "-c", STAGES, str(recording)]
     return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
 
 def processor_seconds(python, recording):
-    """Run the command once with an interpreter."""
+    """Run the command once with an interpreter and return its processor seconds."""
     with tempfile.TemporaryDirectory() as folder:
         words = ["explain", str(recording), "--out", f"{folder}/out"]
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        # Its own packages, and not those of the folder that this benchmark is run in.
+        # Import the packages of this interpreter, not those of the current folder.
         subprocess.run(
             [python, "-P", "-m", "simgap", *words], cwd=folder, capture_output=True, check=True
         )

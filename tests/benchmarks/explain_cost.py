@@ -1,11 +1,12 @@
-"""How the cost of explain grows: ``OMP_NUM_THREADS=1 python -m tests.benchmarks.explain_cost [--out
-DIR] [--score]``.
+"""Measure how the cost of explain grows with samples, runs and candidates.
 
-Seconds of processor time on one core against samples, runs and candidates: of the score alone, with
-its surrogates, on made-up directions (two of each candidate), and of a whole diagnosis of
-recordings with a hidden friction. Exponents are slopes of a line through the logarithms of the
-larger half of each row, so 1 is proportional. Writes cost.csv and the figure cost.png|pdf;
-``--score`` measures the score alone.
+``OMP_NUM_THREADS=1 python -m tests.benchmarks.explain_cost [--out DIR] [--score]``
+
+Costs are processor seconds on one core: of the score test alone, with surrogates, on generated
+directions (two per candidate), and of a whole diagnosis of recordings with hidden friction.
+Exponents are slopes of a line through the logarithms of the larger half of each row, so 1 is
+proportional. Writes cost.csv and the figure cost.png|pdf; ``--score`` measures the score test
+alone.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from tests.bench.diagnosis.explained_samples import linear_fit
 from tests.simulation_arguments import Wish, write
 
 USUAL = Wish(
-    # The engine that explains, so that a long recording hides nothing more than a short one.
+    # Record with the engine that explains, so that numerical errors do not grow with the length.
     "slider",
     effects=["friction.coulomb=0.3"],
     noise=["0.005"],
@@ -51,8 +52,9 @@ RUNS, SAMPLES, CANDIDATES, SURROGATES = 4, 1_600, 24, 120
 
 
 def problem(samples, candidates, runs):
-    """A fit with a parameter and two initial states a run, two smooth directions of each candidate,
-    and residuals that remember.
+    """Return a fit, two smooth directions per candidate, and AR(1) residuals.
+
+    The fit has one parameter, and two initial states per run.
     """
     rng = np.random.default_rng(0)
     length = samples // runs
@@ -79,7 +81,7 @@ def problem(samples, candidates, runs):
 
 
 def scoring(samples=SAMPLES, candidates=CANDIDATES, runs=RUNS):
-    """Processor seconds of scoring once, with surrogates: the least of three."""
+    """Return processor seconds of one scoring with surrogates, the minimum of three."""
     fit, directions, residual = problem(samples, candidates, runs)
     best = np.inf
     for _ in range(3):
@@ -98,7 +100,7 @@ def _scored(fit, directions, residual):
 
 
 def memory(samples, candidates):
-    """Megabytes of the directions, and what scoring takes on top at most."""
+    """Return the size of the directions and the additional peak memory of scoring, in MB."""
     fit, directions, residual = problem(samples, candidates, RUNS)
     tracemalloc.start()
     _scored(fit, directions, residual)
@@ -108,7 +110,7 @@ def memory(samples, candidates):
 
 
 def explained(samples=SAMPLES, candidates=None, runs=RUNS):
-    """Processor seconds of explain on a recording: the least of two, of a long one the only."""
+    """Return processor seconds of explain, the minimum of two calls (one if it is long)."""
     usual, best = explaining.RunEvaluator, np.inf
     if candidates is not None:
         names = [n for n in effects.list_names() if effects.get_effect(n).fits(SliderSystem)]
@@ -131,10 +133,10 @@ def explained(samples=SAMPLES, candidates=None, runs=RUNS):
 
 
 def measured(score_alone):
-    """Rows (of what, against what, how much, seconds); more runs are of the usual length."""
+    """Return rows (part, varied quantity, its value, seconds); the length of runs is constant."""
     asked = [("score", scoring, SCORED)]
     if not score_alone:
-        explained()  # the first call loads and traces
+        explained()  # The first call includes imports and tracing.
         asked.append(("explain", explained, EXPLAINED))
     for part, cost, counts in asked:
         for what, numbers in counts.items():
@@ -168,7 +170,7 @@ def _of(rows, part, what):
 
 
 def _slope(rows, part, what):
-    """Of the larger half: below it what every call costs hides how the rest grows."""
+    """Use the larger half, because the constant cost of every call hides the growth below it."""
     counts, costs = _of(rows, part, what)
     upper = slice(counts.size // 2, None)
     return float(np.polyfit(np.log(counts[upper]), np.log(costs[upper]), 1)[0])

@@ -1,8 +1,8 @@
-"""Measure what the harness costs compared with a bare loop over the same work.
+"""Measure the cost of the harness compared with a bare loop over the same work.
 
-An evaluation goes through `drive_tuner` and `ProposalEvaluator`. Run with `make benchmark`. The
-bare loop draws the same proposals and calls the same simulator; all that is left is harness:
-budget, checks, unit cube, loss, recommendation, timing, rows. Simulators: one that costs nothing,
+An evaluation uses `drive_tuner` and `ProposalEvaluator`. Run with `make benchmark`. The bare loop
+draws the same proposals and calls the same simulator; the difference is the cost of the harness:
+budget, checks, unit cube, loss, recommendation, timing, rows. The simulators are one without cost,
 and the spring in closed form.
 """
 
@@ -31,7 +31,7 @@ REPEATS = 7
 
 
 class Drawing(Tuner):
-    """Proposes prepared points, so that the tuner costs next to nothing."""
+    """Proposes prepared points, so that the tuner itself costs almost nothing."""
 
     def __init__(self, points):
         self.points = points
@@ -44,7 +44,7 @@ class Drawing(Tuner):
 
 
 def bare(points, problem, scenario):
-    """The work itself: map to physical units, simulate."""
+    """Time the bare loop: map to physical units and simulate."""
     low, span = problem.cube._low, problem.cube._span
     simulate = problem.simulator.simulate
     started = perf_counter()

@@ -1,5 +1,6 @@
-"""The tuner that reads histories beside the other learned ones: tables of a few numbers, from
-comparisons and from studies of a missing effect.
+"""Compare the tuner that reads histories with the other learned ones.
+
+Tables of a few numbers, from comparisons and from studies of a missing effect.
 
     simgap compare ball-drop --tuners least_squares,regressor,tunenet,hybrid,in_context \\
         --targets 20 --seeds 1 --budget 20 --salt public --out results/history/ball-drop
@@ -15,11 +16,11 @@ import pandas as pd
 from sims.core.atomic_files import write_atomically
 
 AFTER = (0, 1, 2, 3, 5, 10, 20)
-"""Simulations after which errors are told."""
+"""Simulation counts at which errors are reported."""
 
 
 def compared(folder):
-    """Errors of the parameters against simulations, and what was trained on."""
+    """Return parameter errors by simulation count, and the number of training simulations."""
     table = pd.read_csv(folder / "table.csv")
     kept = table[(table.metric == "param_error") & table.simulations.isin(AFTER)]
     columns = ["range", "tuner", "simulations", "mean", "median", "low", "high", "runs"]
@@ -29,7 +30,7 @@ def compared(folder):
 
 
 def missing(folder):
-    """Errors before and after explain, of those who came through."""
+    """Return errors before and after explain, of tuners without failures."""
     parts = []
     for path in sorted(folder.glob("*/table.csv")):
         table = pd.read_csv(path)
@@ -44,6 +45,6 @@ if __name__ == "__main__":
     out, *folders = (argument for argument in sys.argv[1:] if argument != "--missing")
     read = missing if studies else compared
     frame = pd.concat([read(Path(folder)) for folder in folders])
-    # of runs that were made twice, the later ones
+    # Of repeated runs, keep the later ones.
     frame = frame.drop_duplicates(list(frame.columns[:4]), keep="last")
     write_atomically(Path(out), frame.to_csv(index=False, float_format="%.4g"))

@@ -1,12 +1,12 @@
 """Measure whether the identifiability check is right.
 
-``python -m tests.benchmarks.identifiability_check [--count 200]``.
+``python -m tests.benchmarks.identifiability_check [--count 200]``
 
-Random problems: a pendulum, slider, servo or two-joint arm with numbers of unknown value, driven
-more or less, seen by more or less noise. Of a number that the check calls identifiable the interval
-must hold in 90 to 98 of 100 problems; one that it does not is fitted by three tuners to three
-robots that differ in nothing but it, and counts as fixed if every estimate is within a tenth of its
-range.
+Problems are random: a pendulum, slider, servo or two-joint arm with some unknown numbers, and with
+random strengths of input and noise. For a number that the check calls identifiable, the interval
+must hold the truth in 90 to 98 of 100 problems. Otherwise three tuners fit the number for three
+robots that differ in this number only, and it counts as fixed if every estimate is within a tenth
+of its range.
 """
 
 import argparse
@@ -29,8 +29,8 @@ from sims.systems.servo import Servo
 from sims.systems.slider import Slider
 
 TUNERS = ("nelder_mead", "cma_es", "least_squares")
-FIXED = 0.1  # of a number's range
-VALUES = 3  # of a number that is not identifiable, all else the same
+FIXED = 0.1  # Fraction of a number's range.
+VALUES = 3  # Number of values of a number that is not identifiable.
 TIMES = np.arange(120) / 40.0
 SYSTEMS = {
     "pendulum": (Pendulum, "q", ((), ("mass",), ("length",), ("mass", "gravity"))),
@@ -54,7 +54,7 @@ ARM = """
 
 
 class Problem:
-    """One: what moves how, and which numbers are unknown."""
+    """A random problem: motion, noise and unknown numbers."""
 
     def __init__(self, rng, arm):
         self.system = str(rng.choice([*SYSTEMS, "arm"]))
@@ -74,7 +74,7 @@ class Problem:
         self.truth = self.drawn(rng)
 
     def drawn(self, rng):
-        """Values of parameters, and of constants that are free, by name."""
+        """Draw values of parameters and of free constants, by name."""
         values = {}
         for p in self.parameters:
             low, high = p.training or p.bounds
@@ -85,7 +85,7 @@ class Problem:
         return values
 
     def recording(self, truth):
-        """Two runs that it moves through, and noise."""
+        """Return two runs with motion and noise."""
         rng = np.random.default_rng(self.seed)
         names = [p.name for p in self.parameters]
         constants = {k: v for k, v in truth.items() if k not in names}
@@ -117,7 +117,7 @@ class Problem:
         return given
 
     def world(self, truth):
-        """The recording as explain meets it, and its noise."""
+        """Return the evaluator of the recording, as in explain, and its noise model."""
         recording = self.recording(truth)
         free = () if self.system == "arm" else self.free
         engine = self.kind.default_engine if self.kind.own_engine else "batch"
@@ -128,7 +128,7 @@ class Problem:
 
 
 def answered(problem, rng):
-    """(word, whether it holds or is fixed) of each free number."""
+    """Return (level, whether its interval holds the truth or it is fixed) of each free number."""
     world, noise = problem.world(problem.truth)
     fit = compute_central_jacobian(world, fit_base_model(world, noise).fit, noise)
     places = {world.parameters[i].name: i for i in world.base}
@@ -147,10 +147,10 @@ def answered(problem, rng):
 
 
 def is_fixed(problem, number, rng):
-    """Whether every tuner finds each of several values of a number."""
+    """Return whether every tuner finds each of several values of a number."""
     name, near = number.name, FIXED * (number.high - number.low)
     for value in range(VALUES):
-        # From all over its range: what nobody moves stays near its nominal value.
+        # Draw from the whole range: an insensitive number stays near its nominal value.
         truth = {**problem.truth, name: float(rng.uniform(number.low, number.high))}
         world, noise = problem.world(truth)
         (place,) = (k for k, i in enumerate(world.base) if world.parameters[i].name == name)

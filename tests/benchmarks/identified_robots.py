@@ -1,10 +1,9 @@
-"""What the data of the problems of several parameters identify: `python -m
-tests.benchmarks.identified_robots [--out FILE.csv]`.
+"""Show which parameter combinations the data of multi-parameter problems identify.
 
-Of each problem and range medians over targets of the least and the largest 1 sigma that an
-unbiased estimate can have along a direction, how many directions are stiff in how many targets,
-and which parameters the sloppiest direction is made of: the mean of its squared components. The
-table of docs/problems.md is made from it.
+Run: `python -m tests.benchmarks.identified_robots [--out FILE.csv]`. For each problem and range,
+print medians over targets of the smallest and largest standard error (1 sigma) of an unbiased
+estimate along a direction, the counts of stiff directions, and the parameters of the sloppiest
+direction: the mean of its squared components. The table of docs/problems.md uses these numbers.
 """
 
 import argparse
@@ -21,12 +20,12 @@ PROBLEMS = {
     "slider-push": 20, "pendulum-swing": 20, "servo-step": 20, "ball-wind": 20, "ball-tilt": 20,
     "pendulum-driven": 20, "servo-friction": 20, "arm-swing": 10, "arm-drive": 10,
 }  # fmt: skip
-"""Targets in each range."""
+"""Number of targets in each range."""
 OUT = Path(__file__).resolve().parents[2] / "results" / "reference" / "multi" / "identified.csv"
 
 
 def identified(name, count):
-    """A row for each range of a problem."""
+    """Yield a row for each range of a problem."""
     problem = TuningProblem(load_experiment(name).chosen(targets=count))
     for kind in ("in", "wide"):
         spectra = [problem.compute_spectrum(problem.draw_target(kind, i)) for i in range(count)]

@@ -1,14 +1,15 @@
-"""What sealing costs, side by side with trusted runs and other harnesses in one run on one machine:
-``python -m tests.benchmarks.isolation_overhead``.
+"""Measure the cost of isolation, with in-process runs and other harnesses on the same machine.
 
-- an evaluation: random search, trusted and sealed by turns, with a simulator that costs nothing and
-  with the spring at 400 samples; wall time, and processor time of both sides;
-- the harness alone: a trusted tuner that costs nothing, less the bare loop over the same work;
-- a run: one of a single simulation, trusted and sealed by turns; its parts; of random search and of
-  a tuner with torch loaded.
+``python -m tests.benchmarks.isolation_overhead``
 
-Prints a JSON line each. Peers are measured between (`benchmarks.peer_libraries`), where they can be
-had.
+- An evaluation: random search, in-process and isolated runs alternate, with a simulator without
+  cost and with the spring at 400 samples; wall time, and processor time of both processes.
+- The harness alone: an in-process tuner without cost, minus the bare loop over the same work.
+- A run of one simulation, in-process and isolated runs alternate, and its parts; for random search
+  and for a tuner that has loaded torch.
+
+Prints one JSON line each. Other libraries are measured between the rounds
+(`benchmarks.peer_libraries`), if they can be installed.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ REPEATS = 15
 RUNS = 40
 ROUNDS = 3
 NAMES = ("sealed-benchmark", 0)
-"""Of the random streams."""
+"""Names from which the random streams are seeded."""
 
 
 def spent(pid):
-    """Seconds of processor time of a process, to the nanosecond where Linux tells."""
+    """Return the processor seconds of a process, to the nanosecond where Linux provides it."""
     path = Path(f"/proc/{pid}/schedstat")
     if path.exists():
         return int(path.read_text().split()[0]) / 1e9
@@ -57,13 +58,13 @@ def spent(pid):
 
 
 def tuners_process():
-    """The one that runs the tuner's code: the last of nursery, keeper, tuner."""
+    """Return the process that runs the tuner: the last of fork server, supervisor and tuner."""
     (last,) = [p for p in psutil.Process().children(recursive=True) if not p.children()]
     return last.pid
 
 
 def timed(tuner, task, problem, target, child):
-    """Wall seconds of a run, processor seconds of this side and of the tuner's process."""
+    """Return wall seconds of a run, and processor seconds of this and the tuner's process."""
     evaluator = ProposalEvaluator(problem, target.blinded.fitting)
     there = spent(child)
     started, used = perf_counter(), process_time()
@@ -74,7 +75,7 @@ def timed(tuner, task, problem, target, child):
 
 
 def evaluation(problem, name):
-    """Microseconds an evaluation, of random search."""
+    """Measure microseconds per evaluation of random search."""
     target = problem.draw_targets()[0]
     sealed = target.blinded
     points = np.random.default_rng(0).uniform(size=(EVALUATIONS, problem.cube.dim))
@@ -112,7 +113,7 @@ def evaluation(problem, name):
 
 
 def orders(experiment, tuner):
-    """The same run of one simulation, trusted and sealed."""
+    """Return the same run request of one simulation, in-process and isolated."""
     entry = TunerEntry(tuner, tuner)
     target = get_problem(experiment).draw_targets()[0].blinded
     trusted = RunRequest("run", entry, 0, target, 1)
@@ -122,7 +123,7 @@ def orders(experiment, tuner):
 
 
 def run(experiment, tuner):
-    """Milliseconds of a run: its start, the tuner's building, one simulation, its end."""
+    """Measure milliseconds of a run: start, construction of the tuner, one simulation, end."""
     trusted, sealed = orders(experiment, tuner)
     started = perf_counter()
     execute_run(experiment, sealed)
@@ -149,7 +150,7 @@ def run(experiment, tuner):
 
 
 def steps(tuned):
-    """Milliseconds until a process is begun, until the tuner in it is built, and of its end."""
+    """Return milliseconds to start a process, to build the tuner in it, and to end it."""
     times = [perf_counter()]
     files = [tuned.file] if tuned.file else []
     child = sandboxed_tuner.get_fork_server().start_process(
@@ -164,7 +165,7 @@ def steps(tuned):
 
 
 def said(rows):
-    """Print what several rounds found: the median of each number."""
+    """Print the median of each number over several rounds."""
     middle = {
         name: round(median([row[name] for row in rows]), 2) if not isinstance(value, str) else value
         for name, value in rows[0].items()
@@ -184,7 +185,7 @@ def main():
     with tempfile.TemporaryDirectory() as place:
         python = peer_libraries.environment(Path(place))
         for number in range(ROUNDS):
-            # A new nursery: the first run of a worker is measured too.
+            # Start a new fork server, because the first run of a worker is measured too.
             sandboxed_tuner.close_isolated_processes()
             rounds.append([
                 evaluation(nothing, "none"),

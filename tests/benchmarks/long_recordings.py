@@ -1,8 +1,8 @@
 """Long recordings, searched with all samples and with fewer: ``OMP_NUM_THREADS=1 python -m
 tests.benchmarks.long_recordings [RECORDING.csv ...]``.
 
-Processor time of explain on one core, both ways by turns, with the verdicts; of four made
-recordings (3 runs of 8 s at 1 kHz) and of those that are named. Prints a table.
+Processor time of explain on one core, both variants in turn, with the verdicts; for four simulated
+recordings (3 runs of 8 s at 1 kHz) and for those given as arguments. Prints a table.
 """
 
 import argparse
@@ -39,7 +39,7 @@ MADE = {
 
 
 def asked(path, long):
-    """Processor seconds, and what is answered, where recordings are long from so many samples."""
+    """Return processor seconds and the answer, if recordings are thinned from `long` samples."""
     usual = run_thinning.MIN_SAMPLES_TO_THIN
     run_thinning.MIN_SAMPLES_TO_THIN = long
     begin = time.process_time()
@@ -55,7 +55,7 @@ def asked(path, long):
 
 
 def row(name, path):
-    """A row of the table."""
+    """Return a row of the table."""
     whole, said = asked(path, np.inf)
     few, also = asked(path, run_thinning.MIN_SAMPLES_TO_THIN)
     same = "the same" if also == said else also
@@ -72,7 +72,7 @@ def main():
         for number, (name, wish) in enumerate(MADE.items()):
             path = Path(folder) / f"{number}.csv"
             write(Wish(**wish, **LONG), path)
-            # once before: what is loaded and traced once is no cost of either way
+            # Run once before measuring, so that imports and tracing are not counted.
             if not number:
                 explain(path)
             print(row(name, path), flush=True)

@@ -1,4 +1,4 @@
-"""The table of results/reference/misspecified/README.md, as Markdown, from its tables.
+"""Print the Markdown table of results/reference/misspecified/README.md from its CSV tables.
 
 python -m tests.benchmarks.misspecification_tables results/reference/misspecified
 """
@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 FIT = "least_squares"
-"""The tuner whose error is the model's own: it finds the best fit where there is one."""
+"""Tuner that finds the best fit if there is one; its error is the error of the model."""
 HEAD = (
     "| system | targets | runs | parameter: bias of least squares, as it is | extended "
     "| RMSE of unseen runs, as it is | extended | τ of parameters' ranks | of halves | p |\n"
@@ -18,17 +18,17 @@ HEAD = (
 
 
 def number(value):
-    """Two digits, as a person writes them."""
+    """Format a number with two digits."""
     return f"{value:.2g}".replace("-", "−").replace("e−0", "e−")
 
 
 def between(row):
-    """A mean with its interval."""
+    """Format a mean with its interval."""
     return f"{number(row['mean'])} ({number(row['low'])} to {number(row['high'])})"
 
 
 def lines(folder):
-    """The rows of the table: one a system."""
+    """Return the rows of the table, one per system."""
     table, ranking = (pd.read_csv(folder / f"{name}.csv") for name in ("table", "ranking"))
     rows = []
     for name, part in table.groupby("experiment", sort=False):

@@ -1,9 +1,8 @@
-"""What a lane costs in MuJoCo, together and one after the other, beside MuJoCo's own stepping.
+"""Measure the cost of a batch element in MuJoCo, together, one by one, and in MuJoCo alone.
 
-Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.mujoco_batches``; prints a table in
-Markdown.
-A lane is a pendulum for 4 s at 100 Hz, 1,600 steps of 2.5 ms. Ways are taken by turns in one
-process, the best of some rounds counts.
+Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.mujoco_batches``; prints a Markdown table. A
+batch element is a pendulum for 4 s at 100 Hz, 1,600 steps of 2.5 ms. The variants alternate in one
+process, and the minimum of some rounds counts.
 """
 
 from __future__ import annotations
@@ -22,26 +21,28 @@ LANES = (1, 16, 256, 1024)
 STEPS = 1600
 STEP = 2.5e-3
 FRICTION = 0.01
-"""N*m of dry friction."""
+"""Dry friction, N*m."""
 CASES = {
     "plain": (),
     "dry friction and drag": ("friction.coulomb", "drag.quadratic"),
     "dry friction by Stribeck, spring": ("friction.stribeck", "spring.linear"),
 }
 Cost = tuple[float, float]
-"""Processor and wall time of a lane, ms."""
+"""Processor and wall time per batch element, ms."""
 
 
 def native(lanes: int, threads: int = 1) -> Callable[[], None]:
-    """MuJoCo by itself, the yardstick: `mujoco.batch.Batch` with dry friction by the joint's
-    `frictionloss`, nothing read out on the way.
+    """Return a function that runs MuJoCo alone, as the reference for costs.
+
+    It uses `mujoco.batch.Batch` with dry friction by the joint's `frictionloss`, and reads no
+    intermediate results.
 
     Args:
-        lanes: pendulums, each begun at its own angle.
-        threads: of the batch.
+        lanes: number of pendulums, each with its own initial angle.
+        threads: threads of the batch.
 
     Returns:
-        What makes all steps once, from the start.
+        Function that makes all steps once, from the start.
     """
     import mujoco
     from mujoco import batch
@@ -65,7 +66,10 @@ def native(lanes: int, threads: int = 1) -> Callable[[], None]:
 
 
 def ours(effects: tuple[str, ...], lanes: int, **settings: int) -> Callable[[], None]:
-    """The engine `mujoco` on as many pendulums, with half of what each effect may be."""
+    """Return a function that runs the engine `mujoco` on many pendulums.
+
+    Each effect has half of its largest coefficient.
+    """
     pendulum = Pendulum(engine="mujoco", effects=effects, **settings)
     known = len(Pendulum.system.parameters)
     middle = [p.nominal for p in pendulum.parameters[:known]]
@@ -77,7 +81,7 @@ def ours(effects: tuple[str, ...], lanes: int, **settings: int) -> Callable[[], 
 
 @contextmanager
 def one_by_one() -> Iterator[None]:
-    """Lanes one after the other, as where MuJoCo has no batches."""
+    """Simulate batch elements one by one, as if MuJoCo had no batches."""
     before = dict(mujoco_joint_batch.MIN_BATCH_SIZE)
     mujoco_joint_batch.MIN_BATCH_SIZE.update(dict.fromkeys(before, 10**9))
     try:
@@ -87,16 +91,16 @@ def one_by_one() -> Iterator[None]:
 
 
 def once(work: Callable[[], None], lanes: int) -> Cost:
-    """The cost of a lane."""
+    """Return the cost per batch element."""
     processor, wall = process_time(), perf_counter()
     work()
     return 1e3 * (process_time() - processor) / lanes, 1e3 * (perf_counter() - wall) / lanes
 
 
 def row(effects: tuple[str, ...], lanes: int, rounds: int) -> list[Cost]:
-    """One by one, together, and MuJoCo by itself."""
+    """Return the costs one by one, together, and with MuJoCo alone."""
     work, yardstick = ours(effects, lanes), native(lanes)
-    few = min(lanes, 16)  # one after the other, lanes cost the same each
+    few = min(lanes, 16)  # The cost per element is constant one by one, so 16 are enough.
     alone = ours(effects, few)
     costs = []
     for _ in range(rounds):

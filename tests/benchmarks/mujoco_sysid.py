@@ -1,16 +1,15 @@
-"""Side by side with mujoco.sysid on the arm of examples/robot: what each finds, how far off it is
-on held-out runs, and what it costs.
+"""Compare with mujoco.sysid on the arm of examples/robot: results, held-out errors and costs.
 
-Run: `python -m tests.benchmarks.mujoco_sysid [--only CASE]`. The toolbox and what it needs are
-    installed
-into a throwaway environment, or are those of the Python that $PEERS names. Cases:
+Run: `python -m tests.benchmarks.mujoco_sysid [--only CASE]`. The toolbox and its dependencies are
+installed into a temporary environment, or come from the Python in $PEERS. Cases:
 
-- mass: the model file states a forearm of 0.96 kg, a fifth too heavy; the arm has 0.8 kg;
-- friction: the example as it ships; the elbow has dry friction of 0.03 N m that the model lacks;
-- late: the elbow's command arrives 20 ms late, which no number of a model file states.
+- mass: the model file specifies a forearm of 0.96 kg, a fifth too heavy; the arm has 0.8 kg;
+- friction: the example as published; the elbow has dry friction of 0.03 N m that the model lacks;
+- late: the elbow's command arrives 20 ms late, which no number of a model file describes.
 
-mujoco.sysid fits what it is told to: once masses, damping and armature of both links, as its own
-examples do, once dry friction too. It is told the initial states; simgap estimates them.
+mujoco.sysid fits the requested parameters: once masses, damping and armature of both links, as in
+its own examples, and once dry friction as well. It receives the initial states; simgap estimates
+them.
 """
 
 import argparse
@@ -37,7 +36,7 @@ CASES = ("mass", "friction", "late")
 
 
 def late_table(samples):
-    """The recording of an arm whose elbow's command arrives some samples late."""
+    """Return the recording of an arm whose elbow command arrives some samples late."""
     straight = make_log.table(0.0).splitlines()
     rows, arm = [straight[0]], make_log.Arm()
     for number in make_log.RUNS:
@@ -54,7 +53,7 @@ def late_table(samples):
 
 
 def prepare(case, folder):
-    """A folder with arm2.xml, log.csv and log.toml of a case."""
+    """Return a folder with arm2.xml, log.csv and log.toml of a case."""
     folder.mkdir()
     shutil.copy(EXAMPLE / "log.toml", folder)
     model = (EXAMPLE / "arm2.xml").read_text()
@@ -73,7 +72,7 @@ def prepare(case, folder):
 
 
 def measured(command):
-    """What a command prints, and its seconds: by the clock and of all its processes."""
+    """Return the output, wall seconds and processor seconds of a command."""
     started = perf_counter()
     with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(command, stdout=output, stderr=errors, cwd=ROOT)
@@ -127,7 +126,7 @@ def by_simgap(folder):
 
 
 def environment(folder):
-    """Python of an environment that has the toolbox: of $PEERS, else of one made in `folder`."""
+    """Return the Python that has the toolbox: $PEERS, or a new environment in `folder`."""
     if os.environ.get("PEERS"):
         return os.environ["PEERS"]
     python = str(folder / "venv" / "bin" / "python")
@@ -137,7 +136,7 @@ def environment(folder):
 
 
 def line(case, name, outcome):
-    """A row of the table."""
+    """Return a row of the table."""
     errors = " / ".join(f"{1e3 * v:.2f}" for v in outcome["heldout_rmse"].values())
     numbers = ", ".join(
         f"{key} {v['value']:.4g} ({v['low']:.4g} to {v['high']:.4g})"

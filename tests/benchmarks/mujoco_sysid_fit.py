@@ -1,7 +1,8 @@
-"""One fit by mujoco.sysid, run by a Python that has it: `sysid_fit.py MODEL.xml LOG.csv FREED...`.
+"""Make one fit with mujoco.sysid: `mujoco_sysid_fit.py MODEL.xml LOG.csv FREED...`.
 
-Prints what was found as JSON. The recording is one of examples/robot: runs 1 to 4 are fitted, 5 and
-6 held out, each begins with the arm hanging at rest.
+Runs in a Python that has mujoco.sysid and prints the estimates as JSON. The recording is one of
+examples/robot: runs 1 to 4 are fitted, 5 and 6 are held out, each begins with the arm hanging at
+rest.
 """
 
 import csv
@@ -18,11 +19,11 @@ HELD_OUT = ("5", "6")
 JOINTS = ("shoulder", "elbow")
 BODIES = ("upper_arm", "forearm")
 START = {"damping": (1e-3, 2.0), "armature": (1e-4, 0.1), "frictionloss": (0.0, 0.5)}
-"""Bounds of what is freed at the joints, in SI units."""
+"""Bounds of the free parameters of a joint, in SI units."""
 
 
 def runs_of(path):
-    """By run: times (T,), torques (T, 2), positions (T, 2)."""
+    """Return by run: times (T,), torques (T, 2), positions (T, 2)."""
     with path.open() as lines:
         rows = list(csv.reader(lines))[1:]
     names = dict.fromkeys(row[0] for row in rows)
@@ -31,7 +32,7 @@ def runs_of(path):
 
 
 def freed(spec, what):
-    """The parameters, begun at what the model file states."""
+    """Return the free parameters, with initial values from the model file."""
     parameters = sysid.ParameterDict()
     for body in BODIES if "mass" in what else ():
         mass, inertia = float(spec.body(body).mass), np.array(spec.body(body).inertia)
@@ -57,7 +58,7 @@ def freed(spec, what):
 
 
 def sequences(spec, model, runs):
-    """The runs as the toolbox takes them; each torque holds to the next sample."""
+    """Return the runs in the format of the toolbox; torques are held to the next sample."""
     every = round(0.01 / model.opt.timestep)
     controls, measured = [], []
     for times, torques, positions in runs.values():
@@ -79,7 +80,7 @@ def sequences(spec, model, runs):
 
 
 def errors(model, runs):
-    """Root mean square of each joint over some runs, rad."""
+    """Return the RMS error of each joint over some runs, rad."""
     squares = []
     for _, torques, positions in runs.values():
         data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""The tables of results/reference/multi, as Markdown, from the folders of its comparisons.
+"""Print the tables of results/reference/multi as Markdown, from the folders of its comparisons.
 
 python -m tests.benchmarks.multi_problem_tables results/multi > results/multi/tables.md
 """
@@ -20,7 +20,7 @@ METRICS = {
 
 
 def identified(folders):
-    """What the data of each problem identify: a line a problem and range."""
+    """Return what the data of each problem identify, one line per problem and range."""
     lines = [
         "| problem | parameters | range | targets | stiff directions | 1 sigma of the stiffest | "
         "of the sloppiest |",
@@ -44,7 +44,7 @@ def identified(folders):
 
 
 def errors(folders, metric, simulations=None):
-    """Median over targets of a metric after so many simulations (default: all), in range / wide."""
+    """Return the median of a metric over targets after `simulations` (default: all), by range."""
     columns = {}
     for folder in folders:
         table = pd.read_csv(folder / "table.csv")
@@ -65,7 +65,7 @@ def errors(folders, metric, simulations=None):
 
 
 def _rank(columns, tuner):
-    """Mean rank over problems and ranges."""
+    """Return the mean rank over problems and ranges."""
     ranks = [c.rank().reindex([tuner]).to_numpy() for c in columns.values()]
     return float(np.nanmean(np.concatenate(ranks, axis=1)))
 
@@ -81,7 +81,7 @@ def _number(value):
 
 
 def failures(folders):
-    """How many runs there were, and how many of them failed."""
+    """Return the number of runs and of failed runs."""
     statuses = pd.concat(
         [pd.read_csv(folder / "status.csv", keep_default_na=False) for folder in folders]
     )

@@ -1,20 +1,19 @@
 """Does the run that ``simgap design`` proposes split what was open? ``python -m
 tests.benchmarks.next_recording_value [--sets 20] [--seed 0] [--out DIR]``.
 
-Of the questions of the exam with one hidden cause (tests/simple_exam) sets of causes that are not
-all one
-by `items.EQUIVALENT` are drawn by seed; nothing is known of them but that explain, as it is, leaves
-such a set open. The proposed run is recorded once by the exam's own simulators, with the truth
-hidden and with new noise, and all is explained together. A set is
+From the exam questions with one hidden cause (tests/simple_exam), sets of causes that explain
+cannot distinguish are drawn by seed; the causes of a set are not all equivalent by
+`find_equivalent_effects`. The proposed run is recorded once by the exam's own simulators, with the
+hidden cause and new noise, and everything is explained together. A set is
 
-* settled, where all that is left is equivalent in any data, or by the design's word not told from
-  the truth by any run of this kind; and the truth is among it, or one of those,
-* split, where fewer are left than that they were, the truth among them, but more than that,
-* open, where as many are left,
-* lost, where the truth is gone, or explain says something else of it.
+* settled, if all remaining causes are equivalent in any data to the truth, or, according to the
+  design, cannot be distinguished from it by any run of this kind; one of these causes remains,
+* split, if fewer causes remain than before, the truth among them, but more than in a settled set,
+* open, if no cause was excluded,
+* lost, if the truth is excluded, or explain gives another verdict.
 
-The word is held where nothing stays beside what leads that it says is told from it, and the truth
-is not lost.
+The prediction of the design is kept if no two remaining causes are predicted to be distinguishable,
+and the truth is not lost.
 """
 
 import argparse
@@ -47,7 +46,8 @@ from sims.recording.recording_writer import write_recording
 from tests.simple_exam.exam_questions import sheet
 
 SECONDS = 4.0
-SLIPPED = 0.01  # of what a state should begin with, and that in m and rad: nobody sets it exactly
+# Relative error of the initial states (absolute below 1 m or 1 rad), as in a real experiment.
+SLIPPED = 0.01
 COLUMNS = (
     "question", "hidden", "before", "groups", "worth", "says", "after", "verdict", "outcome",
     "kept", "seconds",
@@ -82,7 +82,7 @@ def main(arguments):
 
 
 def _asked(call):
-    """A row about a question; None where it leaves nothing open that data could tell."""
+    """Return a row about a question; None if it leaves no set open that data could split."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"
     question, offset, longest = call
@@ -101,7 +101,7 @@ def _asked(call):
 
 
 def _set_of(explanation):
-    """The causes of a set that is open; None where something else is found."""
+    """Return the causes of an ambiguous set; None for another result."""
     causes = explanation.answer.causes
     if explanation.answer.verdict != "ambiguous" or len(causes) != 1:
         return None
@@ -113,7 +113,7 @@ def _classes(item, names):
 
 
 def recorded(item, design, folder):
-    """The proposed run, made in the world of an item: its path."""
+    """Record the proposed run with the reference simulators of a case, and return its path."""
     setting, rng = restore_conditions(item), np.random.default_rng(item.seed + 7)
     begin = {
         name: value + SLIPPED * rng.standard_normal() * max(abs(value), 1.0) * (value != 0.0)
@@ -138,7 +138,7 @@ def _row(question, item, known, proposed, found):
     answer = found.answer
     left = {name for cause in answer.causes for name in (cause.effect, *cause.alternatives)}
     (truth,) = item.effects
-    # What stays together with the truth by the design's word, and what is equivalent to it.
+    # Causes that the design cannot distinguish from the truth, and their equivalents.
     twins = next(set(group) for group in design.groups if truth in group)
     alike = {
         name for twin in twins for name in find_equivalent_effects(item.system, item.driven, twin)
@@ -150,7 +150,7 @@ def _row(question, item, known, proposed, found):
         outcome = "settled"
     else:
         outcome = "split" if len(left) < len(known) else "open"
-    # Of what it says is told, no two may stay.
+    # No two causes that are predicted to be distinguishable may remain.
     broken = [
         (a, b)
         for mine, others in itertools.combinations(design.groups, 2)

@@ -1,10 +1,11 @@
-"""Whether p-values are what they say on short runs: ``OMP_NUM_THREADS=1 python -m
-tests.benchmarks.null_quantiles [--count N]``.
+"""Test whether p-values are correct for short runs.
 
-Clean runs of 60 samples of a pendulum and a slider, linearised about the model that made them, with
-noise of several memories; what a fit leaves is scored against the whole library. Printed is the
-share of p-values below each level, with surrogates as they are made now and as they would be
-without taking the fit's bias out (`evaluation.surrogate_residuals`), of the same noise by turns.
+``OMP_NUM_THREADS=1 python -m tests.benchmarks.null_quantiles [--count N]``
+
+Runs of 60 samples of a pendulum and a slider without a hidden cause are linearised about the true
+model, with AR(1) noise of several coefficients, and their residuals are scored against the whole
+library. The output is the share of p-values below each level, with the present surrogates and with
+surrogates that keep the bias of the fit (`evaluation.surrogate_residuals`), for the same noise.
 """
 
 import argparse
@@ -24,7 +25,7 @@ RUNS, MEMORIES, SURROGATES, SIGMA = (1, 3), (0.0, 0.6, 0.85), 120, 0.01
 
 
 def tested(system, runs):
-    """The score test about the true model of 3 s at 20 Hz, and the shape of its observations."""
+    """Return the score test about the true model of 3 s at 20 Hz, and its observation mask."""
     recorded = recording(
         system, runs=runs, seconds=3.0, rate=20.0, seed=5, observe=[SYSTEMS[system]]
     )
@@ -36,7 +37,7 @@ def tested(system, runs):
 
 
 def chances(test, seen, memory, count):
-    """(2, count) p-values: with the bias taken out, and without."""
+    """Return p-values (2, count): with the bias of the fit removed, and without."""
     rng = np.random.default_rng(1)
     found = []
     for _ in range(count):

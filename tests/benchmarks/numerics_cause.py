@@ -1,13 +1,12 @@
-"""How far MuJoCo's own step and integrator miss a model's fine motion, and how truly its dry
-friction sticks: tables for docs/engines.md.
+"""Measure the errors of MuJoCo's step, integrator and dry friction: tables for docs/engines.md.
 
 Run: `OMP_NUM_THREADS=1 python -m tests.benchmarks.numerics_cause`. Models: the arm of
-    examples/robot,
-with its motors or with position servos, and the KUKA iiwa of pybullet_data with position servos of
-natural frequency w: kp = w² M, kv = 2 w M with M the joint's own inertia at the pose. Commands are
-sines of 0.2 to 1.5 Hz, held for 10 ms. Errors are root mean squares over samples, joints and runs
-of 4 s, in mrad, against RK4 at 0.2 ms; dry friction against the example's own integrator, less the
-error that the model has without friction.
+examples/robot, with its motors or with position servos, and the KUKA iiwa of pybullet_data with
+position servos of natural frequency w: kp = w² M, kv = 2 w M with M the joint's own inertia at the
+pose. Commands are sines of 0.2 to 1.5 Hz, held for 10 ms. Errors are root mean squares over
+samples, joints and runs of 4 s, in mrad. The reference is RK4 at 0.2 ms. For dry friction, the
+reference is the example's own integrator, and the error of the model without friction is
+subtracted.
 """
 
 from __future__ import annotations
@@ -45,11 +44,11 @@ FRICTIONS = {
     "rate of 2.5 a step, 0.9999": lambda step: ((-1e-9, -2.5 / step), SOLVED),
     "rate of 4 a step, 0.9999": lambda step: ((-1e-9, -4 / step), SOLVED),
 }
-"""Of solreffriction and solimpfriction, by the step."""
+"""Functions from the step to solreffriction and solimpfriction."""
 
 
 def served(path, pose, frequency):
-    """A model whose joints are driven by critically damped position servos."""
+    """Return a model whose joints are driven by critically damped position servos."""
     spec = read_robot(path).spec.copy()
     for actuator in list(spec.actuators):
         spec.delete(actuator)
@@ -69,7 +68,7 @@ def served(path, pose, frequency):
 
 
 def commands(count, run, amplitude):
-    """Sums of four sines, (T, count)."""
+    """Return sums of four sines, (T, count)."""
     rng = np.random.default_rng([18, run])
     time = np.arange(RATE * SECONDS) / RATE
     phases = rng.uniform(0.2, 1.5, (count, 4, 1)) * time + rng.uniform(size=(count, 4, 1))
@@ -77,7 +76,7 @@ def commands(count, run, amplitude):
 
 
 def moved(model, integrator, step, initial, controls):
-    """Positions at the samples (T, nq), and ms of processor time a simulated second."""
+    """Return positions at the samples (T, nq), and ms of processor time per simulated second."""
     model.opt.integrator, model.opt.timestep = INTEGRATORS[integrator], step
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     data = mujoco.MjData(model)
@@ -94,12 +93,12 @@ def moved(model, integrator, step, initial, controls):
 
 
 def rms(differences):
-    """Root mean square in mrad."""
+    """Return the root mean square in mrad."""
     return 1e3 * float(np.sqrt(np.mean(np.square(differences))))
 
 
 def shift(errors, fine):
-    """By how much a motion is early, and which share of the error's squares that is."""
+    """Return the time shift of a motion, and the share of the squared error that it explains."""
     error, rate = np.stack(errors), np.gradient(np.stack(fine), 1 / RATE, axis=1)
     seconds = np.sum(error * rate) / np.sum(rate**2)
     share = 1 - np.sum((error - seconds * rate) ** 2) / np.sum(error**2)
@@ -107,7 +106,7 @@ def shift(errors, fine):
 
 
 def smooth_cases():
-    """By name, a model and its runs: initial positions and commands."""
+    """Yield by name a model and its runs: initial positions and commands."""
     motors = read_robot(ARM).spec.compile()
     arm = [(np.zeros(2), make_log.torques_of(run)) for run in make_log.RUNS[:RUNS]]
     yield "arm2, motors", motors, arm
@@ -122,7 +121,7 @@ def smooth_cases():
 
 
 def smooth():
-    """The table of steps and integrators, and what two steps tell of the fine motion."""
+    """Print the table of steps and integrators, with the extrapolation from two steps."""
     head = [f"{name} {1e3 * step:g}" for name in INTEGRATORS for step in STEPS]
     print("| model | " + " | ".join(head[:-1]) + " | implicitfast 2 and 1 extrapolated |")
     print("|---|" + "---|" * len(head))
@@ -150,7 +149,7 @@ def smooth():
 
 
 def friction():
-    """The table of MuJoCo's dry friction at the arm's elbow."""
+    """Print the table of MuJoCo's dry friction at the arm's elbow."""
     model = read_robot(ARM).spec.compile()
     default = model.dof_solref[1].copy(), model.dof_solimp[1].copy()
     columns = [(name, step) for name in ("Euler", "RK4") for step in (0.002, 0.0005)]
@@ -186,7 +185,7 @@ CREEPER = """<mujoco><option timestep="0.002" gravity="0 0 0"/><worldbody><body>
 
 
 def creep():
-    """How far a joint that should stand moves in 4 s, pushed with four fifths of its friction."""
+    """Print the drift in 4 s of a joint that should stick, pushed with 80 % of its friction."""
     for name, setting in FRICTIONS.items():
         model = mujoco.MjModel.from_xml_string(CREEPER)
         model.dof_solref[0], model.dof_solimp[0] = setting(model.opt.timestep)

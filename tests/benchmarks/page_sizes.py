@@ -1,11 +1,10 @@
-"""What the page of a comparison costs: seconds, bytes, and how soon it answers, beside cocopp's.
-Run: `python -m tests.benchmarks.page_sizes`.
+"""Measure a comparison page against cocopp's: seconds, bytes and response time.
 
-Prints one JSON line a measurement; seconds are the processor's, but for those of the browser and
-where the clock is named. A click is answered when the next frame is painted: the `duration` of the
-browser's Event Timing, which counts in steps of 8 ms. cocopp is that of the Python that $PEERS
-names, or is installed into a throwaway environment; it gets as many runs of the same length
-(`tests.benchmarks.coco_bbob`).
+Run: `python -m tests.benchmarks.page_sizes`. Prints one JSON line per measurement; seconds are
+processor time, except those of the browser and where the clock is named. The response to a click is
+complete when the next frame is painted: the `duration` of the browser's Event Timing (8 ms steps).
+cocopp comes from the Python in $PEERS, or is installed into a temporary environment; it gets the
+same number of runs of the same length (`tests.benchmarks.coco_bbob`).
 """
 
 from __future__ import annotations
@@ -40,13 +39,12 @@ ANSWERED = """
   new PerformanceObserver(note).observe({ type: "event", durationThreshold: 16 });
 }
 """
-"""Milliseconds from each click to the next frame, from now on; what takes less than 16 is not told
-of.
+"""Script that records milliseconds from each click to the next frame; values below 16 are missing.
 """
 
 
 def invented(targets, budget):
-    """A comparison of six tuners on so many targets of each of two ranges."""
+    """Return a comparison of six tuners with random errors on targets of two ranges."""
     rng = np.random.default_rng(0)
     k = np.arange(budget + 1)
     parts = []
@@ -81,12 +79,12 @@ def invented(targets, budget):
 
 
 def clicked(page):
-    """Milliseconds from each of some clicks on tuners to the next frame."""
+    """Return milliseconds from each of some clicks on tuners to the next frame."""
     page.evaluate(ANSWERED)
     keys = page.locator("#error .key")
     for i in range(CLICKS):
         keys.nth(i % len(TUNERS)).click()
-        # Each click finds the page at rest.
+        # Wait until the page is idle before the next click.
         page.wait_for_timeout(300)
     answers = page.evaluate("window.answered")
     return [*answers, *[16] * (CLICKS - len(answers))]
@@ -125,7 +123,7 @@ def ours(browser, place, targets, budget):
 def main():
     with tempfile.TemporaryDirectory() as folder:
         with launched() as browser:
-            # The first pays for imports.
+            # The first comparison is small, because its time includes imports.
             for targets, budget in ((5, 20), (60, 100), (825, 100)):
                 ours(browser, Path(folder), targets, budget)
         coco_bbob.measured(Path(folder), 100)

@@ -1,16 +1,14 @@
-"""Overhead beside benchopt and nevergrad: what each harness adds to a trivial problem that costs
-nothing itself.
+"""Compare the overhead with benchopt and nevergrad on a trivial problem without cost.
 
-Run: `python -m tests.benchmarks.peer_libraries`. The peers are installed into a throwaway
-    environment, or
-are those of the Python that $PEERS names.
+Run: `python -m tests.benchmarks.peer_libraries`. The other libraries are installed into a temporary
+environment, or come from the Python in $PEERS.
 
-- an evaluation: random search over two numbers, the objective a sum of squares, evaluated a few
-  thousand times, less the bare loop over the same numbers; nevergrad by `RandomSearch.minimize`,
-  simgap by `drive` and its evaluator;
-- a run: a method that does nothing, in isolation: simgap by a worker process of its pool, benchopt
-  by `run_benchmark` (its smallest benchmark: one objective, data set, solver), slope between a few
-  and many repetitions.
+- An evaluation: random search over two numbers, with a sum of squares as the objective, evaluated a
+  few thousand times, minus the bare loop over the same numbers; nevergrad by
+  `RandomSearch.minimize`, simgap by `drive_tuner` and its evaluator.
+- A run: a method that does nothing, in isolation: simgap by a worker process of its pool, benchopt
+  by `run_benchmark` (its smallest benchmark: one objective, data set, solver), as the slope between
+  a few and many repetitions.
 """
 
 from __future__ import annotations
@@ -87,7 +85,7 @@ def nothing(x):
 
 
 def simgap_run():
-    """Milliseconds of a call in an isolated worker, when the worker is there."""
+    """Return milliseconds of a call in an isolated worker that is already started."""
     with LocalPool(1) as pool:
         list(pool.iterate_results([(nothing, (1,))], 60.0))
         started = perf_counter()
@@ -96,9 +94,7 @@ def simgap_run():
 
 
 def simgap_fresh():
-    """Milliseconds of the first call in a worker that has to be started: what a killed run
-    costs.
-    """
+    """Return milliseconds of the first call in a new worker, which is the cost of a killed run."""
     times = []
     for _ in range(3):
         started = perf_counter()
@@ -109,7 +105,7 @@ def simgap_fresh():
 
 
 def simgap_evaluation():
-    """Microseconds that `drive` and the evaluator add, from the harness's own benchmark."""
+    """Return the microseconds that the harness adds to an evaluation, from its own benchmark."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.benchmarks.harness_overhead"],
         capture_output=True,
@@ -130,7 +126,7 @@ def nevergrad_evaluation(python):
 
 
 def benchopt_run(python, folder):
-    """Milliseconds of one more run: the slope between a benchmark of 10 and one of 410."""
+    """Return milliseconds of one more run: the slope between benchmarks of 10 and 410 runs."""
     times = {}
     for count in (10, 410):
         place = folder / f"benchmark-{count}"
@@ -161,8 +157,9 @@ def benchopt_run(python, folder):
 
 
 def environment(folder, packages=("benchopt", "nevergrad")):
-    """Python of an environment that has the peers: of $PEERS, else of one made below `folder`; None
-    where they cannot be had.
+    """Return the Python that has the packages: $PEERS, or a new environment in `folder`.
+
+    The result is None if they cannot be installed.
     """
     if os.environ.get("PEERS"):
         return os.environ["PEERS"]

@@ -1,10 +1,10 @@
 """Explain the measured recordings.
 
-``python -m tests.benchmarks.real_recordings [NAME ...] [--thorough] [--out DIR]``.
+``python -m tests.benchmarks.real_recordings [NAME ...] [--thorough] [--out DIR]``
 
-Writes a folder for each recording (verdict, extended simulator, report; of a thorough search one
-called so) and the table of results/reference/real. What is published of each, and the held-out
-errors of a quick independent fit, stand in the README of the recordings.
+Writes a folder for each recording (verdict, extended simulator, report; the folder of a thorough
+search is named `thorough`) and the table of results/reference/real. The README of the recordings
+gives published results and the held-out errors of a quick independent fit.
 """
 
 import argparse
@@ -56,14 +56,14 @@ def main():
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         explain(path, thorough=options.thorough).write(folder)
-        for figure in folder.glob("*.p*"):  # they stand in the report
+        for figure in folder.glob("*.p*"):  # The report contains the figures.
             figure.unlink()
         if name.startswith("pendulum"):
             (folder / "open_loop.json").write_text(
                 json.dumps(open_loop(folder / "extended.toml", path)) + "\n"
             )
         print(row(options.out, folder), flush=True)
-    kinds = sorted({path.parent.name for path in paths})  # robots have a program of their own
+    kinds = sorted({path.parent.name for path in paths})  # Robots have their own program.
     folders = [
         found.parent for of in kinds for found in sorted(options.out.glob(f"{of}/*/verdict.json"))
     ]
@@ -73,7 +73,7 @@ def main():
 
 
 def open_loop(model, path):
-    """Error over the held-out runs as one run of 25 s, of which they were cut."""
+    """Return the error over the held-out runs, joined to the original run of 25 s."""
     recording = read_recording(path, Pendulum, whole=True)
     parts, begin = recording.held_out(), 0.0
     times, channels = [], {name: [] for name in parts[0].channels}
@@ -92,7 +92,7 @@ def open_loop(model, path):
 
 
 def row(out, folder):
-    """A row of the table."""
+    """Return a row of the table."""
     verdict = json.loads((folder / "verdict.json").read_text())
     name = str(folder.relative_to(out))
     causes = "; ".join(

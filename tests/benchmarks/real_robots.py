@@ -1,10 +1,12 @@
-"""The measured arm and drive, from logs as they lie: ``python -m tests.benchmarks.real_robots``.
+"""Explain the measured arm and drive from unchanged logs.
 
-The arm goes from its folder to a verdict in two commands, which are run as a user would; then the
-model that it began with, the same with its gains tuned, and the extended one each predict the six
-motions that no fit has seen, from where they begin: RMSE by joint and motion, in mrad. Of the drive
-what was found stands beside what is published. With ``--explained DIR`` a folder that is there is
-taken; else explain runs, which takes a quarter of an hour.
+``python -m tests.benchmarks.real_robots``
+
+The arm needs two commands from its folder to a verdict, which are run as by a user. Then three
+models predict the six held-out motions from their initial states: the initial model, the model with
+tuned gains, and the extended one. The result is the RMSE by joint and motion, in mrad. For the
+drive, estimates are printed with published values. With ``--explained DIR`` an existing folder is
+used; otherwise explain runs, which takes a quarter of an hour.
 """
 
 import argparse
@@ -48,7 +50,7 @@ unit = "N"
 
 
 def simgap(*arguments):
-    """The installed command."""
+    """Run the installed command."""
     command = Path(sys.executable).with_name("simgap")
     subprocess.run([str(command), *map(str, arguments)], check=True)
 
@@ -72,7 +74,7 @@ def so101(out, explained):
     after = world.get_nominal_theta()
     for place, parameter in enumerate(world.parameters[: world.own]):
         after[place] = extended.parameters[parameter.name].value
-    # A search that its budget has ended says nothing of the base model's numbers.
+    # A search that its budget ended has no numbers of the base model.
     known = tuned(explained) if (explained / "apart.csv").exists() else {}
     before = world.get_nominal_theta()
     for place, parameter in enumerate(world.parameters[: world.own]):
@@ -92,14 +94,14 @@ def so101(out, explained):
 
 
 def tuned(explained):
-    """The base model's parameters, as apart.csv has them."""
+    """Return the base model's parameters from apart.csv."""
     with (explained / "apart.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["model"] == "base"]
     return {row["number"]: float(row["value"]) for row in rows if row["group"] == "all"}
 
 
 def by_run(world, theta):
-    """(R, C) RMSE of a model that begins where each run begins."""
+    """Return the RMSE (R, C) of a model that begins in the initial state of each run."""
     runs = np.arange(len(world.tracks))
     simulated = world.simulate(np.tile(theta, (runs.size, 1)), runs, world.guess)
     return np.sqrt(np.nanmean((world.observed - simulated) ** 2, axis=1))
@@ -142,8 +144,10 @@ def emps(out, explained):
 
 
 def emps_slide(out, explained):
-    """The drive as the system `slider`, which may have a flexible transmission: once fitted on the
-    first run, once on the second with its pulses, in pieces, forces in units of 50 N.
+    """Explain the drive as the system `slider`, which may have a flexible transmission.
+
+    It is fitted once on the first run, and once on the second with its pulses, in segments, with
+    forces in units of 50 N.
     """
     unit, length = 50.0, 500
     with (ROBOTS / "emps" / "recording.csv").open() as file:

@@ -1,10 +1,10 @@
 """Who is ahead of a tuner, at which number of simulations.
 
-``python -m tests.benchmarks.reference_overlay FOLDER [TUNER]``.
+``python -m tests.benchmarks.reference_overlay FOLDER [TUNER]``
 
-Reads a comparison's folder; paired tests over its targets after 1, 2, 3, 5, ... simulations
-(`statistics.paired_tests`: Wilcoxon on the logarithms of errors, Holm's correction over all pairs).
-Writes behind.csv there and prints it as a table.
+Reads the folder of a comparison and makes paired tests over its targets after 1, 2, 3, 5, ...
+simulations (`statistics.paired_tests`: Wilcoxon on the logarithms of errors, Holm's correction over
+all pairs). Writes behind.csv there and prints it as a table.
 """
 
 import argparse
@@ -19,8 +19,9 @@ from bench.benchmark.storage.result_folder import read_comparison, read_configur
 
 
 def against(folder, tuner):
-    """One row a rival, range and number of simulations: median error of `tuner` over the rival's,
-    and Holm's p.
+    """Return one row per competing tuner, range and number of simulations.
+
+    A row has the median error of `tuner` divided by that of the competitor, and Holm's p-value.
     """
     stored = read_comparison(folder)
     parts = []

@@ -1,13 +1,14 @@
-"""Whether the SO-101's base servo has a D term on the error, and what limits it:
-``python -m tests.benchmarks.so101_base``.
+"""Test for a D term on the error in the SO-101's base servo, and for what limits the servo.
+
+``python -m tests.benchmarks.so101_base``; twenty minutes.
 
 Stiffness, damping and the dead zone of the servo are fitted to the first 80 s of `chirp_sweep`,
-from where each run begins, with a D term on the error, or a command that leads, held at several
-sizes; RMSE of every motion in mrad. Then what is left of the chirp beyond, part by part. Then the
-same three numbers are fitted to the whole chirp, without and with a motion profile, which begins
-near the acceleration that the firmware allows. At last to the chirp, `prbs_excitation` and steps
-together: the dead zone alone, with a profile, and a drive that hardly brakes with what rubs and
-limits it. Twenty minutes.
+with initial states from each run, with a D term on the error, or a leading command, fixed at
+several sizes. The output is the RMSE of every motion in mrad, and the residual of the later chirp
+by interval. Then the same three numbers are fitted to the whole chirp, without and with a motion
+profile, whose fit begins near the acceleration limit of the firmware. Finally, chirp,
+`prbs_excitation` and steps are fitted together: the dead zone alone, with a profile, and a drive
+that hardly brakes, with friction and a force limit.
 """
 
 from itertools import pairwise
@@ -31,17 +32,22 @@ ZONE, LEAD, LATE, WAY, BRAKE = (
 DRY, DRAG, MOST = f"friction.coulomb@{JOINT}", f"drag.linear@{JOINT}", f"actuator.limit@{PLACE}"
 STIFF, DAMP = f"actuator.stiffness@{PLACE}", f"actuator.damping@{PLACE}"
 FREE = {STIFF: (0.0, 0.1), DAMP: (0.0, 0.1), ZONE: (0.01, 1e-3)}
-"""What is fitted: where it begins, and how far apart two of it differ."""
+"""Fitted parameters, with their initial values and scales."""
 LIMIT = 40.0
-"""rad/s^2, where a fit of the profile begins, near the STS3215's largest acceleration of 254 times
-100 encoder steps, 38.96: at a limit that is met a motion may skip every other turn, so that the
-sum of squares has many minima."""
+"""Initial value of a fit of the profile, rad/s^2.
+
+It is near the STS3215's largest acceleration of 254 times 100 encoder steps, 38.96. If a limit is
+reached, a motion may skip every other turn, so that the sum of squares has many minima.
+"""
 COASTS = {
     STIFF: (4.3, 0.1), DAMP: (2.0, 0.1), BRAKE: (0.98, 0.02), DRY: (0.15, 0.01),
     LATE: (0.0255, 1e-3), MOST: (1.4, 0.05), DRAG: (0.1, 0.01),
 }  # fmt: skip
-"""Where a fit of a drive that hardly brakes begins: where a search at random (CMA-ES, by hand, of
-a plain model of one joint) has ended from numbers that a servo might have."""
+"""Initial values and scales of a fit of a drive that hardly brakes.
+
+They are the result of a manual CMA-ES search with a plain model of one joint, from values that a
+servo might have.
+"""
 HELD = ({}, {LEAD: 0.05}, {LATE: -0.05})
 PARTS = (0.0, 80.0, 95.0, 105.0, 112.0, 121.0)
 
@@ -58,7 +64,7 @@ def main():
     slow = shown[chirp] & (np.arange(shown.shape[1]) < np.searchsorted(times, UPTO))
 
     def errors(thetas, run):
-        """Of rows of parameters in one run, mrad."""
+        """Return errors for rows of parameters in one run, mrad."""
         of = np.full(len(thetas), run)
         return 1e3 * (world.simulate(thetas, of, world.guess[of]) - world.observed[of])[:, :, 0]
 
@@ -85,8 +91,9 @@ def main():
 
 
 def fitted(errors, theta, column, free, held, seen):
-    """Parameters, those that are free as the runs say of which samples are `seen`, each run as much
-    as another; those of `held` as they are.
+    """Return parameters after a fit of those in `free`; those in `held` are fixed.
+
+    The fit uses the samples in `seen`, and all its runs have the same weight.
     """
     for name, value in {**held, **{name: begun for name, (begun, _) in free.items()}}.items():
         theta[column[name]] = value

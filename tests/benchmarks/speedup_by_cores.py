@@ -1,11 +1,10 @@
 """Measure how much time several cores save in a diagnosis.
 
-``OMP_NUM_THREADS=1 python -m tests.benchmarks.speedup_by_cores [RECORDING.csv ...] [--jobs N]``;
-a pair of causes on each system without a recording.
+``OMP_NUM_THREADS=1 python -m tests.benchmarks.speedup_by_cores [RECORDING.csv ...] [--jobs N]``
 
-On a machine that others use the clock tells little, so the critical path stands beside it: the
-processor time of the process that leads, and in each round that is shared that of the worker with
-the most of it.
+Without a recording, it uses a pair of causes on each system. On a shared machine wall time is
+unreliable, so the critical path is printed as well: the processor time of the main process, plus
+the largest processor time of a worker in each shared round.
 """
 
 import argparse
@@ -37,7 +36,7 @@ PAIRS = {
 
 
 class Meter:
-    """Adds up what rounds take that are shared."""
+    """Sums up the processor times of shared rounds."""
 
     def __init__(self):
         self.longest = self.all = 0.0
@@ -65,14 +64,19 @@ class Meter:
 
 
 def timed(world, task, *item):
-    """A task with the worker that has done it, and the processor time that it took."""
+    """Run a task and return its result, the worker and the processor time."""
     begun = time.process_time()
     result = task(world, *item)
     return result, os.getpid(), time.process_time() - begun
 
 
 def measured(path, jobs):
-    """Seconds of the clock and of the critical path, shared rounds, and the verdict."""
+    """Explain a recording and measure the times.
+
+    Returns:
+        Wall seconds, seconds of the critical path, processor seconds of the main process, the meter
+        of the shared rounds, and the verdict.
+    """
     begun, clock = time.process_time(), time.perf_counter()
     with Meter() as meter:
         found = explain(path, jobs=jobs)
@@ -94,7 +98,7 @@ def main():
             paths = [*paths, Path(folder) / f"{name}.csv"]
             write(wish, paths[-1])
         for path in paths:
-            explain(path)  # the first loads and traces
+            explain(path)  # The first call includes imports and tracing.
             row = measured(path, 1), measured(path, given.jobs)
             (clock, alone, *_, first), (shared, path_of, own, meter, second) = row
             assert first == second, "the answer depends on the number of processes"

@@ -1,9 +1,9 @@
-"""What stepping costs in machine code and in numpy, side by side in one process on one core.
+"""Measure the cost of stepping in machine code and in NumPy, in one process on one core.
 
-Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.stepping_speed``; prints a table. Runs of 4
-s at
-100 Hz; processor time of the engine's own work, the best of some repetitions by turns, so that both
-see the same machine. Behind them what MuJoCo takes by itself, of which nothing is read out.
+Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.stepping_speed``; prints a table. Runs have
+4 s at 100 Hz. The number is the processor time of the engine's own work, the minimum of some
+repetitions. The variants alternate, so that changes of the machine affect both. The last rows are
+the times of MuJoCo alone, without reading results.
 """
 
 from __future__ import annotations
@@ -35,9 +35,7 @@ CASES = (
 
 
 def work(cls, effects, lanes):
-    """What the engine is given for so many parameter vectors on four runs; the whole call's
-    seconds beside it.
-    """
+    """Return the simulator, parameter vectors and scenarios of a batch on four runs."""
     rng = np.random.default_rng(2)
     t = np.arange(400) / 100
     simulator = cls(engine="batch", effects=effects)
@@ -55,7 +53,7 @@ def work(cls, effects, lanes):
 
 
 class Noted:
-    """An engine that notes how long it takes."""
+    """An engine that measures its own time."""
 
     def __init__(self, engine):
         self.engine, self.seconds = engine, 0.0
@@ -71,7 +69,7 @@ class Noted:
 
 
 def seconds(cls, effects, lanes, repeats=REPEATS):
-    """Processor seconds in numpy and in machine code: of the engine, of the whole call."""
+    """Return processor seconds (2, 2): NumPy and machine code, each for the engine and the call."""
     simulator, theta, scenarios = work(cls, effects, lanes)
     engines = [
         Noted(cls(engine="batch", compiled=compiled, effects=effects).engine)
@@ -84,13 +82,13 @@ def seconds(cls, effects, lanes, repeats=REPEATS):
             started = process_time()
             simulator.simulate_batch(theta, scenarios)
             found = engine.seconds, process_time() - started
-            if repeat:  # the first loads and traces
+            if repeat:  # The first call includes imports and tracing.
                 best[k] = np.minimum(best[k], found)
     return best
 
 
 def table():
-    """Rows of the table."""
+    """Yield the rows of the table."""
     yield "| system and effects | lanes | numpy, ms a lane | compiled | ratio | of the whole call |"
     yield "|---|---|---|---|---|---|"
     for cls, effects in CASES:
@@ -104,7 +102,7 @@ def table():
 
 
 def yardsticks():
-    """Rows of MuJoCo's own stepping."""
+    """Yield the rows of MuJoCo's own stepping."""
     for lanes in LANES:
         work = native(lanes)
         least = min(once(work, lanes)[0] for _ in range(REPEATS))

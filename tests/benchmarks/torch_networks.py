@@ -1,4 +1,4 @@
-"""A plugin: random search with torch loaded, as learned tuners have it, and no training."""
+"""Plugin with random search and torch loaded, as in learned tuners, without training."""
 
 import torch
 

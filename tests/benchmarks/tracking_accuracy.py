@@ -1,10 +1,10 @@
-"""How far the tracker is off on rendered drops, by the camera's distance and by the ball's speed,
-and how fast it is.
+"""Measure the error and the speed of the tracker on rendered drops.
 
-Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.tracking_accuracy --out DIR``; writes
-table.csv, drops.csv and a figure. Truth is the projection of the ball's centre through the camera
-model. Every drop has its own published camera, light, colours, noise and compression, and goes
-through a compressed video file.
+Errors are given by the distance of the camera and by the speed of the ball. Run with
+``OMP_NUM_THREADS=1 python -m tests.benchmarks.tracking_accuracy --out DIR``; writes table.csv,
+drops.csv and a figure. The truth is the projection of the ball's centre through the camera model.
+Every drop has its own published camera, light, colours, noise and compression, and is read from a
+compressed video file.
 """
 
 from __future__ import annotations
@@ -31,9 +31,7 @@ BINS = {"range [m]": [5, 7, 8.5, 10, 13], "speed [px/frame]": [0, 0.5, 1, 2, 4]}
 
 
 def one(seed, folder, count):
-    """A row for each of `count` frames of the drop of this seed, and the seconds that reading and
-    tracking took.
-    """
+    """Return a row for each of `count` frames of one drop, and a summary with frames per second."""
     times = np.arange(count) / RATE
     rng = np.random.default_rng([7, seed])
     camera, look = PinholeCamera.draw_published(rng), SceneAppearance.draw(rng)

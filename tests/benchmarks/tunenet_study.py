@@ -1,10 +1,10 @@
 """What limits the published TuneNet, step by step: ``python -m tests.benchmarks.tunenet_study
 [--out DIR]``.
 
-On the published bouncing ball (`ball-drop`): the published network and training are changed one
-thing at a time until they are this project's, and each of these things is taken away from this
-project's again. Then: sensor noise, an ensemble and its uncertainty, what training and one
-iteration cost. Writes tables (CSV) and figures; docs/tunenet.md says what they mean.
+On the published bouncing ball (`ball-drop`), the published network and training are changed one
+item at a time until they are this project's, and each item is then removed from this project's
+version. Further parts are sensor noise, an ensemble and its uncertainty, and the cost of training
+and of one iteration. Writes tables (CSV) and figures; docs/tunenet.md explains them.
 """
 
 import argparse
@@ -39,15 +39,16 @@ from methods.tuners.tunenet import MIN_STEP, BroydenSearch, TuneNet, TuneNetPubl
 AT = (1, 2, 3, 5, 10)
 SEEDS, TARGETS, MEMBERS = 2, 100, 5
 NOISE = 0.01
-"""Sensor noise of the noisy targets, m."""
+"""Sensor noise of the targets with noise, m."""
 OURS = PairNetworkDesign(epochs=300)
 RAW, WEIGHED = FeatureConfig(noise=0.0, raw=True), FeatureConfig(noise=0.0)
 
 
 @dataclass(eq=False)
 class Variant(PairTuner):
-    """A network, what it reads, how many scenarios and simulations in each it trains on, and the
-    step it takes.
+    """A network with its input features, training data and step.
+
+    `spread` is the number of training scenarios and of simulations in each.
     """
 
     name = "variant"
@@ -84,7 +85,7 @@ class Variant(PairTuner):
 
 
 def path():
-    """From the published network to this project's, one change added after another."""
+    """Return the variants from the published network to this project's; changes are cumulative."""
     sgd = replace(PUBLISHED_DESIGN)
     linear = replace(sgd, bounded=False)
     adam = replace(linear, adam=True, rate=3e-3, weight_decay=1e-5, epochs=300, batch=10)
@@ -106,7 +107,7 @@ def path():
 
 
 def without():
-    """This project's network with one thing taken away."""
+    """Return variants of this project's network with one item removed."""
     sgd = {
         "adam": False,
         "rate": 0.1,
@@ -134,7 +135,7 @@ def without():
 
 
 class Study:
-    """Targets and training simulations, made once."""
+    """Targets and training simulations, which are made once."""
 
     def __init__(self, targets=TARGETS):
         self.problem = TuningProblem(load_experiment("ball-drop").chosen(targets=targets))
@@ -158,8 +159,9 @@ class Study:
         return time.perf_counter() - begin
 
     def errors(self, tuner, budget=10, noise=0.0):
-        """Absolute errors, one row a target, a column a simulation; and seconds of the tuner for
-        each simulation.
+        """Return absolute errors, and the seconds of the tuner for each simulation.
+
+        Errors have one row per target and one column per simulation.
         """
         rows, seconds = [], []
         for target in self.targets:
@@ -187,7 +189,7 @@ class Study:
         return np.array(rows), seconds
 
     def rows(self, what, tuners, noise=0.0, seconds=0.0):
-        """Lines of a table: mean errors of trained tuners, one a seed, by range."""
+        """Return rows of a table: mean errors of trained tuners, one per seed, by range."""
         found = np.mean([self.errors(tuner, noise=noise)[0] for tuner in tuners], axis=0)
         kinds = np.array([target.blinded.range for target in self.targets])
         for kind in ("in", "wide"):
@@ -205,9 +207,7 @@ class Study:
 
 
 def ablation(study):
-    """Rows of every variant, each trained with every seed; and the first seed's trained variants by
-    name.
-    """
+    """Return rows of all variants over all seeds, and the tuners of the first seed by name."""
     rows, kept = [], {}
     for variant in [*path(), *without()]:
         trained = [replace(variant, members=[]) for _ in range(SEEDS)]
@@ -219,7 +219,7 @@ def ablation(study):
 
 
 def noisy(study, kept):
-    """Rows of targets with sensor noise."""
+    """Return rows of targets with sensor noise."""
     both = Variant("tunenet, with a second network for noise", OURS, FeatureConfig(noise=0.01))
     study.train(both, 0)
     variants = [kept["published"], kept["+ Broyden's step = tunenet"], both]
@@ -230,9 +230,7 @@ def noisy(study, kept):
 
 
 def ensemble(study):
-    """Rows of one network and of the mean of several; and how the members' spread foretells their
-    error.
-    """
+    """Return rows of one network and of an ensemble, and the spread and error of its members."""
     data, members = study.data((100, 8), 0), []
     for seed in range(MEMBERS):
         one = Variant(f"member {seed}")
@@ -263,9 +261,7 @@ def ensemble(study):
 
 
 def cost(study):
-    """Seconds of a whole training as `compare` makes it, and of one iteration beyond the
-    simulation.
-    """
+    """Return seconds of a training as in `compare`, and of one iteration without its simulation."""
     rows = []
     for tuner in (TuneNet(), TuneNetPublished()):
         begin = time.perf_counter()

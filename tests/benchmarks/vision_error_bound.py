@@ -1,8 +1,8 @@
-"""Why TuneNet on vision puts a table-tennis ball's restitution at its bound in a model that explain
-extended, and which training keeps it away from there.
+"""Find out why TuneNet on vision puts a ball's restitution at its bound in an extended model.
 
-The shots of a bounce shot's folder are tuned again, each in the model that explain extended for it,
-by networks that were trained otherwise; they are held against explain's own fit of the same model.
+The ball is a table-tennis ball, and explain extended the model. The study also shows which training
+avoids the error. The shots of a folder of bounce shots are tuned again, each in its extended model,
+by networks with other training data. The reference is explain's own fit of the same model.
 
     simgap compare AIR.toml --targets 20 --salt public --out results/air     # balls: table-tennis
     python -m tests.benchmarks.vision_error_bound results/air OUT.csv
@@ -34,7 +34,7 @@ FOUND = {
         "restitution.speed": [-0.07],
     },
 }
-"""Effects that explain found for a shot, and the coefficients that it found on the whole."""
+"""Effects that explain found for a shot, with typical coefficients."""
 TRAINED = {
     "as published": {},
     "over drag": {"nuisance": DRAG},
@@ -44,8 +44,8 @@ TRAINED = {
 
 
 def grounds(base, changes, entry):
-    """What a network is trained in, by the effects of the shots that it tunes; None for all."""
-    # at once: an entry that is randomised needs its effects
+    """Yield (effects of the shots, training experiment); the effects are None for all shots."""
+    # Select all at once, because a randomised entry needs its effects.
     base = base.chosen(**TRAINED[changes], tuners=(entry,))
     if "extended" not in changes:
         yield None, base
@@ -56,7 +56,7 @@ def grounds(base, changes, entry):
 
 
 def tuned(experiment, folder, shot, entry, weights, effects):
-    """The restitution that a network finds in the extended model of one shot."""
+    """Return the restitution that a network finds in the extended model of one shot."""
     path = folder / "recordings" / f"{shot}.csv"
     known = shot_planning.ShotInputs(shot, path, None, {VISION: weights})
     recording = read_recording(path, Ball, whole=True)
@@ -68,14 +68,14 @@ def tuned(experiment, folder, shot, entry, weights, effects):
 
 
 def rows(folder, base):
-    """A row for each training, seed and shot."""
+    """Yield a row for each training, seed and shot."""
     shots = pd.read_csv(folder / "shots.csv")
     own = shots[shots.method == shot_planning.EXPLAIN_METHOD].set_index("shot")
     for trained in TRAINED:
         entry = TunerEntry(VISION, VISION, randomised="over drag" in trained)
         for found, ground in grounds(base, trained, entry):
             before = shot_planning.make_tuning_experiment(ground, read_shot_config(ground), entry)
-            # the tuned simulator is the shot's own, whatever the network was trained in
+            # The tuned simulator is that of the shot, independent of the training of the network.
             plain = ground.chosen(settings=base.settings)
             for seed in range(SEEDS):
                 weights = train_or_load(before, TrainingRequest(entry, seed)).path

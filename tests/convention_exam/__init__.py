@@ -1,1 +1,1 @@
-"""Random logs with one convention broken, and sound ones."""
+"""Random logs with one broken convention, and correct logs."""

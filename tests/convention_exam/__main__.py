@@ -82,8 +82,10 @@ def _row(name, seed, broken, cause):
 
 
 def is_right(log, differences):
-    """Return whether the answer to a log is right: the broken convention first or among the
-    equally likely ones, with its joints and offset; nothing for a sound log.
+    """Return whether the answer to a log is right.
+
+    The broken convention must be first or among the equally likely ones, with its joints and
+    offset. For a correct log there must be no answer.
     """
     if log.broken is None:
         return not differences

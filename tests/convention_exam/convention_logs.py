@@ -1,6 +1,6 @@
 """Draw a random arm, move it in MuJoCo, and write its log with one convention broken or none.
 
-MuJoCo alone makes the motion, so that nothing of the code under test is in the data.
+MuJoCo alone makes the motion, so the data are independent of the code under test.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ BROKEN = (
     "wrapped",
     "late commands",
 )
-"""Conventions that are broken, one in each log."""
+"""Conventions to break, one in each log."""
 CAUSES = ("nothing", "friction", "damping", "delay", "offset", "mass", "stiffness")
-"""What is hidden in sound logs: causes, not conventions."""
+"""Causes in correct logs; they are not broken conventions."""
 RATE, SECONDS, RUNS, NOISE = 100.0, 3.0, 3, 5e-4
 TIMESTEP = 0.002
 
 
 @dataclass(frozen=True)
 class Log:
-    """A log that was written.
+    """A log on disk.
 
     Attributes:
-        path: of the table.
-        broken: the convention that is broken; None for a sound log.
-        cause: what is hidden in a sound log.
-        joints: numbers of the joints that are concerned.
-        size: of the offset, factor or delay.
+        path: path of the table.
+        broken: the broken convention; None for a correct log.
+        cause: hidden cause of a correct log.
+        joints: numbers of the affected joints.
+        size: size of the offset, factor or delay.
     """
 
     path: Path
@@ -57,9 +57,9 @@ def write_log(folder: Path, seed: int, broken: str | None, cause: str = "nothing
     """Draw an arm and write its log.
 
     Args:
-        folder: a new one.
-        seed: of all that is drawn.
-        broken: one of `BROKEN`; None for a sound log.
+        folder: a folder that does not exist yet.
+        seed: seed of everything that is drawn.
+        broken: one of `BROKEN`; None for a correct log.
         cause: one of `CAUSES`.
     """
     rng = np.random.default_rng([seed, 7])
@@ -94,7 +94,7 @@ def write_log(folder: Path, seed: int, broken: str | None, cause: str = "nothing
 
 
 def _axes(rng, joints):
-    """An axis for each joint; the first may be vertical, the others seldom are."""
+    """Draw an axis for each joint; the first is often vertical, the others seldom are."""
     kinds = ["0 0 1", "0 1 0", "1 0 0"]
     axes = [str(rng.choice(kinds, p=[0.6, 0.3, 0.1]))]
     for _ in range(joints - 1):
@@ -105,12 +105,12 @@ def _axes(rng, joints):
 
 
 def _felt(axes):
-    """Joints that gravity acts on: the others may be counted from any zero."""
+    """Return the joints on which gravity acts; the zero of the others cannot be identified."""
     return [i for i, axis in enumerate(axes) if axis == "0 1 0"] or [1]
 
 
 def _model(rng, axes, servo):
-    """The MJCF of an arm whose links bend out of line, so that every joint carries weight."""
+    """Return the MJCF of an arm whose links bend sideways, so every joint carries weight."""
     body, ends, tip = "", "", "0 0 0.2"
     for i, axis in enumerate(axes):
         length = float(rng.uniform(0.15, 0.35))
@@ -139,7 +139,7 @@ def _model(rng, axes, servo):
 
 
 def _hide(model, rng, cause, joint, servo):
-    """Put a cause into the model; returns its size."""
+    """Put a cause into the model and return its size."""
     if cause == "friction":
         size = float(rng.uniform(0.1, 0.8))
         model.dof_frictionloss[joint] = size
@@ -165,7 +165,7 @@ def _hide(model, rng, cause, joint, servo):
 
 
 def _run(model, rng, servo, cause, joint, size, travel):
-    """One run: positions, velocities and commands (T, D) at the samples."""
+    """Simulate one run: positions, velocities and commands (T, D) at the samples."""
     count, every = int(SECONDS * RATE) + 1, round(1.0 / RATE / TIMESTEP)
     joints = model.nv
     data = mujoco.MjData(model)
@@ -190,7 +190,7 @@ def _run(model, rng, servo, cause, joint, size, travel):
         if servo:
             u[k] = wanted
         else:
-            # Torques of a controller that knows gravity, and would be logged by it.
+            # Log the torques of a controller with gravity compensation.
             mujoco.mj_forward(model, data)
             torque = np.zeros((1, joints))
             wish = 60.0 * (wanted - data.qpos) - 12.0 * data.qvel
@@ -203,7 +203,7 @@ def _run(model, rng, servo, cause, joint, size, travel):
 
 
 def _break(rng, broken, joint, felt, q, qd, u, units, servo):
-    """Break a convention in place; returns the joints that are concerned, and the size."""
+    """Break a convention in place; return the affected joints and the size."""
     joints = q.shape[-1]
     other = int(rng.choice([i for i in range(joints) if i != joint]))
     if broken == "sign of position":

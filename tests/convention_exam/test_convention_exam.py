@@ -1,5 +1,6 @@
-"""Conventions of logs that MuJoCo alone made: broken ones are found and corrected, and causes are
-not taken for them.
+"""Tests of conventions in logs from MuJoCo.
+
+Broken conventions are found and corrected, and causes are not mistaken for them.
 """
 
 import math
@@ -35,9 +36,9 @@ SEEDS = {
     "wrapped": (10, "position q.j2 looks wrapped: whole turns are left out"),
     "late commands": (23, "commands look stamped 0.03 s late"),
 }
-"""By convention, the seed of a log that breaks it, and what is said of it."""
+"""By convention, the seed of a log that breaks it, and the expected message."""
 QUICK = ("exchanged positions",)
-"""Conventions that the fast tests look at."""
+"""Conventions of the fast tests."""
 
 
 def check(path):
@@ -80,16 +81,14 @@ def test_a_change_that_transforms_nothing_finds_nothing(tmp_path, monkeypatch):
 
 
 def test_soft_friction_is_no_other_zero(tmp_path):
-    """A rod that gravity turns, with friction in MuJoCo's soft form: another zero gains something,
-    and less than friction does.
-    """
+    """With MuJoCo's soft friction, another zero improves the fit less than friction does."""
     log = write_log(tmp_path / "log", 2002, None, "friction")
     comparison = check(log.path)
     assert comparison.differences() == []
 
 
 def test_a_model_that_diverges_between_samples_tells_nothing(tmp_path):
-    """Stamps in milliseconds read as seconds: in 20 s an unstable joint exceeds all numbers."""
+    """Milliseconds read as seconds: in 20 s an unstable joint exceeds the range of numbers."""
     model = valid_input.ARM.replace(b'name="hip"', b'name="hip" stiffness="-5e4"')
     (tmp_path / "arm.xml").write_bytes(model)
     (tmp_path / "log.csv").write_bytes(valid_input.logs()["log.csv"])
@@ -113,8 +112,10 @@ def test_whole_turns_are_put_back_beside_the_command():
 
 
 def test_the_corrected_description_reads_as_the_change_says(tmp_path):
-    """Numbers in degrees with a scale and an offset, of a joint that counts the other way round
-    from 0.5 rad: the new keys make -1 x the old value, plus 0.5 rad.
+    """The new keys make -1 times the old value, plus 0.5 rad.
+
+    The log has degrees with a scale and an offset. The joint counts in the opposite direction from
+    0.5 rad.
     """
     log = write_log(tmp_path / "log", 2001, None)
     path = log.path.with_suffix(".toml")

@@ -62,7 +62,7 @@ def _is_chosen(name, only):
 
 
 def _available(questions):
-    """The questions whose model files are installed; the others are printed."""
+    """Return the questions whose model files are installed, and print the others."""
     missing = {}
     for name in dict.fromkeys(q.robot for q in questions):
         try:
@@ -74,7 +74,7 @@ def _available(questions):
 
 
 def read_rows(path):
-    """Rows of items.jsonl; an incomplete last line is left out."""
+    """Return the rows of items.jsonl without an incomplete last line."""
     rows = []
     for line in path.read_text().splitlines() if path.exists() else ():
         try:

@@ -1,4 +1,4 @@
-"""Whether another cause follows the held-out run as well as the planted one.
+"""Compare the held-out error of other causes with the error of the planted one.
 
 The cause is put into plain MuJoCo, its coefficients are fitted to the runs for fitting, and its
 error on the held-out run is compared with the error of the planted cause. Initial states are
@@ -16,19 +16,21 @@ import numpy as np
 from tests.planted_causes.planted_items import rms
 from tests.planted_causes.planted_motion import HELD_OUT, RATE, RUNS, SAMPLES, Change, Run
 
-MAX_STEPS = 12  # Levenberg-Marquardt steps
-MAX_TRIALS = 8  # dampings that are tried in one step
+MAX_STEPS = 12  # Maximum number of Levenberg-Marquardt steps.
+MAX_TRIALS = 8  # Maximum number of damping values that are tried in one step.
 FIRST_DAMPING = 1e-3
-NUDGE = 1e-3  # finite difference, in units of the scaled coefficients
-CONVERGED = 1e-4  # scaled step that ends a fit
+NUDGE = 1e-3  # Finite-difference step, in units of the scaled coefficients.
+CONVERGED = 1e-4  # Scaled step at which a fit has converged.
 
 
 def held_out_ratios(item, names):
-    """Held-out error of causes as a multiple of the planted cause's; None where not expressible.
+    """Return the held-out errors of causes, divided by the error of the planted cause.
+
+    The result is None for a cause that plain MuJoCo cannot express.
 
     Args:
-        item: with the planted cause.
-        names: of causes, effect@place or effect@* for all places.
+        item: case with the planted cause.
+        names: causes, effect@place or effect@* for all places.
     """
     comparison = _Comparison(item)
     return {name: comparison.ratio(name) for name in names}
@@ -63,7 +65,7 @@ class _Comparison:
         return every if place == "*" else [p for p in every if p == place]
 
     def _residual(self, name, simulated):
-        """Residual of a run in units of the noise, without what an initial state explains."""
+        """Return the residual of a run in units of the noise, with initial states projected out."""
         flat = ((self.measured[name] - simulated) / self.experiment.sigma).ravel()
         basis = self.experiment.state_bases[name]
         return flat - basis @ (basis.T @ flat)
@@ -95,7 +97,7 @@ class _Comparison:
 
 
 def levenberg_marquardt(residual, numbers, lowest):
-    """Minimise the sum of squares of `residual(numbers)` above lower bounds."""
+    """Minimise the sum of squares of `residual(numbers)` subject to lower bounds."""
     now, damping = residual(numbers), FIRST_DAMPING
     for _ in range(MAX_STEPS):
         jacobian = np.stack(
@@ -108,7 +110,8 @@ def levenberg_marquardt(residual, numbers, lowest):
                 numbers - np.linalg.solve(normal + damping * scaling, gradient), lowest
             )
             result = residual(trial)
-            if result @ result <= now @ now:  # false for what is not finite
+            # The comparison is false for values that are not finite.
+            if result @ result <= now @ now:
                 break
             damping *= 8
         else:
@@ -128,9 +131,9 @@ class _Form:
     Attributes:
         units: scale of each coefficient, see `scale`.
         edit: (model, place, c) changes the compiled model.
-        step: (model, data, joint, c) acts before each step of the engine.
-        command: (c, commands (SAMPLES,)) returns what an actuator receives.
-        reading: (c, positions (SAMPLES,)) returns what a sensor shows.
+        step: (model, data, joint, c) is called before each step of the engine.
+        command: (c, commands (SAMPLES,)) returns the input of an actuator.
+        reading: (c, positions (SAMPLES,)) returns the reading of a sensor.
         at_least: (model, place) returns the lowest physical coefficients.
         begin: scaled coefficients at which the fit begins.
     """
@@ -144,7 +147,7 @@ class _Form:
     begin: tuple[float, ...] = (0.0,)
 
     def scale(self, experiment, place):
-        """Plausible sizes of the coefficients."""
+        """Return plausible sizes of the coefficients."""
         torque = max(0.05 * float(experiment.nominal_peaks.max()), 1e-6)
         sizes = {"ratio": 0.1, "time": 1.0 / RATE, "angle": 0.01, "speed": 0.1, "torque": torque}
         if "inertia" in self.units:
@@ -153,7 +156,7 @@ class _Form:
         return np.array([sizes[unit] for unit in self.units])
 
     def simulate(self, experiment, coefficients, run):
-        """Channels (SAMPLES, C) with the cause."""
+        """Return the channels (SAMPLES, C) with the cause."""
         simulator = experiment.simulator()
         model, commands = simulator.model, run.commands.copy()
         for place, c in coefficients.items():
@@ -191,7 +194,7 @@ class _Form:
 
 
 class _Joint:
-    """Addresses of a joint, and the dry friction that its file states."""
+    """Addresses of a joint, and the dry friction that its file specifies."""
 
     def __init__(self, model, name):
         self.position, self.dof = model.joint(name).qposadr[0], model.joint(name).dofadr[0]
@@ -199,7 +202,7 @@ class _Joint:
 
 
 def _force(law):
-    """A generalised force c -> law(c, q, v) at a joint."""
+    """Return a step function with the generalised force law(c, q, v) at a joint."""
 
     def step(model, data, joint, c):
         data.qfrc_applied[joint.dof] = law(c, data.qpos[joint.position], data.qvel[joint.dof])
@@ -217,7 +220,7 @@ def _planted(kind, unit, at_least):
 
 
 def _stiff_friction(model, place, c):
-    """Dry friction with a stiff solver reference, as simgap writes it into a file."""
+    """Add dry friction with a stiff solver reference, as simgap writes it into a file."""
     dof = model.joint(place).dofadr[0]
     model.dof_frictionloss[dof] += c[0]
     model.dof_solref[dof] = [-1e-9, -1250]
@@ -249,13 +252,13 @@ def _gravity_tilt(model, _, c):
 
 
 def _delayed(c, column):
-    """A signal that is late by a time, linear between samples."""
+    """Delay a signal by c[0] seconds, with linear interpolation between samples."""
     times = np.arange(column.size) / RATE
     return np.interp(times - c[0], times, column)
 
 
 def _lagged(c, column):
-    """First-order lag with a time constant (at least a thousandth of a second)."""
+    """Apply a first-order lag with time constant c[0], at least 0.001 s."""
     blend = 1 - np.exp(-1 / RATE / max(c[0], 1e-3))
     result, state = np.empty_like(column), column[0]
     for index, wanted in enumerate(column):
@@ -265,12 +268,12 @@ def _lagged(c, column):
 
 
 def _stated(field):
-    """Lowest difference of a number of a joint: minus what the file states."""
+    """Return the lower bound of a change of a joint's number: minus the value in the file."""
     return lambda model, place: -float(getattr(model, field)[model.joint(place).dofadr[0]])
 
 
 def _ratio(model, place):
-    """Lowest relative change of a positive number."""
+    """Return the lower bound of the relative change of a positive number."""
     return -0.95
 
 

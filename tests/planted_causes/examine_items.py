@@ -1,4 +1,4 @@
-"""One item examined: draw it, write its recording, have it explained, mark the answer."""
+"""Examine one case: draw it, write its recording, explain it, grade the answer."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from tests.planted_causes.planted_marking import mark
 
 
 def examine(question, simgap, folder, cpu_limit=run_explain.CPU_LIMIT):
-    """A row of items.jsonl.
+    """Return a row of items.jsonl.
 
     Args:
-        question: which item.
-        simgap: path of the command that is examined.
-        folder: where a folder for the recording and the answer is made.
+        question: specification of the case.
+        simgap: path of the examined command.
+        folder: parent of the folder for the recording and the answer.
         cpu_limit: processor seconds of the call.
     """
     row = {"item": question.name, "robot": question.robot, "kind": question.kind}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # MuJoCo warns of deprecated attributes of old files
+            # MuJoCo warns about deprecated attributes in old files.
+            warnings.simplefilter("ignore")
             item = draw(question)
             place = folder / question.name.replace("/", "-")
             table = planted_recording.write(item, place / "recording")

@@ -1,7 +1,7 @@
-"""The items of the planted-cause test, and how one is drawn.
+"""Benchmark cases of the planted-cause test.
 
-An item is a robot, a kind of number and a seed. Place, size, motion and noise are drawn from the
-seed. The size is scaled so that the gap lies between 3 and 30 times the noise.
+A case is a robot, a kind of number and a seed. Place, size, motion and noise are drawn from the
+seed. The size is scaled so that the model discrepancy is 3 to 30 times the noise.
 """
 
 from __future__ import annotations
@@ -26,37 +26,39 @@ from tests.planted_causes.planted_motion import (
 from tests.planted_causes.planted_robots import ROBOTS
 
 KINDS = tuple(EFFECTS)
-INVISIBLE = {("reacher", "mass")}  # the links are light against the armature of the joints
-DRAWS = 3  # items of each robot and kind
-GAP = (3.0, 30.0)  # smallest and largest gap, in multiples of the noise
-POSITION_NOISE = (1e-4, 2e-4, 3e-4)  # standard deviations to draw from, rad or m
-VELOCITY_NOISE = 2e-3  # standard deviation, rad/s or m/s
-VELOCITY_SHARE = 0.3  # share of items with velocities as channels
-SATURATED_SHARE = 0.5  # share of servo items with force limits that are reached in some runs
-FORMS = ("multisine", "steps", "both")  # motion of the runs r1, r2, r3
-STATE_STEP = 1e-5  # finite difference of an initial state, rad, m, rad/s or m/s
-MAX_GROWTH = 4.0  # of a deviation of the initial positions; beyond, the motion counts as chaotic
-MAX_SERVO_STEP = 1.0  # kv * timestep / inertia of a servo with a force limit
-MAX_SIZINGS = 8  # simulations of a size before the place is given up
-GAP_TOLERANCE = 0.15  # relative difference between the wanted gap and the accepted one
+# Masses of the links are small compared with the armature of the joints.
+INVISIBLE = {("reacher", "mass")}
+DRAWS = 3  # Cases for each robot and kind.
+GAP = (3.0, 30.0)  # Smallest and largest discrepancy, in multiples of the noise.
+POSITION_NOISE = (1e-4, 2e-4, 3e-4)  # Standard deviations of positions to draw from, rad or m.
+VELOCITY_NOISE = 2e-3  # Standard deviation of velocities, rad/s or m/s.
+VELOCITY_SHARE = 0.3  # Fraction of cases with velocity channels.
+SATURATED_SHARE = 0.5  # Fraction of servo cases with force limits that are reached in some runs.
+FORMS = ("multisine", "steps", "both")  # Motion of the runs r1, r2, r3.
+STATE_STEP = 1e-5  # Finite-difference step of an initial state, rad, m, rad/s or m/s.
+# Maximum growth of a deviation of the initial positions; above it, the motion is chaotic.
+MAX_GROWTH = 4.0
+MAX_SERVO_STEP = 1.0  # Maximum of kv * timestep / inertia for a servo with a force limit.
+MAX_SIZINGS = 8  # Maximum number of simulated sizes per place.
+GAP_TOLERANCE = 0.15  # Accepted relative difference between the wanted and the reached discrepancy.
 
-# Largest change of each kind. Armature and damping are related to the inertia M that the joint
+# Largest change of each kind. Armature and damping are relative to the inertia M that the joint
 # moves, the damping at a servo also to the servo's kv, friction to the torque of the motion.
-MAX_MASS = 2.0  # relative increase
-MAX_DECREASE = 0.7  # relative decrease of mass, kp, damping, friction or armature of the file
-MAX_KP = 1.0  # relative increase
-MAX_ARMATURE = 3.0  # multiples of M
-MAX_DAMPING = 100.0  # multiples of M per second, and multiples of kv for servos
-MAX_FRICTION = 0.8  # multiple of the largest torque at the joint
+MAX_MASS = 2.0  # Relative increase.
+MAX_DECREASE = 0.7  # Relative decrease of mass, kp, damping, friction or armature in the file.
+MAX_KP = 1.0  # Relative increase.
+MAX_ARMATURE = 3.0  # Multiples of M.
+MAX_DAMPING = 100.0  # Multiples of M per second, and multiples of kv for servos.
+MAX_FRICTION = 0.8  # Multiple of the largest torque at the joint.
 
 
 class UndrawableItemError(Exception):
-    """No place of the robot shows a change of this kind with the wanted gap."""
+    """No place of the robot shows a change of this kind with the wanted discrepancy."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """What identifies an item: robot, kind and number of the draw."""
+    """Specification of a case: robot, kind and number of the draw."""
 
     robot: str
     kind: str
@@ -68,7 +70,7 @@ class Question:
 
 
 def sheet():
-    """All questions, in an order that makes every first N a fair sample."""
+    """Return all questions in an order in which every first N are a fair sample."""
     questions = [
         Question(robot.name, kind, draw)
         for robot in ROBOTS.values()
@@ -84,19 +86,19 @@ class Item:
     """One recording with a planted cause.
 
     Attributes:
-        robot: name.
-        kind: of the number.
+        robot: name of the robot.
+        kind: kind of the changed number.
         draw: number of the draw.
         place: joint, body or actuator.
         size: see `Change`.
-        gap: of the recording, in multiples of the noise: root mean square over all samples and
-            channels of the difference that a fitted initial state leaves.
-        plain_gap: the same without a fitted initial state.
+        gap: RMS discrepancy over all samples and channels with fitted initial states, in multiples
+            of the noise.
+        plain_gap: RMS discrepancy without fitted initial states, in multiples of the noise.
         noise: standard deviation of positions, rad or m.
         with_velocities: whether velocities are channels.
         force_limits: by joint, N m or N.
         swing: factor of the robot's amplitude.
-        seed: of motion and noise.
+        seed: seed of motion and noise.
     """
 
     robot: str
@@ -131,11 +133,11 @@ class Item:
 
     @cached_property
     def truth(self):
-        """The experiment's runs on the changed robot: (runs, states) by name of the run."""
+        """Runs of the experiment on the changed robot: (runs, states) by name of the run."""
         return self.experiment.performed(self.change)
 
     def measured(self):
-        """Channels (SAMPLES, C) with noise, by name of the run."""
+        """Return channels (SAMPLES, C) with noise, by name of the run."""
         _, states = self.truth
         rng = np.random.default_rng([self.seed, 1])
         experiment = self.experiment
@@ -150,12 +152,12 @@ class Experiment:
     """A robot, its motions and its sensors, without a change.
 
     Args:
-        robot: name.
-        seed: of the motion.
+        robot: name of the robot.
+        seed: seed of the motion.
         noise: standard deviation of positions.
         with_velocities: whether velocities are channels.
         swing: factor of the robot's amplitude.
-        force_limits: of servos, by joint.
+        force_limits: force limits of servos, by joint.
     """
 
     def __init__(self, robot, seed, noise, with_velocities, swing=1.0, force_limits=None):
@@ -182,14 +184,14 @@ class Experiment:
         self.with_velocities = with_velocities
 
     def _is_carried(self, body):
-        """Whether a driven joint carries the body, as opposed to a target or an object."""
+        """Return whether a driven joint carries the body; targets and objects have none."""
         driven = self.model.jnt_bodyid[self.model.actuator_trnid[:, 0]]
         while body and body not in driven:
             body = self.model.body_parentid[body]
         return bool(body)
 
     def _amplitudes(self):
-        """Amplitudes (nu,) that stay inside the joints' ranges."""
+        """Return amplitudes (nu,) that stay inside the joints' ranges."""
         joints = self.model.actuator_trnid[:, 0]
         limited = self.model.jnt_limited[joints].astype(bool)
         room = np.abs(self.model.jnt_range[joints] - self.pose[self.operator.positions, None])
@@ -205,7 +207,7 @@ class Experiment:
         return states[:, self.columns]
 
     def performed(self, change):
-        """Perform the runs on the changed robot: ({name: Run}, {name: states}).
+        """Simulate the runs on the changed robot: ({name: Run}, {name: states}).
 
         Raises:
             ObstructedMotionError: if a contact or a joint limit is active.
@@ -220,7 +222,7 @@ class Experiment:
         return runs, states
 
     def difference(self, change):
-        """What the file's model misses, in multiples of the noise, by run (SAMPLES, C)."""
+        """Return the error of the unchanged model in units of the noise, (SAMPLES, C) by run."""
         runs, states = self.performed(change)
         simulator = self.simulator()
         return {
@@ -230,7 +232,7 @@ class Experiment:
 
     @cached_property
     def state_responses(self):
-        """Derivatives (SAMPLES, C, nq + nv) of the channels by the initial state, by run."""
+        """Derivatives (SAMPLES, C, nq + nv) of the channels by the initial state, for each run."""
         runs, _ = self.performed(None)
         simulator = self.simulator()
         responses = {}
@@ -246,10 +248,10 @@ class Experiment:
         return responses
 
     def growth(self, change=None):
-        """Deviation of later states, in multiples of a deviation of the initial positions.
+        """Return the growth of a deviation of the initial positions.
 
         The initial positions deviate by 1e-4 rad. Later deviations (root mean square after the
-        first tenth of a second) are counted in 1e-4 rad and, of velocities, in 2e-3 rad/s.
+        first tenth of a second) are counted in units of 1e-4 rad and, for velocities, 2e-3 rad/s.
         """
         runs, states = self.performed(change)
         simulator, largest = self.simulator(change), 0.0
@@ -273,7 +275,7 @@ class Experiment:
         return bases
 
     def gaps(self, change):
-        """(gap with fitted initial states, gap without), in multiples of the noise."""
+        """Return (gap with fitted initial states, gap without), in multiples of the noise."""
         plain, fitted = [], []
         for name, values in self.difference(change).items():
             flat, basis = values.ravel(), self.state_bases[name]
@@ -283,7 +285,7 @@ class Experiment:
 
     @cached_property
     def nominal_peaks(self):
-        """Largest joint torque by run (runs, nu), of the model of the file."""
+        """Largest joint torque of the unchanged model by run, (runs, nu)."""
         runs, _ = self.performed(None)
         simulator, rows = self.simulator(), []
         for run in runs.values():
@@ -306,7 +308,7 @@ class ObstructedMotionError(Exception):
 
 
 def draw(question):
-    """Draw the item of a question.
+    """Draw the case of a question.
 
     Raises:
         UndrawableItemError: if no place shows the change.
@@ -324,7 +326,7 @@ def draw(question):
         limited = Experiment(question.robot, seed, noise, with_velocities, swing, limits)
         if _is_simple(limited):
             experiment = limited
-        else:  # the limited servos chatter or let the robot fall
+        else:  # The limited servos chatter or the robot falls.
             limits = {}
     for place in rng.permutation(_places(experiment, question.kind)):
         signs = rng.permutation([1.0, -1.0])
@@ -343,7 +345,7 @@ def draw(question):
 
 
 def _untouched(robot, seed, noise, with_velocities):
-    """The experiment with the largest amplitude whose motion is simple."""
+    """Return the experiment with the largest amplitude whose motion is simple."""
     for swing in (1.0, 0.7, 0.5, 0.35):
         experiment = Experiment(robot, seed, noise, with_velocities, swing)
         if _is_simple(experiment):
@@ -354,7 +356,7 @@ def _untouched(robot, seed, noise, with_velocities):
 
 
 def _is_simple(experiment, change=None):
-    """Whether the motion is free of contacts and joint limits, and is not chaotic."""
+    """Return whether the motion is free of contacts and joint limits, and is not chaotic."""
     try:
         return experiment.growth(change) <= MAX_GROWTH
     except ObstructedMotionError:
@@ -362,10 +364,10 @@ def _is_simple(experiment, change=None):
 
 
 def _force_limits(experiment, peaks):
-    """Limits (N m or N, by joint) that the quieter runs keep and the livelier runs reach.
+    """Return limits (N m or N, by joint) that only the faster runs reach.
 
-    A servo that reaches its limit chatters from step to step where kv * timestep / inertia is
-    large, so joints with little inertia have no limit.
+    A servo at its limit chatters from step to step if kv * timestep / inertia is large, so joints
+    with little inertia have no limit.
     """
     model = experiment.model
     dofs, joints = experiment.operator.dofs, model.actuator_trnid[:, 0]
@@ -379,7 +381,7 @@ def _force_limits(experiment, peaks):
 
 
 def _places(experiment, kind):
-    """Joints, bodies or actuators that the motion concerns."""
+    """Return the joints, bodies or actuators that the motion affects."""
     model = experiment.model
     if kind == "kp":
         return [model.actuator(i).name for i in range(model.nu)]
@@ -389,7 +391,7 @@ def _places(experiment, kind):
 
 
 def _largest(experiment, kind, place, sign, torques):
-    """Size of the largest plausible change of this sign; 0 where there is none."""
+    """Return the size of the largest plausible change of this sign; 0 if there is none."""
     model, operator = experiment.model, experiment.operator
     if kind == "mass":
         return MAX_MASS if sign > 0 else MAX_DECREASE
@@ -415,7 +417,7 @@ def _largest(experiment, kind, place, sign, torques):
 
 
 def _sized(experiment, kind, place, largest, wanted):
-    """(size, gap, plain gap) with about the wanted gap; None where the place cannot show one."""
+    """Return (size, gap, plain gap) near the wanted gap; None if the place cannot show one."""
 
     def gaps(size):
         try:
@@ -431,7 +433,7 @@ def _sized(experiment, kind, place, largest, wanted):
         if found is None or found[0] > wanted * (1 + GAP_TOLERANCE):
             high = size
         elif found[0] < wanted * (1 - GAP_TOLERANCE):
-            if size == largest:  # the largest change shows less than wanted
+            if size == largest:  # Even the largest change shows less than wanted.
                 break
             low = size
         else:

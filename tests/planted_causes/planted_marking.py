@@ -1,15 +1,15 @@
-"""Marks an answer of ``simgap explain`` on an item.
+"""Grade an answer of ``simgap explain`` on a case.
 
-| outcome | when |
+| outcome | condition |
 |---|---|
 | right | the planted cause is named alone, and its number is right |
 | number | the planted cause is named alone with a wrong number |
-| set | the planted cause is in a set that is said to explain the data equally well |
+| set | the planted cause is in a set of causes reported as equivalent |
 | partial | the planted cause is the only one, but the verdict is `partial` |
 | extra | the planted cause is named, and another cause in addition |
 | place | the effect is named at another place |
-| wrong | something else is named |
-| unnamed | a gap is seen, and no cause is named |
+| wrong | another cause is named |
+| unnamed | a discrepancy is detected, and no cause is named |
 | missed | the verdict is `adequate` |
 | none | there is no answer: an error, or the limit of processor time |
 """
@@ -18,24 +18,24 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 
-MAX_SET = 4  # causes in a set that still tells something
-EQUAL_RATIO = 1.05  # held-out errors whose ratio is at most this are equal
-TOLERANCE = 0.05  # relative error of a right number
+MAX_SET = 4  # Maximum size of a set that is still informative.
+EQUAL_RATIO = 1.05  # Held-out errors are equal if their ratio is at most this value.
+TOLERANCE = 0.05  # Relative error of a right number.
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What an answer is worth.
+    """Grade of an answer.
 
     Attributes:
-        outcome: see this module.
-        causes: of the answer, alternatives joined by "|".
-        number: coefficient of the planted cause; None where the answer states none.
-        is_number_right: whether it is within 5 % or its 95 % interval holds the truth; None
-            where there is no number.
-        members: causes of the set that holds the planted cause.
-        ratios: of a set, by other member: its held-out error, refitted with plain MuJoCo, as a
-            multiple of the error of the planted cause; None where plain MuJoCo cannot express it.
+        outcome: see the table of this module.
+        causes: causes of the answer, alternatives joined by "|".
+        number: coefficient of the planted cause; None if the answer contains none.
+        is_number_right: whether it is within 5 % or its 95 % interval holds the truth; None if
+            there is no number.
+        members: count of causes in the set that holds the planted cause.
+        ratios: by other member of a set, its held-out error, refitted with plain MuJoCo, divided by
+            the error of the planted cause; None if plain MuJoCo cannot express it.
     """
 
     outcome: str
@@ -47,12 +47,12 @@ class Mark:
 
     @property
     def strict(self):
-        """Named alone with the right number."""
+        """True if the cause is named alone with the right number."""
         return self.outcome == "right"
 
     @property
     def fair(self):
-        """Named alone, or in a set of at most `MAX_SET` whose other members are as good."""
+        """True if the cause is named alone, or in a set of at most `MAX_SET` equal members."""
         if self.strict:
             return True
         equal = all(ratio is not None and ratio <= EQUAL_RATIO for ratio in self.ratios.values())
@@ -69,13 +69,13 @@ class Mark:
 
 
 def mark(effect, size, verdict, held_out_ratios=None):
-    """Mark one answer.
+    """Grade one answer.
 
     Args:
-        effect: planted, as effect@place.
+        effect: planted cause as effect@place.
         size: planted coefficient in the effect's definition.
-        verdict: document of verdict.json; None for no answer.
-        held_out_ratios: called with the other members of a set, returns `Mark.ratios`.
+        verdict: document of verdict.json; None if there is no answer.
+        held_out_ratios: function from the other members of a set to `Mark.ratios`.
     """
     if verdict is None:
         return Mark("none")
@@ -108,7 +108,7 @@ def mark(effect, size, verdict, held_out_ratios=None):
 
 
 def _number(cause, effect, size):
-    """(coefficient of the planted cause, whether it is right), None where none is stated."""
+    """Return (coefficient of the planted cause, whether it is right), or (None, None)."""
     if cause["effect"] != effect:
         return None, None
     estimate = next(iter(cause["coefficients"].values()))

@@ -1,4 +1,4 @@
-"""Commands, and the motion that plain MuJoCo makes of them: ``mujoco.mj_step`` and nothing else."""
+"""Commands, and the motion that ``mujoco.mj_step`` alone makes from them."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-RATE = 100  # samples per second
-SECONDS = 3.0  # duration of a run
+RATE = 100  # Samples per second.
+SECONDS = 3.0  # Duration of a run, s.
 SAMPLES = round(RATE * SECONDS) + 1
 RUNS = ("r1", "r2", "r3")
 HELD_OUT = "r3"
-SETTLE_SAMPLES = 300  # samples during which the robot settles before a run begins
+SETTLE_SAMPLES = 300  # Samples before a run, in which the robot comes to rest.
 
-BANDWIDTH = 2 * np.pi * 3.0  # of the position loop that computes motor torques, rad/s
-DAMPING_RATIO = 0.7  # of the same loop
+BANDWIDTH = 2 * np.pi * 3.0  # Bandwidth of the position loop that computes motor torques, rad/s.
+DAMPING_RATIO = 0.7  # Damping ratio of this position loop.
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Change:
 
     @property
     def effect(self):
-        """The change in simgap's words, `effect@place`."""
+        """The change in simgap's notation, `effect@place`."""
         return f"{EFFECTS[self.kind]}@{self.place}"
 
     def apply(self, model):
@@ -69,10 +69,10 @@ DOF_FIELDS = {
 
 @dataclass(frozen=True)
 class Run:
-    """What is known of a run apart from the model.
+    """Commands and initial state of a run.
 
     Attributes:
-        commands: controls (SAMPLES, nu) held from one sample to the next.
+        commands: controls (SAMPLES, nu), held from one sample to the next.
         positions: initial qpos (nq,).
         velocities: initial qvel (nv,).
     """
@@ -83,12 +83,12 @@ class Run:
 
 
 def reference(kind, count, rng):
-    """Positions (SAMPLES, count) between about -1 and 1 that start at 0.
+    """Return reference positions (SAMPLES, count) between about -1 and 1 that start at 0.
 
     Args:
         kind: "multisine", "steps" (smooth ones) or "both".
         count: number of joints.
-        rng: draws phases, frequencies and targets.
+        rng: random generator for phases, frequencies and targets.
     """
     times = np.arange(SAMPLES) / RATE
     columns = []
@@ -106,12 +106,13 @@ def reference(kind, count, rng):
 
 
 def _smooth_steps(times, rng):
-    """Minimum-jerk movements between random targets."""
+    """Return minimum-jerk movements between random targets."""
     column, begin, level = np.zeros(times.size), rng.uniform(0.1, 0.3), 0.0
     while begin < times[-1]:
         target, duration = rng.uniform(-1, 1), rng.uniform(0.15, 0.4)
         phase = np.clip((times - begin) / duration, 0, 1)
-        blend = phase**3 * (10 - 15 * phase + 6 * phase**2)  # minimum jerk, Flash & Hogan 1985
+        # Minimum-jerk polynomial (Flash & Hogan 1985).
+        blend = phase**3 * (10 - 15 * phase + 6 * phase**2)
         column += (target - level) * blend
         begin, level = begin + duration + rng.uniform(0.1, 0.4), target
     return column
@@ -121,8 +122,8 @@ class Simulator:
     """A compiled model that is simulated with plain MuJoCo.
 
     Args:
-        model: compiled.
-        watched: bodies whose contacts and joint limits count as touching.
+        model: compiled model.
+        watched: bodies whose contacts and joint limits set `touches`.
     """
 
     def __init__(self, model, watched):
@@ -130,7 +131,7 @@ class Simulator:
         self.geoms = np.isin(model.geom_bodyid, watched)
         self.joints = np.isin(model.jnt_bodyid, watched)
         self.steps = round(1 / RATE / model.opt.timestep)
-        self.touches = False  # whether a contact or a joint limit was active since `start`
+        self.touches = False  # Whether a contact or a joint limit was active since `start`.
         if not np.isclose(self.steps * model.opt.timestep, 1 / RATE):
             raise ValueError(f"timestep {model.opt.timestep} s does not divide 1/{RATE} s")
 
@@ -149,7 +150,7 @@ class Simulator:
         self.touches |= bool(self.joints[self.data.efc_id[limited]].any())
 
     def simulate(self, run):
-        """Positions and velocities (SAMPLES, nq + nv) of a run."""
+        """Return positions and velocities (SAMPLES, nq + nv) of a run."""
         self.start(run.positions, run.velocities)
         states = np.empty((SAMPLES, self.model.nq + self.model.nv))
         for sample in range(SAMPLES):
@@ -162,11 +163,11 @@ class Simulator:
 class Operator:
     """Makes the robot follow reference positions.
 
-    Servos receive the reference. Motors receive the torques of a position loop, as from a
-    controller of the user's; the torques are part of the recording.
+    Servos receive the reference. Motors receive the torques of a position loop, as from a user's
+    controller; the torques are part of the recording.
 
     Args:
-        model: with the numbers of the file; gains of the position loop are derived from it.
+        model: model with the numbers of the file, from which the gains of the loop are derived.
         is_servo: whether actuators are position servos.
         pose: qpos (nq,).
     """
@@ -180,25 +181,25 @@ class Operator:
         low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
         high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
         self.range = low, high
-        # A joint's inertia while the other joints are free; with the larger inertia of locked
-        # joints the sampled loop would chatter.
+        # Use the inertia of a joint while the other joints are free. With the larger inertia of
+        # locked joints the sampled loop would chatter.
         inertia = 1 / np.diag(np.linalg.inv(mass_matrix(model, pose)))[self.dofs]
         self.kp = BANDWIDTH**2 * inertia + 2 * model.jnt_stiffness[joints]
         self.kv = 2 * DAMPING_RATIO * np.sqrt(self.kp * inertia)
 
     def command(self, data, wanted):
-        """Controls (nu,) for the wanted positions of the driven joints."""
+        """Return controls (nu,) for the wanted positions of the driven joints."""
         if self.is_servo:
             return np.clip(wanted, *self.range)
         torque = self.kp * (wanted - data.qpos[self.positions]) - self.kv * data.qvel[self.dofs]
         command = np.clip(torque / self.gear, *self.range)
-        return np.array([float(f"{value:.9g}") for value in command])  # as the table states it
+        return np.array([float(f"{value:.9g}") for value in command])  # Round as in the table.
 
     def drive(self, simulator, begin, references):
-        """The run that results: settle at the first reference, then follow the references.
+        """Let the robot settle at the first reference, then follow all, and return the run.
 
         Args:
-            simulator: of the robot as it really is.
+            simulator: simulator of the changed robot.
             begin: qpos (nq,) before settling.
             references: positions of driven joints (SAMPLES, nu).
         """
@@ -216,7 +217,7 @@ class Operator:
 
 
 def mass_matrix(model, pose):
-    """Mass matrix (nv, nv) at qpos."""
+    """Return the mass matrix (nv, nv) at qpos."""
     data = mujoco.MjData(model)
     data.qpos[:] = pose
     mujoco.mj_forward(model, data)

@@ -1,4 +1,4 @@
-"""An item as a user's files: model, table and description."""
+"""Write a case as the files of a user: model, table and description."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write(item, folder):
 
 
 def digest(folder):
-    """SHA-256 of all files of a recording: equal digests mean equal items."""
+    """Return a SHA-256 hash of all files of a recording; equal hashes mean equal cases."""
     content = b"".join(path.read_bytes() for path in sorted(folder.iterdir()))
     return hashlib.sha256(content).hexdigest()[:16]
 

@@ -1,4 +1,4 @@
-"""Tables of the planted-cause test: one row an item, and shares by version, robot and kind."""
+"""Tables of the planted-cause test: one row per case, and shares by version, robot and kind."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import csv
 
 import numpy as np
 
-MIN_ITEMS = 100  # items of a complete test
-MIN_SHARE = 0.9  # share of fair answers
-MAX_MEDIAN_CPU = 5.0  # processor seconds of an answer at the median
+MIN_ITEMS = 100  # Minimum number of cases of a complete test.
+MIN_SHARE = 0.9  # Minimum share of fair answers.
+MAX_MEDIAN_CPU = 5.0  # Maximum median of the processor seconds of an answer.
 COLUMNS = (
     "item", "version", "place", "size", "gap", "outcome", "strict", "fair", "verdict", "causes",
     "number", "other_members", "cpu_s", "wall_s", "memory_mb", "heldout_base",
@@ -65,7 +65,7 @@ def _number(value):
 
 
 def groups(rows):
-    """Counts and times: all items of a version, by robot, by kind, and with force limits."""
+    """Return counts and times: all cases of a version, by robot, by kind, and with force limits."""
     result = []
     for version in dict.fromkeys(row["version"] for row in rows):
         drawn = [r for r in rows if r["version"] == version and r["drawn"]]
@@ -96,7 +96,7 @@ def _group(version, name, rows):
 
 
 def text(rows):
-    """The tables as aligned text."""
+    """Return the tables as aligned text."""
     lines = []
     for version in dict.fromkeys(row["version"] for row in rows):
         for row in rows:
@@ -118,7 +118,7 @@ def text(rows):
 
 
 def verdict(total):
-    """Whether a version reaches the marks, from its row of all items."""
+    """Return a line that says whether a version reaches the targets, from its row of all cases."""
     share, seconds = total["fair"] / total["items"], float(total["cpu_median_s"])
     is_reached = total["items"] >= MIN_ITEMS and share >= MIN_SHARE and seconds <= MAX_MEDIAN_CPU
     return (

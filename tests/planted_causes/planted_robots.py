@@ -1,8 +1,8 @@
-"""Model files of installed packages that the planted-cause test examines.
+"""Model files of installed packages for the planted-cause test.
 
-Each robot is the file as its package ships it, with the few edits that a user would make: a trunk
-is fixed to a stand, shapes of a URDF are removed, fingers are locked, motors are replaced by
-position servos.
+Each robot is the file from its package, with the few edits that a user would make: a trunk is fixed
+to a stand, shapes of a URDF are removed, fingers are locked, motors are replaced by position
+servos.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STIFF_SERVO = (2000.0, 100.0)
 
 
 class MissingModelError(Exception):
-    """The package that ships a model file is not installed."""
+    """The package that contains a model file is not installed."""
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,17 @@ class Robot:
     """A model file and how it is driven.
 
     Attributes:
-        name: of the robot in this test.
-        package: that ships the file: "gymnasium", "example-robot-data" or "pybullet_data".
-        path: of the file inside the package.
+        name: name of the robot in this test.
+        package: package of the file: "gymnasium", "example-robot-data" or "pybullet_data".
+        path: path of the file inside the package.
         drive: "motor" or "servo".
-        pose: by joint, the position about which the joint moves (rad or m); 0 where missing.
+        pose: position around which each joint moves (rad or m), by joint; the default is 0.
         swing: amplitude of the commanded motion, rad or m.
         gains: kp and kv of every servo.
         locked: joints that are removed (MJCF) or fixed (URDF).
-        driven: joints with a drive; every joint that has none listed is driven where it is empty.
-        engine: timestep (s) and integrator; the file's own where it is None.
-        height: z of the root body of an MJCF, m, where a stand raises it.
+        driven: joints with a drive; if empty, every joint.
+        engine: timestep (s) and integrator; the file's own if None.
+        height: z of the root body of an MJCF on a stand, m.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Robot:
 
     @cached_property
     def text(self):
-        """The model file that the recording is published with (without servos of a URDF)."""
+        """Text of the model file in the recording (without the servos of a URDF)."""
         tree = ElementTree.fromstring(self.source().read_text())
         (self._edit_urdf if self.is_urdf else self._edit_mjcf)(tree)
         ElementTree.indent(tree)
@@ -113,7 +113,7 @@ class Robot:
             option = tree.find("option")
             option.set("timestep", f"{self.engine[0]}")
             option.set("integrator", self.engine[1])
-        if self.drive == "servo":  # motors of the file are replaced; forcerange is added later
+        if self.drive == "servo":  # Replace the motors of the file; forcerange is added later.
             joints = [motor.get("joint") for motor in tree.find("actuator")]
             tree.remove(tree.find("actuator"))
             actuator = ElementTree.SubElement(tree, "actuator")
@@ -134,7 +134,7 @@ class Robot:
                     motor.set("name", f"m_{motor.get('joint')}")
 
     def model_text(self, force_limits):
-        """Text of the published model file with the servos' force limits.
+        """Return the text of the recording's model file with the servos' force limits.
 
         Args:
             force_limits: by joint, N m or N; those of a URDF are in the description instead.
@@ -151,7 +151,7 @@ class Robot:
         return ElementTree.tostring(tree, encoding="unicode") + "\n"
 
     def compile(self, force_limits=None):
-        """Compile the model with plain MuJoCo, actuators of the description included."""
+        """Compile the model with plain MuJoCo, including actuators of the description."""
         import mujoco
 
         limits = force_limits or {}
@@ -175,7 +175,7 @@ class Robot:
         return spec.compile()
 
     def about(self, model):
-        """The positions (nq,) about which the robot moves."""
+        """Return the positions (nq,) around which the robot moves."""
         pose = np.array(model.qpos0)
         for name, value in self.pose.items():
             pose[model.joint(name).qposadr[0]] = value

@@ -1,4 +1,4 @@
-"""Runs ``simgap explain`` of an installation under a limit of processor time, and measures it."""
+"""Run ``simgap explain`` of an installation with a limit of processor time, and measure it."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-CPU_LIMIT = 120.0  # processor seconds of one call, all of its processes together
-WALL_FACTOR = 10.0  # a call that waits is ended after this multiple of the limit
+CPU_LIMIT = 120.0  # Maximum processor seconds of one call, summed over its processes.
+WALL_FACTOR = 10.0  # A call that waits is ended after this multiple of the limit.
 POLL_SECONDS = 0.1
-RUNNING = set()  # process groups of calls that are running
+RUNNING = set()  # Process groups of running calls.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a call of ``simgap explain`` returned and what it took.
+    """Result and resources of a call of ``simgap explain``.
 
     Attributes:
-        verdict: verdict.json without candidates and reports; None where there is none.
-        code: exit code; None where the call was ended at its limit.
+        verdict: verdict.json without candidates; None if there is none.
+        code: exit code; None if the call was ended at its limit.
         cpu: user and system seconds of all processes of the call.
         wall: elapsed seconds.
         memory: peak resident memory of the largest process, MB.
-        output: what the call printed.
+        output: output of the call.
     """
 
     verdict: dict | None
@@ -42,7 +42,7 @@ class Outcome:
 
     @property
     def message(self):
-        """Last lines that a call without a verdict printed."""
+        """Last lines of the output of a call without a verdict."""
         return "" if self.verdict else "\n".join(self.output.strip().splitlines()[-6:])[-1500:]
 
     def json(self):
@@ -50,7 +50,7 @@ class Outcome:
 
 
 def parser_of(program, description, out):
-    """Return a parser with the options that programs have in common which examine an installation.
+    """Return a parser with the common options of programs that examine an installation.
 
     Args:
         program: module that is run, as in ``python -m PROGRAM``.
@@ -84,9 +84,9 @@ def explain(simgap, recording, out, cpu_limit=CPU_LIMIT, options=("--jobs", "1")
     """Run ``SIMGAP explain RECORDING --out OUT``.
 
     Args:
-        simgap: path of the command of the installation that is examined.
-        recording: path of the table or of the description; several where it is a list.
-        out: folder that the command writes.
+        simgap: path of the command of the examined installation.
+        recording: path of the table or of the description, or a list of paths.
+        out: output folder of the command.
         cpu_limit: processor seconds after which the call is ended.
         options: further options of the command.
     """
@@ -134,7 +134,7 @@ def explain(simgap, recording, out, cpu_limit=CPU_LIMIT, options=("--jobs", "1")
 
 
 def end_when_terminated():
-    """Make SIGTERM and Ctrl-C of this program end its running calls as well."""
+    """Make SIGTERM and Ctrl-C of this program also end its running calls."""
 
     def end(number, frame):
         for group in RUNNING:
@@ -146,7 +146,7 @@ def end_when_terminated():
 
 
 def _tree_usage(pid):
-    """Processor seconds and peak resident MB of a process and its descendants."""
+    """Return processor seconds and peak resident MB of a process and its descendants."""
     import psutil
 
     try:
@@ -161,7 +161,7 @@ def _tree_usage(pid):
             resident = max(resident, process.memory_info().rss / 2**20)
         except psutil.NoSuchProcess:
             continue
-        # Children that have ended are counted by their parent once it has waited for them.
+        # The parent includes the times of ended children after it has waited for them.
         seconds += times.user + times.system + times.children_user + times.children_system
     return seconds, resident
 
@@ -174,9 +174,9 @@ def _verdict(path):
 
 
 def version_of(simgap):
-    """Name of the version of an installation: the commit of its source, or its release.
+    """Return the version of an installation: the commit of its source, or its release.
 
-    A "+" follows the commit where tracked files of the source differ from it.
+    A "+" follows the commit if tracked files of the source differ from it.
     """
     code = (
         "import bench, importlib.metadata as m; print(bench.__file__); print(m.version('simgap'))"

@@ -1,4 +1,4 @@
-"""Other causes, refitted with plain MuJoCo."""
+"""Tests of other causes that are refitted with plain MuJoCo."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 
 def test_a_twin_is_as_good_and_another_cause_is_not():
-    # A cart on a slide: its mass and the armature of the slide are the same in all data.
+    # For a cart on a slide, its mass and the armature of the slide have the same effect.
     item = drawn("double-pendulum-cart/armature/2")
     assert item.place == "slider"
     ratios = held_out_ratios(

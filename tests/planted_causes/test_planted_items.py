@@ -1,4 +1,4 @@
-"""Items: their data are what plain MuJoCo makes of the changed file."""
+"""Tests of planted cases: plain MuJoCo with the changed file makes the same data."""
 
 import csv
 from xml.etree import ElementTree
@@ -12,7 +12,7 @@ from tests.planted_causes.planted_items import GAP, Question, draw, rms, sheet
 from tests.planted_causes.planted_motion import Change
 from tests.planted_causes.planted_robots import ROBOTS, MissingModelError, Robot
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # MuJoCo's, about old files
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # MuJoCo warns about old files.
 
 
 def drawn(name):
@@ -34,7 +34,7 @@ def table(path):
 
 
 def changed_xml(path, item):
-    """The recording's MJCF with the planted number written into its text."""
+    """Return the recording's MJCF with the planted number written into its text."""
     tree = ElementTree.parse(path)
     defaults = tree.find("default/joint")
     if item.kind == "kp":
@@ -48,9 +48,10 @@ def changed_xml(path, item):
 
 
 def errors(model, item, path):
-    """Difference of a recorded table and a simulation that this test makes itself, in noises.
+    """Return the RMS of recorded minus simulated positions in units of the noise.
 
-    The recorded commands are held between rows. Runs begin in the state of the item.
+    This test makes the simulation itself. The recorded commands are held between rows. Runs begin
+    in the initial state of the case.
     """
     joints, differences = item.experiment.joints, []
     runs, _ = item.truth

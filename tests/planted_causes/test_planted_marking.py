@@ -1,4 +1,4 @@
-"""Marks of right answers and of deliberately wrong ones."""
+"""Tests of the grades of right and of deliberately wrong answers."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Shares and marks of the planted-cause test."""
+"""Tests of the shares and targets of the planted-cause test."""
 
 import pytest
 

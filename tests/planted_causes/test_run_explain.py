@@ -1,4 +1,4 @@
-"""Calls of a command are measured, limited, and resumed."""
+"""Tests that calls of the command are measured, limited and resumed."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ BURN = "import time\nwhile time.process_time() < {seconds}: sum(range(10000))\n"
 
 
 def command(path, body):
-    """An executable that stands for simgap; `out` is the folder of --out."""
+    """Write an executable that replaces simgap; `out` is the folder of --out."""
     path.write_text(
         f"#!{sys.executable}\nimport json, pathlib, subprocess, sys\n"
         f"out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1])\n{body}\n"
@@ -33,7 +33,7 @@ def test_an_answer_and_the_time_of_all_processes(tmp_path):
     assert outcome.code == 0
     assert 0.7 <= outcome.cpu < 2.0
     assert outcome.wall > 0.3
-    # A child counts the pages of the process that started it, before it becomes the command.
+    # A child also counts the memory pages of its parent until it executes the command.
     assert outcome.memory > 5
 
 
@@ -63,7 +63,7 @@ def test_an_interrupted_test_continues(tmp_path, capsys):
     given = ["--simgap", str(simgap), "--out", str(out), "--only", "reacher/damping"]
     assert main([*given, "--version", "one", "--count", "1"]) == 0
     with (out / "items.jsonl").open("a") as file:
-        file.write('{"item": "cut o')  # as an interruption leaves it
+        file.write('{"item": "cut o')  # An interruption leaves an incomplete line.
     assert main([*given, "--version", "one", "--count", "2"]) == 0
     assert calls.read_text() == "xx"
     assert main([*given, "--version", "two", "--count", "1"]) == 0

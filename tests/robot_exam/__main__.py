@@ -21,7 +21,7 @@ from pathlib import Path
 from tests.robot_exam import robot_answers, robot_exam_report, robot_questions
 from tests.simple_exam.__main__ import ALONE, _before
 
-LIMIT = 900  # seconds for drawing, writing, explaining and marking one question
+LIMIT = 900  # Maximum seconds to draw, record, explain and grade one question.
 
 
 def main(arguments):
@@ -30,7 +30,7 @@ def main(arguments):
     path, drawn = given.out / "items.jsonl", [robot_questions.digest(), given.seed_offset]
     sheet = robot_questions.quick() if given.quick else robot_questions.sheet()
     sheet = robot_questions.spread() if given.spread else sheet
-    # In no order of what is asked, so that what is answered early is a fair sample.
+    # Sort by hash, so that the questions answered first are a fair sample.
     sheet = sorted(sheet, key=lambda q: hashlib.sha256(q.name.encode()).digest())
     asked = [q for q in sheet if not given.only or fnmatch(q.name, f"{given.only}*")]
     rows = {name: row for name, row in _before(path).items() if row.get("drawn") == drawn}
@@ -89,7 +89,7 @@ def _ask(asked, path, known, drawn, given):
 def _row(future, question, known):
     try:
         return future.result()
-    except Exception as error:  # a worker that was killed or took too long costs one question
+    except Exception as error:  # A worker that was killed or timed out costs one question only.
         return robot_answers.lost(
             question, known.get(question.name), f"{type(error).__name__}: {error}"
         )

@@ -1,6 +1,7 @@
-"""How large a hidden cause has to be: the gap that it leaves once initial states are refitted.
+"""Scale a hidden cause until its model discrepancy has the wanted size.
 
-All of it by the world that also makes the data, in coarser steps.
+Initial states are refitted. The simulations use the reference world that also makes the data, with
+longer steps.
 """
 
 from __future__ import annotations
@@ -12,15 +13,18 @@ from tests.robot_exam.exam_settings import FITTED
 from tests.robot_exam.reference_world import COARSE, World
 from tests.robot_exam.sensor_models import observed
 
-ACCURATE = 0.03  # of the wanted size
+ACCURATE = 0.03  # Relative tolerance of the size that is reached.
 LARGEST, LEAP = 1.0, 8.0
-NARROW = 0.98  # of two strengths, between which nothing more is looked for
-NUDGE = 1e-3  # of an initial state, rad or rad/s: the motion is smooth in it
-SETTLED = 1.2  # seconds after which a servo has forgotten where it began
+NARROW = 0.98  # Stop the search when the bracket of strengths is narrower than this ratio.
+NUDGE = 1e-3  # Finite-difference step of an initial state, rad or rad/s.
+SETTLED = 1.2  # Seconds after which a servo no longer depends on its initial state.
 
 
 class Gauge:
-    """Measures gaps of a setting's runs for fitting, or of those held out, in noises."""
+    """Measure model discrepancies of the fitted or held-out runs of a setting.
+
+    Discrepancies are in units of the noise standard deviation.
+    """
 
     def __init__(self, setting, held_out=False):
         self.setting = setting
@@ -33,7 +37,7 @@ class Gauge:
         ]
 
     def seen(self, effects):
-        """Noiseless observations in noises, one (T, C) a run."""
+        """Return noise-free observations in units of the noise, one (T, C) per run."""
         world = World(
             self.setting.machine, effects, causes_outside_library.plant_of(effects), self.step
         )
@@ -44,29 +48,41 @@ class Gauge:
         ]
 
     def change(self, effects):
-        """What effects change, with what initial states can take up taken out, one (N,) a run."""
+        """Return the change that effects cause, one (N,) per run.
+
+        The part that initial states can explain is projected out.
+        """
         return self.beyond_states(self.seen(effects))
 
     def beyond_states(self, seen):
-        """How observations, one (T, C) a run, differ from the base beyond initial states."""
+        """Return the difference of observations from the base, one (N,) per run.
+
+        The part that initial states can explain is projected out.
+
+        Args:
+            seen: observations in units of the noise, one (T, C) per run.
+        """
         differences = [
             (after - before).ravel() for after, before in zip(seen, self.base, strict=True)
         ]
         return [d - basis @ (basis.T @ d) for d, basis in zip(differences, self.free, strict=True)]
 
     def gap(self, effects, beyond=()):
-        """The gap: root mean square over runs, samples and channels; with `beyond`, what another
-        change makes, one (N,) a run, that to this one.
+        """Return the RMS discrepancy over runs, samples and channels.
+
+        Args:
+            effects: coefficients by effect@place.
+            beyond: changes that are subtracted first, one (N,) per run.
         """
         try:
             changes = self.change(effects)
             others = beyond or [np.zeros_like(change) for change in changes]
             return rms(np.concatenate([c - b for c, b in zip(changes, others, strict=True)]))
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
-            return np.inf  # it diverged
+            return np.inf  # The simulation diverged.
 
     def _states(self, run, base):
-        """An orthonormal basis (N, S) of what the initial state changes."""
+        """Return an orthonormal basis (N, S) of the changes that initial states cause."""
         machine = self.setting.machine
         servo = bool(machine.drives[0].kp)
         count = run.times.searchsorted(SETTLED) if servo else run.times.size
@@ -92,8 +108,9 @@ def rms(values):
 
 
 def left(change, others):
-    """What the best sum of other changes leaves of one, root mean square; each (N,). What is not
-    finite leaves all.
+    """Return the RMS of a change (N,) after a least-squares fit of other changes, each (N,).
+
+    Other changes that are not finite are left out.
     """
     others = [other for other in others if np.isfinite(other).all()]
     if not others:
@@ -103,10 +120,10 @@ def left(change, others):
 
 
 def sized(gap, wanted, first=0.03):
-    """(strength, gap) at which `gap(strength)`, which grows from zero, is `wanted`; None if it is
-    not below `LARGEST`.
+    """Return (strength, gap) at which `gap(strength)` is `wanted`, or None.
 
-    Secants on logarithmic scales, within a bracket once there is one.
+    `gap` grows from zero. The result is None if the strength would be `LARGEST` or more. The method
+    is the secant method on logarithmic scales, inside a bracket once there is one.
     """
     low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(12):
@@ -120,13 +137,13 @@ def sized(gap, wanted, first=0.03):
         else:
             high = strength, now
         if low[0] > NARROW * high[0]:
-            return None  # it jumps: a servo that begins to swing
+            return None  # The discrepancy jumps, for example because a servo begins to oscillate.
         strength = float(min(_between(low, high, wanted), LARGEST))
     return None
 
 
 def _between(low, high, wanted):
-    """The next strength to try, given (strength, gap) on either side of what is wanted."""
+    """Return the next strength to try, given (strength, gap) below and above the wanted one."""
     if not low[0]:
         known = np.isfinite(high[1])
         return high[0] * min(max(wanted / high[1], 1e-2), 0.9) if known else high[0] / 5

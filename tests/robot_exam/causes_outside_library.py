@@ -1,5 +1,7 @@
-"""Causes that the library does not have: friction that another joint heats, teeth that lag, a
-binding range, a slipping encoder.
+"""Causes that the effect library does not contain.
+
+They are friction that the work of another joint heats, cogging with hysteresis, friction in a part
+of the range, and a slipping encoder.
 """
 
 from __future__ import annotations
@@ -10,19 +12,22 @@ from tests.robot_exam.reference_plant import Binding, Cogging, Heated
 
 
 def drawn(cause, joint, setting, rng):
-    """What is hidden, by strength: keyword arguments for `hidden` of a question.
+    """Return a function from strength to keyword arguments, the hidden cause of a question.
 
     Args:
-        cause: of `causes.FOREIGN`.
-        joint: its index.
-        setting: of the recording.
-        rng: draws its shape.
+        cause: one of `planted_effects.FOREIGN`.
+        joint: index of the joint.
+        setting: setting of the recording.
+        rng: random generator for the shape of the cause.
     """
     return DRAWN[cause](joint, setting, rng)
 
 
 def _heated(joint, setting, rng):
-    """By the work of another joint, in a second or two; its heat is 1 at the usual power."""
+    """Draw friction that the work of another joint heats, with a time constant of 0.5 to 2 s.
+
+    At the typical power the equilibrium heat is 1.
+    """
     others = [k for k in setting.machine.driven if k != joint]
     other = int(rng.choice(others)) if others else joint
     power = float(setting.typical["force"][other] * setting.typical["speed"][other])
@@ -31,14 +36,14 @@ def _heated(joint, setting, rng):
 
 
 def _cogging(joint, setting, rng):
-    """A few teeth over the travel."""
+    """Draw three to eight teeth over the travel."""
     tooth = float(setting.typical["travel"][joint] / rng.uniform(3.0, 8.0))
     force = float(setting.typical["force"][joint])
     return lambda strength: {"cogging": (joint, 2 * force * strength, tooth)}
 
 
 def _binding(joint, setting, rng):
-    """About a place that the joint passes often, over a part of its travel."""
+    """Draw friction around a position that the joint often passes, over a part of its travel."""
     path = np.concatenate([motion[:, joint] for motion in setting.bare])
     centre = float(np.quantile(path, rng.uniform(0.3, 0.7)))
     half = float(setting.typical["travel"][joint] * rng.uniform(0.08, 0.2))
@@ -47,7 +52,7 @@ def _binding(joint, setting, rng):
 
 
 def _slip(joint, setting, rng):
-    """A jump or two in every run: (joint, jump, instants of the first run, of the second, ...)."""
+    """Draw one or two jumps per run: (joint, run, time, jump, run, time, jump, ...)."""
     seconds = setting.runs[0].times[-1]
     jumps = []
     for number in range(len(setting.runs)):
@@ -66,7 +71,7 @@ DRAWN = {"heated": _heated, "cogging": _cogging, "binding": _binding, "slip": _s
 
 
 def plant_of(effects):
-    """What is foreign in the plant; None where nothing is."""
+    """Return the unmodelled cause that acts in the plant, or None."""
     if "heated" in effects:
         joint, other, *rest = effects["heated"]
         return Heated(int(joint), int(other), *rest)
@@ -80,7 +85,7 @@ def plant_of(effects):
 
 
 def slips_of(effects, number):
-    """(joint, instant, jump) of the encoder in a run."""
+    """Return the encoder jumps of a run as tuples (joint, time, jump)."""
     if "slip" not in effects:
         return ()
     joint, *rest = effects["slip"]

@@ -1,6 +1,4 @@
-"""What the robots are told to do: multisines, ramps and holds, steps, chirps; each begins at
-zero.
-"""
+"""Command signals of the robots: multisine, ramps, steps and chirp; each begins at zero."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ FORMS = ("multisine", "ramps", "steps", "chirp")
 
 
 def wave(form, times, rng):
-    """A signal of amplitude 1 at most, (T,)."""
+    """Return a signal (T,) whose largest amplitude is 1."""
     signal = SIGNALS[form](times, rng)
     eased = np.clip(times / 0.4, 0.0, 1.0)
     return signal / max(np.abs(signal).max(), 1e-12) * eased**2 * (3 - 2 * eased)
@@ -23,14 +21,14 @@ def _multisine(times, rng):
 
 
 def _levels(times, rng):
-    """Random levels, one after another: (instants, levels)."""
+    """Draw random levels: (start times, levels)."""
     count = int(rng.integers(4, 8))
     begins = np.sort(rng.uniform(0.1, times[-1] - 0.3, count))
     return begins, rng.uniform(-1.0, 1.0, count)
 
 
 def _ramps(times, rng):
-    """From level to level at a steady pace, then a hold."""
+    """Return ramps of constant rate between random levels, with a hold after each."""
     begins, levels = _levels(times, rng)
     ends = np.minimum(begins + rng.uniform(0.2, 0.8, begins.size), [*begins[1:], times[-1]])
     knots = np.column_stack([begins, ends]).ravel()

@@ -1,5 +1,6 @@
-"""Whether another cause would have done as well: refitted in the world that made the data, and
-compared on the runs held out.
+"""Compare other causes with the true one on the held-out runs.
+
+Each cause is refitted in the reference world that made the data.
 """
 
 from __future__ import annotations
@@ -12,18 +13,20 @@ from tests.robot_exam.exam_settings import FITTED
 from tests.robot_exam.robot_items import rng_of
 
 ROUNDS = 5
-SHAPES = 4  # that are drawn of an effect that has one, the best is taken
-FIRST = 0.05  # of what is plausible, where the fit begins
+SHAPES = 4  # Shapes that are drawn for an effect with shape parameters; the best one counts.
+FIRST = 0.05  # Start of the fit, as a fraction of the largest plausible value.
 NUDGE = 0.02
 
 
 class Rivals:
-    """Held-out errors of causes, fitted to one recording, in noises.
+    """Compute held-out errors of causes that are fitted to one recording.
+
+    Errors are in units of the noise standard deviation.
 
     Args:
-        setting: of the recording.
-        effects: what was hidden.
-        recorded: every run, (T, C).
+        setting: setting of the recording.
+        effects: hidden effects, coefficients by effect@place.
+        recorded: recorded channels of every run, (T, C).
     """
 
     def __init__(self, setting, effects, recorded):
@@ -34,23 +37,24 @@ class Rivals:
         self.unseen = np.concatenate(self.held.beyond_states(values[FITTED:]))
 
     def truth(self):
-        """The held-out error of what was hidden, as it is."""
+        """Return the held-out error of the hidden effects with their true coefficients."""
         return self._error(self.effects)
 
     def ratio(self, name, beside=()):
-        """The held-out error with the cause of this name, fitted, as a multiple of the truth's;
-        None where this world does not have it.
+        """Return the held-out error of a fitted cause, divided by the error of the truth.
+
+        The result is None if the reference world does not contain the cause.
 
         Args:
             name: effect@place, or effect@* for every place.
-            beside: names of what was hidden that stay as they are.
+            beside: names of hidden effects that keep their true coefficients.
         """
         others = {key: self.effects[key] for key in beside}
         errors = [self._fitted(of, count, others) for of, count in self._forms(name)]
         return min(errors) / self.truth() if errors else None
 
     def _forms(self, name):
-        """(effects by scaled numbers, how many of them there are), one for each drawn shape."""
+        """Yield (function from scaled numbers to effects, count of numbers) for each shape."""
         effect, _, place = name.partition("@")
         machine = self.setting.machine
         known = planted_effects.effects("servo" if machine.drives[0].kp else "motor")
@@ -106,4 +110,4 @@ FREE = {
     "friction.load_direction": 2, "friction.load_quadratic": 2,
     "friction.position": 3, "friction.warming": 2,
 }  # fmt: skip
-"""Numbers that are fitted; those behind them shape the effect."""
+"""Count of the leading coefficients that are fitted; the others are shape parameters."""

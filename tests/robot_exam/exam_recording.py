@@ -1,4 +1,4 @@
-"""An item as its files: recording, description, and the robot's file beside them."""
+"""Write a benchmark case as files: recording, description and the robot's model file."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ FORCES = {"rad": "N*m", "m": "N"}
 
 
 def realise(item, folder):
-    """Write recording.csv, recording.toml and robot.urdf; the path of the first. Nothing in them
-    tells what is hidden.
+    """Write recording.csv, recording.toml and robot.urdf, and return the path of the first.
+
+    No file reveals the hidden cause.
     """
     setting, folder = setting_of(item.name), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -31,7 +32,7 @@ def realise(item, folder):
 
 
 def recorded(item):
-    """Every run as recorded, (T, C)."""
+    """Return the recorded channels of every run, (T, C)."""
     setting, rng = setting_of(item.name), rng_of(item.name, "noise")
     world = World(setting.machine, _library(item), causes_outside_library.plant_of(item.effects))
     values = []
@@ -58,7 +59,7 @@ def _table(item, setting):
 
 
 def described(setting):
-    """The recording's toml."""
+    """Return the text of the recording's TOML description."""
     machine = setting.machine
     lines = ['model = "robot.urdf"', "", "[engine]", f"timestep = {machine.step}"]
     lines += [f'integrator = "{machine.integrator}"', ""]

@@ -1,4 +1,4 @@
-"""Robots as their files describe them: a URDF, actuators, the engine's settings."""
+"""Robots as their files describe them: URDF, actuators and engine settings."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ class Drive:
     """An actuator of one joint.
 
     Attributes:
-        joint: its name.
-        kind: motor (the control is a force) or position (kp (u - q) - kv v).
-        kp, kv: of a position servo.
-        force: the largest force.
+        joint: name of the joint.
+        kind: motor (the control is a force) or position (force kp (u - q) - kv v).
+        kp, kv: gains of a position servo.
+        force: largest force, N m or N.
     """
 
     joint: str
@@ -33,14 +33,14 @@ class Drive:
 
 @dataclass(frozen=True)
 class Machine:
-    """A robot.
+    """A robot with its actuators and engine settings.
 
     Attributes:
-        name: says where it comes from and how it is driven.
-        urdf: the text of its file.
-        drives: an actuator for each joint that has one.
-        pose: positions about which it moves, (N,), rad or m.
-        step, integrator: of MuJoCo, as the recording states them.
+        name: model and drive, as in `robot_models.NAMES`.
+        urdf: text of the URDF file.
+        drives: one actuator for each driven joint.
+        pose: positions around which the robot moves, (N,), rad or m.
+        step, integrator: MuJoCo settings that the recording specifies.
     """
 
     name: str
@@ -56,32 +56,32 @@ class Machine:
 
     @cached_property
     def joints(self):
-        """Names in Pinocchio's order."""
+        """Joint names in Pinocchio's order."""
         return tuple(self.model().names)[1:]
 
     @cached_property
     def bodies(self):
-        """The link that each joint moves, in the same order."""
+        """The link that each joint moves, in the order of `joints`."""
         child = {j.get("name"): j.find("child").get("link") for j in self._tree.findall("joint")}
         return tuple(child[name] for name in self.joints)
 
     @property
     def driven(self):
-        """Indices of the joints that have an actuator, in the actuators' order."""
+        """Indices of the joints with an actuator, in the order of the actuators."""
         return [self.joints.index(drive.joint) for drive in self.drives]
 
     def before(self, joint):
-        """Index of the joint that carries the one of this index; -1 where none of its kind does."""
+        """Return the index of the parent joint; -1 if there is none of the same unit."""
         index = int(self.model().parents[joint + 1]) - 1
         kinds = [self.unit(self.joints[k]) for k in (index, joint)] if index >= 0 else [0, 1]
         return index if kinds[0] == kinds[1] else -1
 
     def unit(self, joint):
-        """Of a joint's position."""
+        """Return the unit of the position of a joint."""
         return "m" if self._joint(joint).get("type") == "prismatic" else "rad"
 
     def range(self, joint):
-        """Lowest and highest position."""
+        """Return the lowest and the highest position of a joint."""
         limit = self._joint(joint).find("limit")
         if limit is None or self._joint(joint).get("type") == "continuous":
             return -np.inf, np.inf
@@ -89,7 +89,7 @@ class Machine:
         return (low, high) if high > low else (-np.inf, np.inf)
 
     def stated(self):
-        """(damping, dry friction) of every joint, as the file says."""
+        """Return (damping, dry friction) of every joint as the file specifies them."""
         found = [self._joint(name).find("dynamics") for name in self.joints]
         return [
             (0.0, 0.0) if d is None else (float(d.get("damping", 0)), float(d.get("friction", 0)))
@@ -97,8 +97,9 @@ class Machine:
         ]
 
     def index(self, place):
-        """The joint that a place belongs to: its own name, its body's, its actuator's, a
-        channel's.
+        """Return the index of the joint to which a place belongs.
+
+        A place is the name of a joint, a body, an actuator or a channel.
         """
         for name in (place, place.removeprefix("m_"), place.partition(".")[2]):
             if name in self.joints:
@@ -108,7 +109,10 @@ class Machine:
         raise KeyError(place)
 
     def model(self):
-        """A new model of Pinocchio, gravity downwards; joints without end are unwrapped angles."""
+        """Build a new Pinocchio model with gravity downwards.
+
+        Continuous joints become revolute joints with unwrapped angles.
+        """
         import pinocchio
 
         text = self.urdf.replace('type="continuous"', 'type="revolute"')
@@ -127,11 +131,11 @@ class Machine:
 
 
 def plain(text, locked=(), mount=None):
-    """A URDF without shapes, some joints locked, its root turned.
+    """Return a URDF without geometry, with some joints locked and the root rotated.
 
     Args:
-        text: of the file.
-        locked: joints that become fixed.
+        text: text of the file.
+        locked: names of joints that become fixed.
         mount: roll, pitch and yaw of the root, rad.
     """
     tree = ElementTree.fromstring(text)

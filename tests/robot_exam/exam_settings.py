@@ -1,4 +1,4 @@
-"""The circumstances of a robot's recordings, drawn from a seed: machine, runs, channels, noise."""
+"""Recording conditions of a robot, drawn from a seed: machine, runs, channels and noise."""
 
 from __future__ import annotations
 
@@ -15,24 +15,26 @@ from tests.robot_exam.sensor_models import NOISES
 
 RATE, SECONDS = 100, 4.0
 FITTED, HELD_OUT = 4, 2
-QUIET = 0.1  # of the noise: what MuJoCo's own numerics may cost where they are not the cause
-STEPS = (0.002, 0.001, 0.0005, 0.00025)  # of MuJoCo's Runge-Kutta, the first that is quiet
+# Largest error of MuJoCo's numerics where they are not the cause, in units of the noise.
+QUIET = 0.1
+# Time steps in s tried with MuJoCo's Runge-Kutta; the first one below QUIET is used.
+STEPS = (0.002, 0.001, 0.0005, 0.00025)
 COARSER = ((0.005, "Euler"), (0.002, "Euler"), (0.01, "implicitfast"), (0.01, "Euler"))
-SPARE = 0.8  # of an actuator's force
+SPARE = 0.8  # Largest fraction of an actuator's force that a motion may use.
 
 
 @dataclass(frozen=True)
 class Setting:
-    """All of a recording but what is hidden in it.
+    """All conditions of a recording except the hidden cause.
 
     Attributes:
-        machine: the robot as its file says.
-        runs: those for fitting, then those held out.
-        channels: what is recorded.
-        noise: of the sensors.
-        bare: noiseless motion of every run with nothing hidden, positions (T, N).
-        typical: scales of the bare motion, by name, each (N,).
-        numerics: what MuJoCo's own numerics leave, in noises.
+        machine: the robot as its file describes it.
+        runs: runs for fitting, followed by the held-out runs.
+        channels: names of the recorded channels.
+        noise: sensor noise.
+        bare: noise-free positions of every run without a hidden cause, (T, N).
+        typical: scales of the bare motion by name, each (N,).
+        numerics: error of MuJoCo's numerics in units of the noise.
     """
 
     machine: Machine
@@ -53,10 +55,17 @@ class Setting:
 
 
 def setting(name, rng, coarse=False, noise=None):
-    """A setting of a robot of `robot_models.NAMES`; with `coarse`, MuJoCo's numerics are the cause.
+    """Draw a setting of a robot.
+
+    Args:
+        name: one of `robot_models.NAMES`.
+        rng: random generator.
+        coarse: whether MuJoCo's numerics are the hidden cause.
+        noise: kind of noise; drawn if None.
 
     Raises:
-        ValueError: no step of those that are tried is quiet, or coarse enough.
+        ValueError: if no tried step has a small enough numerical error or, with `coarse`, a large
+            enough one.
     """
     machine = robot_models.machine(name, rng)
     times = np.arange(round(RATE * SECONDS) + 1) / RATE
@@ -78,7 +87,10 @@ def setting(name, rng, coarse=False, noise=None):
 
 
 def _run(machine, form, times, rng):
-    """A run, and its motion with nothing hidden, within limits of force and range."""
+    """Draw a run and return it with its motion without a hidden cause.
+
+    Commands are scaled until the motion stays within the limits of force and range.
+    """
     pose, plant = np.array(machine.pose), World(machine).plant
     hold, moved = plant.needed(pose, 0 * pose), np.diag(plant.inertia(pose))
     servo = machine.drives[0].kind == "position"
@@ -106,13 +118,13 @@ def _run(machine, form, times, rng):
 
 
 def _reach(machine, pose):
-    """How far each joint may go from its pose."""
+    """Return how far each joint may move away from its pose."""
     limits = np.array([machine.range(name) for name in machine.joints])
     return 0.8 * np.minimum(np.abs(limits[:, 0] - pose), np.abs(limits[:, 1] - pose))
 
 
 def _over(machine, motion, pose, reach, wanted):
-    """By what factor a motion goes too far."""
+    """Return the factor by which a motion exceeds its limits."""
     far = np.abs(motion.q - pose).max(axis=0)
     if not np.isfinite(far).all():
         return 10.0
@@ -123,7 +135,7 @@ def _over(machine, motion, pose, reach, wanted):
 
 
 def _channels(machine, motions, sigma, rng):
-    """Positions always; now and then speeds or the actuators' forces beside them."""
+    """Draw the channels: positions, and in some settings velocities or actuator forces."""
     names, noise = [], {}
     for joint in machine.joints:
         names.append(f"q.{joint}")
@@ -141,7 +153,7 @@ def _channels(machine, motions, sigma, rng):
 
 
 def _typical(machine, motions):
-    """Scales of a motion by joint: travel, speed, what moves it, and what it moves."""
+    """Return scales of a motion by joint: force, speed, travel, position and inertia."""
     world = World(machine)
     force, speed, travel, away = [], [], [], []
     for motion in motions:
@@ -162,8 +174,10 @@ def _typical(machine, motions):
 
 
 def _stepped(machine, runs, motions, noises, coarse, rng):
-    """The machine with a step of MuJoCo at which its numerics do not show in any channel, or do in
-    all; and how much they leave, in noises.
+    """Return the machine with a MuJoCo step, and the error of its numerics in units of the noise.
+
+    Without `coarse` the error is below `QUIET` in every channel; with it, the RMS error is 3 to
+    300.
     """
     choices = COARSER if coarse else tuple((step, "RK4") for step in STEPS)
     order = rng.permutation(len(choices)).tolist() if coarse else range(len(choices))
@@ -177,7 +191,13 @@ def _stepped(machine, runs, motions, noises, coarse, rng):
 
 
 def _missed(machine, moved, noises):
-    """By how much MuJoCo misses what each channel shows, RMS in noises; (run, motion) pairs."""
+    """Return the RMS error of MuJoCo in each channel, in units of the noise.
+
+    Args:
+        machine: robot with the step and integrator to test.
+        moved: pairs (run, motion of the reference world).
+        noises: noise standard deviation by channel.
+    """
     drives, gaps = Drives.of(machine), []
     for run, motion in moved:
         q, v = reference_answers.moved(machine, run)

@@ -1,4 +1,4 @@
-"""Commands as the actuators feel them, and the forces that they make of them."""
+"""Effects on commands, and the actuator forces that result."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ COUPLING = "joint.coupling@"
 class Felt:
     """A command on its way to an actuator.
 
-    It passes gain, power, bias, dead band, saturation, a limit of its rate, delay, a servo's motion
-    profile, its D term and lag, in this order; it is constant from one stamp to the next, and
-    before the first it has the first value.
+    The order of the effects is: gain, power, bias, dead band, saturation, rate limit, delay, motion
+    profile of a servo, its D term, lag. The command is constant between time stamps; before the
+    first stamp it has its first value.
     """
 
     times: np.ndarray
@@ -52,25 +52,25 @@ class Felt:
         if self.profile:
             values, begins = profiled(values, begins, self.profile)
         if self.derivative:
-            # what a D term makes of a jump lasts as long as its rate is taken over
+            # The D term takes a rate over `derivative` seconds, so a jump acts for that time.
             both = np.unique(np.concatenate([begins, begins + self.derivative]))
             now, before = (_held(begins, values, both - late) for late in (0.0, self.derivative))
             values, begins = 2 * now - before, both
         self.values, self.begins = values, begins
 
     def at(self, t):
-        """What arrives at t, before the lag; a value holds from its stamp on."""
+        """Return the signal at time t before the lag (zero-order hold)."""
         place = np.searchsorted(self.begins, t + 1e-9, side="right") - 1
         return self.values[max(place, 0)]
 
 
 def _held(begins, values, t):
-    """What holds at instants; before the first stamp the first value."""
+    """Return zero-order-hold values at given times; before the first stamp, the first value."""
     return values[np.maximum(np.searchsorted(begins, t + 1e-9, side="right") - 1, 0)]
 
 
 def _slewed(values, times, most):
-    """What follows no faster than `most` a second, held over a millisecond each."""
+    """Limit the rate of a signal to `most` per second; results are held for 1 ms each."""
     fine = np.arange(times[0], times[-1] + 1e-3, 1e-3)
     wanted, state, risen = _held(times, values, fine), values[0], []
     for level in wanted.tolist():
@@ -81,8 +81,9 @@ def _slewed(values, times, most):
 
 
 def profiled(values, times, most):
-    """What goes to each value in the shortest time with accelerations of `most`, and arrives at
-    rest; held over a millisecond each, at its middle.
+    """Return time-optimal moves to each value with acceleration limit `most`.
+
+    Moves arrive at rest. Each result is held for 1 ms and is the value at the middle of this time.
     """
     fine = np.arange(times[0], times[-1] + 1.0, 1e-3)
     place, speed, went = values[0], 0.0, []
@@ -97,7 +98,13 @@ def profiled(values, times, most):
 
 
 def _shortest(x, v, most, t):
-    """A double integrator's way to rest at zero in the shortest time, and its speed, at t."""
+    """Return position and speed of a double integrator on its time-optimal way to rest at zero.
+
+    Args:
+        x, v: initial position and speed.
+        most: largest acceleration.
+        t: times.
+    """
     way = -np.sign(x + v * abs(v) / (2 * most)) or -np.sign(v) or 1.0
     x, v = way * x, way * v
     peak = np.sqrt(max(v**2 / 2 - most * x, 0.0))
@@ -109,7 +116,7 @@ def _shortest(x, v, most, t):
 
 
 def felt(machine, times, commands, effects):
-    """The signal of every actuator of a machine, by its name."""
+    """Return the applied signal of every actuator of a machine, by name."""
     signals = {}
     for drive in machine.drives:
         numbers = {}
@@ -123,10 +130,13 @@ def felt(machine, times, commands, effects):
 
 @dataclass
 class Drives:
-    """Forces of all actuators: clip(gain u - kp q - kv v, within +-limit) by joint, (N,); a servo
-    does nothing about an error u - q that is below `dead`; of a force U a supply leaves
-    U / (1 + sag |U|), one that all share U_i / (1 + battery (|U_1| + |U_2| + ...)). A shaft turns
-    with q_i + sum of `shafts`_ij q_j, and pushes those joints likewise.
+    """Forces of all actuators by joint, (N,).
+
+    The force is clip(gain u - kp q - kv v, within +-limit). A servo does not react to an error u -
+    q smaller than `dead`. A supply of its own reduces a force U to U / (1 + sag |U|); a shared
+    battery reduces it to U_i / (1 + battery (|U_1| + |U_2| + ...)). With coupling, the shaft of a
+    drive turns with q_i + sum of `shafts`_ij q_j and exerts its force on those joints by the same
+    factors.
     """
 
     gain: np.ndarray
@@ -141,7 +151,7 @@ class Drives:
 
     @classmethod
     def of(cls, machine, effects=None):
-        """Of a machine, with what is hidden in its servos."""
+        """Build the drives of a machine, with the hidden effects of its actuators."""
         count, effects = len(machine.joints), effects or {}
         gain, kp, kv, limit, dead, sag, lost = np.zeros((7, count))
         for joint, drive in zip(machine.driven, machine.drives, strict=True):
@@ -163,7 +173,7 @@ class Drives:
         (battery,) = effects.get("supply.sag", (0.0,))
         return cls(gain, kp, kv, limit, dead, sag, lost, battery, _shafts(machine, effects))
 
-    # Asked in every stage of every step, so answered once.
+    # These properties are read in every stage of every step, therefore they are cached.
     @cached_property
     def dull(self):
         return bool(self.dead.any())
@@ -177,13 +187,14 @@ class Drives:
         return bool(self.lost.any())
 
     def forces(self, u, q, v):
-        """For commands u by joint."""
+        """Return the forces for commands u by joint."""
         if self.shafts is not None:
             q, v = q + q @ self.shafts.T, v + v @ self.shafts.T
         wanted = self.gain * u - self.kp * q - self.kv * v
         if self.dull:
             wanted -= self.kp * np.clip(u - q, -self.dead, self.dead)
-        force = np.minimum(np.maximum(wanted, -self.limit), self.limit)  # np.clip takes three times
+        # np.clip takes three times as long.
+        force = np.minimum(np.maximum(wanted, -self.limit), self.limit)
         if self.sags:
             drawn = np.abs(force)
             force = force / (1 + self.sag * drawn + self.battery * drawn.sum(-1, keepdims=True))
@@ -193,7 +204,7 @@ class Drives:
 
 
 def _shafts(machine, effects):
-    """(N, N) by how much the drive of a joint (row) turns with others; None where none does."""
+    """Return the coupling (N, N) of each drive (row) to other joints; None without coupling."""
     pairs = {n.partition("@")[2]: c for n, (c, *_) in effects.items() if n.startswith(COUPLING)}
     if not pairs:
         return None

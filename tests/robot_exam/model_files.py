@@ -1,5 +1,7 @@
-"""Model files as they lie in packages, unchanged, with something hidden in what they describe: the
-data are Pinocchio's and this folder's own integrator's, of the same file.
+"""Test cases from unchanged model files of packages, each with a hidden cause.
+
+The reference world makes the data: Pinocchio reads the same file, and the integrator of this folder
+simulates it.
 """
 
 from __future__ import annotations
@@ -20,18 +22,18 @@ RATE, NOISE = 100, 1e-3
 
 @dataclass(frozen=True)
 class Case:
-    """What is asked of one file.
+    """A test case for one model file.
 
     Attributes:
-        package: that ships it; or a folder.
-        file: of it.
-        drives: actuators, in the order of the file's, or those that the recording adds.
-        pose: about which it moves, rad or m, by joint.
+        package: package that contains the file, or a folder.
+        file: path inside the package.
+        drives: actuators in the order of the file, or those that the recording adds.
+        pose: positions around which the robot moves, by joint, rad or m.
         swing: amplitudes of commands: N m or N of motors, rad of servos.
         hidden: coefficients by effect@place.
-        seconds: of a run.
-        runs: how many; the last two are held out.
-        gears: what a unit of each motor's control exerts, N m or N.
+        seconds: duration of a run.
+        runs: count of runs; the last two are held out.
+        gears: force per unit of each motor's control, N m or N.
         locked: joints that the recording locks.
     """
 
@@ -68,7 +70,7 @@ def motor(name, joint, force=1e4):
 
 @dataclass(frozen=True)
 class _Named(Drive):
-    """An actuator whose name a file gives."""
+    """An actuator whose name is given by the file."""
 
     called: str = ""
 
@@ -78,7 +80,7 @@ class _Named(Drive):
 
 
 class FromMjcf(Machine):
-    """A machine whose file is an MJCF; its path stands for the text."""
+    """A machine from an MJCF file; `urdf` is the path of the file."""
 
     @cached_property
     def joints(self):
@@ -106,14 +108,17 @@ class FromMjcf(Machine):
 
 
 def machine_of(case):
-    """The machine that a case's file describes."""
+    """Return the machine that the file of a case describes."""
     if case.path.suffix == ".xml":
         return FromMjcf(case.file, str(case.path), case.drives, case.pose)
     return Machine(case.file, plain(case.path.read_text()), case.drives, case.pose)
 
 
 def written(case, folder, seed=0):
-    """A recording of it, its path: commands that hold between stamps, positions with noise."""
+    """Write a recording of a case and return its path.
+
+    Commands are held between time stamps; positions have noise.
+    """
     machine, rng = machine_of(case), np.random.default_rng(seed)
     world = World(machine, case.hidden)
     times = np.arange(round(case.seconds * RATE) + 1) / RATE

@@ -1,5 +1,6 @@
-"""What can be hidden, where, and how strongly: coefficients as a function of a strength, 1 being
-the far end of plausible.
+"""Effects that can be hidden, their places and their coefficients.
+
+Coefficients are a function of a strength; strength 1 is the largest plausible value.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ SERVO = (
 )  # fmt: skip
 CHANNEL = ("sensor.bias", "sensor.gain", "sensor.delay", "sensor.eccentricity", "sensor.slip")
 WORLD = ("gravity.tilt", "gravity.scale", "clock.skew")
-STIFFEST = 10.0  # Hz, of a link on its elastic joint at strength 1/10
+STIFFEST = 10.0  # Natural frequency in Hz of a link on its elastic joint at strength 0.1.
 FOREIGN = ("heated", "cogging", "binding", "slip")
 FAMILIES = ("friction.coulomb", "drag.linear")
 SIMPLER = {
@@ -36,13 +37,13 @@ SIMPLER = {
     "joint.backlash": "inertia.armature",
 }  # fmt: skip
 WITH_ROTOR = ("joint.flexibility", "joint.backlash")
-"""Those with an inertia of the drive that no file states, their last coefficient."""
+"""Effects whose last coefficient is a drive inertia that no file specifies."""
 SIGNED = (
     "force.bias", "mass.scale", "inertia.scale", "input.gain", "input.bias", "sensor.bias",
     "sensor.gain", "clock.skew", "gravity.scale", "actuator.stiffness", "actuator.damping",
     "joint.coupling",
 )  # fmt: skip
-FAR = {  # of effects that need no scale of the motion
+FAR = {  # Coefficients at strength 1 of effects that do not depend on the scale of the motion.
     "mass.scale": 0.5, "inertia.scale": 0.9, "input.gain": 0.4, "input.delay": 0.1,
     "input.lag": 0.2, "sensor.bias": 0.2, "sensor.gain": 0.3, "sensor.delay": 0.1,
     "clock.skew": 0.06, "gravity.scale": 0.3, "actuator.stiffness": 0.5, "actuator.damping": 0.8,
@@ -52,13 +53,13 @@ FAR = {  # of effects that need no scale of the motion
 
 
 def effects(drive):
-    """What can be hidden in a machine that is driven so: motor or servo."""
+    """Return the effects that can be hidden in a machine with this drive, motor or servo."""
     inputs = BOTH + (MOTOR if drive == "motor" else SERVO)
     return JOINT + BODY + inputs + CHANNEL + WORLD
 
 
 def places(machine, effect):
-    """Where an effect can be."""
+    """Return the places where an effect can act."""
     if effect == "joint.coupling":
         return [machine.joints[joint] for joint in machine.driven if machine.before(joint) >= 0]
     if effect.startswith(("friction.load", "joint.")):
@@ -78,12 +79,12 @@ def places(machine, effect):
 
 
 def named(effect, place):
-    """effect@place, or the effect alone where it is the world's."""
+    """Return effect@place, or the effect alone if it acts on the whole system."""
     return f"{effect}@{place}" if place else effect
 
 
 def shape(effect, place, setting, rng):
-    """Coefficients by strength."""
+    """Return a function from strength to coefficients."""
     sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED else 1.0
     if effect in SHAPES:
         return SHAPES[effect](place, setting, rng)
@@ -92,7 +93,7 @@ def shape(effect, place, setting, rng):
 
 
 def _at(setting, place):
-    """Typical numbers of the joint of a place, by name."""
+    """Return the typical scales of the joint of a place, by name."""
     index = setting.machine.index(place)
     return {name: float(values[index]) for name, values in setting.typical.items()}
 
@@ -110,7 +111,7 @@ def _per_force(bottom):
 
 
 def _drawn(place, setting):
-    """A typical force of a drive, or of all."""
+    """Return a typical force of one drive, or the sum over all drives if there is no place."""
     if place:
         return _at(setting, place)["force"]
     return float(setting.typical["force"][setting.machine.driven].sum())
@@ -156,31 +157,31 @@ def _offset(place, setting, rng):
 
 
 def _saturation(place, setting, rng):
-    """A limit below the command's peak: at strength 0 at the peak, at 1 at nothing."""
+    """Return limits below the peak of the command: the peak at strength 0, zero at strength 1."""
     peak = float(np.abs(_command(setting, place)).max())
     return lambda s: (peak * (1 - s),)
 
 
 def _rate(place, setting, rng):
-    """A jump over the command's range takes from no time at all to a second."""
+    """Return rate limits: a jump over the command's range takes 0 s to 1 s."""
     range_ = float(np.ptp(_command(setting, place)))
     return lambda s: (range_ / s,)
 
 
 def _profile(place, setting, rng):
-    """A jump over the command's range takes from two samples to a second."""
+    """Return acceleration limits: a jump over the command's range takes two samples to 1 s."""
     range_, least = float(np.ptp(_command(setting, place))), 2 * setting.fitted[0].times[1]
     return lambda s: (4.0 * range_ / float(least + s) ** 2,)
 
 
 def _power(place, setting, rng):
-    """Up to the square and beyond; at the command's peak it does what the command alone would."""
+    """Return exponents above 1, normalised so that the peak of the command does not change."""
     peak = float(np.abs(_command(setting, place)).max())
     return lambda s: (peak ** (-2 * s) - 1, 2.0 * s)
 
 
 def _direction(place, setting, rng):
-    """Several times as much one way as the other."""
+    """Return different damping for the two directions; one is at most 0.3 times the other."""
     far = SCALES["drag.linear"](place, setting)
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)
@@ -188,7 +189,10 @@ def _direction(place, setting, rng):
 
 
 def _uneven(place, setting, rng):
-    """A wave of most of the mean, that the motion passes once to four times."""
+    """Return friction that varies sinusoidally by 50 to 95 % of its mean over the position.
+
+    The period is drawn so that the travel contains one to four periods, within 0.5 to 6.28 rad.
+    """
     typical, angle = _at(setting, place), rng.uniform(0, 2 * np.pi)
     period = float(np.clip(typical["travel"] / rng.uniform(1.0, 4.0), 0.5, 6.28))
     far, share = typical["force"], float(rng.uniform(0.5, 0.95))
@@ -197,7 +201,7 @@ def _uneven(place, setting, rng):
 
 
 def _warming(place, setting, rng):
-    """Most of it, or half, is gone by the end of a run."""
+    """Return friction that decays with a time constant of 20 to 80 % of a run."""
     typical, lasting = _at(setting, place), float(setting.fitted[0].times[-1])
     time = max(lasting * float(rng.uniform(0.2, 0.8)), 0.5)
     viscous = float(rng.uniform(0.0, 1.0)) * typical["force"] / typical["speed"]
@@ -205,14 +209,14 @@ def _warming(place, setting, rng):
 
 
 def _by_side(place, setting, rng):
-    """One side of the gears several times the other."""
+    """Return load friction whose coefficients differ: one is at most 0.3 times the other."""
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)
     return lambda s: (0.5 * shares[0] * s, 0.5 * shares[1] * s)
 
 
 def _square(place, setting, rng):
-    """At the forces that act the square makes several times as much as the load itself."""
+    """Return load friction with a quadratic term 2 to 6 times the linear one at typical forces."""
     square = float(rng.uniform(2.0, 6.0)) / _at(setting, place)["force"]
     return lambda s: (0.25 * s, 0.5 * square * s)
 
@@ -224,7 +228,7 @@ def _eccentric(place, setting, rng):
 
 
 def _slip(place, setting, rng):
-    """Once in every run, at the same instant of the clock."""
+    """Return a jump at the same time in every run."""
     times = setting.runs[0].times
     instant = float(rng.uniform(0.15, 0.85) * times[-1])
     sign = float(rng.choice([-1.0, 1.0]))
@@ -232,7 +236,7 @@ def _slip(place, setting, rng):
 
 
 def _stop(place, setting, rng):
-    """At an end of where the joint would go, above or below."""
+    """Return a stop near one end of the joint's travel."""
     typical, index = _at(setting, place), setting.machine.index(place)
     path = np.concatenate([motion[:, index] for motion in setting.bare])
     side, within = float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.03, 0.15))
@@ -243,26 +247,29 @@ def _stop(place, setting, rng):
 
 
 def _hysteresis(place, setting, rng):
-    """Over a way that shows in the travel."""
+    """Return hysteresis over 2 to 15 % of the travel, limited to 0.01 to 0.2 rad or m."""
     typical = _at(setting, place)
     way = float(np.clip(typical["travel"] * rng.uniform(0.02, 0.15), 0.01, 0.2))
     return lambda s: (typical["force"] * s, way)
 
 
 def _rotor(rng):
-    """Of what a joint moves; no file states it, and a heavy one alone would show."""
+    """Draw the drive inertia as a fraction of the inertia that the joint moves.
+
+    No file specifies it; a larger value alone would be visible.
+    """
     return float(rng.uniform(0.015, 0.04))
 
 
 def _flexible(place, setting, rng):
-    """A spring that grows softer: at strength 0.1 what is carried swings at 10 Hz on it."""
+    """Return a spring that becomes softer: at strength 0.1 the natural frequency is 10 Hz."""
     inertia = _at(setting, place)["inertia"]
     ratio, rotor = float(rng.uniform(0.02, 0.1)), _rotor(rng)
     return lambda s: (10.0 * s / (inertia * (2 * np.pi * STIFFEST) ** 2), ratio, rotor)
 
 
 def _play(place, setting, rng):
-    """A gap of up to a tenth of the travel."""
+    """Return backlash of up to a tenth of the travel."""
     rotor = _rotor(rng)
     return lambda s: (0.1 * _at(setting, place)["travel"] * s, rotor)
 
@@ -291,7 +298,7 @@ SHAPES = {
 
 
 def family(effect, setting, rng):
-    """Coefficients by effect@place of every joint, of different sizes, by strength."""
+    """Return a function from strength to coefficients of different sizes for every joint."""
     shares = {joint: float(rng.uniform(0.5, 1.5)) for joint in setting.machine.joints}
     far = {joint: SCALES[effect](joint, setting) for joint in shares}
     return lambda s: {f"{effect}@{joint}": (shares[joint] * far[joint] * s,) for joint in shares}

@@ -1,4 +1,4 @@
-"""The same machine in plain MuJoCo: for tests of the worlds, and to see what its numerics cost."""
+"""The machine in plain MuJoCo, to test the reference world and to measure MuJoCo's numerics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def compiled(machine, step=None, integrator=None):
-    """An MjModel of the machine with its actuators."""
+    """Compile a MuJoCo model of the machine with its actuators."""
     import mujoco
 
     spec = mujoco.MjSpec.from_string(machine.urdf)
@@ -26,7 +26,7 @@ def compiled(machine, step=None, integrator=None):
 
 
 def moved(machine, run, step=None, integrator=None):
-    """Positions and speeds (T, N) at the run's stamps, which are multiples of the step."""
+    """Return positions and velocities (T, N) at the run's time stamps, multiples of the step."""
     import mujoco
 
     model = compiled(machine, step, integrator)

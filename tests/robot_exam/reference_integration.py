@@ -1,4 +1,4 @@
-"""A run as it is known, and a motion as it was."""
+"""Data classes for a run and its motion."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Run:
-    """What is known of a run: stamps (T,) that begin at 0, commands (T,) by actuator, and where it
-    starts.
-    """
+    """A run: time stamps (T,) that begin at 0, commands (T,) by actuator, and the initial state."""
 
     times: np.ndarray
     commands: dict[str, np.ndarray]
@@ -21,8 +19,9 @@ class Run:
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions, speeds and actuators' forces at some instants, each (T, N); the encoder's
-    positions where a joint is elastic.
+    """Positions, velocities and actuator forces at given times, each (T, N).
+
+    For an elastic joint, the position is that of the encoder.
     """
 
     times: np.ndarray

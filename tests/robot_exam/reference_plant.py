@@ -1,8 +1,8 @@
-"""What there really is: a robot by Pinocchio, with whatever is hidden in it.
+"""The true plant: a robot in Pinocchio with its hidden effects.
 
 Equations of motion: M(q) a + n(q, v) = drive - damping v - quadratic |v| v - spring q + bias +
-ripple + friction, with M and n of Pinocchio (J. Carpentier et al., The Pinocchio C++ library, SII
-2019; R. Featherstone, Rigid Body Dynamics Algorithms, 2008). Everything else is written here.
+ripple + friction, with M and n from Pinocchio (J. Carpentier et al., The Pinocchio C++ library, SII
+2019; R. Featherstone, Rigid Body Dynamics Algorithms, 2008). This module defines the other terms.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Binding:
-    """Dry friction in part of a joint's travel: a foreign cause."""
+    """Dry friction in a part of a joint's travel: an unmodelled cause."""
 
     joint: int
     force: float
@@ -27,15 +27,16 @@ class Binding:
     half: float
 
     def limit(self, q):
-        """It sets in over a tenth of its half width."""
+        """Return the friction limit; it rises over a tenth of the half width."""
         inside = (self.half - abs(q[self.joint] - self.centre)) / (0.1 * self.half)
         return self.force * min(max(inside, 0.0), 1.0)
 
 
 @dataclass(frozen=True)
 class Heated:
-    """Dry friction of a joint that grows with the work that another one's drive has done: a foreign
-    cause. Its heat h follows h' = |power| / `power` - h / `time`.
+    """Dry friction of a joint that grows with the work of another joint's drive.
+
+    This is an unmodelled cause. The heat h follows h' = |power| / `power` - h / `time`.
     """
 
     joint: int
@@ -47,14 +48,14 @@ class Heated:
 
 @dataclass(frozen=True)
 class Cogging:
-    """A ripple along a joint that lags by half a tooth, whichever way it goes: a foreign cause."""
+    """A ripple along a joint that lags by half a tooth in both directions: an unmodelled cause."""
 
     joint: int
     force: float
     tooth: float
 
     def caught(self, tooth, q):
-        """Where the teeth are, that follow the joint as if with play."""
+        """Return the position of the teeth, which follow the joint with backlash of one tooth."""
         return min(max(tooth, q[self.joint] - 0.5 * self.tooth), q[self.joint] + 0.5 * self.tooth)
 
     def push(self, tooth, q):
@@ -63,9 +64,7 @@ class Cogging:
 
 @dataclass(frozen=True)
 class Elastic:
-    """A joint whose motor sits behind a spring, or behind flanks with a gap between them. The
-    encoder is the motor's.
-    """
+    """A joint with a spring or backlash between motor and link. The encoder is on the motor."""
 
     joint: int
     rotor: float
@@ -75,11 +74,11 @@ class Elastic:
 
     @property
     def fastest(self):
-        """rad/s at which the rotor swings on what passes the force on."""
+        """Bound on the fastest rate of the rotor on its spring and damper, rad/s."""
         return np.sqrt(self.stiffness / self.rotor) + self.damping / self.rotor
 
     def through(self, apart, speed):
-        """What passes from the motor to the link; flanks push and never pull."""
+        """Return the force from the motor to the link; flanks of a backlash only push."""
         beyond = apart - min(max(apart, -0.5 * self.gap), 0.5 * self.gap)
         force = self.stiffness * beyond + self.damping * speed
         if not self.gap:
@@ -87,7 +86,7 @@ class Elastic:
         return max(force, 0.0) if beyond > 0 else min(force, 0.0) if beyond < 0 else 0.0
 
     def rests(self, load):
-        """How far the link is ahead of the motor that is held, where `load` pulls at it."""
+        """Return how far the link is ahead of the fixed motor under the force `load`."""
         ahead = load / self.stiffness
         return ahead + 0.5 * self.gap * np.sign(load) * (abs(load) > 1e-9)
 
@@ -100,14 +99,15 @@ class Plant:
         model, data: of Pinocchio.
         damping, quadratic, spring, bias: by joint, (N,).
         coulomb, extra, speed: dry friction `coulomb + extra exp(-(v / speed)^2)`, (N,).
-        ahead, back: damping of motion the one way and the other, (N,).
+        ahead, back: damping of positive and of negative motion, (N,).
         ripples: (joint, sine, cosine, period).
-        stops: (joint, stiffness at a depth of 0.01, place, loss); above where that is positive.
-        uneven: (joint, least, sine, cosine, period) of dry friction over the joint.
-        loads: (joint, motor, external, quadratic) of friction by what the drive carries.
-        cold: (joint, dry, viscous, time) of friction that dies away.
-        memory: (joint, force, way) of friction that builds up over a way (Dahl).
-        binding, elastic, heated, cogging: see there; None where there is none.
+        stops: (joint, stiffness at a depth of 0.01, position, loss); a positive stiffness is a stop
+            above the position.
+        uneven: (joint, minimum, sine, cosine, period) of dry friction over the joint.
+        loads: (joint, motor, external, quadratic) of friction by the load of the drive.
+        cold: (joint, dry, viscous, time) of friction that decays.
+        memory: (joint, force, distance) of friction with hysteresis (Dahl).
+        binding, elastic, heated, cogging: objects of these classes, or None.
     """
 
     model: object
@@ -142,7 +142,7 @@ class Plant:
     def size(self):
         return self.damping.size
 
-    # Asked in every stage of every step, so answered once.
+    # These properties are read in every stage of every step, therefore they are cached.
     @cached_property
     def springs(self):
         return bool(self.spring.any())
@@ -161,7 +161,7 @@ class Plant:
 
     @property
     def rubs(self):
-        """Which joints have dry friction, (N,)."""
+        """Mask (N,) of the joints with dry friction."""
         rubs = (self.coulomb > 0) | (self.extra > 0)
         if self.binding:
             rubs[self.binding.joint] = True
@@ -172,7 +172,14 @@ class Plant:
         return rubs
 
     def limit(self, t, q, v, drive=None, heat=0.0):
-        """Largest dry friction of every joint, (N,); `drive` (N,) is asked for by `loads`."""
+        """Return the largest dry friction of every joint, (N,).
+
+        Args:
+            t: time, s.
+            q, v: positions and velocities, (N,).
+            drive: actuator forces (N,), needed if there are `loads`.
+            heat: heat of `heated`.
+        """
         limit = self.coulomb
         if self.stribeck:
             limit = limit + self.extra * np.exp(-((v / self.speed) ** 2))
@@ -198,7 +205,7 @@ class Plant:
         return limit
 
     def passive(self, q, v):
-        """Forces of joints by position and speed, without dry friction, (N,)."""
+        """Return joint forces that depend on position and velocity, without dry friction, (N,)."""
         force = self.bias - self.damping * v
         if self.springs:
             force -= self.spring * q
@@ -216,30 +223,30 @@ class Plant:
         return force
 
     def accelerations(self, q, v, force):
-        """By the articulated-body algorithm, (N,)."""
+        """Return accelerations (N,) by the articulated-body algorithm."""
         return self.aba(self.model, self.data, q, v, force)
 
     def inertia(self, q):
-        """M(q), (N, N)."""
+        """Return the mass matrix M(q), (N, N)."""
         import pinocchio
 
         mass = pinocchio.crba(self.model, self.data, q)
         return np.triu(mass) + np.triu(mass, 1).T
 
     def needed(self, q, v):
-        """n(q, v): forces at which nothing accelerates, (N,)."""
+        """Return n(q, v): forces at which all accelerations are zero, (N,)."""
         import pinocchio
 
         return pinocchio.nonLinearEffects(self.model, self.data, q, v).copy()
 
     def torque(self, q, v, a):
-        """What moves it so, (N,)."""
+        """Return the joint forces (N,) for given accelerations (inverse dynamics)."""
         import pinocchio
 
         return pinocchio.rnea(self.model, self.data, q, v, a).copy()
 
     def energy(self, q, v):
-        """Kinetic and potential energy, J."""
+        """Return the sum of kinetic and potential energy, J."""
         import pinocchio
 
         kinetic = pinocchio.computeKineticEnergy(self.model, self.data, q, v)
@@ -247,11 +254,11 @@ class Plant:
 
 
 def plant(machine: Machine, effects=None, foreign=None):
-    """A machine's plant.
+    """Build the plant of a machine.
 
     Args:
-        machine: as its file describes it.
-        effects: coefficients by effect@place; what acts on signals is not looked at.
+        machine: robot as its file describes it.
+        effects: coefficients by effect@place; effects on signals are ignored.
         foreign: `Binding`, `Heated`, `Cogging` or None.
     """
     model = machine.model()
@@ -326,11 +333,11 @@ def _cold(plant, joint, c):
     plant.cold.append((joint, *c))
 
 
-FLANKS = 2000.0  # rad/s on which what is carried swings on a flank, critically damped
+FLANKS = 2000.0  # Natural frequency of the load on a flank, rad/s; critically damped.
 
 
 def _inertia(plant, joint):
-    """About a joint, all at zero, as the file states it."""
+    """Return the inertia at a joint with all joints at zero, as the file specifies it."""
     import pinocchio
 
     model = plant.model
@@ -339,7 +346,10 @@ def _inertia(plant, joint):
 
 
 def stiff(machine, place, rotor):
-    """A drive's inertia, a share of the joint's, that is there whether the joint yields or not."""
+    """Return the effect of the drive inertia alone, a fraction of the joint's inertia.
+
+    This inertia exists even if the joint is rigid.
+    """
     inertia = _inertia(plant(machine), machine.index(place))
     return {f"inertia.armature@{place}": (rotor * inertia,)}
 
@@ -402,7 +412,7 @@ def _armature(plant, joint, c):
 
 
 def _reshaped(model, joint, mass=1.0, tensor=1.0, shift=0.0):
-    """The body that a joint moves, with all that is fixed to it."""
+    """Change the inertia of the body that a joint moves, with everything fixed to it."""
     import pinocchio
 
     body = model.inertias[joint + 1]

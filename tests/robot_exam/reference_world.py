@@ -1,10 +1,10 @@
-"""One run of a robot, with whatever is hidden in it.
+"""Simulate one run of a robot with its hidden effects.
 
-Between the instants at which something switches, classical Runge-Kutta of fourth order with fixed
-steps (E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, section
-II.1). What switches: a command reaches its actuator, a joint comes to rest (the step ends there,
-by Brent's method), a joint that is held is pulled loose. A joint at rest has its speed zero, not
-nearly zero: it does not creep.
+Between events, the integrator is the classical Runge-Kutta method of fourth order with fixed steps
+(E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, section II.1).
+Events are: a command reaches its actuator, a joint comes to rest (the step ends there, found by
+Brent's method), a held joint breaks away. A joint at rest has a velocity of exactly zero, therefore
+it does not creep.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from tests.robot_exam.reference_integration import Motion, Run
 from tests.robot_exam.reference_plant import plant
 
 __all__ = ["Motion", "Run", "World"]
-FINE, COARSE = 1e-3, 2e-3  # seconds: longest steps of data, and of what only chooses sizes
-ZENO = 100  # events in a step, at most
-LATER = 1e-9  # of a step: shorter ones are none
+FINE, COARSE = 1e-3, 2e-3  # Maximum step in s for data, and for simulations that only choose sizes.
+ZENO = 100  # Maximum number of events in a step.
+LATER = 1e-9  # Smallest step after an event, as a fraction of the step.
 
 
 class World:
-    """A machine with what is hidden in it.
+    """A machine with its hidden effects.
 
     Args:
-        machine: as its file describes it.
+        machine: robot as its file describes it.
         effects: coefficients by effect@place.
-        foreign: of `plant.Binding`, `plant.Heated` or `plant.Cogging`, or None.
-        step: the longest step, s.
+        foreign: `Binding`, `Heated`, `Cogging` or None.
+        step: maximum step, s.
     """
 
     def __init__(self, machine, effects=None, foreign=None, step=FINE):
@@ -40,18 +40,20 @@ class World:
         self.plant = plant(machine, self.effects, foreign)
         self.drives = Drives.of(machine, self.effects)
         if soft := self.plant.elastic:
-            self.step = min(step, 0.7 / soft.fastest)  # Runge-Kutta is stable up to 2.8
+            self.step = min(step, 0.7 / soft.fastest)  # Runge-Kutta 4 is stable up to about 2.8.
         self.rubs = self.plant.rubs
         self.dry = bool(self.rubs.any())
 
     def move(self, run, instants):
-        """The motion at instants that increase, (K,)."""
+        """Return the motion at increasing times, (K,)."""
         return _Course(self, run).through(np.asarray(instants, dtype=float))
 
 
 class _Course:
-    """A run on its way. `way` is -1 or 1 for a joint with friction that slides, 0 for one that is
-    held or has no friction; `stuck` tells which are held.
+    """State of a run during its simulation.
+
+    `way` is -1 or 1 for a sliding joint with friction, and 0 for a joint that is held or has no
+    friction. `stuck` is the mask of the held joints.
     """
 
     def __init__(self, world, run):
@@ -63,11 +65,11 @@ class _Course:
         more = []
         if self.elastic:
             at = self.elastic.joint
-            # Its motor was held, and the link hung on it.
+            # Before the run, the motor was held and the link was in equilibrium.
             load = -self.plant.needed(run.q, run.v)[at]
             more = [run.q[at], run.v[at]]
             self.state[at] = run.q[at] + self.elastic.rests(load)
-        # Behind positions and speeds the rotor's, then what friction remembers, then the heat.
+        # The state has positions, velocities, rotor states, hysteresis states, heat, in this order.
         self.memory = slice(2 * self.count + len(more), None)
         more += [0.0] * len(self.plant.memory)
         more += [0.0] if self.plant.heated else []
@@ -114,7 +116,7 @@ class _Course:
         return values
 
     def _enter(self, begin):
-        """A new piece: what is commanded may have changed."""
+        """Begin a new interval, in which the command may differ."""
         self.lagged = self._commands(begin)
         self.target, self.begin = self._arrived(begin), begin
         if self.world.dry:
@@ -134,7 +136,7 @@ class _Course:
                 self.tooth = self.cogging.caught(self.tooth, self.state)
 
     def _step(self, now, end):
-        """From now to end, through whatever comes to rest or breaks loose between them."""
+        """Advance from `now` to `end` through all events between them."""
         if not self.world.dry:
             self.state = self._moved(now, end - now)
             return
@@ -153,9 +155,7 @@ class _Course:
         raise RuntimeError("it never gets through: too many standstills")
 
     def _first_event(self, now, end, tried):
-        """When something first comes to rest or breaks loose, the state moved there; None if
-        nothing does.
-        """
+        """Return the time of the first event, and move the state there; None without an event."""
         span, n = end - now, self.count
         speeds = tried[n : 2 * n]
         turned = np.flatnonzero(self.way * speeds < 0)
@@ -195,13 +195,16 @@ class _Course:
 
     @staticmethod
     def _going(speed, span, begins):
-        """When in a step that ends backwards a joint still goes its way; None if it never does."""
+        """Return a time in a step at which a joint still moves forward; None if there is none.
+
+        The joint moves backward at the end of the step.
+        """
         if begins != 0.0:
             return 0.0
         return next((h for h in span * 0.5 ** np.arange(1, 20) if speed(h) > 0), None)
 
     def _overloaded(self, t, state):
-        """By how much the worst of the held joints needs more than its friction; -1 with none."""
+        """Return the largest excess of needed over available friction; -1 if no joint is held."""
         if not self.stuck.any():
             return -1.0
         need = np.abs(self._holding(t, state)[0])
@@ -209,7 +212,7 @@ class _Course:
         return float(np.max(need - limit * (1 + 1e-9)))
 
     def _limit(self, t, state):
-        """Largest dry friction of every joint, (N,)."""
+        """Return the largest dry friction of every joint, (N,)."""
         q, v = state[: self.count], state[self.count : 2 * self.count]
         loaded = self.plant.loads
         if self.plant.heated:
@@ -218,7 +221,7 @@ class _Course:
         return self.plant.limit(t, q, v, drive)
 
     def _decide(self, t):
-        """Which joints at rest are held, and which way the others go."""
+        """Decide which joints at rest are held, and the direction of the others."""
         n = self.count
         q, v = self.state[:n], self.state[n : 2 * n]
         rubs = self.world.rubs
@@ -241,7 +244,7 @@ class _Course:
         )
 
     def _force(self, t, state):
-        """Of actuators, damping, springs and biases, without dry friction, (N,)."""
+        """Return forces of actuators, damping, springs and biases, without dry friction, (N,)."""
         n = self.count
         q, v = state[:n], state[n : 2 * n]
         if self.elastic:
@@ -254,7 +257,7 @@ class _Course:
         return force
 
     def _elastic_forces(self, t, state):
-        """On the arm, and on the rotor behind the spring; the file's damping is the motor's."""
+        """Return the forces on arm and rotor; the damping of the file acts on the motor."""
         n, soft = self.count, self.elastic
         q, v = state[:n].copy(), state[n : 2 * n].copy()
         link = q[soft.joint], v[soft.joint]
@@ -266,7 +269,7 @@ class _Course:
         return outer, rotor
 
     def _holding(self, t, state):
-        """Friction of the held joints, (S,), and everybody's accelerations, (N,)."""
+        """Return friction of the held joints, (S,), and accelerations of all joints, (N,)."""
         n = self.count
         q, v = state[:n], state[n : 2 * n]
         force = self._force(t, state) - self.way * self._limit(t, state)
@@ -292,7 +295,7 @@ class _Course:
         more = []
         if self.elastic:
             more += [self._rotor(state)[1], self._elastic_forces(t, state)[1] / self.elastic.rotor]
-        # Towards the way that it goes, over the way (Dahl): w' = v / d - |v / d| w.
+        # Dahl model of hysteresis: w' = v / d - |v / d| w.
         for (joint, _, way), w in zip(self.plant.memory, state[self.memory], strict=False):
             more.append((v[joint] - abs(v[joint]) * w) / way)
         if hot := self.plant.heated:
@@ -301,7 +304,7 @@ class _Course:
         return np.concatenate([v, a, more])
 
     def _moved(self, now, h):
-        """The state after a step of Runge and Kutta; what is held stays where it is."""
+        """Return the state after a Runge-Kutta 4 step; held joints do not move."""
         y = self.state
         k1 = self._rate(now, y)
         k2 = self._rate(now + h / 2, y + h / 2 * k1)

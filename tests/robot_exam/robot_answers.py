@@ -1,6 +1,4 @@
-"""One question answered: draw the item, write its recording, have it explained, mark the answer.
-Runs in a worker.
-"""
+"""Answer one question in a worker: draw the case, write and explain its recording, grade it."""
 
 from __future__ import annotations
 
@@ -18,13 +16,13 @@ MOST_RIVALS = 6
 
 
 def answered(question, offset, known=None, explain=EXPLAIN, equal=True):
-    """A row about a question (a dictionary, as JSON): the item, the verdict, the mark.
+    """Return the result row of a question: case, verdict and grade.
 
     Args:
-        question: as JSON.
-        offset: of the seeds.
-        known: the item as JSON if it was drawn before, {} if it was found not to show, None if it
-            was not drawn.
+        question: question as JSON.
+        offset: offset of the seeds.
+        known: case as JSON if it was drawn before, {} if no drawing is visible, None if it was not
+            drawn.
         explain: module:function to examine.
         equal: whether the members of a set are refitted.
     """
@@ -44,7 +42,7 @@ def _answer(item, explain, equal):
 
 
 def _equal(item, verdict):
-    """How the other members of the sets that hold the truth do on runs held out."""
+    """Return held-out error ratios of the other members of the sets that hold the truth."""
     rivals = Rivals(setting_of(item.name), item.effects, recorded(item))
     ratios = {}
     truth = set(item.effects)
@@ -56,7 +54,7 @@ def _equal(item, verdict):
 
 
 def lost(question, known, error):
-    """The row of a question whose worker did not come back."""
+    """Return the row of a question whose worker failed."""
     asked = question.json()
     row = {name: asked[name] for name in ("kind", "robot", "effect")}
     row |= {"question": question.name, "item": known or {}, "verdict": None, "seconds": None}

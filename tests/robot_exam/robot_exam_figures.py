@@ -1,4 +1,4 @@
-"""Two figures about robots, readable in grey: what was taken for what, and how long it took."""
+"""Two figures of the robot exam, readable in grey: confusion of causes, and seconds."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from tests.simple_exam.exam_figures import _confusion, _save
 
 
 def draw(folder, counts, seconds):
-    """Draw `figures`/confusion and `figures`/seconds, PNG and PDF, as far as there is something to
-    draw.
-    """
+    """Draw `figures`/confusion and `figures`/seconds as PNG and PDF, if there are data."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""What the questions about robots leave behind: tables, figures, and a page about them."""
+"""Tables, figures and a page with the results of the robot exam."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ HIDDEN = ("single", "family", "double")
 
 
 def write(folder, rows):
-    """Write all of it into `folder`; returns the summary. What a person has to say of it stands in
-    ABOUT there, and goes into the page.
+    """Write all results into `folder` and return the summary.
+
+    Remarks of a person in the file `ABOUT` of the folder become part of the page.
     """
     asked = [row for row in rows if row.get("mark")]
     summary, about = summarised(rows), folder / ABOUT
@@ -30,7 +31,7 @@ def write(folder, rows):
 
 
 def summarised(rows):
-    """All numbers about the rows of an exam."""
+    """Return all numbers about the rows of an exam."""
     asked = [row for row in rows if row.get("mark")]
     of = {kind: [r for r in asked if r["kind"] == kind] for kind in KINDS}
     covered = [held for r in asked for held in r["mark"]["covered"].values() if held is not None]
@@ -56,7 +57,7 @@ def summarised(rows):
 
 
 def _quantiles(asked, key):
-    """Of the seconds that answers took."""
+    """Return quantiles of a duration in seconds."""
     seconds = [row[key] for row in asked if row.get(key) is not None]
     return {
         name: float(np.quantile(seconds, q)) if seconds else None
@@ -69,7 +70,7 @@ def _is(how):
 
 
 def _by(asked, key):
-    """Shares of hidden causes that are named, by one of the columns and by drive."""
+    """Return shares of diagnosed hidden causes, grouped by a column and by drive."""
     groups = {}
     for row in asked:
         if row["kind"] in HIDDEN:
@@ -84,7 +85,7 @@ def _by(asked, key):
 
 
 def confusion(asked):
-    """Counts by (effect that was hidden, effect that was named first)."""
+    """Return counts by (hidden effect, effect that was diagnosed first)."""
     return Counter((_hidden(row), _first(row)) for row in asked if row["kind"] != "double")
 
 
@@ -105,7 +106,7 @@ def _first(row):
 
 
 def _seconds(asked):
-    """Seconds by robot."""
+    """Return seconds by robot."""
     groups = {}
     for row in asked:
         if row["seconds"] is not None:
@@ -114,7 +115,7 @@ def _seconds(asked):
 
 
 def marks(summary):
-    """Rows (what, wanted, reached, whether met) of the marks that `explain` must reach."""
+    """Return rows (description, required, result, is met) of the targets of `explain`."""
     named, rows = summary["named"], []
     for what, wanted, got in (
         ("a single cause: effect and place, alone", None, named["single"]["strict"]),
@@ -137,7 +138,7 @@ def marks(summary):
 
 
 def printed(summary):
-    """The marks as plain lines."""
+    """Return the targets as lines of text."""
     lines = [f"{_ratio(got):>34}  {what} {wanted}" for what, wanted, got, _ in marks(summary)]
     return "\n".join([*lines, _times(summary)])
 
@@ -164,14 +165,14 @@ def _times(summary):
 
 
 def page(summary, about=""):
-    """README.md, with what a person says of it."""
+    """Return the text of README.md, including the remarks of a person."""
     lines = ["# Causes hidden in robots", "", INTRODUCTION, ""]
     lines += [about.strip(), ""] if about else []
     lines += ["| mark | wanted | reached (95 % interval) | met |", "|---|---|---|---|"]
     for what, wanted, got, met in marks(summary):
         lines.append(f"| {what} | {wanted} | {_ratio(got)} | {_WORDS[met]} |")
     lines += ["", _times(summary) + ".", ""]
-    if "code" in summary:  # exams of before did not say
+    if "code" in summary:  # Summaries of older exams have no code version.
         code = ", ".join(f"{count} by `{name}`" for name, count in summary["code"].items())
         lines += [f"Answers by version of the code: {code}.", ""]
     for key, groups in summary["by"].items():
@@ -195,7 +196,7 @@ def page(summary, about=""):
 
 
 def listed(path, asked):
-    """Write a table of answers: a line for each, what was hidden, told, and how well it was."""
+    """Write the answers as a CSV table, one line per answer."""
     lines = [_line(row) for row in sorted(asked, key=lambda row: row["question"])]
     with path.open("w", newline="") as file:
         names = list(lines[0]) if lines else []

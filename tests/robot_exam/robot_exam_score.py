@@ -1,44 +1,43 @@
-"""Marks an answer about a robot: what `explain` concluded against what was hidden, effect and
-place.
+"""Grade a diagnosis of a robot recording by effect and place.
 
-| outcome | of | when |
+| outcome | kinds | condition |
 |---|---|---|
 | right | clean, foreign | clean: adequate; foreign: unknown or partial |
-| right | all others | each cause by itself and no other; of numerics the step or the integrator |
-| set | single, family, double | a cause stands in a set, said to be alike in these data |
-| member | family | causes of the family are named, place by place |
-| place | single, double | the effect is named, at another place |
-| effect | single, double | another effect is named, at the place |
-| one | double | one of the two is found, the other is not |
-| extra | single, family, numerics | the cause is named, and another beside it |
-| wrong | all but clean | something else is named |
-| unnamed | all but clean, foreign | a gap is seen, no cause named |
-| missed | all but clean | nothing is seen |
-| alarm | clean | something is seen |
-| undecided | all | said to be unidentifiable |
-| failed | all | there is no answer: it crashed or took too long |
+| right | all others | exactly the true causes, each alone; numerics: the step or the integrator |
+| set | single, family, double | a true cause is in a set of equivalent causes |
+| member | family | causes of the family are named place by place |
+| place | single, double | the effect is named at another place |
+| effect | single, double | another effect is named at the place |
+| one | double | one of the two causes is found, the other is not |
+| extra | single, family, numerics | the cause is named, and another one in addition |
+| wrong | all but clean | another cause is named |
+| unnamed | all but clean, foreign | a discrepancy is detected, no cause is named |
+| missed | all but clean | no discrepancy is detected |
+| alarm | clean | a discrepancy is detected |
+| undecided | all | the verdict is unidentifiable |
+| failed | all | there is no answer because of a crash or a timeout |
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 
-FEW = 4  # members of a set that still tells something
-SAME = 1.05  # held-out errors whose ratio is below this are equal
+FEW = 4  # Maximum size of a set that is still informative.
+SAME = 1.05  # Held-out errors are equal if their ratio is below this value.
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What an answer is worth.
+    """Grade of an answer.
 
     Attributes:
-        outcome: see this module.
-        members: causes in the set that holds the truth (the largest of them); 0 where none does.
-        named: what was named, alternatives behind a bar, several causes with a plus.
-        covered: by coefficient: whether the 95 % interval holds the truth; None where it is open.
-        equal: by member of the set that holds the truth, without the truth: how its held-out
-            error, refitted in the world that made the data, compares with the truth's; None where
-            that was not measured.
+        outcome: see the table of this module.
+        members: causes in the largest set that holds the truth; 0 if there is none.
+        named: diagnosed causes; alternatives are joined by "|", several causes by " + ".
+        covered: by coefficient, whether the 95 % interval holds the truth; None for an open
+            interval.
+        equal: by other member of the set that holds the truth, its held-out error, refitted in the
+            reference world, divided by the error of the truth; None if it was not measured.
     """
 
     outcome: str
@@ -49,22 +48,22 @@ class Mark:
 
     @property
     def strict(self):
-        """Named alone."""
+        """True if the causes are named alone."""
         return self.outcome == "right"
 
     @property
     def few(self):
-        """Named, or in a set of at most `FEW`."""
+        """True if the causes are named alone, or in a set of at most `FEW`."""
         return self.strict or (self.outcome == "set" and self.members <= FEW)
 
     @property
     def any(self):
-        """Named, or in any set."""
+        """True if the causes are named alone, or in any set."""
         return self.outcome in ("right", "set")
 
     @property
     def fair(self):
-        """Named, or in a set of which all other members do as well on runs held out."""
+        """True if the causes are named alone, or all other members have an equal held-out error."""
         ratios = self.equal.values()
         alike = bool(ratios) and all(ratio is not None and ratio < SAME for ratio in ratios)
         return self.strict or (self.outcome == "set" and alike)
@@ -75,7 +74,7 @@ class Mark:
 
 
 def marked(item, verdict):
-    """Mark one answer; a verdict of None is no answer."""
+    """Grade one answer; a verdict of None means no answer."""
     if verdict is None:
         return Mark("failed")
     sets = sets_of(verdict)
@@ -88,7 +87,7 @@ def marked(item, verdict):
 
 
 def sets_of(verdict):
-    """Every cause with its alternatives."""
+    """Return every cause with its alternatives."""
     return [(cause["effect"], *cause["alternatives"]) for cause in verdict["causes"]]
 
 
@@ -127,17 +126,18 @@ def _family(item, verdict, sets):
 
 
 def _nothing(verdict, sets, both=False):
-    """The outcome where nothing is named."""
+    """Return the outcome if no cause is named."""
     outcome = None
     if verdict == "adequate":
         outcome = "missed"
-    elif not sets or verdict == "unknown":  # what it lists then are no answers
+    # With the verdict "unknown", listed causes are not answers.
+    elif not sets or verdict == "unknown":
         outcome = "unnamed"
     return (outcome, 0) if outcome and both else outcome
 
 
 def _found(truth, sets):
-    """Causes in sets of their own, and no set without one: (outcome, members)."""
+    """Assign each true cause to its own set, and return (outcome, members)."""
     places = {}
     for name in truth:
         free = [i for i, names in enumerate(sets) if name in names and i not in places.values()]
@@ -154,7 +154,7 @@ def _found(truth, sets):
 
 
 def _near(truth, sets):
-    """Whether the effect is named elsewhere, or another effect there."""
+    """Return the outcome for an effect at another place, or another effect at the place."""
     named = [name.partition("@") for names in sets for name in names]
     wanted = [name.partition("@") for name in truth]
     if any(n[0] == w[0] for n in named for w in wanted):
@@ -164,7 +164,7 @@ def _near(truth, sets):
 
 
 def joint_of(place):
-    """The joint that a place of the questions belongs to, as far as its name tells."""
+    """Return the joint to which a place belongs, as far as its name shows."""
     for prefix in ("m_", "q.", "qd.", "tau."):
         place = place.removeprefix(prefix)
     return place.removesuffix("_link")
@@ -181,7 +181,7 @@ OUTCOMES = {
 
 
 def _covered(item, verdict):
-    """Whether intervals of what is named first hold what was hidden."""
+    """Return whether the intervals of the causes named first hold the hidden coefficients."""
     covered = {}
     for cause in verdict["causes"]:
         for key, said, value in _pairs(item, cause):
@@ -192,7 +192,7 @@ def _covered(item, verdict):
 
 
 def _pairs(item, cause):
-    """(name, estimate, truth) of every coefficient of a cause that was hidden."""
+    """Yield (name, estimate, truth) of every coefficient of a cause that was hidden."""
     effect, _, place = cause["effect"].partition("@")
     if cause["effect"] in item.effects:
         truth = item.effects[cause["effect"]]

@@ -1,8 +1,7 @@
-"""The questions about robots: recordings in which a cause is hidden, drawn from a seed.
+"""Benchmark cases of robots: recordings with a hidden cause, drawn from a seed.
 
-`draw` chooses what is hidden, where and how strongly, `realise` writes the recording with the
-robot's file beside it. Whatever is drawn follows from the item's name; an item is a recipe, no
-data.
+`draw` chooses the cause, its place and its size. Everything that is drawn follows from the name of
+the case. A case is a specification and contains no data.
 """
 
 from __future__ import annotations
@@ -18,32 +17,36 @@ from tests.robot_exam.exam_settings import setting as drawn_setting
 
 KINDS = ("clean", "single", "family", "double", "foreign", "numerics")
 APART = 1.0
-"""Noises that must be left when only one of two causes, or no cause at the same place for a foreign
-one, is in the model."""
+"""Smallest residual without the full truth in the model, in units of the noise.
+
+The model has only one of two causes or, for an unmodelled cause, one effect at the same joint.
+"""
 TELLING = 0.4
-"""Noises that the simpler form of an effect must leave, or else it is the right answer."""
+"""Smallest residual with the simpler form of an effect, in units of the noise.
+
+Below it, the simpler form is the right answer.
+"""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One question.
+    """One benchmark case.
 
     Attributes:
-        name: says kind, robot, what was asked for, and seed.
-        kind: see `KINDS`.
-        robot: of `robots.NAMES`.
-        effects: coefficients of what is hidden, by effect@place; of a foreign cause its own
-            numbers.
-        family: whether all of them are one family, one coefficient a place.
-        size: RMS of the gap that initial states, refitted, leave in the runs for fitting, in
-            noises; of two causes that of each by itself; of what lies between a drive and its
-            links, beyond what the drive's inertia alone makes.
+        name: kind, robot, requested effect and seed.
+        kind: one of `KINDS`.
+        robot: one of `robot_models.NAMES`.
+        effects: hidden coefficients by effect@place; for an unmodelled cause, its own numbers.
+        family: whether all effects are one family with one coefficient per place.
+        size: RMS discrepancy in the fitted runs with refitted initial states, in units of the
+            noise. For two causes it is the smaller one; for backlash and joint flexibility, the
+            effect of the drive inertia alone is subtracted.
         noise: white, ar1 or quantised.
-        channels: what is recorded.
-        beyond: what is left of the gap, in noises, with the nearest other answers that were looked
-            at (to first order); None where none were.
-        numerics: what MuJoCo's own numerics leave, in noises.
-        step, integrator: of MuJoCo, as the recording states them.
+        channels: names of the recorded channels.
+        beyond: residual in units of the noise with the nearest tested alternatives, to first order;
+            None if none were tested.
+        numerics: error of MuJoCo's numerics in units of the noise.
+        step, integrator: MuJoCo settings that the recording specifies.
     """
 
     name: str
@@ -64,7 +67,7 @@ class Item:
 
     @classmethod
     def of(cls, document):
-        """An item from its JSON."""
+        """Build a case from its JSON document."""
         effects = {name: tuple(c) for name, c in document["effects"].items()}
         return cls(**{**document, "effects": effects, "channels": tuple(document["channels"])})
 
@@ -75,7 +78,7 @@ def rng_of(name, purpose):
 
 @lru_cache(maxsize=4)
 def setting_of(name):
-    """The circumstances in which the item of this name was drawn."""
+    """Return the setting in which the case of this name was drawn."""
     kind, robot, *_ = name.split("/")
     return drawn_setting(robot, rng_of(name, "setting"), coarse=kind == "numerics")
 
@@ -86,13 +89,13 @@ def gauge_of(name):
 
 
 def draw(kind, robot, effect, seed):
-    """An item, or None where this machine and these commands cannot show it.
+    """Draw a case, or return None if these commands and this machine cannot show the cause.
 
     Args:
-        kind: of `KINDS`.
-        robot: of `robots.NAMES`.
-        effect: what to hide (of two, the first); "any" where it is drawn.
-        seed: everything else follows from it.
+        kind: one of `KINDS`.
+        robot: one of `robot_models.NAMES`.
+        effect: effect to hide (the first of two); "any" to draw it.
+        seed: seed of everything else.
     """
     name = f"{kind}/{robot}/{effect}/{seed}"
     try:
@@ -119,7 +122,7 @@ def _drawn_effect(item, effect, rng):
 
 
 def _sized(item, effect, setting, rng, taken=()):
-    """({effect@place: coefficients}, size) of a place that is drawn; None if it cannot show."""
+    """Return ({effect@place: coefficients}, size) at a drawn place; None if it is not visible."""
     places = [p for p in planted_effects.places(setting.machine, effect) if p not in taken]
     if not places:
         return None
@@ -131,7 +134,7 @@ def _sized(item, effect, setting, rng, taken=()):
     )
     gauge, beyond = gauge_of(item.name), ()
     if effect in planted_effects.WITH_ROTOR:
-        # What gives is small where it hardly gives; its rotor would be there all the same.
+        # The drive inertia is there even if the joint is nearly rigid, so its change is subtracted.
         beyond = gauge.change(reference_plant.stiff(setting.machine, place, of(0.0)[-1]))
     found = cause_sizing.sized(lambda s: gauge.gap({name: of(s)}, beyond), wanted)
     return found and ({name: of(found[0])}, found[1])
@@ -166,7 +169,7 @@ def _family(item, setting, effect, rng):
 
 
 def _double(item, setting, effect, rng):
-    """Two causes at different places; neither may look like a stronger form of the other."""
+    """Draw two causes at different places; one cause alone must not explain both."""
     first = _sized(item, _drawn_effect(item, effect, rng), setting, rng)
     if first is None:
         return None
@@ -194,9 +197,7 @@ def _double(item, setting, effect, rng):
 
 
 def _foreign(item, setting, effect, rng):
-    """A cause that the library does not have, and of which its effects at the same joint explain
-    only a part.
-    """
+    """Draw an unmodelled cause that no effect at the same joint explains completely."""
     cause = str(rng.choice(planted_effects.FOREIGN)) if effect == "any" else effect
     joint = int(rng.choice(setting.machine.driven))
     of, gauge = causes_outside_library.drawn(cause, joint, setting, rng), gauge_of(item.name)
@@ -211,7 +212,7 @@ def _foreign(item, setting, effect, rng):
 
 
 def _near(setting, joint, gauge, rng):
-    """What effects at one joint change, each (N,)."""
+    """Yield the changes (N,) that effects at one joint cause."""
     machine = setting.machine
     at = {machine.joints[joint], machine.bodies[joint], f"q.{machine.joints[joint]}"}
     at |= {d.name for d in machine.drives if d.joint == machine.joints[joint]} | {""}

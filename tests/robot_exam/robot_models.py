@@ -1,4 +1,4 @@
-"""The robots that are asked about, drawn by a seed: arms of our own, UR5, Panda, KUKA iiwa."""
+"""Robot models of the exam, drawn from a seed: generated arms, UR5, Panda and KUKA iiwa."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from tests.robot_exam.exam_robots import Drive, Machine, plain
 
-FASTEST = 300.0  # 1/s: no servo's damping is quicker than this, so that a millisecond follows it
+FASTEST = 300.0  # Largest damping rate of a servo in 1/s, so that 1 ms steps resolve it.
 
 
 def link(name, mass, com, tensor):
-    """Text of a link: kg, m, and the principal moments in kg m^2."""
+    """Return the URDF text of a link; kg, m, and principal moments in kg m^2."""
     (x, y, z), (ixx, iyy, izz) = com, tensor
     return (
         f'<link name="{name}"><inertial><origin xyz="{x:.6g} {y:.6g} {z:.6g}"/>'
@@ -23,7 +23,7 @@ def link(name, mass, com, tensor):
 
 
 def joint(name, kind, parent, child, origin, axis, limits, damping=0.0, friction=0.0):
-    """Text of a joint."""
+    """Return the URDF text of a joint."""
     (x, y, z), (low, high, effort) = origin, limits
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
@@ -34,18 +34,18 @@ def joint(name, kind, parent, child, origin, axis, limits, damping=0.0, friction
 
 
 def urdf(name, *parts):
-    """A whole robot whose root is a link without mass."""
+    """Return a robot whose root is a link without mass."""
     return plain(f'<robot name="{name}"><link name="base"/>{"".join(parts)}</robot>')
 
 
 def rod(mass, length, radius=0.03):
-    """(mass, centre of mass, moments) of a rod that hangs down from its joint."""
+    """Return (mass, centre of mass, moments) of a rod that hangs from its joint."""
     across = mass * (3 * radius**2 + length**2) / 12
     return mass, (0.0, 0.0, -length / 2), (across, across, mass * radius**2 / 2)
 
 
 def hanging(name, lengths, masses, names, axes=None, damping=0.0):
-    """An arm of rods that hangs down at zero."""
+    """Return an arm of rods that hangs down at zero."""
     parts, parent, origin = [], "base", (0.0, 0.0, 0.0)
     axes = axes or ["0 1 0"] * len(lengths)
     dampings = np.broadcast_to(damping, len(lengths))
@@ -104,7 +104,7 @@ def _random(rng):
 
 
 def example(name):
-    """Text of a file of PyPI's example-robot-data."""
+    """Return the text of a file of the PyPI package example-robot-data."""
     import pinocchio
 
     for folder in Path(pinocchio.__file__).parents:
@@ -142,18 +142,18 @@ KINDS = {
     "iiwa": _iiwa,
 }
 MOTORS = ("arm2", "double", "cartpole", "random")
-"""Driven by forces about where they hang; the others would fall."""
+"""Robots driven by forces around their hanging pose; the other robots would fall."""
 SERVOS = ("arm2", "random", "ur5", "panda", "iiwa")
 NAMES = tuple(f"{name}-motor" for name in MOTORS) + tuple(f"{name}-servo" for name in SERVOS)
 
 
 def machine(name, rng, numerics=None):
-    """A machine of `NAMES`.
+    """Draw a machine.
 
     Args:
-        name: robot and drive.
-        rng: draws its numbers, its pose, and how it is mounted.
-        numerics: (step, integrator) that the recording states; fine ones where it is None.
+        name: robot and drive, one of `NAMES`.
+        rng: random generator for its numbers, pose and mounting.
+        numerics: (step, integrator) that the recording specifies; (0.002, "RK4") if None.
     """
     kind, _, drive = name.partition("-")
     text, _, pose = KINDS[kind](rng)
@@ -166,8 +166,9 @@ def machine(name, rng, numerics=None):
 
 
 def _drives(bare, kind, rng):
-    """A motor at every joint (of the cartpole its cart, of the double pendulum one of two), or
-    servos whose gains suit what each joint moves.
+    """Return a motor for each joint, or servos with gains that suit the moved inertia.
+
+    The cartpole has a motor at its cart only, the double pendulum at one of its two joints.
     """
     efforts = _efforts(bare)
     if kind == "motor":
@@ -184,8 +185,10 @@ def _drives(bare, kind, rng):
 
 
 def _served(bare, rate):
-    """The inertia that each servo is made for, kg m^2: what its joint moves, and no less than a
-    share of the most, unless a servo with this share would be too quick.
+    """Return the inertia for which each servo is designed, kg m^2.
+
+    It is the inertia that the joint moves, or a fraction of the largest one if that is more. The
+    fraction is reduced until no servo is faster than `FASTEST`.
     """
     import pinocchio
 

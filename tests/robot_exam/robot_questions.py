@@ -1,4 +1,4 @@
-"""The sheet of questions about robots. A question becomes an item when it is drawn."""
+"""Questions of the robot exam; drawing a question gives a benchmark case."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tests.robot_exam.robot_items import draw
 from tests.robot_exam.robot_models import NAMES
 
 CLEAN, DOUBLE, FOREIGN, FAMILY, NUMERICS = 24, 4, 2, 2, 2
-"""Of each robot and drive: so many clean ones, pairs, of each foreign cause, of each family, and of
-numerics."""
-ATTEMPTS = 6  # drawings of one question, if the drawn machine cannot show what it hides
+"""Questions for each robot and drive: clean, double, each unmodelled cause, each family, numerics.
+"""
+ATTEMPTS = 6  # Maximum number of drawings of a question whose cause is not visible.
 QUICK = (
     ("clean", "arm2-motor", "any"), ("single", "arm2-motor", "friction.coulomb"),
     ("single", "arm2-motor", "mass.scale"), ("clean", "arm2-servo", "any"),
@@ -23,7 +23,7 @@ QUICK = (
 
 @dataclass(frozen=True)
 class Question:
-    """What to draw; `index` tells questions of one sort apart."""
+    """Specification of a case; `index` distinguishes questions of the same kind."""
 
     kind: str
     robot: str
@@ -35,7 +35,7 @@ class Question:
         return f"{self.kind}/{self.robot}/{self.effect}/{self.index}"
 
     def drawn(self, offset=0):
-        """The first of several drawings that shows; None if none does."""
+        """Return the first drawing whose cause is visible; None if there is none."""
         first = 1000 * offset + 10 * self.index
         items = (draw(self.kind, self.robot, self.effect, first + k) for k in range(ATTEMPTS))
         return next((item for item in items if item is not None), None)
@@ -45,14 +45,14 @@ class Question:
 
 
 def sheet():
-    """All questions, the robots one after another within each sort."""
+    """Return all questions, ordered by index and then by robot."""
     return [
         question for index in range(CLEAN) for robot in NAMES for question in _round(robot, index)
     ]
 
 
 def _round(robot, index):
-    """The questions about a robot whose index is this."""
+    """Yield the questions of one index for a robot."""
     servo = robot.endswith("servo")
     yield Question("clean", robot, "any", index)
     if index < 1:
@@ -71,13 +71,13 @@ def _round(robot, index):
 
 
 def quick():
-    """A few of two robots."""
-    # of the clean ones those that end at the first look, as nine of ten do
+    """Return a few questions about two robots."""
+    # Index 1 gives clean cases that end after the first test, as nine out of ten do.
     return [Question(kind, robot, effect, int(kind == "clean")) for kind, robot, effect in QUICK]
 
 
 def spread():
-    """One question of each effect, the robots in turn: for a look in an hour or two."""
+    """Return one question per effect, with the robots in turn; it takes one to two hours."""
     chosen = []
     for drive in ("motor", "servo"):
         robots = [name for name in NAMES if name.endswith(drive)]
@@ -94,7 +94,7 @@ def spread():
 
 
 def digest():
-    """Of the code that draws; items drawn by the same code need not be drawn again."""
+    """Return a hash of the code that draws; cases of the same code are not drawn again."""
     here, text = Path(__file__).parent, hashlib.sha256()
     for module in (
         "friction_laws", "reference_plant", "exam_robots", "excitation_signals",

@@ -1,4 +1,4 @@
-"""What sensors make of a motion."""
+"""Sensor readings of a motion."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ NOISES = ("white", "ar1", "quantised")
 
 
 def observed(world, run, channels, slips=()):
-    """What noiseless sensors record of a run, (T, C).
+    """Return noise-free sensor readings of a run, (T, C).
 
     Args:
-        world: of `world.World`.
-        run: of `world.Run`.
+        world: `reference_world.World`.
+        run: `reference_integration.Run`.
         channels: names such as q.elbow.
-        slips: (joint, instant, jump) of an encoder that slips: a foreign cause.
+        slips: (joint, time, jump) of a slipping encoder, an unmodelled cause.
     """
     skew = world.effects.get("clock.skew", (0.0,))[0]
     instants = {}

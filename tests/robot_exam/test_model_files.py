@@ -1,4 +1,4 @@
-"""`explain` about robots' files as they lie in packages: no code, no change to the file."""
+"""Tests of `explain` with unchanged model files of packages and no user code."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A few causes hidden in two robots: `explain` finds them, at their places."""
+"""Tests that `explain` finds a few hidden causes of two robots at their places."""
 
 import pytest
 
@@ -16,7 +16,7 @@ from tests.robot_exam import (
 
 @pytest.fixture
 def shorter(monkeypatch):
-    """Recordings of three runs of 3 s, not of six of 4 s: what is hidden is drawn as large."""
+    """Make recordings of three runs of 3 s instead of six of 4 s; causes have the same sizes."""
     for module in (exam_settings, exam_recording, cause_sizing):
         monkeypatch.setattr(module, "FITTED", 2)
     monkeypatch.setattr(exam_settings, "HELD_OUT", 1)

@@ -1,4 +1,4 @@
-"""The worlds against physics, and against MuJoCo."""
+"""Tests of the reference world against closed-form solutions and against MuJoCo."""
 
 import numpy as np
 import pytest
@@ -23,12 +23,12 @@ ROLLER = robot_models.urdf(
 
 
 def roller(kind="motor"):
-    """A disc of 0.4 kg m^2 about an upright axle: gravity has no say."""
+    """Return a disc of 0.4 kg m^2 on a vertical axle, where gravity has no effect."""
     return Machine("roller", ROLLER, (Drive("axle", kind, 30.0, 3.0, 50.0),), (0.0,))
 
 
 def driven(machine, amplitude, frequency=3.0, stamps=STAMPS):
-    """Every actuator's command a sine about what holds the pose."""
+    """Return a run with sinusoidal commands around the values that hold the pose."""
     pose = np.array(machine.pose)
     hold = World(machine).plant.needed(pose, 0 * pose)
     commands = {}
@@ -120,7 +120,7 @@ def test_friction_holds_exactly_below_its_limit_and_breaks_loose_above_it():
 
 
 def test_a_servo_breaks_loose_when_its_lagging_command_pulls_enough():
-    """kp (1 - exp(-t / lag)) = friction."""
+    """The joint breaks away when kp (1 - exp(-t / lag)) = friction."""
     lag, friction, step = 0.5, 12.0, np.ones(STAMPS.size)
     effects = {"friction.coulomb@axle": (friction,), "input.lag@m_axle": (lag,)}
     world = World(roller("position"), effects)
@@ -187,7 +187,7 @@ def test_an_armature_slows_a_joint_by_what_it_adds():
 
 
 def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
-    """w^2 = k (1/J1 + 1/J2), about the common motion."""
+    """The frequency about the common motion is w^2 = k (1/J1 + 1/J2)."""
     kick = np.where(STAMPS < 0.02, 10.0, 0.0)
     world = World(roller(), {"joint.flexibility@axle": (1 / 20.0, 0.0, 0.25)})
     motion = world.move(Run(STAMPS, {"m_axle": kick}, np.zeros(1), np.zeros(1)), STAMPS)
@@ -200,7 +200,7 @@ def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
 
 
 def test_a_gap_is_passed_alone_and_a_flank_takes_the_link_along():
-    """A tenth of the roller's inertia is the motor's: it goes ten times as fast as both would."""
+    """The motor has a tenth of the roller's inertia and moves alone until it meets the flank."""
     gap, pull = 0.02, np.full(STAMPS.size, 0.1)
     world = World(roller(), {"joint.backlash@axle": (gap, 0.1)})
     motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
@@ -213,7 +213,7 @@ def test_a_gap_is_passed_alone_and_a_flank_takes_the_link_along():
 
 
 def test_friction_that_remembers_takes_its_energy_over_its_way():
-    """J v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
+    """Energy balance: J v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
     dry, way, pull = 0.3, 0.1, np.full(STAMPS.size, 0.4)
     world = World(roller(), {"friction.hysteresis@axle": (dry, way)})
     motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
@@ -231,8 +231,10 @@ def test_friction_that_remembers_takes_its_energy_over_its_way():
     ],
 )
 def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
-    """An arm of two joints, the second one's drive on a spring, with play, or rubbing with memory:
-    by how much motions differ, as a share of what the effect changes.
+    """The library agrees with the reference world for the second joint of an arm.
+
+    The difference is given as a fraction of the change that the effect causes. The effects are a
+    flexible drive, backlash and hysteresis.
     """
     machine = robot_models.machine("arm2-motor", np.random.default_rng(5))
     off, changed = differs(machine, f"{effect}@{machine.joints[1]}", c, 0.5, tmp_path)
@@ -246,8 +248,10 @@ def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
     [("joint.coupling", -0.3, 1e-3), ("supply.sag", 0.02, 0.03), ("supply.braking", 0.5, 0.11)],
 )
 def test_drives_of_the_library_move_as_those_of_this_world_do(robot, effect, c, close, tmp_path):
-    """A drive that turns the joint before as well, one battery for all, and a drive that hardly
-    brakes; what these take is told of the last step, to first order in its length.
+    """The library agrees with the reference world for coupling, a shared battery and braking loss.
+
+    The tolerances are larger where the library uses values of the previous step, which is accurate
+    to first order in the step length.
     """
     machine = robot_models.machine(robot, np.random.default_rng(5))
     last = {"joint.coupling": machine.joints[-1], "supply.braking": machine.drives[-1].name}
@@ -259,8 +263,10 @@ def test_drives_of_the_library_move_as_those_of_this_world_do(robot, effect, c, 
 
 
 def differs(machine, name, c, moves, folder):
-    """How far motions of the library are from those of the world, as a share of what an effect
-    changes; and that.
+    """Compare the library with the reference world.
+
+    Returns:
+        The difference of the motions as a fraction of the effect's change, and the RMS change.
     """
     run = driven(machine, moves, stamps=np.arange(101) / 100)
     bare, hidden = (World(machine, of).move(run, run.times).q for of in ({}, {name: c}))
@@ -299,7 +305,7 @@ def test_a_shaft_turns_two_joints_and_one_battery_serves_all_drives():
 
 
 def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():
-    """Its friction is the heat of that one, which comes with the work and goes in its time."""
+    """Friction follows the heat of another joint, which grows with its work and decays in time."""
     machine = robot_models.machine("arm2-motor", np.random.default_rng(1))
     world = World(machine, foreign=Heated(1, 0, 0.5, 0.2, 1.0))
     run = driven(machine, 0.5, stamps=np.arange(101) / 100)
@@ -329,7 +335,7 @@ def test_a_binding_range_rubs_only_where_it_is():
     start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
     v = world.move(start, STAMPS).v[:, 0]
     assert v[STAMPS < 1.2].tolist() == [2.0] * int(np.sum(STAMPS < 1.2))
-    # Friction sets in and goes over a tenth of the half width, which counts half.
+    # Friction rises and falls over a tenth of the half width, which counts half.
     assert v[-1] ** 2 == pytest.approx(4.0 - 2 * 0.5 * 0.95 / 0.4, rel=1e-4)
 
 

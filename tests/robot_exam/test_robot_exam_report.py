@@ -1,4 +1,4 @@
-"""The tables and the page that questions about robots leave behind."""
+"""Tests of the tables and the page of the robot exam."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Marks of answers about robots."""
+"""Tests of the grades of robot diagnoses."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Questions about robots: drawn alike every time, as large as they say, told to nobody."""
+"""Tests of robot cases: reproducible, of the stated size, with the cause in no file."""
 
 import csv
 import dataclasses
@@ -118,7 +118,7 @@ def test_a_slipping_encoder_jumps_and_stays(item):
 
 @pytest.mark.slow
 def test_what_is_alike_in_a_servo_is_found_so_and_a_sensor_of_force_splits_it(item):
-    """A force that is constant is a command that is off: kp times as much."""
+    """A constant force is equivalent to a command offset multiplied by kp."""
     whole = robot_items.setting_of(item.name)
     runs = tuple(
         Run(r.times[:60], {name: u[:60] for name, u in r.commands.items()}, r.q, r.v)

@@ -20,7 +20,7 @@ from pathlib import Path
 from sims.engines.compiled import kernel
 from tests.simple_exam import exam_answers, exam_questions, exam_report
 
-LIMIT = 600  # seconds for drawing, writing, explaining and marking one item
+LIMIT = 600  # Maximum seconds to draw, record, explain and grade one case.
 ALONE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -84,7 +84,7 @@ def _amiss(row):
 
 
 def _before(path):
-    """Rows by question; a line that was cut off is none."""
+    """Return rows by question; incomplete lines are ignored."""
     rows = {}
     for line in path.read_text().splitlines() if path.exists() else ():
         try:
@@ -101,7 +101,7 @@ def _ask(asked, path, known, drawn, given):
 
     for name in ALONE:
         os.environ[name] = "1"
-    kernel.get_kernel()  # compiled, if it never was, before it takes a question's time
+    kernel.get_kernel()  # Compile now, so that the time does not count for a question.
     context = multiprocessing.get_context("spawn")
     with ProcessPool(max_workers=given.jobs, context=context) as pool, path.open("a") as file:
         running = {
@@ -119,7 +119,7 @@ def _ask(asked, path, known, drawn, given):
                     row = future.result()
                 except (
                     Exception
-                ) as error:  # a worker that was killed or took too long costs one question
+                ) as error:  # A worker that was killed or timed out costs one question only.
                     row = exam_answers.lost(
                         question, known.get(question.name), f"{type(error).__name__}: {error}"
                     )

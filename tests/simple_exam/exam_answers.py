@@ -1,6 +1,4 @@
-"""One question answered: draw the item, write its recording, have it explained, mark the answer.
-Runs in a worker.
-"""
+"""Answer one question in a worker: draw the case, write and explain its recording, grade it."""
 
 from __future__ import annotations
 
@@ -20,13 +18,13 @@ MOST_RIVALS = 6
 
 
 def answered(question, offset, known=None, explain=EXPLAIN):
-    """A row about a question (a dictionary, as JSON): the item, the verdict, the mark.
+    """Return the result row of a question: case, verdict and grade.
 
     Args:
-        question: as JSON.
-        offset: of the seeds.
-        known: the item as JSON if it was drawn before, {} if it was found not to show, None if it
-            was not drawn.
+        question: question as JSON.
+        offset: offset of the seeds.
+        known: case as JSON if it was drawn before, {} if no drawing is visible, None if it was not
+            drawn.
         explain: module:function to examine.
     """
     asked = Question(**question)
@@ -50,13 +48,14 @@ def _answer(item, explain):
 
 def _written(item, folder):
     path = write_case(item, folder, truth=False)
-    path = path.rename(path.with_name("recording.csv"))  # the name tells what is hidden
+    # The original name reveals the hidden cause.
+    path = path.rename(path.with_name("recording.csv"))
     path.with_name(f"{item.name}.toml").rename(path.with_suffix(".toml"))
     return path
 
 
 def lost(question, known, error):
-    """The row of a question whose worker did not come back."""
+    """Return the row of a question whose worker failed."""
     row = {name: question.json()[name] for name in ("part", "kind", "system", "effect")}
     mark = asdict(Grade("failed", 0, 0, "", {})) | {"found": False, "found_class": False}
     row |= {
@@ -70,9 +69,12 @@ def lost(question, known, error):
 
 
 def _rivals(item, verdict, mark):
-    """By effect that was named without being hidden: what it leaves of the gap, in units of the
-    noise, and how many sigmas of evidence that is against it; few if it explains these data as well
-    as the truth does."""
+    """Test effects that were diagnosed but not hidden.
+
+    Returns:
+        By effect, the RMS residual in units of the noise and the sigmas of evidence against the
+        effect. A small number of sigmas means that it explains the data as well as the truth does.
+    """
     if item.kind != "single" or mark.found or not verdict or len(verdict["causes"]) != 1:
         return {}
     (cause,) = verdict["causes"]
@@ -82,7 +84,7 @@ def _rivals(item, verdict, mark):
     setting = restore_conditions(item)
     observed = effect_sizing.simulate_observations(setting, item.effects)
     phi = setting.noise.phi if item.noise == "ar1" else 0.0
-    samples = observed.size * (1 - phi) / (1 + phi)  # noise that repeats itself tells less
+    samples = observed.size * (1 - phi) / (1 + phi)  # Effective number of samples with AR(1) noise.
     left = {
         name: competing_effects.compute_refitted_residual(setting, observed, name) for name in names
     }

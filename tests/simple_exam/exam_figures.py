@@ -1,4 +1,4 @@
-"""The exam's two figures, readable in grey: power against size, and what was taken for what."""
+"""The two figures of the exam, readable in grey: power against size, and confusion of causes."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ WANTED = 0.97
 
 
 def draw(folder, power, counts):
-    """Draw `figures`/power and `figures`/confusion, PNG and PDF, as far as there is something to
-    draw.
-    """
+    """Draw `figures`/power and `figures`/confusion as PNG and PDF, if there are data."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -99,5 +97,5 @@ def _confusion(counts):
 
 
 def _ordered(names):
-    """Effects by name, then what is none, in brackets."""
+    """Sort effects by name; entries in parentheses, which are not effects, are last."""
     return sorted(names, key=lambda name: (name.startswith("("), name))

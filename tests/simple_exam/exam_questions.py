@@ -1,4 +1,4 @@
-"""The exam's sheet: which questions are asked. A question becomes an item when it is drawn."""
+"""Questions of the exam; drawing a question gives a benchmark case."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
 )
 from sims import effects as library
 
-CLEAN, EACH, DOUBLE, EACH_FOREIGN = 105, 4, 15, 4  # of each system, effect, system, foreign cause
-ATTEMPTS = 8  # drawings of one question, if the drawn sensors cannot show what it hides
+# Questions per system, effect, system and unmodelled cause.
+CLEAN, EACH, DOUBLE, EACH_FOREIGN = 105, 4, 15, 4
+ATTEMPTS = 8  # Maximum number of drawings of a question whose cause is not visible.
 QUICK = (
     ("single", "ball", "restitution.speed", 3.0), ("single", "ball", "drag.quadratic", 4.0),
     ("single", "pendulum", "friction.coulomb", 3.0), ("single", "pendulum", "input.delay", 5.0),
@@ -33,8 +34,10 @@ QUICK = (
 
 @dataclass(frozen=True)
 class Question:
-    """What to draw: `part` is marks, or power for the power curve alone; `index` tells questions of
-    one sort apart.
+    """Specification of a case.
+
+    `part` is "marks", or "power" for the power curve only; `index` distinguishes questions of the
+    same kind.
     """
 
     part: str
@@ -49,7 +52,7 @@ class Question:
         return f"{self.part}/{self.kind}/{self.system}/{self.effect or 'any'}/{self.index}"
 
     def drawn(self, offset):
-        """The first of several drawings that shows; None if none does."""
+        """Return the first drawing whose cause is visible; None if there is none."""
         first = 1000 * offset + 10 * self.index
         items = (
             draw_case(self.kind, self.system, first + k, self.effect, self.size)
@@ -62,7 +65,7 @@ class Question:
 
 
 def sheet(offset):
-    """All questions of a whole exam."""
+    """Return all questions of a full exam."""
     effects = [
         (system, name)
         for system in SYSTEMS
@@ -98,21 +101,21 @@ def sheet(offset):
 
 
 def quick():
-    """A few of every kind."""
+    """Return a few questions of every kind."""
     questions = [
         Question("marks", "clean", system, None, k, None) for k, system in enumerate(SYSTEMS)
     ]
     questions += [
         Question("marks", kind, system, name, 0, size) for kind, system, name, size in QUICK
     ]
-    # The slider's pair takes minutes by itself: the whole exam asks it.
+    # The slider's pair takes minutes, so only the full exam contains it.
     return questions + [
         Question("marks", "double", system, None, 0, None) for system in SYSTEMS[:2]
     ]
 
 
 def _size(offset, system, name, index):
-    """From 1 to 10, the questions about one effect spread evenly on a logarithmic scale."""
+    """Return a size from 1 to 10; sizes of an effect are evenly spread on a logarithmic scale."""
     share = (
         index % EACH + np.random.default_rng([offset, index, *f"{system} {name}".encode()]).random()
     ) / EACH
@@ -120,7 +123,7 @@ def _size(offset, system, name, index):
 
 
 def digest():
-    """Of the code that draws; items drawn by the same code need not be drawn again."""
+    """Return a hash of the code that draws; cases of the same code are not drawn again."""
     here, text = Path(reference_simulation.__file__).parent, hashlib.sha256()
     for module in (
         "true_system",

@@ -1,4 +1,4 @@
-"""What an exam leaves behind: tables, figures, and a page about them."""
+"""Tables, figures and a page with the results of an exam."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import json
 from tests.simple_exam import exam_figures
 from tests.simple_exam.exam_summary import confusion, power, summarised
 
-QUICK_SHARE = 0.8  # of the few of a quick exam that must be right
+QUICK_SHARE = 0.8  # Minimum share of right answers in a quick exam.
 
 
 def write(folder, rows):
-    """Write all of it into `folder`; returns the summary."""
+    """Write all results into `folder` and return the summary."""
     summary = summarised(rows)
     answered = [row for row in rows if row.get("mark")]
     _items(folder / "items.csv", answered)
@@ -24,9 +24,7 @@ def write(folder, rows):
 
 
 def marks(summary):
-    """Rows (what, wanted, reached, interval, whether met) of the marks that `explain` must
-    reach.
-    """
+    """Return rows (description, required, result, interval, is met) of the targets of `explain`."""
     single, clean, double = summary["single"], summary["clean"], summary["double"]
     at_least = [
         (
@@ -72,7 +70,7 @@ def _at(got, low, high):
 
 
 def passes(summary):
-    """Whether a quick exam went well: no alarm, nothing failed, most found."""
+    """Return whether a quick exam has no alarm, no failure and enough right answers."""
     kinds = [
         summary["single"]["named up to equivalence"],
         summary["double"]["named up to equivalence"],
@@ -87,7 +85,7 @@ def passes(summary):
 
 
 def printed(summary):
-    """The marks as plain lines."""
+    """Return the targets as lines of text."""
     lines = [
         f"{'yes' if met else 'NO ':4}{_ratio(got):>34}  {what} ({wanted})"
         for what, wanted, got, met in marks(summary)
@@ -112,7 +110,7 @@ def _seconds(summary):
 
 
 def page(summary):
-    """README.md."""
+    """Return the text of README.md."""
     lines = [
         "# The exam of `simgap explain`",
         "",

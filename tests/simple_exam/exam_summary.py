@@ -1,6 +1,4 @@
-"""The numbers of an exam: shares with their 95 % intervals, coverage of intervals, times, power,
-confusion.
-"""
+"""Numbers of an exam: shares with 95 % intervals, interval coverage, times, power and confusion."""
 
 from __future__ import annotations
 
@@ -10,13 +8,14 @@ import numpy as np
 from scipy.stats import binomtest
 
 BINS = ((1.0, 10**0.25), (10**0.25, 10**0.5), (10**0.5, 10**0.75), (10**0.75, 10.001))
-"""Sizes of single effects, in units of the noise, that are counted together."""
-EVIDENCE = 4.0  # sigmas
+"""Intervals of the size of single effects, in units of the noise, that are counted together."""
+EVIDENCE = 4.0  # Sigmas above which the data exclude a cause.
 
 
 def share(rows, right, exact=False):
-    """How many are right, of how many, and the 95 % interval of the share (Wilson, or Clopper and
-    Pearson).
+    """Return the count of right rows, the total, and the share with its 95 % interval.
+
+    The interval is Wilson's, or Clopper-Pearson's with `exact`.
     """
     rows = list(rows)
     hits = sum(bool(right(row)) for row in rows)
@@ -41,7 +40,7 @@ def found_class(row):
 
 
 def as_data_tell(row):
-    """Found, or in a set whose other members nothing in these data speaks against."""
+    """Return whether the cause is found, or in a set that the data cannot reduce."""
     sigmas = [rival["sigmas"] for rival in row["rivals"].values()]
     return found_class(row) or (
         row["mark"]["outcome"] == "set" and max(sigmas, default=np.inf) < EVIDENCE
@@ -57,7 +56,7 @@ def right(row):
 
 
 def summarised(rows):
-    """All numbers about the rows of an exam."""
+    """Return all numbers about the rows of an exam."""
     answered = [row for row in rows if row.get("mark")]
     marks = [row for row in answered if row["part"] == "marks"]
     of = {
@@ -93,9 +92,7 @@ def _one(row):
 
 
 def _named(rows, by=("system", "effect", "noise", "stated", "source", "size")):
-    """Shares by names and by classes; whatever is `wrong` although the data tell the two apart
-    stands by itself.
-    """
+    """Return shares by effect, by equivalence class, and as far as the data distinguish causes."""
     result = {"named": share(rows, found), "named up to equivalence": share(rows, found_class)}
     result["named as data tell"] = share(rows, as_data_tell)
     result["named alone"] = share(rows, right)
@@ -129,9 +126,7 @@ def _value(row, key):
 
 
 def _coverage(rows):
-    """How many 95 % intervals hold the truth, of those that are closed; by what they are of, and by
-    noise.
-    """
+    """Return the coverage of finite 95 % intervals, by kind of quantity and by noise."""
     counts = [
         {
             "of": "coefficients" if "." in name else "parameters",
@@ -167,8 +162,9 @@ def _times(seconds):
 
 
 def _cannot(rows):
-    """Effects of which some or all drawings do not show within twice the plausible range, whatever
-    was drawn.
+    """Return the effects for which some or all drawings are not visible.
+
+    A drawing is not visible if it needs more than twice the plausible range.
     """
     asked, shown = Counter(), Counter()
     for row in rows:
@@ -183,7 +179,7 @@ def _cannot(rows):
 
 
 def power(rows):
-    """(size, share, share up to equivalence) by group of sizes."""
+    """Return (size, share, share up to equivalence) by group of sizes."""
     singles = [row for row in rows if row["kind"] == "single" and row["item"]]
     groups = {}
     for row in singles:
@@ -201,7 +197,7 @@ def power(rows):
 
 
 def confusion(rows):
-    """Counts by (truth, what was named first)."""
+    """Return counts by (truth, cause that was diagnosed first)."""
     counts = Counter()
     for row in rows:
         if row["part"] == "marks" and row["kind"] != "double":

@@ -1,4 +1,4 @@
-"""A recording that is explained, as its user would have it, and timed."""
+"""Explain a recording as a user would, and measure the time."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ EXPLAIN = "bench.diagnosis.explain:explain"
 
 
 def explained(written, explain=EXPLAIN, **settings):
-    """The verdict on a recording, and what it took; or why there is none.
+    """Return the verdict on a recording with its time, or the error.
 
     Args:
-        written: writes the recording into a folder, and returns its path.
+        written: function that writes the recording into a folder and returns its path.
         explain: module:function to examine.
-        settings: of that function.
+        settings: keyword arguments of that function.
     """
     module, function = explain.split(":")
     row = {"verdict": None, "seconds": None, "error": ""}

@@ -24,7 +24,7 @@ from sims import effects as library
 
 
 def candidates(kind, system):
-    """What can be hidden, of this kind in this system; None where nothing is."""
+    """Return the names of causes of this kind in this system; [None] for clean recordings."""
     if kind == "clean":
         return [None]
     return (
@@ -57,7 +57,7 @@ def main(arguments):
         made = 0
         for seed in range(
             given.seed, given.seed + 3 * given.count
-        ):  # what sensors cannot show is drawn again
+        ):  # Cases that the sensors cannot show are drawn again.
             item = (
                 draw_case(given.kind, given.system, seed, name, given.size)
                 if made < given.count

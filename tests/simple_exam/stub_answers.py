@@ -1,4 +1,4 @@
-"""Stand-ins for `explain`: what the exam's own tests examine, and a dry run without it."""
+"""Replacements of `explain` for the tests of the exam and for a dry run."""
 
 from types import SimpleNamespace
 
@@ -12,12 +12,12 @@ ADEQUATE = {
 
 
 def sees_nothing(path, system=None, engine="batch"):
-    """Everything is adequate."""
+    """Return the verdict "adequate" for every recording."""
     assert path.exists()
     assert path.with_suffix(".toml").exists()
     return SimpleNamespace(answer=Verdict.from_document(ADEQUATE))
 
 
 def crashes(path, system=None, engine="batch"):
-    """No answer."""
+    """Raise an error instead of an answer."""
     raise RuntimeError("no answer")

@@ -1,6 +1,4 @@
-"""The exam's questions: as large as wanted, the same for the same seed, and readable as
-recordings.
-"""
+"""Tests of the exam's cases: of the wanted size, reproducible, and readable as recordings."""
 
 import json
 from dataclasses import replace
@@ -41,7 +39,7 @@ from tests.simple_exam.exam_questions import Question, quick, sheet
 
 
 def refitted(item):
-    """The gap once more, by scipy's solvers and scipy's least squares."""
+    """Return the discrepancy computed with SciPy's solvers and SciPy's least squares."""
     drawn = restore_conditions(item)
     drawn = replace(drawn, scenarios=drawn.scenarios[: item.runs - count_held_out_runs(item)])
     hidden = drawn.make_true_system(item.effects)
@@ -95,9 +93,7 @@ def test_the_gap_is_as_large_as_wanted(system, seed, effect, size):
     ],
 )
 def test_the_hidden_effect_explains_all(system, effect):
-    """Solver and engine differ by so little of the noise that no number of samples asked for could
-    show it.
-    """
+    """Solver and engine differ by less than one sigma of evidence."""
     item = Question("marks", "single", system, effect, 0, 4.0).drawn(0)
     drawn = restore_conditions(item)
     for see in (simulate_with_scipy, simulate_with_mujoco):
@@ -107,12 +103,13 @@ def test_the_hidden_effect_explains_all(system, effect):
         left = competing_effects.compute_refitted_residual(
             drawn, observed, effect, item.effects[effect]
         )
-        assert left * observed.size**0.5 < 1.0  # sigmas of evidence against the truth
+        assert left * observed.size**0.5 < 1.0  # Sigmas of evidence against the truth.
 
 
 def test_what_the_sensors_cannot_show_is_not_asked():
-    assert draw_case("single", "slider", 0, "input.gain") is None  # the mass takes it up
-    assert draw_case("single", "slider", 0, "sensor.bias") is None  # the initial position does
+    assert draw_case("single", "slider", 0, "input.gain") is None  # The estimated mass explains it.
+    # The initial position explains it.
+    assert draw_case("single", "slider", 0, "sensor.bias") is None
 
 
 def test_of_two_effects_neither_does_for_both():
@@ -181,7 +178,7 @@ def test_the_same_seed_gives_the_same_files(tmp_path):
     ("kind", "system"), [("clean", "ball"), ("clean", "pendulum"), ("single", "slider")]
 )
 def test_files_are_recordings(tmp_path, kind, system):
-    # An effect that these sensors cannot show is not drawn.
+    # A case whose effect these sensors cannot show is not drawn.
     item = next(filter(None, (draw_case(kind, system, index) for index in range(2, 9))))
     recording = read_recording(write_case(item, tmp_path), SIMULATORS[system].system())
     assert recording.system == system
@@ -235,7 +232,7 @@ def test_the_sheet_asks_enough_of_everything():
 def test_a_question_is_drawn_until_it_shows():
     asked = Question(
         "marks", "single", "slider", "sensor.gain", 0, 2.5
-    )  # needs the rate, which few record
+    )  # The effect is visible only in the velocity channel, which few cases record.
     item = asked.drawn(0)
     assert item.seed > 0
     assert restore_conditions(item).channels == ("x", "v")

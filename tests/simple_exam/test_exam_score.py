@@ -1,4 +1,4 @@
-"""Marking: answers made up for the purpose, right and wrong."""
+"""Tests of the grading with right and wrong answers."""
 
 import json
 
@@ -34,7 +34,7 @@ def item(kind="single", system="slider", **effects):
 
 
 def answer(verdict="named", *sets, **values):
-    """A verdict that names these sets, the value 0.3 to 0.5 in every interval."""
+    """Return a verdict that names these sets, with the interval 0.3 to 0.5 everywhere."""
     interval = {"value": 0.4, "unit": "1", "low": 0.3, "high": 0.5}
     causes = [
         {
@@ -128,10 +128,10 @@ def test_intervals_are_held_against_the_truth():
 def test_shares_have_their_intervals():
     assert share([True] * 97 + [False] * 3, bool)["low"] == pytest.approx(
         0.9155, abs=1e-3
-    )  # Wilson's
+    )  # Wilson interval.
     assert share([False] * 300, bool, exact=True)["high"] == pytest.approx(
         1 - 0.025 ** (1 / 300)
-    )  # Clopper, Pearson
+    )  # Clopper-Pearson interval.
 
 
 def test_a_crash_is_a_row():
@@ -149,7 +149,8 @@ def test_an_exam_goes_on_where_it_was(tmp_path, capsys):
     assert main([*given, *explain]) == 0
     rows = (tmp_path / "items.jsonl").read_text()
     assert rows.count("\n") == 3
-    (tmp_path / "items.jsonl").write_text(rows[: rows.index("\n") + 5])  # as if it had been cut off
+    # Leave an incomplete line, as an interruption does.
+    (tmp_path / "items.jsonl").write_text(rows[: rows.index("\n") + 5])
     assert main([*given, "--explain", "tests.simple_exam.stub_answers:crashes"]) == 1
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["outcomes"]["clean"] == {"right": 1, "failed": 2}

@@ -1,6 +1,4 @@
-"""Recordings whose commands act at other times than their table says: `explain` names that, and
-what is hidden besides.
-"""
+"""Tests that `explain` finds a wrong command time, together with another hidden cause."""
 
 import pytest
 
@@ -24,7 +22,7 @@ def drawn(system, effect, index):
 
 
 def moved(monkeypatch, **besides):
-    """Let what is felt of commands differ from what the table will say."""
+    """Add input effects to the simulation that the recorded table does not show."""
 
     def felt(scenario, effects, until):
         return USUAL(scenario, {**besides, **effects}, until)

@@ -1,5 +1,6 @@
-"""The exam's worlds: scipy and MuJoCo agree about every effect; foreign causes keep to closed
-forms.
+"""Tests of the reference simulations.
+
+SciPy and MuJoCo agree about every effect, and unmodelled causes agree with closed forms.
 """
 
 import numpy as np
@@ -18,12 +19,11 @@ from sims import effects as library
 from sims.core.simulator import Scenario
 
 TIMES = np.arange(300) / 100
-SLIPPED = 0.705  # between two samples
-# What MuJoCo's second-order steps of 1 ms (sensor.lag: what they miss at a bounce) leave, in m,
-# rad, m/s, rad/s.
+SLIPPED = 0.705  # A time between two samples.
+# Error of MuJoCo's second-order steps of 1 ms (for sensor.lag: at a bounce), in m, rad, m/s, rad/s.
 TOLERANCE = {"ball": (5e-5,) * 3, "pendulum": (1e-4, 1e-3), "slider": (5e-6, 5e-6)}
-KNOCKS = (1e-5, 5e-4)  # a flank is met between two steps: its force bends there
-TURNS = (2e-3, 8e-3)  # a motion turns round between two steps: its force jumps there
+KNOCKS = (1e-5, 5e-4)  # Larger, because the force has a kink if a flank is met between two steps.
+TURNS = (2e-3, 8e-3)  # Larger, because the force jumps if a motion reverses between two steps.
 BASE = {"ball": {"restitution": 0.7}, "pendulum": {"inertia": 0.004}, "slider": {"mass": 1.2}}
 SOMEWHERE = {
     "ball": {
@@ -134,7 +134,7 @@ def test_scipy_and_mujoco_agree_about_each_effect(system, effect):
     within = {"joint.backlash": KNOCKS, "supply.braking": TURNS}
     tolerance = within.get(effect, TOLERANCE[system])
     assert (np.abs(seen - other).max(axis=0) < tolerance).all()
-    assert changes.max() > 50 * max(tolerance)  # or else the agreement says nothing
+    assert changes.max() > 50 * max(tolerance)  # Otherwise the agreement would mean nothing.
 
 
 def test_every_effect_of_the_library_has_its_world():
@@ -152,7 +152,7 @@ def test_scipy_and_mujoco_agree_about_effects_together(system, effects):
 
 
 def strange(system, foreign, initial, number=0, times=TIMES):
-    """A run without input, with a foreign cause."""
+    """Simulate a run without input, with an unmodelled cause."""
     names = list(SIMULATORS[system].states)
     run = Scenario(times, dict(zip(names, initial, strict=True)))
     return simulate_with_scipy(
@@ -196,7 +196,8 @@ def test_patch_takes_its_work_and_holds_what_is_too_slow():
     assert v[-1] ** 2 == pytest.approx(0.8**2 - 2 * rubs * 2 * half / mass, rel=1e-5)
     x, v = strange("slider", {"patch": (rubs, 0.4, half)}, (0.0, 0.3)).T
     assert v[-1] == 0.0
-    assert x[-1] == pytest.approx(0.3 + 0.3**2 * mass / (2 * rubs), abs=0.01)  # the border is soft
+    # The tolerance is 0.01 because the border of the patch is smooth.
+    assert x[-1] == pytest.approx(0.3 + 0.3**2 * mass / (2 * rubs), abs=0.01)
 
 
 def test_pendulum_meets_the_same_causes():

@@ -49,7 +49,7 @@ def main(arguments=None):
 
 
 def answered(kind, robot, effect, index):
-    """A row about a question: the item, the verdict, the mark."""
+    """Return the result row of a question: case, verdict and grade."""
     found = floating_items.drawn(kind, robot, effect, index)
     row = {"kind": kind, "robot": robot, "effect": effect, "item": None, "mark": None}
     if found is None:
@@ -60,7 +60,7 @@ def answered(kind, robot, effect, index):
 
 
 def table(rows):
-    """Right answers of all that show, by robot and kind."""
+    """Return right answers among the visible cases, by robot and kind."""
     counted, right, outcomes = Counter(), Counter(), Counter()
     for row in (row for row in rows if row["mark"]):
         key, outcome = (row["robot"], row["kind"]), row["mark"]["outcome"]

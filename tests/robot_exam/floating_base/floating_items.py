@@ -1,6 +1,4 @@
-"""Questions about robots that float: a recording in which a cause is hidden, or none, drawn from a
-name; its files; and what is asked.
-"""
+"""Benchmark cases of floating-base robots: draw a case from its name and write its files."""
 
 from __future__ import annotations
 
@@ -30,15 +28,16 @@ OWN = {
     "hung-motor": ("gravity.scale", "input.deadband"),
 }
 CLEAN = 40
-"""Of each robot."""
+"""Count of clean questions per robot."""
 ATTEMPTS = 4
 FOREIGN_APART = 1.0
-"""Noises that no one effect at the same joint explains of a foreign cause."""
+"""Smallest residual of an unmodelled cause after fitting one effect at its joint, in sigmas."""
 
 
 def questions():
-    """(kind, robot, effect, index) of all, in no order of what is asked, so that what is answered
-    early is a fair sample.
+    """Return (kind, robot, effect, index) of all questions.
+
+    They are sorted by hash, so that the questions answered first are a fair sample.
     """
     sheet = []
     for robot in floating_robots.NAMES:
@@ -49,7 +48,7 @@ def questions():
 
 
 def drawn(kind, robot, effect, index):
-    """The first of some drawings that shows, with its setting; None if none does."""
+    """Return the first drawing whose cause is visible, with its setting; None if there is none."""
     for attempt in range(ATTEMPTS):
         name = f"{kind}/{robot}/{effect}/{10 * index + attempt}"
         found = _draw(name, kind, robot, effect)
@@ -59,7 +58,7 @@ def drawn(kind, robot, effect, index):
 
 
 def bare(name, effects):
-    """The question of a name with this hidden in it, and its setting; nothing is measured."""
+    """Return the case of a name with given effects, and its setting; no size is measured."""
     kind, robot, *_ = name.split("/")
     made = setting(robot, rng_of(name, "setting"))
     item = Item(
@@ -103,7 +102,7 @@ def _places(machine, effect):
 
 
 def _simpler(hidden, gauge):
-    """What the simpler form of an effect changes, if it has one."""
+    """Return the changes that the simpler form of an effect causes, if there is one."""
     ((name, c),) = hidden.items()
     effect, _, place = name.partition("@")
     if effect not in planted_effects.SIMPLER:
@@ -114,7 +113,7 @@ def _simpler(hidden, gauge):
 
 
 def _near(made, hidden, gauge, rng):
-    """What single effects at the joint of a foreign cause change."""
+    """Return the changes that single effects at the joint of an unmodelled cause make."""
     ((_, c),) = hidden.items()
     joint = made.machine.joints[int(c[0])]
     changed = []
@@ -125,8 +124,9 @@ def _near(made, hidden, gauge, rng):
 
 
 def written(item, made, folder):
-    """Write log.csv, log.toml and robot.xml; the path of the first. Nothing in them tells what is
-    hidden.
+    """Write log.csv, log.toml and robot.xml, and return the path of log.csv.
+
+    No file reveals the hidden cause.
     """
     folder, machine = Path(folder), made.machine
     folder.mkdir(parents=True, exist_ok=True)

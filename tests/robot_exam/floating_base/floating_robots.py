@@ -1,5 +1,6 @@
-"""Robots that float or hang on a ball, drawn by a seed: numbers from which the MJCF for simgap is
-written, and from which Pinocchio's model is built without any file.
+"""Floating-base robots, drawn from a seed.
+
+The same numbers give the MJCF text for simgap and, without any file, Pinocchio's model.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 from tests.robot_exam.exam_robots import Drive
 
 PADS = {"free": 7, "ball": 4}
-"""Numbers of a pose; of a velocity there is one less."""
+"""Count of numbers in a pose of the floating base; a velocity has one less."""
 
 
 @dataclass(frozen=True)
@@ -20,15 +21,15 @@ class Link:
     """A body and the joint that moves it.
 
     Attributes:
-        name: of the body.
-        joint: of its joint.
-        parent: its carrier; "" for the one that floats.
-        at: (3,) m, where the joint is in the carrier.
-        axis: (3,) of a hinge; of what floats it means nothing.
+        name: name of the body.
+        joint: name of its joint.
+        parent: parent body; "" for the floating base.
+        at: (3,) m, position of the joint in the parent.
+        axis: (3,) axis of a hinge; unused for the floating base.
         mass: kg.
-        com: (3,) m, in the body.
+        com: (3,) m, centre of mass in the body frame.
         moments: (3,) kg m^2 about the centre of mass, along the body's axes.
-        damping: of a hinge, N m s/rad.
+        damping: damping of a hinge, N m s/rad.
     """
 
     name: str
@@ -44,19 +45,19 @@ class Link:
 
 @dataclass(frozen=True)
 class Floater:
-    """A robot whose first link floats or turns on a ball.
+    """A robot whose first link has a free joint or a ball joint.
 
-    Its coordinates in this folder are those of its hinges, and behind them what floats, padded so
-    that there are as many speeds as positions: a pose (x, y, z and) qx, qy, qz, qw, a velocity in
-    the body's own axes, and a zero.
+    The coordinates in this folder are those of the hinges, followed by those of the floating base.
+    The latter are padded so that there are as many velocities as positions: a pose (x, y, z and)
+    qx, qy, qz, qw, a velocity in the body's axes, and a zero.
 
     Attributes:
-        name: says what it is.
+        name: name of the model.
         root: free or ball.
         gravity: m/s^2 downwards.
-        links: the one that floats first, the others in the order of their joints.
-        drives: an actuator for each joint that has one.
-        step, integrator: of MuJoCo, as the file states them.
+        links: the floating base first, the others in the order of their joints.
+        drives: one actuator for each driven joint.
+        step, integrator: MuJoCo settings that the file specifies.
     """
 
     name: str
@@ -69,48 +70,48 @@ class Floater:
 
     @property
     def hinges(self):
-        """Names of the joints of one coordinate."""
+        """Names of the joints with one coordinate."""
         return tuple(link.joint for link in self.links[1:])
 
     @cached_property
     def joints(self):
-        """Names of all coordinates; those of what floats are no places."""
+        """Names of all coordinates; those of the floating base are not effect places."""
         return (*self.hinges, *(f"~{k}" for k in range(PADS[self.root])))
 
     @property
     def bodies(self):
-        """By coordinate: the link that a hinge moves; the rest, the one that floats."""
+        """By coordinate, the link that a hinge moves, or the floating base."""
         rest = (self.links[0].name,) * PADS[self.root]
         return (*(link.name for link in self.links[1:]), *rest)
 
     @property
     def driven(self):
-        """Coordinates that have an actuator, in the actuators' order."""
+        """Coordinates with an actuator, in the order of the actuators."""
         return [self.joints.index(drive.joint) for drive in self.drives]
 
     def unit(self, joint):
-        """Of a coordinate of a hinge."""
+        """Return the unit of a hinge coordinate."""
         return "rad"
 
     def stated(self):
-        """(damping, dry friction) of every coordinate."""
+        """Return (damping, dry friction) of every coordinate."""
         rest = [(0.0, 0.0)] * PADS[self.root]
         return [(link.damping, 0.0) for link in self.links[1:]] + rest
 
     def index(self, place):
-        """The coordinate that a place belongs to."""
+        """Return the coordinate to which a place belongs."""
         for name in (place, place.removeprefix("m_"), place.partition(".")[2]):
             if name in self.joints:
                 return self.joints.index(name)
         return self.bodies.index(place)
 
     def number(self, place):
-        """Pinocchio's number of the joint of a place, the one that floats being 1."""
+        """Return Pinocchio's number of the joint of a place; the floating base has number 1."""
         at = self.index(place)
         return 1 if at >= len(self.hinges) else at + 2
 
     def model(self):
-        """A new model of Pinocchio."""
+        """Build a new Pinocchio model."""
         import pinocchio as pin
 
         model = pin.Model()
@@ -129,11 +130,11 @@ class Floater:
 
     @property
     def mount(self):
-        """Where a ball is in the world; a free joint is nowhere of its own."""
+        """Position of a ball joint in the world; zero for a free joint."""
         return self.links[0].at if self.root == "ball" else (0.0, 0.0, 0.0)
 
     def mjcf(self):
-        """The text of its file."""
+        """Return the MJCF text of the robot."""
         lines = [f'<mujoco model="{self.name}">']
         lines.append(
             f'  <option timestep="{self.step}" integrator="{self.integrator}" '
@@ -149,7 +150,7 @@ class Floater:
         return "\n".join([*lines, "  </actuator>", "</mujoco>"]) + "\n"
 
     def _body(self, link, indent):
-        """Lines of a body and those that it carries."""
+        """Return the MJCF lines of a body and its children."""
 
         def text(numbers):
             return " ".join(f"{number:.17g}" for number in numbers)
@@ -173,20 +174,19 @@ class Floater:
 
 
 NAMES = ("satellite-motor", "dropped-servo", "hung-motor")
-"""A hull in space with an arm; a trunk that falls, with two legs; a body on a ball joint that
-swings with an arm.
+"""A hull in space with an arm; a falling trunk with two legs; a body on a ball joint with an arm.
 """
 
 
 def machine(name, rng):
-    """A robot of `NAMES`, drawn."""
+    """Draw a robot of `NAMES`."""
     return {"satellite": _satellite, "dropped": _dropped, "hung": _hung}[name.partition("-")[0]](
         rng
     )
 
 
 def _rod(name, joint, parent, at, axis, mass, length, damping):
-    """A rod that hangs down from its joint."""
+    """Return a rod that hangs from its joint."""
     thick = 0.04
     across = mass * (3 * thick**2 + length**2) / 12
     along = mass * thick**2 / 2
@@ -195,7 +195,7 @@ def _rod(name, joint, parent, at, axis, mass, length, damping):
 
 
 def _axis(rng):
-    """Mostly across a rod."""
+    """Draw a hinge axis, mostly across a rod."""
     way = np.array([rng.normal(), rng.normal(), 0.3 * rng.normal()])
     return tuple((way / np.linalg.norm(way)).tolist())
 

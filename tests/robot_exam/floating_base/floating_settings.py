@@ -1,6 +1,4 @@
-"""The circumstances of recordings of what floats, drawn from a seed: machine, runs, channels and
-noise.
-"""
+"""Recording conditions of floating-base robots: machine, runs, channels and noise."""
 
 from __future__ import annotations
 
@@ -18,14 +16,15 @@ from tests.robot_exam.sensor_models import NOISES, observed
 
 RATE, SECONDS = 100, 2.5
 HELD_OUT = 2
-COARSE = 2e-3  # s, of steps that only choose sizes
-SPIN, DRIFT = 1.0, 0.5  # rad/s and m/s at most in each direction, as a run begins
-SWING = 0.9  # rad that a hinge goes from where it began, about
-LEAN = 0.5  # rad from the file's pose at most of what hangs; what is free may begin any way round
+COARSE = 2e-3  # Step in s of simulations that only choose sizes.
+# Largest initial rotation rate in rad/s and velocity in m/s in each direction.
+SPIN, DRIFT = 1.0, 0.5
+SWING = 0.9  # Approximate largest deviation of a hinge from its initial position, rad.
+LEAN = 0.5  # Largest initial rotation of a ball joint, rad; a free joint begins at any orientation.
 
 
 def setting(name, rng):
-    """A setting of a robot of `floating_robots.NAMES`."""
+    """Draw a setting of a robot of `floating_robots.NAMES`."""
     machine = floating_robots.machine(name, rng)
     times = np.arange(round(RATE * SECONDS) + 1) / RATE
     forms = rng.choice(command_signals.FORMS, FITTED + HELD_OUT)
@@ -43,7 +42,7 @@ def setting(name, rng):
 
 
 def _run(machine, form, times, rng):
-    """A run whose hinges go about as far as `SWING`, and its motion with nothing hidden."""
+    """Draw a run whose hinges move by about `SWING`, and its motion without a hidden cause."""
     hinges = len(machine.hinges)
     start = rng.uniform(-0.5, 0.5, hinges)
     pose, rate = _begun(machine, rng)
@@ -69,7 +68,7 @@ def _run(machine, form, times, rng):
 
 
 def _begun(machine, rng):
-    """A pose and a padded velocity of what floats."""
+    """Draw a pose and a padded velocity of the floating base."""
     turn = rng.uniform(-SPIN, SPIN, 3)
     if machine.root == "ball":
         lean = Rotation.from_rotvec(rng.uniform(-LEAN, LEAN, 3))
@@ -82,8 +81,9 @@ def _begun(machine, rng):
 
 
 def stated(machine, run):
-    """What the recording says of where a run begins, by simgap's names: place and velocity by the
-    world's axes, the turn by the body's.
+    """Return the initial base state of a run by simgap's names.
+
+    Position and velocity are in world axes, the rotation rate is in body axes.
     """
     base, hinges = machine.links[0].joint, len(machine.hinges)
     pose, rate = run.q[hinges:], run.v[hinges:-1]
@@ -98,7 +98,7 @@ def stated(machine, run):
 
 
 def _typical(machine, motions):
-    """Scales of a motion by coordinate: travel, speed, what moves it, and what it moves."""
+    """Return scales of a motion by coordinate: force, speed, travel, position and inertia."""
     plant = FloatWorld(machine).plant
     speed = np.concatenate([motion.v for motion in motions])
     away = np.concatenate([motion.q for motion in motions])
@@ -114,7 +114,10 @@ def _typical(machine, motions):
 
 
 class FloatGauge(Gauge):
-    """Gaps of a setting's runs, in noises: hinges begin anywhere, what floats where it is known."""
+    """Measure model discrepancies of a setting's runs, in units of the noise.
+
+    Initial states of the hinges are fitted; that of the floating base is known.
+    """
 
     def seen(self, effects):
         from tests.robot_exam import causes_outside_library

@@ -1,13 +1,13 @@
-"""One run of a robot that floats: the world of `reference_world`, with a pose and its velocity
-behind the hinges' coordinates.
+"""Simulate one run of a floating-base robot.
 
-Positions of all coordinates are q = (hinges, pose), speeds v = (hinges, velocity in the body's
-axes, 0); with a pose (p, r) of a place and a unit quaternion, a velocity (u, w) has
+It extends `reference_world` with a pose and its velocity after the coordinates of the hinges.
+Positions are q = (hinges, pose), velocities v = (hinges, velocity in the body's axes, 0). A pose
+(p, r) of a position and a unit quaternion with the velocity (u, w) follows
 
     p' = r u r*,    r' = r (0, w) / 2,                                                        (1)
 
-and Pinocchio says what a hinge and what floats is accelerated by (a free flyer and a spherical
-joint of its own; nothing here is MuJoCo's).
+and Pinocchio computes the accelerations of hinges and floating base with its own free-flyer and
+spherical joints. MuJoCo is not used.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from tests.robot_exam.reference_world import FINE, World, _Course
 
 @dataclass
 class FloatPlant(shapes.Plant):
-    """Forces and inertias of a robot that floats, by coordinate; the last one is nobody's.
+    """Forces and inertias of a floating-base robot by coordinate; the last coordinate is padding.
 
     Attributes:
-        hinges: how many coordinates come before those of what floats.
+        hinges: count of coordinates before those of the floating base.
     """
 
     hinges: int = 0
@@ -62,7 +62,7 @@ class FloatPlant(shapes.Plant):
         return kinetic + pinocchio.computePotentialEnergy(self.model, self.data, pose)
 
     def _pose(self, q):
-        """As Pinocchio has it: what floats comes first."""
+        """Return positions in Pinocchio's order, floating base first."""
         return np.concatenate([q[self.hinges :], q[: self.hinges]])
 
     def _of(self, q, v, other):
@@ -75,12 +75,12 @@ class FloatPlant(shapes.Plant):
         return [*range(count - self.hinges, count), *range(count - self.hinges)]
 
     def _padded(self, values):
-        """From Pinocchio's order."""
+        """Convert values from Pinocchio's order and append the padding."""
         return np.append(np.asarray(values)[self._order()], 0.0)
 
 
 def plant(machine, effects=None, foreign=None):
-    """A machine's plant; arguments as of `tests.robot_exam.reference_plant.plant`."""
+    """Build the plant of a machine; see `tests.robot_exam.reference_plant.plant` for arguments."""
     model = machine.model()
     damping, coulomb = (np.array(values) for values in zip(*machine.stated(), strict=True))
     count = damping.size
@@ -108,7 +108,7 @@ def plant(machine, effects=None, foreign=None):
 
 
 class FloatWorld(World):
-    """A machine that floats with what is hidden in it; arguments as of `World`."""
+    """A floating-base robot with its hidden effects; see `World` for arguments."""
 
     def __init__(self, machine, effects=None, foreign=None, step=FINE):
         self.machine, self.effects, self.step = machine, dict(effects or {}), step
@@ -118,12 +118,12 @@ class FloatWorld(World):
         self.dry = bool(self.rubs.any())
 
     def move(self, run, instants):
-        """The motion at instants that increase, (K,)."""
+        """Return the motion at increasing times, (K,)."""
         return _FloatCourse(self, run).through(np.asarray(instants, dtype=float))
 
 
 class _FloatCourse(_Course):
-    """A run on its way, as (1) has it for what floats."""
+    """State of a run during its simulation, with equation (1) for the floating base."""
 
     def _rate(self, t, state):
         rate = super()._rate(t, state)

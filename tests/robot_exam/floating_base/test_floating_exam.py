@@ -1,6 +1,4 @@
-"""Robots that float, with something hidden in them: the world that makes the data, and what
-`simgap explain` says of one of its recordings.
-"""
+"""Tests of the floating-base world and of `simgap explain` on its recordings."""
 
 import json
 from dataclasses import replace
@@ -24,7 +22,7 @@ def machine(request):
 
 
 def begun(machine):
-    """A run in which nothing is commanded."""
+    """Return a run with zero commands."""
     rng, hinges = np.random.default_rng(6), len(machine.hinges)
     pose, rate = floating_settings._begun(machine, rng)
     q = np.concatenate([rng.uniform(-0.4, 0.4, hinges), pose])
@@ -34,14 +32,14 @@ def begun(machine):
 
 
 def frictionless(machine):
-    """Without damping and without servos."""
+    """Return the machine without damping and with motors instead of servos."""
     links = tuple(replace(link, damping=0.0) for link in machine.links)
     drives = tuple(replace(drive, kind="motor", kp=0.0, kv=0.0) for drive in machine.drives)
     return replace(machine, links=links, drives=drives)
 
 
 def test_the_world_keeps_energy_and_what_else_is_kept(machine):
-    """Where nothing rubs, and momentum where nothing pulls either."""
+    """Without friction energy is constant; without gravity momentum is constant as well."""
     import pinocchio
 
     machine = frictionless(machine)
@@ -72,7 +70,7 @@ def test_friction_makes_the_world_lose_energy(machine):
 
 
 def test_simgap_begins_where_the_recording_says_and_moves_alike(machine, tmp_path):
-    """Two engines, two ways to write poses and velocities, one motion."""
+    """simgap and the reference world, with different pose conventions, make the same motion."""
     from bench.core.plugin_registries import make_robot_simulator
     from sims.core.simulator import Scenario
 
@@ -95,7 +93,7 @@ def test_simgap_begins_where_the_recording_says_and_moves_alike(machine, tmp_pat
 
 @pytest.mark.slow
 def test_a_wrong_mass_below_a_ball_joint_is_found_by_the_command(tmp_path):
-    """A question of the sheet, of which four runs are enough."""
+    """The command finds a wrong mass from four runs of an exam question."""
     name, truth = "single/hung-motor/mass.scale/0", 0.0787
     item, made = floating_items.bare(name, {"mass.scale@upper": (truth,)})
     log = floating_items.written(item, replace(made, runs=made.runs[2:]), tmp_path)
@@ -111,8 +109,10 @@ def test_a_wrong_mass_below_a_ball_joint_is_found_by_the_command(tmp_path):
 
 @pytest.mark.slow
 def test_a_held_out_run_that_is_chaotic_is_no_gap(tmp_path):
-    """It grows 1,400 times what the guess of its beginning is off by: derivatives there lead a fit
-    astray, which leaves twice the noise.
+    """A chaotic held-out run must not count as a discrepancy.
+
+    Errors of its initial state grow by a factor of 1,400. A fit with derivatives at the wrong state
+    ends at twice the noise.
     """
     item, made = floating_items.drawn("clean", "hung-motor", "any", 27)
     log = floating_items.written(item, replace(made, runs=made.runs[3:]), tmp_path)
