@@ -38,7 +38,7 @@ def recorded(item):
     values = []
     for number, run in enumerate(setting.runs):
         slips = causes_outside_library.slips_of(item.effects, number)
-        values.append(setting.noise.added(observed(world, run, setting.channels, slips), rng))
+        values.append(setting.noise.add_to(observed(world, run, setting.channels, slips), rng))
     return values
 
 

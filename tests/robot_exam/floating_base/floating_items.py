@@ -139,7 +139,7 @@ def written(item, made, folder):
     table.writerow(["run", "t", *(f"u.{d.name}" for d in machine.drives), *made.channels])
     for number, run in enumerate(made.runs):
         slips = causes_outside_library.slips_of(item.effects, number)
-        seen = made.noise.added(observed(world, run, made.channels, slips), rng)
+        seen = made.noise.add_to(observed(world, run, made.channels, slips), rng)
         told = np.column_stack([run.commands[drive.name] for drive in machine.drives])
         for t, row in zip(run.times, np.hstack([told, seen]), strict=True):
             table.writerow([number, f"{t:.2f}", *(f"{x:.9g}" for x in row)])
