@@ -1,4 +1,4 @@
-"""Tuners that do what isolation forbids, as in common practice."""
+"""Tuners that do what isolation forbids, as in common training simulations."""
 
 import os
 import socket
