@@ -1,4 +1,4 @@
-"""Tuners that do what isolation forbids, as in common training simulations."""
+"""Tuners that do what isolation forbids, as careless tuners often do."""
 
 import os
 import socket
