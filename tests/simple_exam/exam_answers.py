@@ -75,7 +75,7 @@ def _rivals(item, verdict, mark):
         By effect, the RMS residual in units of the noise and the sigmas of evidence against the
         effect. A small number of sigmas means that it explains the data as well as the truth does.
     """
-    if item.kind != "single" or mark.found or not verdict or len(verdict["causes"]) != 1:
+    if item.kind != "single" or mark.is_correct or not verdict or len(verdict["causes"]) != 1:
         return {}
     (cause,) = verdict["causes"]
     names = [
