@@ -147,7 +147,10 @@ class ExtendedSimulator:
             InputError: The simulator class of the system is unknown.
         """
         if self.kind is None:
-            remedy = "open its file with sims.extended_simulator.open_extended, or use simulator_of"
+            remedy = (
+                "open its file with sims.extended_simulator.open_extended, "
+                "or use make_simulator_class"
+            )
             raise InputError(f"{self.name}: the class of system {self.system} is unknown; {remedy}")
         return make_simulator_class(self, self.kind)()
 

@@ -24,9 +24,7 @@ from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     TrainingResult,
     get_weights_folder,
-)
-from bench.benchmark.runner.tuner_training import (
-    train_or_load as train,
+    train_or_load,
 )
 from bench.core.plugin_registries import simulators, tuners
 from bench.figures.loss_figure import write_loss_figure
@@ -92,7 +90,7 @@ def select_training(
     return chosen, entry
 
 
-def train_or_load(
+def run_training(
     experiment: Experiment,
     entry: TunerEntry,
     seed: int,
@@ -109,7 +107,7 @@ def train_or_load(
         again: Whether to train even if there is an earlier training.
 
     Raises:
-        TooFewError: The training budget is too small.
+        TrainingBudgetTooSmallError: The training budget is too small.
     """
     lesson = TrainingRequest(entry, seed)
     if not experiment.trusted:
@@ -117,7 +115,7 @@ def train_or_load(
             entry, seed, make_tuner_spec(entry), (str(get_weights_folder().resolve()),)
         )
     try:
-        return train(experiment, lesson, watch, again)
+        return train_or_load(experiment, lesson, watch, again)
     except RunEndedError as ended:
         # The error from the isolated process arrives as text: its name and its message.
         name, _, said = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")

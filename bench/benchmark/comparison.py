@@ -24,10 +24,9 @@ from bench.benchmark.storage.journal_segments import (
 from bench.benchmark.storage.plan_checks import check_plan
 from bench.benchmark.storage.result_folder import read_comparison, read_configuration, write_results
 from bench.benchmark.storage.run_journal import RunJournal
-from bench.benchmark.storage.run_status import STATUS_COLUMNS, RunStatus
+from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
 from bench.benchmark.storage.runs_reader import RunsTable
-from bench.benchmark.storage.salt_file import read_salt as kept_salt
-from bench.benchmark.storage.salt_file import reveal_salt
+from bench.benchmark.storage.salt_file import read_salt, reveal_salt
 from bench.benchmark.storage.study_progress import (
     MISSING_STATUS,
     RunEnd,
@@ -118,17 +117,19 @@ class Comparison:
         comparison = cls(folder)
         experiment = comparison.configuration.experiment
         comparison.plugins = check_resumable(folder, comparison.configuration, plugins)
-        comparison.secret = kept_salt(folder, experiment)
+        comparison.secret = read_salt(folder, experiment)
         comparison._attach(prepare_experiment(experiment, comparison.secret))
         return comparison
 
     def _attach(self, results: ExperimentRun) -> None:
         """Open the journal of the folder, and write or check the plan."""
-        from bench.benchmark.runner.tuner_training import get_weights_folder as trained
+        from bench.benchmark.runner.tuner_training import get_weights_folder
 
         self.results = results
         # Tuners must not access true parameters, results of other tuners, or earlier trainings.
-        results.hidden_paths = tuple(str(place.resolve()) for place in (self.folder, trained()))
+        results.hidden_paths = tuple(
+            str(place.resolve()) for place in (self.folder, get_weights_folder())
+        )
         ids = [job.request.run for job in results.plan]
         if not (self.folder / SEGMENTS_FOLDER).exists():
             results.run_sink.statuses = self._complete(ids)
@@ -184,7 +185,7 @@ class Comparison:
         made = statuses[statuses["status"] != "skipped"]
         rows: list[dict[str, Any]] = [
             {str(name): value for name, value in row.items()}
-            for row in made[STATUS_COLUMNS].to_dict("records")
+            for row in made[STATUS_COLUMN_NAMES].to_dict("records")
         ]
         return [RunStatus(**row) for row in rows]
 

@@ -1,7 +1,7 @@
 """Bounce shot: tune a simulator to one recorded drop, plan a shot in it, execute it elsewhere.
 
-The shot is executed in another simulator, the true world. `settings` reads the experiment's [shot]
-table, `deal` draws balls, scenes and release errors and records the drops, `tune` converts a
-recording to models and plans without knowing the ball, `throw` executes the shots, `study` runs all
-steps, `table` and `pictures` report the results.
+The shot is executed in another simulator, the true world. `shot_config` reads the experiment's
+[shot] table, `shot_sampling` draws balls, scenes and release errors and records the drops,
+`shot_planning` converts a recording to models and plans without knowing the ball, `shot_execution`
+executes the shots, `shot_study` runs all steps, `hit_rate_table` and `shot_figures` report them.
 """

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.benchmark.isolation.tuner_client import TunerSpec
-from bench.benchmark.isolation.tuner_client import relocate as elsewhere
+from bench.benchmark.isolation.tuner_client import TunerSpec, relocate
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.problem.recorded_runs import ObservedRuns, make_scenario
 from bench.benchmark.problem.targets import BlindedTarget
@@ -26,8 +25,7 @@ from bench.benchmark.runner.worker_tasks import RunRequest, execute_run, get_pro
 from bench.bounce_shot.pixel_observations import build_pixel_runs, make_pixel_experiment
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_geometry import ShotGeometry
-from bench.bounce_shot.shot_planner import ShotPlan
-from bench.bounce_shot.shot_planner import plan_shot as plan
+from bench.bounce_shot.shot_planner import ShotPlan, plan_shot
 from sims.core.simulator import Array, InputError, Scenario
 from sims.recording.recording import Recording, read_recording
 from sims.systems.ball import Ball as BallSimulator
@@ -98,7 +96,7 @@ class ShotInputs:
     def relocate(self, places: Mapping[Path, Path]) -> ShotInputs:
         """Return a copy for another machine, where the files have other paths."""
         weights = {label: places[path] for label, path in self.weights.items()}
-        tuned = {label: elsewhere(one, places) for label, one in self.tuned.items()}
+        tuned = {label: relocate(one, places) for label, one in self.tuned.items()}
         return replace(self, recording=places[self.recording], weights=weights, tuned=tuned)
 
 
@@ -304,7 +302,7 @@ def get_planning_theta(model: TunedModel) -> Array:
     return np.array([model.restitution])
 
 
-def plan_shot(
+def plan_shot_in_model(
     model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
 ) -> ShotPlan:
     """Plan a shot in a model.
@@ -316,7 +314,7 @@ def plan_shot(
         radius: radius of the ball, m.
     """
     known = get_planning_constants(settings, radius)
-    return plan(
+    return plan_shot(
         make_planning_simulator(model), get_planning_theta(model), scene, known, settings.heights
     )
 
@@ -326,7 +324,7 @@ def _planned(
 ) -> TunedModel:
     if model.status == "crashed":
         return model
-    made = plan_shot(model, settings, scene, radius)
+    made = plan_shot_in_model(model, settings, scene, radius)
     if not made.is_found and model.status in ("done", "converged"):
         return replace(
             model, status="no plan", reason="the model reaches the hoop's plane from no height"

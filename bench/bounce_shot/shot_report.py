@@ -12,7 +12,7 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.results_report import REPORT_FILE
 from bench.benchmark.statistics.provenance_columns import add_trust_column
 from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
-from bench.benchmark.storage.run_status import STATUS_COLUMNS
+from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES
 from bench.bounce_shot.hit_rate_table import (
     NO_SHOT_STATUSES,
     build_result_table,
@@ -153,4 +153,4 @@ def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
         (label, label, SIMULATOR_NAME, "", 0, "skipped", reason, 0, 0.0, False)
         for label, reason in skipped.items()
     ]
-    return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMNS)])
+    return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMN_NAMES)])

@@ -10,12 +10,16 @@ from typing import Any
 
 from bench.benchmark.storage.cell_validation import (
     CellError,
+    check_cells,
     parse_json_column,
     select_declared_columns,
 )
-from bench.benchmark.storage.cell_validation import check_cells as check_cells
-from bench.benchmark.storage.table_schemas import SHOT_COLUMNS as SHOT_COLUMNS
-from bench.benchmark.storage.table_schemas import SHOT_MODEL_COLUMNS, Columns, ColumnSpec
+from bench.benchmark.storage.table_schemas import (
+    SHOT_COLUMNS,
+    SHOT_MODEL_COLUMNS,
+    Columns,
+    ColumnSpec,
+)
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import build_shot_rows
 from bench.bounce_shot.shot_sampling import ShotSetup

@@ -21,8 +21,12 @@ from bench.benchmark.runner.experiment_runner import (
 from bench.benchmark.runner.plugin_discovery import describe_plugins
 from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
 from bench.benchmark.runner.study_setup import prepare_study
-from bench.benchmark.runner.tuner_training import TrainingRequest, TrainingResult, train_or_load
-from bench.benchmark.runner.tuner_training import get_weights_folder as trained
+from bench.benchmark.runner.tuner_training import (
+    TrainingRequest,
+    TrainingResult,
+    get_weights_folder,
+    train_or_load,
+)
 from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
 from bench.benchmark.storage.result_folder import read_configuration
 from bench.benchmark.storage.salt_file import read_salt, reveal_salt
@@ -41,8 +45,7 @@ from bench.bounce_shot.shot_sampling import (
     draw_shots,
     record_drop,
 )
-from bench.bounce_shot.shot_store import SHOTS_FOLDER, list_missing_shots, store_shot
-from bench.bounce_shot.shot_store import check_shots as check_kept
+from bench.bounce_shot.shot_store import SHOTS_FOLDER, check_shots, list_missing_shots, store_shot
 from bench.core.plugin_registries import tuners
 from sims.core.simulator import InputError
 from sims.vision import video_packages
@@ -115,7 +118,7 @@ class BounceShotStudy:
 
         study = cls(folder)
         study.plugins = check_resumable(folder, study.configuration, plugins)
-        check_kept(folder, study.shots)
+        check_shots(folder, study.shots)
         return study
 
     @cached_property
@@ -184,7 +187,7 @@ class BounceShotStudy:
         Raises:
             InputError: the file of a shot is damaged.
         """
-        check_kept(self.folder, self.shots)
+        check_shots(self.folder, self.shots)
         left = {one.name for one in list_missing_shots(self.folder, self.shots)}
         ends = tuple(
             RunEnd(one.name, one.ball.name, MISSING_STATUS if one.name in left else "made")
@@ -221,7 +224,7 @@ class _ShotStages:
         self._tuned: dict[str, TunerSpec] = {}
         if not self._experiment.trusted:
             self._tuned = {entry.label: make_tuner_spec(entry) for entry in self._experiment.tuners}
-        self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
+        self._hidden = tuple(str(place.resolve()) for place in (study.folder, get_weights_folder()))
         self._paths = [study.folder / RECORDINGS_FOLDER / f"{one.name}.csv" for one in left]
 
     def run(self, jobs: int, pool: Pool | None) -> None:
@@ -232,7 +235,7 @@ class _ShotStages:
             pool: worker pool; None to create one.
 
         Raises:
-            LostError: the workers are no longer available.
+            PoolLostError: the workers are no longer available.
             WeightsError: stored trained weights are damaged.
         """
         for name in (SHOTS_FOLDER, RECORDINGS_FOLDER):

@@ -196,13 +196,13 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
 
 def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     """Return the model fields that an effect changes, with the indices of the changed numbers."""
-    from sims.robot.coupled_drives import COUPLING_PLACEHOLDER as COUPLED
+    from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
     from sims.robot.dynamics.series_joints import add_series_joints
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
     robot, native = kind.robot, MODEL_FIELD_EFFECTS[effect.of]  # type: ignore[attr-defined]
-    if effect.of == COUPLED[1]:
-        robot = add_series_joints(robot, (COUPLED,))
+    if effect.of == COUPLING_PLACEHOLDER[1]:
+        robot = add_series_joints(robot, (COUPLING_PLACEHOLDER,))
     fields, changes = {}, []
     for name in native.fields:
         owner, _, field = name.rpartition(".")

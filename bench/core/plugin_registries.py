@@ -20,7 +20,7 @@ from methods.tuner import Tuner
 from sims.core.registry import PartUnavailableError, Registry
 from sims.core.simulator import InputError, Simulator
 from sims.effects import registry as effects
-from sims.extended_simulator import load_extended as load_extended
+from sims.extended_simulator import load_extended
 
 __all__ = [
     "REGISTRIES",

@@ -906,9 +906,9 @@ class _ExplainRun:
         if self.tuner is None:
             return self.identified
         # Few users request a tuner, and the code that drives one is slow to import.
-        from bench.diagnosis.fitting.tuner_initialisation import run_tuner
+        from bench.diagnosis.fitting.tuner_initialisation import find_start_with_tuner
 
-        return run_tuner(self.tuner, self.fitting, self.noise, self.seed)
+        return find_start_with_tuner(self.tuner, self.fitting, self.noise, self.seed)
 
     def _extended(self, search: EffectSearch, finding: DiagnosisResult) -> ExtendedSimulator:
         world, numbers = (

@@ -116,7 +116,7 @@ def _robot(
     model: Path, stated: ModelFileReference | None
 ) -> tuple[ExtendedSimulator, type[SystemSimulator]]:
     """Load a robot from its model file, without fitted numbers and without added effects."""
-    from sims.robot.parsing.read_model_file import read_robot as read_robot
+    from sims.robot.parsing.read_model_file import read_robot
 
     tables = stated.actuators if stated else {}
     # A file written by explain contains the actuators of the recording already.

@@ -26,7 +26,7 @@ from bench.diagnosis_benchmark.machine_cases import machine_case_sampling as mac
 from sims import effects as library
 from sims.systems.servo import Servo
 
-ALL_SYSTEMS = (*case_sampling.SYSTEMS, *machines.MACHINES)
+ALL_SYSTEMS = (*case_sampling.SYSTEMS, *machines.MACHINE_NAMES)
 """Names of all systems."""
 DEFAULT_SYSTEMS = case_sampling.SYSTEMS
 """Systems that are used if an experiment does not name any."""
@@ -67,13 +67,13 @@ def draw_case(
     Returns:
         The case, or None if the hidden cause is not observable.
     """
-    by = machines.draw_case if system in machines.MACHINES else case_sampling.draw_case
+    by = machines.draw_case if system in machines.MACHINE_NAMES else case_sampling.draw_case
     return by(kind, system, seed, effect, size, asked)
 
 
 def list_hideable_effects(system: str) -> list[str]:
     """List the effects of the library that can be hidden in a system."""
-    if system in machines.MACHINES:
+    if system in machines.MACHINE_NAMES:
         return list(hidden_causes.EFFECTS_BY_MACHINE[system])
     return sorted(library.list_effects_for(SIMULATORS[system].system))
 
@@ -82,14 +82,14 @@ def list_unmodelled_causes(system: str) -> list[str]:
     """List the causes for a system that the library does not contain."""
     return list(
         hidden_causes.UNMODELLED_CAUSES
-        if system in machines.MACHINES
+        if system in machines.MACHINE_NAMES
         else UNMODELLED_CAUSES[system]
     )
 
 
 def find_equivalent_effects(item: BenchmarkCase, effect: str) -> frozenset[str]:
     """Return an effect and all effects that are equivalent to it in the recording of a case."""
-    if item.system in machines.MACHINES:
+    if item.system in machines.MACHINE_NAMES:
         return machines.find_equivalent_causes(item.system, effect)
     return case_sampling.find_equivalent_effects(item.system, item.driven, effect)
 
@@ -111,7 +111,7 @@ def list_coefficient_names(system: str, name: str) -> list[str]:
 def render_recording(item: BenchmarkCase) -> RecordingFiles:
     """Render the recording of a case as texts."""
     with tempfile.TemporaryDirectory() as folder:
-        if item.system in machines.MACHINES:
+        if item.system in machines.MACHINE_NAMES:
             path = machines.write_case(item, Path(folder))
         else:
             path = case_sampling.write_case(item, folder, truth=False)

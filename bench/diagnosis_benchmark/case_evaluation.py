@@ -166,7 +166,7 @@ def _diagnose_in_process(given: dict[str, Any], learned: Mapping[str, Array]) ->
     """Run a trusted diagnoser in this process.
 
     Raises:
-        EndedError: the diagnoser failed.
+        RunEndedError: the diagnoser failed.
     """
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -186,7 +186,7 @@ def _diagnose_isolated(
     """Run a diagnoser in an isolated process and validate its answer.
 
     Raises:
-        EndedError: the diagnoser failed.
+        RunEndedError: the diagnoser failed.
     """
     robots = ("mujoco",) if given["beside"] else ()
     child = _started(code, limits.memory, hidden, robots)
@@ -215,7 +215,7 @@ def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
     """Validate the message of an isolated diagnoser.
 
     Raises:
-        FoulError: the reported costs are impossible.
+        ProtocolError: the reported costs are impossible.
     """
     simulations, seconds = int(said["simulations"]), float(said["processor_seconds"])
     if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
@@ -272,7 +272,7 @@ def train_isolated(
         The trained arrays, the number of simulations and the seconds used.
 
     Raises:
-        EndedError: the training failed.
+        RunEndedError: the training failed.
     """
     begun = perf_counter()
     if trusted:

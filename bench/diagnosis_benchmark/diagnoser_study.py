@@ -272,7 +272,7 @@ class _EvaluationRun:
             pool: worker pool; None to create one.
 
         Raises:
-            LostError: the workers are no longer available.
+            PoolLostError: the workers are no longer available.
         """
         open_questions = [q for q in self._mixed() if self._open(q)]
         if not open_questions:

@@ -73,7 +73,7 @@ def train_or_load(
         trusted: whether the diagnoser runs in this process.
 
     Raises:
-        EndedError: the training failed.
+        RunEndedError: the training failed.
     """
     key = compute_digest(
         code.name,

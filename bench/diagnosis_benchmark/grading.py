@@ -6,7 +6,7 @@ An answer is a dictionary as `explain` writes it (DESIGN §6).
 |---|---|---|
 | right | all | clean: adequate; single, double: all causes, no other; foreign: unknown or partial |
 | set | single, double | the cause is in a set of effects that the data cannot distinguish |
-| class | single, double | an effect is named that is equivalent in any data (`items.EQUIVALENT`) |
+| class | single, double | an effect equivalent in any data is named (`EQUIVALENT_EFFECTS`) |
 | one | double | one of the two is named (alone or in a set), the other is not |
 | wrong | single, double, foreign | another effect is named; foreign: an effect as full explanation
 |

@@ -90,7 +90,7 @@ def generate_training_data(
         drawn: function that draws the points of a scenario.
 
     Raises:
-        TooFewError: the budget is smaller than two scenarios.
+        TrainingBudgetTooSmallError: the budget is smaller than two scenarios.
         ValueError: fewer than two scenarios could be simulated.
     """
     # Only complete scenarios are simulated, because pairs are formed within a scenario.

@@ -80,7 +80,7 @@ class Registry(Generic[T]):
 
         Raises:
             InputError: The name is unknown.
-            SkippedError: The part cannot be imported, or needs a missing package.
+            PartUnavailableError: The part cannot be imported, or needs a missing package.
         """
         if name in self._added:
             part: Any = self._added[name].part

@@ -32,7 +32,7 @@ class SimulationCounter:
             lanes: Number of batch elements, each of which is one simulation.
 
         Raises:
-            SpentError: They exceed the limit; none of them is counted.
+            SimulationBudgetExceededError: They exceed the limit; none of them is counted.
         """
         if self.limit is not None and self.used + lanes > self.limit:
             raise SimulationBudgetExceededError(

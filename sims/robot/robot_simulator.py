@@ -36,8 +36,11 @@ from sims.robot.dynamics.active_effects import (
     select_model_field_effects,
     slice_active_effects,
 )
-from sims.robot.dynamics.applied_inputs import SAME_INSTANT_SHARE, STEP_COUNT_TOLERANCE
-from sims.robot.dynamics.applied_inputs import compute_applied_inputs as felt_over
+from sims.robot.dynamics.applied_inputs import (
+    SAME_INSTANT_SHARE,
+    STEP_COUNT_TOLERANCE,
+    compute_inputs_over_steps,
+)
 from sims.robot.dynamics.batch_cache import RefusedModelError, bench_cache
 from sims.robot.dynamics.batch_work import (
     BatchInputs,
@@ -311,8 +314,8 @@ class RobotSimulator(SystemSimulator):
         """
         n = len(work.x)
         of_run = self.time_step, work.scenario, work.commands, work.acting, n, steps
-        felt = felt_over(*of_run)
-        instant = felt_over(*of_run, SAME_INSTANT_SHARE) if self._drives else felt
+        felt = compute_inputs_over_steps(*of_run)
+        instant = compute_inputs_over_steps(*of_run, SAME_INSTANT_SHARE) if self._drives else felt
         begins: Array = self.time_step * np.arange(float(steps))
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
@@ -367,7 +370,7 @@ class RobotSimulator(SystemSimulator):
         scenario, steps = history
         commands = self.run_inputs(scenario)
         n = len(work.x)
-        felt = felt_over(self.time_step, scenario, commands, work.acting, n, steps)
+        felt = compute_inputs_over_steps(self.time_step, scenario, commands, work.acting, n, steps)
         earlier = felt[f"u.{one.actuator.name}"]
         last: Array = self._activations(one, earlier, one.clipped(earlier[:, 0]))[:, -1]
         return last

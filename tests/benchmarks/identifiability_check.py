@@ -19,7 +19,7 @@ from bench.core.plugin_registries import make_robot_simulator
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.base_fit import fit_base_model
-from bench.diagnosis.fitting.tuner_initialisation import run_tuner
+from bench.diagnosis.fitting.tuner_initialisation import find_start_with_tuner
 from bench.diagnosis.identifiability import assess_identifiability
 from bench.diagnosis.validation.gain_and_intervals import compute_central_jacobian
 from sims.core.simulator import Scenario
@@ -155,7 +155,7 @@ def is_fixed(problem, number, rng):
         world, noise = problem.world(truth)
         (place,) = (k for k, i in enumerate(world.base) if world.parameters[i].name == name)
         for tuner in TUNERS:
-            found = run_tuner(tuner, world, noise, value)[place]
+            found = find_start_with_tuner(tuner, world, noise, value)[place]
             if abs(found - truth[name]) > near:
                 world.close()
                 return False

@@ -89,8 +89,8 @@ def _readable(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, 
         if not own and not any(path.is_relative_to(place) for path in kept):
             found.append(str(place))
     libraries = [str(Path(prefix) / "lib") for prefix in sorted(interpreter)]
-    rooms = [str(PROJECT_ROOT / room) for room in _IMPORTABLE_PATHS]
-    return tuple(dict.fromkeys([*found, *libraries, *rooms, *_SYSTEM_PATHS]))
+    own_packages = [str(PROJECT_ROOT / name) for name in _IMPORTABLE_PATHS]
+    return tuple(dict.fromkeys([*found, *libraries, *own_packages, *_SYSTEM_PATHS]))
 
 
 def enter_namespaces() -> list[str]:

@@ -69,7 +69,7 @@ class Message(NamedTuple):
         """Return the body as a new array (n,).
 
         Raises:
-            FoulError: its size is not that of an array.
+            ProtocolError: its size is not that of an array.
         """
         if len(self.body) % 8:
             raise ProtocolError("it sent half a number")
@@ -82,7 +82,7 @@ class Message(NamedTuple):
             limit: maximum size in bytes, because the parsed document takes much more memory.
 
         Raises:
-            FoulError: the body is not JSON, or longer.
+            ProtocolError: the body is not JSON, or longer.
         """
         if len(self.body) > limit:
             raise ProtocolError(f"it sent {len(self.body)} bytes of JSON, {limit} are allowed")
@@ -147,7 +147,7 @@ class MessageChannel:
             deadline: latest time, as of `time.perf_counter`.
 
         Raises:
-            GoneError: the other side has closed its pipe.
+            PeerClosedError: the other side has closed its pipe.
             TimeoutError: the other side does not read in time.
         """
         body = b"".join([part if isinstance(part, bytes) else bytes(part) for part in parts])
@@ -182,8 +182,8 @@ class MessageChannel:
             deadline: latest time, as of `time.perf_counter`.
 
         Raises:
-            GoneError: the other side has ended.
-            FoulError: the data are not a valid message.
+            PeerClosedError: the other side has ended.
+            ProtocolError: the data are not a valid message.
             TimeoutError: there is no message in time.
         """
         there = self._read(self._view, deadline)
@@ -247,7 +247,7 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
     """Unpack the arrays of a body that `pack_arrays` made.
 
     Raises:
-        FoulError: the body is not valid.
+        ProtocolError: the body is not valid.
     """
     line, _, _ = bytes(body[:_NAMES]).partition(b"\n")
     rest = body[len(line) + 1 :]

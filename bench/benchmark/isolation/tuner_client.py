@@ -67,7 +67,7 @@ class IsolatedTuner:
         import_seconds: seconds to build the tuner, nearly all for imports of its file.
 
     Raises:
-        EndedError: the tuner cannot be built; the caller has to end the process if it still runs.
+        RunEndedError: the tuner cannot be built; the caller ends the process if it still runs.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class IsolatedSteps:
         """End the run; the process may serve another one.
 
         Raises:
-            EndedError: the tuner failed while it was closed.
+            RunEndedError: the tuner failed while it was closed.
         """
         self._pace.release_affinity()
         if self._waits:

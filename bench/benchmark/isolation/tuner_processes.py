@@ -141,7 +141,7 @@ class ForkServerClient:
             Handle of the process.
 
         Raises:
-            KilledError: the fork server is gone.
+            KilledExternallyError: the fork server is gone.
         """
         to_child, to_us = os.pipe(), os.pipe()
         request = {
@@ -234,7 +234,7 @@ class IsolatedProcess:
         """Wait until the process is ready.
 
         Raises:
-            KilledError: the process did not start.
+            KilledExternallyError: the process did not start.
         """
         try:
             self.seals = self.channel.receive(
@@ -269,8 +269,8 @@ class IsolatedProcess:
             deadline: latest time, as of `perf_counter`.
 
         Raises:
-            EndedError: the tuner failed, took too long or is gone; the process may have been ended.
-            KilledError: the process was killed externally.
+            RunEndedError: the tuner failed, took too long or is gone; its process may have ended.
+            KilledExternallyError: the process was killed externally.
         """
         try:
             message = self.channel.receive(limit, deadline)

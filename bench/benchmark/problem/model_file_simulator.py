@@ -27,7 +27,7 @@ def get_simulator_class(experiment: Experiment) -> type[Simulator]:
 
     Raises:
         InputError: there is no simulator of that name, or its model file cannot be used.
-        SkippedError: something that it needs is missing on this machine.
+        PartUnavailableError: something that it needs is missing on this machine.
     """
     if not experiment.model:
         return simulators.get(experiment.simulator)
@@ -88,7 +88,7 @@ def find_model(path: str, name: str) -> Path:
         name: name of the experiment, for messages.
 
     Raises:
-        SkippedError: the file is in none of these places.
+        PartUnavailableError: the file is in none of these places.
     """
     if path.startswith(PACKAGE_SCHEME):
         return _packaged(path, name)

@@ -98,8 +98,8 @@ def hash_source_folders(which: tuple[str, ...] = ()) -> str:
     return compute_digest(
         __version__,
         [
-            _contents(PROJECT_ROOT / room, PROJECT_ROOT)
-            for room in which or COMPARISON_SOURCE_FOLDERS
+            _contents(PROJECT_ROOT / source_folder, PROJECT_ROOT)
+            for source_folder in which or COMPARISON_SOURCE_FOLDERS
         ],
     )
 
@@ -239,7 +239,10 @@ def _place(kind: type) -> Any:
     if file is None:
         raise _untold(kind)
     path = Path(file).resolve()
-    if any(path.is_relative_to(PROJECT_ROOT / room) for room in COMPARISON_SOURCE_FOLDERS):
+    if any(
+        path.is_relative_to(PROJECT_ROOT / source_folder)
+        for source_folder in COMPARISON_SOURCE_FOLDERS
+    ):
         return ""
     return _package(kind, path)
 

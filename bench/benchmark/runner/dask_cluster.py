@@ -158,7 +158,7 @@ class ClusterPool:
             Index of the call, and its result or exception.
 
         Raises:
-            LostError: the scheduler is lost; calls that have not ended are not executed.
+            PoolLostError: the scheduler is lost; calls that have not ended are not executed.
         """
         from distributed import CancelledError, KilledWorker
 

@@ -230,7 +230,7 @@ def must_build_isolated(entry: TunerEntry) -> bool:
 
     Raises:
         InputError: the tuner cannot be built, or its code is already in this process.
-        SkippedError: the tuner cannot be used here.
+        PartUnavailableError: the tuner cannot be used here.
     """
     _announce_installed([entry.tuner])
     kind, place = tuners.get(entry.tuner), tuners.place(entry.tuner)
@@ -308,7 +308,7 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
         kind: ``tuner`` or ``diagnoser``.
 
     Raises:
-        SkippedError: it cannot be used here.
+        PartUnavailableError: it cannot be used here.
         InputError: it cannot be inspected.
     """
     known = _asked({"file": "", "kind": kind, "name": name}, name)

@@ -49,8 +49,8 @@ def train_remotely(
         Trained arrays by name.
 
     Raises:
-        EndedError: the tuner failed.
-        KilledError: its process was killed externally.
+        RunEndedError: the tuner failed.
+        KilledExternallyError: its process was killed externally.
     """
     given = {"stream": stream.astype(np.int64), "budget": np.array(practice.budget)}
     child.send(b"F", *pack_arrays(given), flags=watch is not None, deadline=_NO_DEADLINE)
@@ -71,7 +71,7 @@ def _serve(
     """Handle one message of a tuner during its training.
 
     Raises:
-        FoulError: the message is not valid here.
+        ProtocolError: the message is not valid here.
     """
     if message.kind == b"W" and watch is not None:
         watch.epoch(*_parse_progress(message.to_document()))
@@ -91,7 +91,7 @@ def _parse_progress(said: Any) -> tuple[str, int, int, float, float]:
     """Parse a progress message: stage, epoch, number of epochs, and two losses.
 
     Raises:
-        FoulError: the message has another content.
+        ProtocolError: the message has another content.
     """
     try:
         stage, epoch, epochs, loss, held_out = said

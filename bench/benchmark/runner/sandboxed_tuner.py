@@ -97,7 +97,7 @@ def retry_if_killed(work: Callable[[], Result]) -> Result:
         The result of the function.
 
     Raises:
-        EndedError: processes were killed in each of `MAX_RETRIES` attempts.
+        RunEndedError: processes were killed in each of `MAX_RETRIES` attempts.
     """
     for _ in range(MAX_RETRIES):
         try:
@@ -185,8 +185,8 @@ def start_isolated_tuner(
         The isolated tuner.
 
     Raises:
-        EndedError: the tuner cannot be built.
-        KilledError: the process was killed externally.
+        RunEndedError: the tuner cannot be built.
+        KilledExternallyError: the process was killed externally.
     """
     kept = isolation == "tuner"
     # Weights are hashed only if an idle tuner could have different ones.

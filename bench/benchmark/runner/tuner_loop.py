@@ -205,7 +205,7 @@ def drive_tuner(
         The trace; a failure is a status of it.
 
     Raises:
-        KilledError: the tuner's process was killed externally, which is not a failure of the tuner.
+        KilledExternallyError: the tuner's process was killed externally; the tuner did not fail.
     """
     record = _RunRecord(task)
     started = perf_counter()

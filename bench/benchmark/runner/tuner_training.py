@@ -205,7 +205,7 @@ def train_or_load(
 
     Raises:
         WeightsError: there is a file, but it is damaged or belongs to another training.
-        EndedError: the tuner failed in its process.
+        RunEndedError: the tuner failed in its process.
     """
     before: list[str] = []
     return retry_if_killed(lambda: _train(experiment, lesson, watch, anew, before))
@@ -279,7 +279,7 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
             Observations (n, T, C).
 
         Raises:
-            EndedError: the request differs from the one before the kill.
+            RunEndedError: the request differs from the one before the kill.
         """
         asked = compute_digest(repr(rng.bit_generator.state), np.asarray(points).tobytes())
         if self._place == len(self._before):

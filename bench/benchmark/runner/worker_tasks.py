@@ -132,8 +132,8 @@ def execute_run(experiment: Experiment, order: RunRequest) -> RunOutcome:
         order: request of the run.
 
     Raises:
-        CheatError: more points were simulated than the tuner requested from the harness.
-        EndedError: the tuner's process was killed externally several times.
+        HiddenSimulationError: more points were simulated than the tuner requested from the harness.
+        RunEndedError: the tuner's process was killed externally several times.
     """
     before: list[Array] = []
     return retry_if_killed(lambda: _perform(experiment, order, before))
@@ -258,6 +258,6 @@ class FailedTuner:
         """Fail to start a run.
 
         Raises:
-            EndedError: always.
+            RunEndedError: always.
         """
         raise self.error

@@ -17,17 +17,15 @@ from bench.benchmark.storage.row_errors import (
     check_known,
     raise_for_first_bad_row,
 )
-from bench.benchmark.storage.run_status import STATUS_COLUMNS, RunStatus
+from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
 from bench.benchmark.storage.runs_reader import RunsTable
 from bench.benchmark.storage.table_schemas import (
     ERROR_TABLE_COLUMNS,
     IDENTIFIABILITY_COLUMNS,
+    STATUS_COLUMNS,
     TRAINING_COLUMNS,
     ColumnSpec,
     expand_columns,
-)
-from bench.benchmark.storage.table_schemas import (
-    STATUS_COLUMNS as STATUS,
 )
 from sims.core.simulator import InputError
 
@@ -68,7 +66,7 @@ def check_files(
     remedy = get_remedy(folder, under_way=under_way)
     file = RunsTable(folder / "runs.parquet", remedy)
     runs = file.read_runs(experiment)
-    status = CsvTable(folder / "status.csv", STATUS, remedy)
+    status = CsvTable(folder / "status.csv", STATUS_COLUMNS, remedy)
     statuses = status.table.to_pandas()
     check_statuses(statuses, experiment, status.make_error)
     made = statuses[statuses["status"] != "skipped"]
@@ -317,7 +315,7 @@ def check_segment_statuses(
         place = "" if row is None else f", run {places[row]}"
         return InputError(f"{path}{place}: {says}; {remedy}")
 
-    statuses = pd.DataFrame([vars(status) for status in held.values()], columns=STATUS_COLUMNS)
+    statuses = pd.DataFrame([vars(status) for status in held.values()], columns=STATUS_COLUMN_NAMES)
     check_statuses(statuses, experiment, at)
     if plan is not None:
         wanted = [plan[place] if place < len(plan) else "none" for place in places]

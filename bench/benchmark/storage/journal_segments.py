@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.benchmark.storage import cell_validation
 from bench.benchmark.storage.cell_validation import CellError
-from bench.benchmark.storage.run_status import STATUS_COLUMNS, RunStatus
-from bench.benchmark.storage.table_schemas import STATUS_COLUMNS as STATUS
-from bench.benchmark.storage.table_schemas import ColumnSpec
+from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES, RunStatus
+from bench.benchmark.storage.table_schemas import STATUS_COLUMNS, ColumnSpec
 from sims.core.atomic_files import get_first_line, write_atomically
 from sims.core.simulator import InputError
 
@@ -107,12 +106,12 @@ def _statuses_of(held: Any) -> dict[int, RunStatus]:
     """
     places = cell_validation.parse_json_column(_PLACE, [place for place, _ in held])
     cell_validation.check_cells(_PLACE, places)
-    columns = [c for c in STATUS if c.name in STATUS_COLUMNS]
+    columns = [c for c in STATUS_COLUMNS if c.name in STATUS_COLUMN_NAMES]
     for column in columns:
         values = [status[column.name] for _, status in held]
         cell_validation.check_cells(column, cell_validation.parse_json_column(column, values))
     return {
-        place: RunStatus(**{name: status[name] for name in STATUS_COLUMNS})
+        place: RunStatus(**{name: status[name] for name in STATUS_COLUMN_NAMES})
         for place, status in held
     }
 

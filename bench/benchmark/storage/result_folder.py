@@ -16,15 +16,13 @@ from bench.benchmark.storage.integrity_checks import check_files, check_table
 from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER, read_plan
 from bench.benchmark.storage.provenance import describe_machine, get_utc_time, list_package_versions
 from bench.benchmark.storage.run_journal import RunJournal
-from bench.benchmark.storage.run_status import STATUS_COLUMNS
+from bench.benchmark.storage.run_status import STATUS_COLUMN_NAMES
 from bench.benchmark.storage.table_schemas import (
     ENVIRONMENT_KEYS,
     OPTIONAL_ENVIRONMENT_KEYS,
     RUN_COLUMNS,
+    STATUS_COLUMNS,
     Columns,
-)
-from bench.benchmark.storage.table_schemas import (
-    STATUS_COLUMNS as STATUS,
 )
 from sims.core.atomic_files import (
     atomic_new_folder,
@@ -244,7 +242,7 @@ def write_results(
     rows_of_statuses = [
         asdict(journal.statuses[place]) for place in sorted(journal.statuses)
     ] + list(skipped)
-    statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMNS)
+    statuses = pd.DataFrame(rows_of_statuses, columns=STATUS_COLUMN_NAMES)
     write_atomically(folder / "status.csv", statuses.to_csv(index=False))
 
 
@@ -294,7 +292,7 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
     return StoredComparison(
         experiment,
         _with_defaults(runs, RUN_COLUMNS, columns) if there else runs,
-        _with_defaults(files.statuses, STATUS),
+        _with_defaults(files.statuses, STATUS_COLUMNS),
         _costs(files.training),
         files.spectra,
     )

@@ -34,7 +34,7 @@ class RunStatus:
     trusted: bool = False
 
 
-STATUS_COLUMNS = [field.name for field in fields(RunStatus)]
+STATUS_COLUMN_NAMES = [field.name for field in fields(RunStatus)]
 """Columns of status.csv."""
 
 FAILED_STATUSES = ("crashed", "timeout", "diverged")

@@ -63,7 +63,7 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
-    from bench.api.train import LossRecorder, select_training, train_or_load
+    from bench.api.train import LossRecorder, run_training, select_training
     from bench.benchmark.runner.experiment_runner import count_seeds
     from bench.benchmark.runner.resource_checks import check_training_size
     from bench.cli.progress_display import ProgressBars
@@ -88,7 +88,7 @@ def _train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         for seed in range(seeds):
             losses.start_training(f"{entry.label} seed {seed}", seed)
             try:
-                training = train_or_load(experiment, entry, seed, losses, options.again)
+                training = run_training(experiment, entry, seed, losses, options.again)
             except TrainingBudgetTooSmallError as error:
                 raise InputError(f"tuner {entry.label}: {error}; give a larger --budget") from None
             how = "trained earlier with" if training.was_cached else "trained with"

@@ -100,7 +100,7 @@ def render_summary_page(rows: Sequence[LogResult], asked: BatchPageInput) -> str
     )
     page = HtmlPage(f"{_counted(len(rows))}, each explained by itself", made)
     page.add_table("each", logs)
-    page.add_table("logs", summary_tables.format_log_table(rows))
+    page.add_table("logs", summary_tables.read_log_table(rows))
     page.append(f"<header>\n<h1>{_counted(len(rows))}, each explained by itself</h1>\n</header>")
     page.append(f'<div class="conclusion">{make_list(_conclusion(rows, logs, found, asked))}</div>')
     page.add_section("next", "What to do next", *_next(rows, asked))

@@ -12,8 +12,7 @@ from urllib.parse import quote
 
 import pandas as pd
 
-from bench.diagnosis.batch.log_rows import LogResult, format_cause
-from bench.diagnosis.batch.log_rows import format_log_table as table
+from bench.diagnosis.batch.log_rows import LogResult, format_cause, format_log_table
 from bench.diagnosis.report.wording import format_label
 
 REPORT_FILE = "report.html"
@@ -50,9 +49,9 @@ def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> p
     return frame.astype(dict.fromkeys(_MEASURED, float))
 
 
-def format_log_table(rows: Sequence[LogResult]) -> pd.DataFrame:
+def read_log_table(rows: Sequence[LogResult]) -> pd.DataFrame:
     """Read the text of logs.csv as a table; names that look like numbers stay text."""
-    head, *lines = csv.reader(StringIO(table(rows)))
+    head, *lines = csv.reader(StringIO(format_log_table(rows)))
     frame = pd.DataFrame(lines, columns=head)
     for name in ("value", "low", "high", "gap_closed", "seconds"):
         frame[name] = frame[name].map(lambda text: float(text) if text else nan).astype(float)

@@ -47,7 +47,7 @@ from bench.diagnosis.prediction_error.library_columns import group_coefficients
 from bench.diagnosis.prediction_error.model_filters import GAUSS_NEWTON_STEPS, soft_friction_models
 from bench.diagnosis.search.candidate_directions import first_probes
 from bench.diagnosis.search.explained_variance import DirectionGroup
-from bench.diagnosis.search.lack_of_fit import list_hat_effects as force_probes
+from bench.diagnosis.search.lack_of_fit import list_hat_effects
 from sims.recording.recording import Recording, Run
 from sims.robot.robot_simulator import RobotSimulator
 
@@ -296,7 +296,7 @@ class ConventionComparison:
         subject = self.subject
         parts = self._parts(subject.recording)
         world = RunEvaluator(
-            subject.kind, parts, parts.training(), subject.engine, force_probes(subject.kind)
+            subject.kind, parts, parts.training(), subject.engine, list_hat_effects(subject.kind)
         )
         followed = FollowedRuns.follow(
             world, world.get_nominal_theta(), _white_noise(world, parts), None

@@ -155,7 +155,7 @@ class SearchControl:
         """Begin a question of `QUESTION_TEXTS`.
 
         Raises:
-            EndedError: the search has to end.
+            SearchStoppedError: the search has to end.
         """
         self._enter(QUESTION_SECONDS[question])
         self._question = question
@@ -177,7 +177,7 @@ class SearchControl:
         """Report the next step, and check that the search may continue.
 
         Raises:
-            EndedError: the search has to end.
+            SearchStoppedError: the search has to end.
         """
         self.check_not_stopped()
         self.report(what)
@@ -192,7 +192,7 @@ class SearchControl:
         """Raise an error if the last computation may have been stopped early.
 
         Raises:
-            EndedError: the search has to end.
+            SearchStoppedError: the search has to end.
         """
         if self.should_stop():
             raise SearchStoppedError

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.benchmark.runner.standalone_tuning import StandaloneProblem
-from bench.benchmark.runner.standalone_tuning import run_tuner as recommended
+from bench.benchmark.runner.standalone_tuning import StandaloneProblem, run_tuner
 from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
@@ -17,7 +16,7 @@ TIME_LIMIT_SECONDS = 300.0
 """Time limit of the tuner, in seconds."""
 
 
-def run_tuner(name: str, world: RunEvaluator, noise: NoiseModel, seed: int) -> Array:
+def find_start_with_tuner(name: str, world: RunEvaluator, noise: NoiseModel, seed: int) -> Array:
     """Run a tuner, and return the base parameters (b,) that it recommends.
 
     Initial states are fixed at their guesses from the first samples.
@@ -43,7 +42,7 @@ def run_tuner(name: str, world: RunEvaluator, noise: NoiseModel, seed: int) -> A
         lengths=(world.observed.shape[1],) * len(world.tracks),
         evaluate=lambda base: _evaluated(world, noise, observed, base),
     )
-    return recommended(
+    return run_tuner(
         name, problem, SIMULATION_BUDGET, TIME_LIMIT_SECONDS, make_rng("explain", name, seed)
     )
 

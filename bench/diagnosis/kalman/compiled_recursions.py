@@ -1,4 +1,4 @@
-"""Compiled recursions of the filter and the smoother, eqs. (1) to (6) of `state_estimation`.
+"""Compiled recursions of the filter and the smoother, eqs. (1) to (6) of `filter_and_smoother`.
 
 Matrices of a few joints are too small for one library call each: a step in Python takes fifty
 microseconds whatever their size. numba stores the compiled code in the user's cache.

@@ -1,6 +1,6 @@
 """Search for the effects that a robot's model lacks, by prediction errors.
 
-`identification` selects effects by the innovations of a filter. Here, selected sets are fitted to
+`effect_selection` selects effects by the innovations of a filter. Here, selected sets are fitted to
 whole simulated runs (output errors), which decide. The search ends as soon as the residual of a set
 is only noise. The order is:
 
@@ -9,7 +9,7 @@ is only noise. The order is:
     2. If a force is still missing, fit each of the effects with the largest gains alone, and those
        of the standard joint model (`single_effects`, `effect_proposals`).
     3. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
-       filters with the effect in the model (`forward_selection`).
+       filters with the effect in the model (`forward_growth`).
     4. Select again, with effects of many shapes at the joints where a force is missing
        (`selected_sets`).
     5. Simulate elasticity and backlash between a drive and its links (`single_effects`).

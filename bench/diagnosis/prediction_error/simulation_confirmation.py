@@ -45,7 +45,7 @@ class Confirmation(Inquiry):
         """Return the result of the complete diagnosis.
 
         Raises:
-            EndedError: the search had to end early.
+            SearchStoppedError: the search had to end early.
         """
         search, watch = self._robot, self._watch
         unfit = self.unfit_base()

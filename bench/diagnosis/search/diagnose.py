@@ -103,7 +103,7 @@ class Inquiry:
         """Return the result of the complete diagnosis.
 
         Raises:
-            EndedError: the search had to end early.
+            SearchStoppedError: the search had to end early.
         """
         unfit = self.unfit_base()
         if unfit is not None:
@@ -144,7 +144,7 @@ class Inquiry:
         This is the case if nothing moves, or if the data do not determine the base model.
 
         Raises:
-            EndedError: the search had to end before the base model was fitted.
+            SearchStoppedError: the search had to end before the base model was fitted.
         """
         search = self._search
         # An unfinished base fit gives no information, not even about motion.

@@ -36,7 +36,7 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
         search: the search, which contains the fitted base model.
 
     Raises:
-        EndedError: the search had to end early.
+        SearchStoppedError: the search had to end early.
     """
     few = thin_runs(search.world)
     if few is None:

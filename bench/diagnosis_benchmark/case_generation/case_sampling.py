@@ -20,8 +20,7 @@ from bench.diagnosis_benchmark.case_generation import (
     effect_coefficients,
     effect_sizing,
 )
-from bench.diagnosis_benchmark.case_generation.benchmark_case import CASE_KINDS as CASE_KINDS
-from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase as BenchmarkCase
+from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     ANY_CONDITIONS,
     RecordingConditions,

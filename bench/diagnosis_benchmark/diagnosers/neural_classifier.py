@@ -127,7 +127,7 @@ def _example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | N
         `TRAINING_RESIDUAL_RANGE`.
 
     Raises:
-        SpentError: the budget is used up.
+        SimulationBudgetExceededError: the budget is used up.
     """
     rng, kind = lesson.rng, lesson.kind
     system = kind.system

@@ -20,8 +20,7 @@ from bench.diagnosis_benchmark.case_generation.recording_conditions import (
     RequestedConditions,
 )
 from bench.diagnosis_benchmark.machine_cases import hidden_causes
-from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES as PLANTS
-from bench.diagnosis_benchmark.machine_cases.machine_dynamics import Effects
+from bench.diagnosis_benchmark.machine_cases.machine_dynamics import MACHINES, Effects
 from bench.diagnosis_benchmark.machine_cases.machine_recording_conditions import (
     MachineRecordingConditions,
 )
@@ -36,7 +35,7 @@ from bench.diagnosis_benchmark.machine_cases.reference_motion import (
 )
 from sims.core.simulator import Array
 
-MACHINES = tuple(PLANTS)
+MACHINE_NAMES = tuple(MACHINES)
 """Names of the machines."""
 MIN_DISTINCT_SIZE = 1.0
 """Minimum RMS residual that a wrong answer must leave, in units of the noise.
@@ -96,7 +95,7 @@ def draw_case(
         len(made.runs.q),
         "own equations",
         True,
-        PLANTS[system].channels,
+        MACHINES[system].channels,
         seed,
         made.free_parameters,
         asked=wanted_so,
@@ -207,7 +206,7 @@ def _foreign(
 ) -> BenchmarkCase | None:
     """Hide an unmodelled cause, which the library explains only in part."""
     chosen = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
-    joint = str(rng.choice(PLANTS[item.system].joints))
+    joint = str(rng.choice(MACHINES[item.system].joints))
     name = f"{chosen}@{joint}" if joint else chosen
     of, gauge = hidden_causes.draw_unmodelled_cause(name, made, rng), _ResidualGauge(made)
     strength = find_strength_for_size(
@@ -281,7 +280,7 @@ class _ResidualGauge:
         for j in range(joints):
             q[:, 1 + len(numbers) + j, j] += _FINITE_DIFFERENCE_STEP
             v[:, 1 + len(numbers) + joints + j, j] += _FINITE_DIFFERENCE_STEP
-        plant = PLANTS[made.system]({n: a.ravel() for n, a in values.items()}, {}, {})
+        plant = MACHINES[made.system]({n: a.ravel() for n, a in values.items()}, {}, {})
         begun = fitted._replace(q=q.reshape(-1, joints), v=v.reshape(-1, joints))
         seen = read_encoders(simulate_machine(plant, begun), plant, made.runs.times)
         seen = seen.reshape(runs, lanes, -1)
@@ -376,7 +375,7 @@ def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> 
         made: its recording conditions.
     """
     robot = item.system == "arm2"
-    plant = PLANTS[item.system]
+    plant = MACHINES[item.system]
     stated = {"noise": made.noise_sigmas} if item.stated else {}
     channels = {name: {"unit": "rad", **stated} for name in plant.channels}
     inputs = (
@@ -403,7 +402,7 @@ def format_table(item: BenchmarkCase, made: MachineRecordingConditions, seen: Ar
         made: its recording conditions.
         seen: encoder readings, (R, T, N).
     """
-    plant, robot = PLANTS[item.system], item.system == "arm2"
+    plant, robot = MACHINES[item.system], item.system == "arm2"
     inputs = [f"u.{name}" for name in plant.motors] if robot else ["goal", "torque_enable"]
     lines = [",".join(["run", "t", *inputs, *plant.channels])]
     for number, run in enumerate(seen):

@@ -207,7 +207,7 @@ class _MultiBodyWorld:
             The id of the first body.
 
         Raises:
-            ApartError: the bodies might collide.
+            NotBatchableError: the bodies might collide.
         """
         p = bullet_world.import_pybullet()
         first = self._build(client, constants)

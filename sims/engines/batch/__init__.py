@@ -2,7 +2,7 @@
 
 The trajectory of each batch element depends on that element alone, bit for bit, and an effect that
 is inactive on an element changes nothing there. Elements on which only a constant force acts are
-integrated in closed form (`parabola`); the others are stepped (`stepping`).
+integrated in closed form (`ballistic_motion`); the others are stepped (`runge_kutta`).
 """
 
 from __future__ import annotations

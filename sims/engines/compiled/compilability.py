@@ -122,7 +122,7 @@ def _check(
         of: system or effect under test.
 
     Raises:
-        UntracedError: the results differ, or the traced object has its own state.
+        NotTraceableError: the results differ, or the traced object has its own state.
     """
     if getattr(of, "__dict__", None):
         raise NotTraceableError("it has a state of its own")

@@ -106,7 +106,7 @@ class SystemTracer:
         names: input names and sizes.
 
     Raises:
-        UntracedError: the system cannot be traced.
+        NotTraceableError: the system cannot be traced.
     """
 
     def __init__(self, system: System, names: InputNames) -> None:
@@ -142,7 +142,7 @@ class SystemTracer:
         """Return the program of the system with these effects.
 
         Raises:
-            UntracedError: an effect cannot be traced.
+            NotTraceableError: an effect cannot be traced.
         """
         key = tuple(map(type, effects))
         if key not in self._models:
@@ -155,7 +155,7 @@ class SystemTracer:
         """Return the traced effect.
 
         Raises:
-            UntracedError: the effect cannot be traced.
+            NotTraceableError: the effect cannot be traced.
         """
         kind = type(effect)
         if kind not in self._pieces:
@@ -271,7 +271,7 @@ def emit_instructions(
         outputs: output nodes.
 
     Raises:
-        UntracedError: too many registers are needed.
+        NotTraceableError: too many registers are needed.
     """
     place: dict[ExpressionNode, int] = {}
     rows = []

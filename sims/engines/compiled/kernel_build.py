@@ -60,8 +60,8 @@ def build_kernel() -> bytes:
     """Return the packed machine code of the kernel.
 
     Raises:
-        native.UnusableError: the compilation failed; the message is the last line of the compiler's
-            output.
+        llvm_code.CodeNotLoadableError: the compilation failed; the message is the last line of
+            the compiler's output.
     """
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
     # Everything is optimised once at the end, instead of each function with all its callees.

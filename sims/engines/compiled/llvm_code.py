@@ -97,7 +97,7 @@ def load_machine_code(code: MachineCode, pointers: int) -> Callable[..., None]:
         The function.
 
     Raises:
-        UnusableError: a required symbol is missing; LLVM itself would end the process.
+        CodeNotLoadableError: a required symbol is missing; LLVM itself would end the process.
     """
     import llvmlite.binding as llvm
 

@@ -56,7 +56,7 @@ def make_constant_nodes(graph: ExpressionGraph, value: Any) -> Any:
         value: number or array of numbers.
 
     Raises:
-        UntracedError: the value is not numeric.
+        NotTraceableError: the value is not numeric.
     """
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "biuf":
@@ -79,7 +79,7 @@ def apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) ->
         Array of the resulting nodes.
 
     Raises:
-        UntracedError: the operation does not exist.
+        NotTraceableError: the operation does not exist.
     """
     if name not in OPERATION_CODES:
         raise NotTraceableError(f"numpy.{name} is not traced")

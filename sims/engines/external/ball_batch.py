@@ -3,9 +3,9 @@
 The module contains the algorithm of `external.ball_rollout` with arrays instead of numbers.
 
 Between impacts all elements step together. A step with an impact is integrated separately: the
-element is transferred to a `flight.Flight`, which cuts the step at the impact, and transferred back
-afterwards. Each element gets the same result as when it is integrated alone, bit for bit. Elements
-are sorted by their number of steps, largest first.
+element is transferred to a `ball_rollout.BallRollout`, which cuts the step at the impact, and
+transferred back afterwards. Each element gets the same result as when it is integrated alone, bit
+for bit. Elements are sorted by their number of steps, largest first.
 """
 
 from __future__ import annotations

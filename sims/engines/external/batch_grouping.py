@@ -53,7 +53,7 @@ class BatchIntegrator(Protocol):
             The trajectory of each; None where it must be integrated by itself.
 
         Raises:
-            ApartError: all of them must be integrated one by one.
+            NotBatchableError: all of them must be integrated one by one.
         """
         ...
 

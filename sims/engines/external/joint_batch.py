@@ -74,7 +74,7 @@ class JointBatch(Protocol):
             (n,) False where the engine cannot represent the inertia.
 
         Raises:
-            ApartError: these elements cannot share a world.
+            NotBatchableError: these elements cannot share a world.
         """
         ...
 
@@ -137,7 +137,7 @@ class JointBatchIntegrator:
             The trajectory of each element; None where it must be integrated by itself.
 
         Raises:
-            ApartError: the elements must be integrated one by one.
+            NotBatchableError: the elements must be integrated one by one.
         """
         order = sorted(range(len(lanes)), key=lambda i: -lanes[i].steps.size)
         chosen = [lanes[i] for i in order]

@@ -86,7 +86,7 @@ class JointBatchForces(ABC):
         return self._force + self._slope * (v - self._at)
 
     def compute_end_velocity(self, w: Array, half: Array, inertia: Array) -> Array:
-        """Return the velocities half a step after `w`, with the force at the end; see `joint_felt`.
+        """Return velocities half a step after `w`, with the force at the end; see `joint_forces`.
 
         Args:
             w: (n,) the engine's velocities.

@@ -12,8 +12,7 @@ import numpy as np
 
 from sims.core.simulator import Array, Scenario
 from sims.core.system import ActiveEffects, Input
-from sims.engines.time_grid import ScenarioGroups, TimeGrid
-from sims.engines.time_grid import compute_applied_inputs as felt_inputs
+from sims.engines.time_grid import ScenarioGroups, TimeGrid, compute_applied_inputs
 from sims.robot.dynamics.active_effects import slice_active_effects
 from sims.robot.dynamics.midpoint_state import Mask, Places
 
@@ -66,7 +65,7 @@ def _digest(times: Array, signal: Array) -> bytes:
     return digest.digest()
 
 
-def compute_applied_inputs(
+def compute_inputs_over_steps(
     step: float,
     scenario: Scenario,
     commands: Mapping[str, Array],
@@ -196,7 +195,7 @@ def _given(
     runs = ScenarioGroups(tuple(_alone(scenario, one.name) for one in asked), of)
     plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
     commands = [{SINGLE_INPUT_NAME: one.signal} for one in asked]
-    values = felt_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]
+    values = compute_applied_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]
     parts = values.reshape(of.size, steps, cuts.size)
     return parts[:, :, 0] if cuts.size < STEP_SUBDIVISION.size else compute_step_inputs(parts, seen)
 

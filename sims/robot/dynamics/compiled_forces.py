@@ -114,7 +114,7 @@ class _Tracing:
         """Return the program for forces, frictions and effects with hidden states.
 
         Raises:
-            UntracedError: an effect cannot be traced, or there are too many effects.
+            NotTraceableError: an effect cannot be traced, or there are too many effects.
         """
         key = tuple(type(effect) for group in effects for effect in group)
         if key not in self._programs:
@@ -288,7 +288,7 @@ def _check(tracing: _Tracing, forces: EffectForces, run_by: CompiledKernel) -> N
     """Compare an effect's program with numpy at random states.
 
     Raises:
-        UntracedError: the results differ.
+        NotTraceableError: the results differ.
     """
     program = tracing.program([[effect for effect, _ in group] for group in _groups(forces)])
     quick = CompiledForces(forces, program, run_by)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sims.core.simulator import Array, Scenario
 from sims.core.system import ActiveEffects, Effect, Input, Sensor
-from sims.robot.dynamics.applied_inputs import SAME_INSTANT_SHARE
-from sims.robot.dynamics.applied_inputs import compute_applied_inputs as felt_over
+from sims.robot.dynamics.applied_inputs import SAME_INSTANT_SHARE, compute_inputs_over_steps
 from sims.robot.dynamics.batch_work import BatchInputs, RobotRunBatch
 from sims.robot.dynamics.linearisation_points import (
     LINEARISATION_INTERVAL_SECONDS,
@@ -20,7 +19,7 @@ from sims.robot.dynamics.linearisation_points import (
 )
 from sims.robot.dynamics.midpoint_state import compute_midpoint_loads, forces_are_at_step_end
 from sims.robot.dynamics.sensor_sampling import (
-    apply_sensor_effects,
+    apply_effects_to_readings,
     find_sample_steps,
     preserves_time,
     sample_readings,
@@ -296,10 +295,10 @@ class RunLinearisation:
         steps = len(self._motion.controls)
         simulator = self._simulator
         given = self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
-        felt = felt_over(simulator.time_step, *given)
+        felt = compute_inputs_over_steps(simulator.time_step, *given)
         instant = felt
         if any(name.startswith("tau.") for name in self._names):
-            instant = felt_over(simulator.time_step, *given, SAME_INSTANT_SHARE)
+            instant = compute_inputs_over_steps(simulator.time_step, *given, SAME_INSTANT_SHARE)
         numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
         result: dict[int, list[Perturbation]] = {}
         for lane, (number, one, _) in enumerate(rows):
@@ -347,7 +346,7 @@ class RunLinearisation:
                 step, times = simulator.time_step, self._times
                 columns.append(sample_readings(values, slopes, step, times, acting, self._clock))
             else:
-                columns.append(apply_sensor_effects(values, self._times, acting, self._clock))
+                columns.append(apply_effects_to_readings(values, self._times, acting, self._clock))
         return np.stack(columns, axis=2)
 
 

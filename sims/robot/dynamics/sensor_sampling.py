@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sims.core.simulator import Array
 from sims.core.system import ActiveEffects, Sensor, Signal
 from sims.engines.time_grid import is_active
-from sims.system_simulator import apply_sensor_effects as sensed
+from sims.system_simulator import apply_sensor_effects
 
 TIME_TOLERANCE_SHARE = 1e-6
 """Tolerance, as a share of a step, within which a time counts as the end of a step."""
@@ -55,13 +55,13 @@ def sample_readings(
     for some, filters in _filtering(sensors):
         grid = np.broadcast_to(ends, (some.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
-        filtered = sensed(filters, values[some], steps, grid, clock)
+        filtered = apply_sensor_effects(filters, values[some], steps, grid, clock)
         # The slope of a filtered signal is unknown.
         result[some] = _at(filtered, None, step, instants[some])
-    return apply_sensor_effects(result, times, sensors, clock)
+    return apply_effects_to_readings(result, times, sensors, clock)
 
 
-def apply_sensor_effects(
+def apply_effects_to_readings(
     readings: Array, times: Array, sensors: ActiveEffects, clock: float = 0.0
 ) -> Array:
     """Apply sensor effects that act on each sample alone, without filters and time shifts.

@@ -14,7 +14,7 @@ from sims.robot.export.mjcf_attributes import (
 from sims.robot.export.mjcf_document import FILE_ELEMENTS, MjcfDocument
 from sims.robot.export.mjcf_writer import SHORTCUT_ATTRIBUTES, format_attributes
 from sims.robot.export.model_comparison import find_first_difference
-from sims.robot.export.write_model_file import ROUNDING_TOLERANCE, compile_mjcf
+from sims.robot.export.write_model_file import EQUAL_NUMBERS_TOLERANCE, compile_mjcf
 from sims.robot.export.xml_editing import NotEditableError, format_number
 from sims.robot.robot_model import RobotModel
 
@@ -108,7 +108,7 @@ def render_model_using_class(
         text: the class, from `render_default_class`.
 
     Raises:
-        UnfitError: the rendered file differs from the modified model; states the field.
+        NotEditableError: the rendered file differs from the modified model; states the field.
     """
     document = MjcfDocument(applied.text.encode(), robot.path)
     tags = document.map_to_compiled_ids(applied.model)
@@ -130,7 +130,7 @@ def render_model_using_class(
         0, ([], "<default>\n    " + text.replace("\n", "\n    ") + "\n  </default>")
     )
     written = document.to_text()
-    differs = find_first_difference(compile_mjcf(written), applied.model, ROUNDING_TOLERANCE)
+    differs = find_first_difference(compile_mjcf(written), applied.model, EQUAL_NUMBERS_TOLERANCE)
     if differs:
         raise NotEditableError(differs)
     return written

@@ -29,7 +29,7 @@ class MjcfDocument:
         root: root element of the outer file.
 
     Raises:
-        UnfitError: a file is missing, or is not XML.
+        NotEditableError: a file is missing, or is not XML.
     """
 
     def __init__(self, text: bytes, path: Path) -> None:
@@ -77,7 +77,7 @@ class MjcfDocument:
         """Map element numbers of the compiled model to the elements of the text.
 
         Raises:
-            UnfitError: the compiled model has other elements than the text.
+            NotEditableError: the compiled model has other elements than the text.
         """
         for tag in self.walk():
             if tag.name in _TWICE:

@@ -13,7 +13,7 @@ from sims.core.simulator import Array
 from sims.robot.export.apply_causes import apply_causes
 from sims.robot.export.model_comparison import find_first_difference
 from sims.robot.export.write_model_file import (
-    ROUNDING_TOLERANCE,
+    EQUAL_NUMBERS_TOLERANCE,
     CauseCoefficients,
     WrittenModelFiles,
 )
@@ -82,7 +82,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     for name in _OF_URDF:
         one, other = getattr(found, name), getattr(wanted, name)
         if one.shape != other.shape or not np.allclose(
-            one, other, rtol=ROUNDING_TOLERANCE, atol=ROUNDING_TOLERANCE
+            one, other, rtol=EQUAL_NUMBERS_TOLERANCE, atol=EQUAL_NUMBERS_TOLERANCE
         ):
             raise RuntimeError(f"extended.urdf is not as it was meant: {name}")
     # The axes of two equal moments are arbitrary, so whole tensors are compared.
@@ -90,7 +90,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
     if not np.allclose(
         one,
         other,
-        rtol=ROUNDING_TOLERANCE,
+        rtol=EQUAL_NUMBERS_TOLERANCE,
         atol=max(MOTION_TOLERANCE * np.abs(other).max(), MIN_MOMENT),
     ):
         raise RuntimeError("extended.urdf is not as it was meant: body_inertia")
@@ -122,7 +122,7 @@ def _without_contacts(model: Any) -> None:
 
 
 def _compare(found: Any, wanted: Any, name: str) -> None:
-    differs = find_first_difference(found, wanted, ROUNDING_TOLERANCE)
+    differs = find_first_difference(found, wanted, EQUAL_NUMBERS_TOLERANCE)
     if differs:
         raise RuntimeError(f"{name} is not as it was meant: {differs}")
     _compare_motion(found, wanted, name)

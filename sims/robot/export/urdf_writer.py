@@ -38,7 +38,7 @@ class UrdfWriter:
         recording: title of the recording to which the causes were fitted.
 
     Raises:
-        UnfitError: the file is not XML in UTF-8.
+        NotEditableError: the file is not XML in UTF-8.
     """
 
     def __init__(self, robot: RobotModel, recording: str) -> None:

@@ -18,11 +18,9 @@ from sims.robot.export.apply_causes import (
     COULOMB,
     KEPT_VALUE_NOTE,
     MAX_CORRECTION_ROUNDS,
+    ROUNDING_TOLERANCE,
     ModifiedModel,
     apply_causes,
-)
-from sims.robot.export.apply_causes import (
-    ROUNDING_TOLERANCE as CLOSE,
 )
 from sims.robot.export.mjcf_attributes import AttributeStatement, find_missing_statements
 from sims.robot.export.mjcf_document import MjcfDocument
@@ -43,7 +41,7 @@ from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 CauseCoefficients = Mapping[str, Mapping[str, FittedValue]]
 """Coefficients by ``effect@place``, ``effect@*`` or ``effect``."""
 
-ROUNDING_TOLERANCE = 1e-12
+EQUAL_NUMBERS_TOLERANCE = 1e-12
 """Relative difference between numbers of a compiled model that counts as rounding."""
 
 _SOFT_IN_URDF = (
@@ -107,7 +105,7 @@ def render_with_series_joints(applied: ModifiedModel) -> bytes:
         applied: model with the causes applied.
 
     Raises:
-        UnfitError: the text does not contain a required joint or actuator.
+        NotEditableError: the text does not contain a required joint or actuator.
     """
     robot = applied.robot
     text = robot.path.read_bytes()
@@ -215,13 +213,15 @@ class MjcfEditor:
         """Return the text with all wanted attributes.
 
         Raises:
-            UnfitError: the edited text does not compile to the wanted model.
+            NotEditableError: the edited text does not compile to the wanted model.
         """
         # An element with comments needs a statement even if its numbers are in the text already.
         statements = {element: AttributeStatement(element) for element in self.applied.comments}
         model = self.original
         for _ in range(MAX_CORRECTION_ROUNDS):
-            for statement in find_missing_statements(model, self.applied.target_values, CLOSE):
+            for statement in find_missing_statements(
+                model, self.applied.target_values, ROUNDING_TOLERANCE
+            ):
                 held = statements.setdefault(
                     statement.element, AttributeStatement(statement.element)
                 )
@@ -230,9 +230,9 @@ class MjcfEditor:
                 held.values |= statement.values
             text = self._written(list(statements.values()))
             model = compile_mjcf(text)
-            if not find_missing_statements(model, self.applied.target_values, CLOSE):
+            if not find_missing_statements(model, self.applied.target_values, ROUNDING_TOLERANCE):
                 break
-        differs = find_first_difference(model, self.applied.model, ROUNDING_TOLERANCE)
+        differs = find_first_difference(model, self.applied.model, EQUAL_NUMBERS_TOLERANCE)
         if differs:
             raise NotEditableError(f"its attributes do not say all ({differs})")
         return text
@@ -255,7 +255,7 @@ def compile_mjcf(text: str) -> Any:
     """Compile an MJCF text.
 
     Raises:
-        UnfitError: MuJoCo rejects the text.
+        NotEditableError: MuJoCo rejects the text.
     """
     import mujoco
 

@@ -73,7 +73,7 @@ class XmlText:
     """An XML text with its elements.
 
     Raises:
-        UnfitError: the text is not XML in UTF-8, or has a document type.
+        NotEditableError: the text is not XML in UTF-8, or has a document type.
     """
 
     def __init__(self, text: bytes, path: Path) -> None:

@@ -11,7 +11,7 @@ from tests.docs.documentation_pages import quoted, section, tables, text_of
 from tests.docs.page_numbers.number_sources import NUMBER, Account
 from tests.docs.page_numbers.source_tables import document, frame
 from tests.robot_exam import robot_exam_report as robots_report
-from tests.simple_exam import exam_report as exam_report
+from tests.simple_exam import exam_report
 from tests.simple_exam.exam_summary import share
 
 

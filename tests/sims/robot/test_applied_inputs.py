@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sims.core.simulator import Scenario
-from sims.robot.dynamics.applied_inputs import compute_applied_inputs
+from sims.robot.dynamics.applied_inputs import compute_inputs_over_steps
 from tests.sims.robot.sample_arms import ARM
 from tests.sims.robot.test_series_joints import made
 
@@ -47,7 +47,9 @@ def test_what_a_lane_feels_does_not_hang_on_its_company_nor_on_other_drives(offs
 
     def feels(lanes, names=WAY):
         signals = {name: WAY[name] for name in names}
-        return compute_applied_inputs(STEP, run, signals, acting(lanes), len(lanes), STEPS, share)
+        return compute_inputs_over_steps(
+            STEP, run, signals, acting(lanes), len(lanes), STEPS, share
+        )
 
     together = feels(LANES)
     bare = feels(LANES[2:3])

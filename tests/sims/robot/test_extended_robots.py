@@ -25,7 +25,7 @@ from sims.extended_simulator import (
     write_extended,
 )
 from sims.robot.integrator_settings import IntegratorSettings
-from sims.robot.parsing.read_model_file import read_robot as read_robot
+from sims.robot.parsing.read_model_file import read_robot
 from sims.robot.robot_simulator import make_robot_simulator as robot_simulator
 from tests.sims.robot.sample_arms import ARM
 
