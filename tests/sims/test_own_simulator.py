@@ -23,7 +23,7 @@ def example(name, kind):
 
 
 class Block(OwnSimulator):
-    """A block pushed along a level track by an input, stepped exactly."""
+    """A block that an input pushes along a level track, stepped exactly."""
 
     name = "block"
     parameters = (Parameter("mass", "kg", 2.0, (0.5, 5.0)),)
