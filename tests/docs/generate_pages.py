@@ -77,8 +77,8 @@ def commands():
         *((str(code), says) for code, says in EXIT_CODES.items()),
     ]
     parts = [
-        "`simgap COMMAND --help` says the same, `simgap list --json` to programs. With `--json` "
-        "every command prints [one JSON document](json.md), and nothing else to stdout.",
+        "`simgap COMMAND --help` prints the same, `simgap list --json` as JSON. With `--json` "
+        "every command prints [one JSON document](json.md) to stdout and nothing else.",
         table(*codes),
         table(*listing),
     ]
@@ -132,11 +132,11 @@ WORDS = {str: "text", int: "whole number", float: "number", bool: "`true` or `fa
 def experiment_keys():
     """Return the page of all keys of an experiment file."""
     parts = [
-        "An experiment is a TOML file: one that comes with the project by its name, your own by "
-        "its path (`simgap compare my.toml`). The keys are the fields of "
-        "`bench.benchmark.problem.experiment.Experiment`; a comparison's `experiment.toml` has "
-        "all of them, defaults filled in. An unknown key is refused by name. "
-        "[Patterns](../../bench/experiments), [what they are for](../problems.md).",
+        "An experiment is a TOML file. Name one of the project, or give the path of your own "
+        "(`simgap compare my.toml`). The keys are the fields of "
+        "`bench.benchmark.problem.experiment.Experiment`; `experiment.toml` of a comparison "
+        "contains all of them with their defaults. Unknown keys are errors. "
+        "[Examples](../../bench/experiments), [what each tests](../problems.md).",
         keys(Experiment, ""),
     ]
     for name, hint in hints(Experiment).items():
@@ -235,20 +235,18 @@ KINDS = {
 }
 """Names of the objects in verdict.json on the page."""
 ESTIMATE = {
-    "value": "fitted",
-    "unit": "of the three numbers",
-    "low": "of its 95 % interval; null where the data do not bound it",
-    "high": "the other end",
-    "at_bound": "which end of its range the number lies at, where there is no interval; left out "
-    "where it lies inside",
-    "stated": "the number of the robot's model file that the estimate changes, such as a joint's "
-    "damping or a body's mass; of an inertia tensor its largest principal moment; left out where "
-    "the file has no such number",
-    "total": "the same number with what was found in it, as extended.xml states it; left out "
-    "where `stated` is",
-    "total_unit": "unit of `stated` and `total`; left out where it is `unit`",
-    "usual_range": "lowest and highest value that one would expect; left out where the value lies "
-    "between them",
+    "value": "fitted value",
+    "unit": "unit of `value`, `low` and `high`",
+    "low": "lower end of the 95 % interval; null if the data do not bound it",
+    "high": "upper end of the interval",
+    "at_bound": "bound at which the value ends (`low` or `high`); it then has no interval; absent "
+    "if the value lies inside its range",
+    "stated": "value in the robot's model file that the estimate changes, such as the damping of "
+    "a joint or the mass of a body; for an inertia tensor, its largest principal moment; absent "
+    "if the file has no such value",
+    "total": "this value including the estimate, as in extended.xml; absent if `stated` is absent",
+    "total_unit": "unit of `stated` and `total`; absent if equal to `unit`",
+    "usual_range": "smallest and largest plausible value; absent if the value lies between them",
 }
 """Descriptions of the fields of an estimate, whose docstring is a single sentence."""
 
@@ -262,8 +260,8 @@ def verdict_keys():
         *((f"`{name}`", text) for name, text in VERDICT_MEANINGS.items()),
     ]
     parts = [
-        "What `simgap explain` writes for programs: one JSON object with these keys and no others; "
-        "in Python `found.answer`. How it is found is on the page [verdicts](../verdicts.md).",
+        "`simgap explain` writes `verdict.json`: one JSON object with exactly these keys; in "
+        "Python, `found.answer`. See [verdicts](../verdicts.md) for how a verdict is reached.",
         "## The six verdicts",
         table(*words_of),
         "## The keys",
@@ -377,13 +375,12 @@ def json_documents():
     commands_of = [each["name"] for each in catalogue.list_commands(build_parser())]
     others = [name for name in schema_names() if name not in commands_of]
     parts = [
-        "`simgap COMMAND --json` prints one JSON document and nothing else to stdout; progress and "
-        "warnings are on stderr. Where it comes to nothing the document is "
-        "[`error`](#error), and the exit code says so too "
-        "([exit codes](commands.md)). What is no finite number is null; paths are as they were "
-        "given. `simgap schema NAME` prints the exact form (JSON Schema, draft 2020-12); the files "
-        "are in `bench/schemas`, and in the wheel. Later versions add keys and remove none: take "
-        "what you know and leave the rest.",
+        "`simgap COMMAND --json` prints one JSON document to stdout and nothing else; progress and "
+        "warnings go to stderr. If the command fails, the document is [`error`](#error), and the "
+        "[exit code](commands.md) is not 0. Values that are not finite numbers are null; paths are "
+        "as given. `simgap schema NAME` prints the exact schema (JSON Schema, draft 2020-12); the "
+        "files are in `bench/schemas` and in the wheel. Later versions only add keys, so ignore "
+        "unknown ones.",
     ]
     for name in [*commands_of, *others]:
         known = load_schema(name)
@@ -459,12 +456,12 @@ def how_tuners_work():
     """Return the page of all tuners: method, equations, sources and options."""
     return page(
         "How each tuner works",
-        "Written from the modules in `methods/`, in whose code the equations' numbers stand. Which "
-        "one to take: [by measured numbers](../choosing-a-tuner.md). How to write one: [add a "
-        "tuner](../add-a-tuner.md).",
+        "Generated from the modules in `methods/`, whose code has the numbers of the equations. "
+        "[Choosing a tuner](../choosing-a-tuner.md) compares them; [add a "
+        "tuner](../add-a-tuner.md) shows how to write one.",
         "![Error against number of simulations](../../results/reference/ball-drop/figures/"
         "error-vs-simulations.png)",
-        "*Ten of them on the bouncing ball (`simgap compare ball-drop --salt public`): a line is "
+        "*Ten tuners on the bouncing ball (`simgap compare ball-drop --salt public`). Each line is "
         "the median over 100 targets.*",
         *tuner_table.sections(),
     )
@@ -474,9 +471,9 @@ def public_names():
     """Return the page of all public names that have a docstring."""
     return page(
         "Public names",
-        "`import simgap`: `simgap.compare` and so on; how they go together is on the page "
-        "[Python](../python.md). Each line that begins with `:::` says where a name is defined; "
-        "on the site its signature and docstring stand there.",
+        "All names after `import simgap`, such as `simgap.compare`; [Python](../python.md) shows how "
+        "to use them together. A line that begins with `:::` says where a name is defined; the "
+        "site shows its signature and docstring there.",
         *documented_names.sections(),
     )
 
