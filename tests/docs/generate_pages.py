@@ -471,8 +471,8 @@ def public_names():
     """Return the page of all public names that have a docstring."""
     return page(
         "Public names",
-        "All names after `import simgap`, such as `simgap.compare`; [Python](../python.md) shows how "
-        "to use them together. A line that begins with `:::` says where a name is defined; the "
+        "All names after `import simgap`, such as `simgap.compare`; [Python](../python.md) shows "
+        "how to use them together. A line that begins with `:::` says where a name is defined; the "
         "site shows its signature and docstring there.",
         *documented_names.sections(),
     )
