@@ -8,13 +8,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
+from bench.api.comparison_options import ComparisonOptions, StudyOptions
 from bench.benchmark.figures import comparison_figures
 from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
 from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
 from bench.benchmark.problem.robot_experiment import make_robot_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.results_report import build_tables
-from bench.benchmark.runner.experiment_runner import ProgressFactory
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
 from bench.benchmark.runner.resource_checks import check_comparison_size
 from bench.benchmark.storage.csv_reader import CsvTable
@@ -28,6 +28,7 @@ from bench.benchmark.storage.table_schemas import (
     SHOT_STATUS_COLUMNS,
     SHOT_TABLE_COLUMNS,
 )
+from bench.core.options import with_options
 from bench.core.plugin_registries import diagnosers
 from bench.core.plugin_registries import tuners as registered
 from bench.diagnosis_benchmark import table_columns as diagnosis
@@ -35,16 +36,7 @@ from bench.figures.figure_files import pdf_figures
 from bench.misspecification.calibration import MODEL_LABELS
 from bench.studies import study
 from methods.tuner import Tuner
-from sims.core.argument_checks import (
-    Count,
-    Expected,
-    Files,
-    Name,
-    Names,
-    Natural,
-    Seconds,
-    check_arguments,
-)
+from sims.core.argument_checks import Expected, check_arguments
 from sims.core.simulator import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:
@@ -65,6 +57,9 @@ _MISSPECIFICATION_TABLE_COLUMNS = {
     "ranking": RANK_AGREEMENT_COLUMNS,
 }
 """Columns of the tables of a study of a missing effect."""
+_EXPERIMENT_OPTIONS = ("targets", "budget", "training_budget", "timeout", "memory")
+"""Options that change the key of the same name in an experiment."""
+DEFAULTS = ComparisonOptions()
 _ROWS = 200
 """Maximum number of table rows that a notebook shows."""
 
@@ -74,74 +69,19 @@ ExperimentSource: TypeAlias = Annotated[
     Expected("the name of an experiment, the path of its TOML file or an Experiment"),
 ]
 """The experiment to run."""
-Tuners: TypeAlias = Annotated[
-    Sequence[Name | type[Tuner]],
-    Expected("names of tuners or subclasses of Tuner, as ['cma_es', 'random']"),
-]
-"""The tuners to compare."""
-RecordingFile: TypeAlias = Annotated[
-    str | Path, Expected("the path of NAME.csv, which results are traced to")
-]
-"""A recording that must be a file."""
 
 
-@check_arguments
+@with_options(ComparisonOptions)
 def compare(
-    experiment: ExperimentSource | None = None,
-    *,
-    model: str | Path | None = None,
-    recording: RecordingFile | None = None,
-    free: Names = (),
-    tuners: Tuners | None = None,
-    targets: Count | None = None,
-    seeds: Count | None = None,
-    budget: Count | None = None,
-    training_budget: Count | None = None,
-    timeout: Seconds | None = None,
-    memory: Natural | None = None,
-    jobs: Natural = 2,
-    trust: bool = False,
-    isolation: Name | None = None,
-    salt: str | None = None,
-    out: str | Path | None = None,
-    plugins: Files = (),
-    cluster: str | None = None,
-    progress: ProgressFactory | None = None,
-    force: bool = False,
-    pdf: bool = False,
+    experiment: ExperimentSource | None = None, options: ComparisonOptions = DEFAULTS
 ) -> ComparisonResult:
     """Run an experiment: every tuner on every target with every seed.
 
     Args:
         experiment: Name of an experiment, path of its TOML file, or an `Experiment`; None for a
             robot, which `model` and `free` describe.
-        model: Model file of a robot, MJCF or URDF.
-        recording: Path of a recording of that robot; without one, targets are simulated.
-        free: Numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
-        tuners: Labels, registered names or classes of the tuners to run; None for all tuners of the
-            experiment. A class is registered.
-        targets: Number of targets in each range.
-        seeds: Number of seeds for each tuner that uses random numbers.
-        budget: Number of simulations on one target.
-        training_budget: Number of simulations that a learned tuner may train on.
-        timeout: Time limit of a run in seconds.
-        memory: Memory limit of a run in MiB; 0 is no limit.
-        jobs: Number of worker processes. 0 runs everything in this process: output of ``print``
-            appears, breakpoints work, and classes of a script or notebook can be used; tuners are
-            then not isolated.
-        trust: Run tuners inside the harness, where they could read the true parameters. This is
-            faster, and the results are marked.
-        isolation: ``run`` starts a fresh process for every run of a tuner, ``tuner`` one for all
-            runs with the same seed; None for the experiment's own choice.
-        salt: Text from which targets are drawn. It is secret until the end; ``public`` draws the
-            published targets; None for a fresh one.
-        out: Folder to write, new or empty; None for a new one below results/.
-        plugins: Python files with further tuners, simulators and effects.
-        cluster: Address of a Dask scheduler to run on.
-        progress: Called with a title and a number of steps; returns the function that is called
-            after each step.
-        force: Start even if it needs more than this machine has.
-        pdf: Write every figure as PDF, too, in addition to PNG.
+        options: Keyword arguments, the attributes of
+            `bench.api.comparison_options.ComparisonOptions`.
 
     Returns:
         Tables and figures of the results.
@@ -150,65 +90,29 @@ def compare(
         InputError: An argument, the experiment or a plugin cannot be used; nothing has been run
             then.
     """
-    if experiment is None and not (model or recording or free):
+    if experiment is None and not (options.model or options.recording or options.free):
         raise InputError(
             "compare: expected an experiment, as simgap.compare('ball-drop'), or a robot, as "
             "simgap.compare(model='robot.xml', free=['damping@*']); experiments are "
             f"{', '.join(list_experiment_names())}"
         )
-    files = [str(Path(plugin).resolve()) for plugin in plugins]
-    chosen = apply_changes(
-        load_experiment_plugins(
-            resolve_experiment(experiment, model, recording, free),
-            files,
-            trust or not jobs,
-            isolation,
-        ),
-        None if tuners is None else [_label(tuner) for tuner in tuners],
-        seeds,
-        targets=targets,
-        budget=budget,
-        training_budget=training_budget,
-        timeout=timeout,
-        memory=memory,
-    )
+    chosen = build_experiment(experiment, options)
     if chosen.sweep:
         raise InputError(f"experiment {chosen.name} sweeps over values: use simgap.sweep")
     if chosen.experiments:
         raise InputError(f"experiment {chosen.name} names several: use simgap.sweep")
-    folder = None if out is None else Path(out)
-    check_comparison_size(chosen, folder, jobs, cluster is not None, force)
-    pool = _cluster(cluster)
-    begun = study.begin_study(chosen, files, folder, jobs, salt)
-    with pdf_figures(pdf):
-        return _run_study(begun, jobs, progress, pool)
+    pool = _cluster(options.cluster)
+    return _run_studies(begin_studies(chosen, options), options, pool)[0]
 
 
-@check_arguments
-def sweep(
-    experiment: ExperimentSource,
-    *,
-    jobs: Natural = 2,
-    trust: bool = False,
-    salt: str | None = None,
-    out: str | Path | None = None,
-    plugins: Files = (),
-    progress: ProgressFactory | None = None,
-    force: bool = False,
-    pdf: bool = False,
-) -> list[ComparisonResult]:
+@with_options(StudyOptions)
+def sweep(experiment: ExperimentSource, options: StudyOptions) -> list[ComparisonResult]:
     """Run one by one the experiments of a ``[sweep]`` or of an ``experiments`` list.
 
     Args:
         experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
-        jobs: As in `compare`.
-        trust: As in `compare`.
-        salt: As in `compare`; all experiments share it, so that they have the same targets.
-        out: Folder in which each experiment gets its own folder, with the experiment's name.
-        plugins: As in `compare`.
-        progress: As in `compare`.
-        force: As in `compare`.
-        pdf: As in `compare`.
+        options: Keyword arguments, the attributes of `bench.api.comparison_options.StudyOptions`;
+            all experiments share the salt, so that they have the same targets.
 
     Returns:
         The results, in the order of the file's values.
@@ -216,50 +120,78 @@ def sweep(
     Raises:
         InputError: An argument is invalid; the message is one line, and nothing has been run then.
     """
-    files = [str(Path(plugin).resolve()) for plugin in plugins]
-    chosen = apply_changes(load_experiment_plugins(experiment, files, trust or not jobs))
-    folder = None if out is None else Path(out)
-    check_comparison_size(chosen, folder, jobs, force=force)
-    begun = study.begin_studies(chosen, files, folder, jobs, salt)
-    with pdf_figures(pdf):
-        made = [_run_study(one, jobs, progress, None) for one in begun]
-        if len(begun) > 1:
-            study.report_jointly(begun[0].folder.parent, _discard_line)
-    return made
+    shared = ComparisonOptions(**vars(options))
+    studies = begin_studies(build_experiment(experiment, shared), shared)
+    results = _run_studies(studies, options)
+    if len(studies) > 1:
+        with pdf_figures(options.pdf):
+            study.report_jointly(studies[0].folder.parent, _discard_line)
+    return results
+
+
+def build_experiment(
+    experiment: str | Path | Experiment | None, options: ComparisonOptions
+) -> Experiment:
+    """Load the experiment that the options describe, with their changes, and its plugins.
+
+    Args:
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`; None for the
+            robot of the options.
+        options: Options of the comparison.
+
+    Raises:
+        InputError: The experiment, a tuner or a plugin does not exist or cannot be used.
+    """
+    trust = options.trust or not options.jobs
+    source = resolve_experiment(experiment, options)
+    loaded = load_experiment_plugins(source, options.plugins, trust, options.isolation)
+    labels = None if options.tuners is None else [_label(tuner) for tuner in options.tuners]
+    changes = {name: getattr(options, name) for name in _EXPERIMENT_OPTIONS}
+    return _apply_changes(loaded, labels, options.seeds, changes)
+
+
+def begin_studies(chosen: Experiment, options: ComparisonOptions) -> list[study.Study]:
+    """Plan the studies of an experiment in new folders, without running them.
+
+    Args:
+        chosen: Experiment, from `build_experiment`.
+        options: Options of the comparison.
+
+    Raises:
+        InputError: They need more than this machine has, or the folder is not free.
+    """
+    folder = None if options.out is None else Path(options.out)
+    jobs, files = options.jobs, [str(Path(plugin).resolve()) for plugin in options.plugins]
+    check_comparison_size(chosen, folder, jobs, options.cluster is not None, options.force)
+    return study.begin_studies(chosen, files, folder, jobs, options.salt)
 
 
 def resolve_experiment(
-    experiment: str | Path | Experiment | None,
-    model: str | Path | None = None,
-    recording: str | Path | None = None,
-    free: Sequence[str] = (),
+    experiment: str | Path | Experiment | None, options: ComparisonOptions
 ) -> str | Path | Experiment:
     """Return the named experiment, or the one described by a model file and a recording.
 
     Args:
         experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
-        model: Model file of a robot.
-        recording: Recording of that robot.
-        free: Numbers of the model file to tune.
+        options: Options with the model file, the recording and the numbers to tune.
 
     Raises:
         InputError: Neither or both are given.
     """
-    parts = {"model": model, "recording": recording, "free": free}
-    there = [name for name, value in parts.items() if value]
+    described = [name for name in ("model", "recording", "free") if getattr(options, name)]
     if experiment is not None:
-        if there:
+        if described:
             raise InputError(
-                f"experiment {experiment} says what it tunes: leave out {', '.join(there)}, or "
-                "leave out the experiment"
+                f"experiment {experiment} states what it tunes: leave out {', '.join(described)}, "
+                "or leave out the experiment"
             )
         return experiment
-    if not there:
+    if not described:
         raise InputError(
             "expected an experiment (see `simgap list experiments`), or --resume DIR, or a robot: "
             "--model FILE --free A,B"
         )
-    return make_robot_experiment(model, recording, free)
+    return make_robot_experiment(options.model, options.recording, options.free)
 
 
 def load_experiment_plugins(
@@ -294,17 +226,23 @@ def _cluster(address: str | None) -> Pool | None:
     return ClusterPool(address)
 
 
-def _run_study(
-    begun: study.Study, jobs: int, progress: ProgressFactory | None, pool: Pool | None
-) -> ComparisonResult:
+def _run_studies(
+    studies: Sequence[study.Study], options: StudyOptions, pool: Pool | None = None
+) -> list[ComparisonResult]:
+    """Run and report studies."""
+    with pdf_figures(options.pdf):
+        return [_run_study(begun, options, pool) for begun in studies]
+
+
+def _run_study(begun: study.Study, options: StudyOptions, pool: Pool | None) -> ComparisonResult:
     """Run and report a study."""
-    made = begun.run(jobs, progress, pool)
-    if made.skipped:
-        raise InputError(f"{begun.configuration.experiment.name}: skipped: {made.skipped}")
+    outcome = begun.run(options.jobs, options.progress, pool)
+    if outcome.skipped:
+        raise InputError(f"{begun.configuration.experiment.name}: skipped: {outcome.skipped}")
     begun.report(_discard_line)
-    if made.interrupted:
+    if outcome.interrupted:
         # A notebook's cell ends as the user requested; finished runs are stored in the folder.
-        raise KeyboardInterrupt(f"what was finished is kept in {begun.folder}")
+        raise KeyboardInterrupt(f"finished runs are stored in {begun.folder}")
     return ComparisonResult(begun.folder)
 
 
@@ -312,24 +250,17 @@ def _discard_line(_line: str) -> None:
     """Discard a line that the command would print; in Python the tables are available."""
 
 
-def apply_changes(
-    experiment: str | Path | Experiment,
-    labels: Sequence[str] | None = None,
-    seeds: int | None = None,
-    **changes: float | None,
+def _apply_changes(
+    whole: Experiment,
+    labels: Sequence[str] | None,
+    seeds: int | None,
+    changes: Mapping[str, float | None],
 ) -> Experiment:
-    """Apply changes to an experiment.
-
-    Args:
-        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
-        labels: Labels or registered names of the only tuners to run; None for all.
-        seeds: Number of seeds for each tuner that uses random numbers.
-        changes: Other fields; None leaves a field unchanged.
+    """Apply changes to an experiment; None leaves a field unchanged.
 
     Raises:
-        InputError: The experiment or a tuner does not exist.
+        InputError: A tuner or diagnoser does not exist.
     """
-    whole = experiment if isinstance(experiment, Experiment) else load_experiment(str(experiment))
     if whole.diagnosis:
         return _choose_diagnosers(whole, labels, changes)
     whole = whole.chosen(**changes)

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
-from bench.api.explain import RecordingSource, Sources, Units, explain, list_sources
+from bench.api.explain import Sources, list_sources, with_all_cores
+from bench.core.options import with_options
 from bench.core.plugin_registries import simulators
+from bench.diagnosis import explain as explaining
 from bench.diagnosis.datasheet.datasheet import DataSheet, build_datasheet
 from bench.diagnosis.datasheet.subject import make_subject
+from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.search.verdict_rules import VERDICT_MEANINGS
 from bench.diagnosis.verdict import Verdict
-from bench.logs.data_frames import FrameDescription
 from bench.logs.joined_recordings import load_joined
-from sims.core.argument_checks import Count, Expected, Name, Names, Seconds, check_arguments
+from sims.core.argument_checks import Expected, Name
 from sims.core.simulator import InputError
 from sims.extended_simulator import ExtendedSimulator, open_extended
+from sims.recording.recording import Recording
 from sims.system_simulator import SystemSimulator
 
 Explained: TypeAlias = Annotated[
@@ -29,105 +32,69 @@ Explained: TypeAlias = Annotated[
 """A result of `explain`."""
 
 
-@check_arguments
-def datasheet(
-    recording: Sources,
-    *,
-    joint: Name | None = None,
-    name: Name | None = None,
-    explained: Explained | None = None,
-    system: Name | None = None,
-    model: str | Path | None = None,
-    units: Units | None = None,
-    constants: Mapping[str, float] | None = None,
-    description: Mapping[str, Any] | None = None,
-    free: Names = (),
-    force: bool = False,
-    budget: Seconds | None = None,
-    jobs: Count | None = None,
-    say: Callable[[str], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[float, str], None] | None = None,
-) -> DataSheet:
+@dataclass(frozen=True, kw_only=True)
+class DatasheetOptions(ExplainOptions):
+    """Options of a data sheet, in addition to those of `explain`.
+
+    Attributes:
+        joint: Name of the joint, if the robot has several.
+        name: Name on the sheet (default: the name of the joint or system).
+        explained: Result of `explain` for these logs, or the folder to which it was written
+            (default: they are explained now).
+    """
+
+    joint: Name | None = None
+    name: Name | None = None
+    explained: Explained | None = None
+
+
+@with_options(DatasheetOptions)
+def datasheet(recording: Sources, options: DatasheetOptions) -> DataSheet:
     """Make the data sheet of a joint or actuator.
 
     Args:
         recording: The logs, as for `explain`.
-        joint: Name of the joint, if the robot has several.
-        name: Name on the sheet; None for the name of the joint or system.
-        explained: Result of `explain` for these logs, or the folder to which it was written; None
-            to explain them now.
-        system: As for `explain`.
-        model: As for `explain`.
-        units: As for `explain`.
-        constants: As for `explain`.
-        description: As for `explain`.
-        free: As for `explain`.
-        force: As for `explain`.
-        budget: As for `explain`.
-        jobs: As for `explain`.
-        say: As for `explain`.
-        stop: As for `explain`.
-        progress: As for `explain`.
+        options: Keyword arguments, the attributes of `DatasheetOptions` and those of `explain`.
 
     Raises:
         InputError: As for `explain`; or there is no such joint, or the folder was not written by
             explain, or belongs to other logs.
     """
-    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
-    sources = list_sources(recording, about)
+    sources, explained = list_sources(recording, options), options.explained
     if explained is None:
-        check_joint_exists(sources, joint, system, model, free)
-        explained = explain(
-            sources,
-            system=system,
-            model=model,
-            free=free,
-            force=force,
-            budget=budget,
-            jobs=jobs,
-            say=say,
-            stop=stop,
-            progress=progress,
-        )
+        check_joint_exists(sources, options)
+        explained = explaining.explain(sources, with_all_cores(options))
     if isinstance(explained, Explanation):
         extended, verdict = explained.extended, explained.answer
     else:
         extended, verdict = _read_explanation_folder(Path(explained))
     free = extended.robot.free if extended.robot is not None else ()
-    loaded, kind = load_joined(sources, system, model, free)
+    loaded, kind = load_joined(sources, options.system, options.model, free)
     if extended.kind is None or kind.name != extended.kind.name:
         raise InputError(
             f"{loaded.path}: expected a recording of {extended.system}, as what was explained; "
             f"found one of {kind.name}"
         )
-    say("asking what these data would have shown")
-    return build_datasheet(loaded, extended, verdict, joint, name)
+    options.say("computing what these data would have shown")
+    return build_datasheet(loaded, extended, verdict, options.joint, options.name)
 
 
 def check_joint_exists(
-    recording: RecordingSource | Sequence[RecordingSource],
-    joint: str | None,
-    system: str | None = None,
-    model: str | Path | None = None,
-    free: Sequence[str] = (),
+    sources: Sequence[str | Path | Recording], options: DatasheetOptions
 ) -> None:
     """Reject a joint that the recording's robot does not have, before anything is explained.
 
     Args:
-        recording: The logs, as for `explain`.
-        joint: Name of the joint; None if the robot has only one.
-        system: As for `explain`.
-        model: As for `explain`.
-        free: As for `explain`.
+        sources: The logs.
+        options: Options of the data sheet, with the name of the joint.
 
     Raises:
         InputError: There is no joint with this name, or there are several and none is named.
     """
-    loaded, kind = load_joined(list_sources(recording), system, model, free)
+    loaded, kind = load_joined(sources, options.system, options.model, options.free)
     if not issubclass(kind, SystemSimulator):
         raise InputError(f"{loaded.path}: simulator {loaded.system} takes no effects")
-    make_subject(kind, joint)
+    make_subject(kind, options.joint)
 
 
 def _check_verdict(verdict: Verdict) -> Verdict:

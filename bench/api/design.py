@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bench.api.explain import Sources, Units, list_sources
+from bench.api.explain import Sources, list_sources, with_all_cores
+from bench.core.options import with_options
 from bench.diagnosis import explain as explaining
-from bench.diagnosis.evaluation.progress_events import ProgressListener
-from bench.diagnosis.evaluation.search_control import SearchControl
-from bench.diagnosis.evaluation.worker_pool import count_available_cores
 from bench.diagnosis.experiment_design.information_gain import DISCRIMINATION_THRESHOLD
 from bench.diagnosis.experiment_design.next_run import NextRunDesign
+from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
-from bench.logs.data_frames import FrameDescription
-from sims.core.argument_checks import Count, Name, Names, check_arguments
+from sims.core.argument_checks import Seconds, check_arguments
 from sims.core.simulator import InputError
 from sims.recording.recording_writer import check_absent, write_files
 
@@ -106,24 +102,22 @@ def _format_discrimination(found: NextRunDesign) -> list[str]:
     return lines
 
 
-@check_arguments
-def design(
-    recording: Sources,
-    *,
-    seconds: float = 4.0,
-    longest: float | None = None,
-    system: Name | None = None,
-    model: str | Path | None = None,
-    units: Units | None = None,
-    constants: Mapping[str, float] | None = None,
-    description: Mapping[str, Any] | None = None,
-    free: Names = (),
-    jobs: Count | None = None,
-    say: Callable[[str], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[float, str], None] | None = None,
-    listener: ProgressListener | None = None,
-) -> NextRecording:
+@dataclass(frozen=True, kw_only=True)
+class DesignOptions(ExplainOptions):
+    """Options of the design of the next recording, in addition to those of `explain`.
+
+    Attributes:
+        seconds: Duration of the next run in seconds.
+        longest: Maximum duration in seconds, if `seconds` does not settle the open questions
+            (default: five times).
+    """
+
+    seconds: Seconds = 4.0
+    longest: Seconds | None = None
+
+
+@with_options(DesignOptions)
+def design(recording: Sources, options: DesignOptions) -> NextRecording:
     """Design the next recording by simulation, within the limits of joints and commands.
 
     The commands distinguish causes that the existing runs cannot tell apart, or reduce the
@@ -131,31 +125,18 @@ def design(
 
     Args:
         recording: The existing recordings, as for `explain`.
-        seconds: Duration of the next run in seconds.
-        longest: Maximum duration in seconds, if `seconds` does not settle the open questions; None
-            for five times `seconds`.
-        system: As for `explain`.
-        model: As for `explain`.
-        units: As for `explain`.
-        constants: As for `explain`.
-        description: As for `explain`.
-        free: As for `explain`.
-        jobs: As for `explain`.
-        say: As for `explain`.
-        stop: As for `explain`.
-        progress: As for `explain`.
-        listener: As for `explain`.
+        options: Keyword arguments, the attributes of `DesignOptions` and those of `explain`.
 
     Raises:
         InputError: As for `explain`, or a duration is out of range.
     """
+    seconds, longest = options.seconds, options.longest
     if not 0 < seconds <= MAX_RUN_SECONDS:
         raise InputError(f"seconds: expected 0 to {MAX_RUN_SECONDS:g}, found {seconds!r}")
     most = min(MAX_LENGTH_FACTOR * seconds, MAX_RUN_SECONDS) if longest is None else longest
     if not seconds <= most <= MAX_RUN_SECONDS:
         raise InputError(f"longest: expected {seconds:g} to {MAX_RUN_SECONDS:g}, found {most!r}")
-    watch = SearchControl(None, stop, progress, listener)
-    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
-    sources = list_sources(recording, about)
-    given = sources, seconds, most, system, model, free, say, watch, jobs or count_available_cores()
-    return NextRecording(*explaining.explain_and_design(*given))
+    sources = list_sources(recording, options)
+    return NextRecording(
+        *explaining.explain_and_design(sources, seconds, most, with_all_cores(options))
+    )

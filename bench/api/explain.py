@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, cast
+from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
+from bench.core.options import with_options
 from bench.diagnosis import explain as explaining
-from bench.diagnosis.evaluation.progress_events import ProgressListener
-from bench.diagnosis.evaluation.search_control import SearchControl
 from bench.diagnosis.evaluation.worker_pool import count_available_cores
+from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.score_extended import MODEL_FILES, score_model
-from bench.logs.data_frames import FrameDescription, recording_of
+from bench.logs.data_frames import FrameDescription, Units, recording_of
 from bench.logs.synthetic_recording import SimulatedRecording
 from sims import extended_simulator as extended_file
-from sims.core.argument_checks import Count, Expected, Name, Names, Seconds, check_arguments
+from sims.core.argument_checks import Expected, check_arguments
 from sims.core.simulator import InputError
 from sims.recording.recording import Recording
 from sims.recording.recording_frame import Frame
 
+SearchOptions = TypeVar("SearchOptions", bound=ExplainOptions)
 _RECORDING = (
     "the path of NAME.csv, a Recording (of read_recording), a SimulatedRecording (of simulate) or "
     "a pandas DataFrame"
@@ -33,68 +34,18 @@ Sources: TypeAlias = Annotated[
     RecordingSource | Sequence[RecordingSource], Expected(f"{_RECORDING}, or a list of these")
 ]
 """A source of one recording, or several."""
-Units: TypeAlias = Annotated[
-    Mapping[str, str], Expected("units of columns by their names, as {'q': 'rad'}")
-]
-"""Units of a data frame's columns, by column name."""
 
 
-@check_arguments
-def explain(
-    recording: Sources,
-    *,
-    system: Name | None = None,
-    model: str | Path | None = None,
-    units: Units | None = None,
-    constants: Mapping[str, float] | None = None,
-    description: Mapping[str, Any] | None = None,
-    engine: Name = "batch",
-    free: Names = (),
-    tuner: Name | None = None,
-    seed: int = 0,
-    force: bool = False,
-    budget: Seconds | None = None,
-    jobs: Count | None = None,
-    whole: bool = False,
-    pieces: Seconds | None = None,
-    thorough: bool = False,
-    say: Callable[[str], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[float, str], None] | None = None,
-    listener: ProgressListener | None = None,
-) -> Explanation:
+@with_options(ExplainOptions)
+def explain(recording: Sources, options: ExplainOptions) -> Explanation:
     """Find the effects that a simulator of a recorded system lacks, and add them to it.
 
     Args:
         recording: Path of ``NAME.csv``, a recording that was read or simulated, or a pandas
             DataFrame with the columns that `read_recording` describes. Several recordings of one
             system are explained together, and each also separately.
-        system: Name of the system, instead of the one that the description states. A DataFrame
-            needs this or `model`.
-        model: Model file of a robot, MJCF or URDF, instead of the one that the description states.
-        units: Units of a DataFrame's columns by name; None for those in ``df.attrs["units"]``.
-        constants: Known numbers of the system in SI units, with a DataFrame.
-        description: Any other entries about a DataFrame, with the keys of ``NAME.toml``.
-        engine: ``pybullet``, ``mujoco`` or ``batch``; not used for a simulator that steps itself.
-        free: Constants to estimate together with the parameters; for a robot, numbers of its model
-            file, as ``damping@*`` or ``mass@forearm``.
-        tuner: Name of a tuner that finds the starting point of the base fit; None for a grid.
-        seed: Seed of the surrogate data and the bootstrap.
-        force: Explain a recording that needs more than this machine has, or whose stamps cannot be
-            seconds.
-        budget: Time limit of the search in seconds; None for no limit. At the limit the search ends
-            with its results so far, and ``cut`` of the answer says what was not tested.
-        jobs: Number of processes; None for one per core. The answer does not depend on it.
-        whole: Use all samples of a long recording of a robot; otherwise segments from all over it.
-        pieces: Length in seconds of the segments that runs are cut into. Each segment has its own
-            initial state, for motion that drifts or is unstable.
-        thorough: If causes are found and a residual remains, search for further causes that
-            held-out runs confirm. This takes about twice as long.
-        say: Called with notes on the recording and the base model.
-        stop: Called between two steps; if it returns True, the search ends as at its time limit.
-        progress: Called with the share that is done (an estimate) and the current step.
-        listener: Receives the events of the search: its stages with their steps, and the best model
-            so far.
+        options: Keyword arguments, the attributes of
+            `bench.diagnosis.explain_options.ExplainOptions`.
 
     Returns:
         The verdict, its causes, the extended simulator and the figures.
@@ -103,12 +54,12 @@ def explain(
         InputError: An argument is wrong; the recording cannot be read, is too short or is of a
             simulator that takes no effects; or the search ended before the first simulation.
     """
-    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
-    sources = list_sources(recording, about)
-    watch = SearchControl(budget, stop, progress, listener)
-    given = system, engine, seed, free, tuner, say, force
-    more = jobs or count_available_cores(), model, whole, pieces, thorough
-    return explaining.explain(sources, *given, watch, *more)
+    return explaining.explain(list_sources(recording, options), with_all_cores(options))
+
+
+def with_all_cores(options: SearchOptions) -> SearchOptions:
+    """Replace the default number of worker processes by the number of cores."""
+    return replace(options, jobs=options.jobs or count_available_cores())
 
 
 def list_sources(
@@ -172,7 +123,7 @@ def score(
     Raises:
         InputError: A file cannot be read, or the recording is of another system.
     """
-    about = FrameDescription(None, None, units or {}, constants or {}, description or {})
+    about = FrameDescription(units=units, constants=constants, description=description)
     if isinstance(recording, Frame):
         about = _of_model(Path(model), about)
     (source,) = list_sources(recording, about)
@@ -188,4 +139,4 @@ def _of_model(model: Path, about: FrameDescription) -> FrameDescription:
     if robot is None:
         return replace(about, system=extended.system)
     stated = {"actuators": robot.actuators, "engine": robot.engine}
-    return replace(about, model=robot.path, description={**stated, **about.description})
+    return replace(about, model=robot.path, description={**stated, **(about.description or {})})

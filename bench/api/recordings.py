@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from bench.api.explain import RecordingSource, Units, list_sources
-from bench.logs.data_frames import FrameDescription
+from bench.api.explain import RecordingSource, list_sources
+from bench.logs.data_frames import FrameDescription, Units
 from bench.logs.importing.log_import import (
     ImportOptions,
     ImportResult,
@@ -143,7 +143,9 @@ def read_recording(
     Raises:
         InputError: The recording is malformed; the message is one line.
     """
-    about = FrameDescription(system, model, units or {}, constants or {}, description or {})
+    about = FrameDescription(
+        system=system, model=model, units=units, constants=constants, description=description
+    )
     (source,) = list_sources(path, about)
     return load_recording(source, system, model)[0]
 

@@ -37,8 +37,8 @@ from sims.core.atomic_files import write_atomically
 from sims.core.simulator import InputError
 
 if TYPE_CHECKING:
-    from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.experiment_runner import ExperimentRun, ProgressFactory
+    from bench.benchmark.runner.study_setup import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
 PrintLine = Callable[[str], None]
@@ -68,37 +68,24 @@ class Comparison:
         self.results: ExperimentRun | None = None
 
     @classmethod
-    def begin(
-        cls,
-        experiment: Experiment,
-        plugins: Sequence[str] = (),
-        folder: Path | None = None,
-        jobs: int = 2,
-        salt: str | None = None,
-    ) -> Comparison:
+    def begin(cls, new: PreparedStudy) -> Comparison:
         """Plan a comparison in a new folder, without running it; see `Study.begin`.
 
         Args:
-            experiment: configuration of the comparison.
-            plugins: plugin files.
-            folder: result folder; None for a default name.
-            jobs: number of worker processes.
-            salt: salt of the targets; None for the default.
+            new: folder, experiment, plugins and salt, from `prepare_study`.
         """
         from bench.benchmark.runner.experiment_runner import (
             check_classes_importable,
             prepare_experiment,
         )
         from bench.benchmark.runner.run_ids import compute_fingerprint
-        from bench.benchmark.runner.study_setup import prepare_study
 
-        new = prepare_study(experiment, folder, jobs, salt)
         results = prepare_experiment(new.experiment, new.secret)
         # This comes before the folder is created, so that a user error leaves no files behind.
-        if jobs:
+        if new.jobs:
             check_classes_importable(new.experiment)
-        hashes = compute_fingerprint(new.experiment, plugins)
-        comparison = cls(new.create_folder(plugins, hashes, results.redraws))
+        hashes = compute_fingerprint(new.experiment, new.plugins)
+        comparison = cls(new.create_folder(hashes, results.redraws))
         comparison.secret = new.secret
         comparison._attach(results)
         return comparison

@@ -20,7 +20,7 @@ from bench.benchmark.runner.experiment_runner import (
 )
 from bench.benchmark.runner.plugin_discovery import describe_plugins
 from bench.benchmark.runner.sandboxed_tuner import make_tuner_spec
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.study_setup import PreparedStudy
 from bench.benchmark.runner.tuner_training import (
     TrainingRequest,
     TrainingResult,
@@ -74,37 +74,26 @@ class BounceShotStudy:
         self.plugins = self.configuration.plugins
 
     @classmethod
-    def begin(
-        cls,
-        experiment: Experiment,
-        plugins: Sequence[str] = (),
-        folder: Path | None = None,
-        jobs: int = 2,
-        salt: str | None = None,
-    ) -> BounceShotStudy:
+    def begin(cls, new: PreparedStudy) -> BounceShotStudy:
         """Create a study in a new folder, without running it; see `Study.begin`.
 
         Args:
-            experiment: experiment with a [shot] table.
-            plugins: plugin files that its tuners need.
-            folder: new result folder; None for the default one.
-            jobs: number of worker processes that will be used; 0 runs everything in this process.
-            salt: random string from which shots are drawn; see `bench.studies.study.Study.begin`.
+            new: folder, experiment, plugins and salt, from `prepare_study`.
         """
         from bench.benchmark.runner.run_ids import compute_fingerprint
 
+        experiment = new.experiment
         if read_shot_config(experiment).filmed:
             video_packages.check_installed("; or set shot.filmed = 0")
         if experiment.simulator != "ball" or experiment.observe != ("z",):
             raise InputError(
                 f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
             )
-        new = prepare_study(experiment, folder, jobs, salt)
         # Validated before the folder is created: an error of the user leaves no files.
-        check_tuners(new.experiment)
-        if jobs:
-            check_classes_importable(new.experiment)
-        return cls(new.create_folder(plugins, compute_fingerprint(new.experiment, plugins)))
+        check_tuners(experiment)
+        if new.jobs:
+            check_classes_importable(experiment)
+        return cls(new.create_folder(compute_fingerprint(experiment, new.plugins)))
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:

@@ -11,30 +11,13 @@ import argparse
 import gc
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NamedTuple, NoReturn
 
 from bench import __version__
-from bench.cli.commands.bundle import add_bundle_arguments
-from bench.cli.commands.check import add_check_arguments
-from bench.cli.commands.compare import add_compare_arguments
-from bench.cli.commands.completion import add_completion_arguments
-from bench.cli.commands.datasheet import add_datasheet_arguments
-from bench.cli.commands.design import add_design_arguments
-from bench.cli.commands.diff import add_diff_arguments
-from bench.cli.commands.download import add_download
-from bench.cli.commands.explain import add_explain_arguments, add_score_arguments
-from bench.cli.commands.film import add_film_arguments, add_track_arguments
-from bench.cli.commands.import_logs import add_import_arguments
-from bench.cli.commands.info import add_info_arguments
-from bench.cli.commands.list_catalogue import add_list_arguments, add_schema_arguments
-from bench.cli.commands.plot import add_plot_arguments
-from bench.cli.commands.recordings import add_inspect_arguments, add_simulate_arguments
-from bench.cli.commands.status import add_status_arguments
-from bench.cli.commands.train import add_train_arguments
-from bench.cli.commands.verify import add_verify_arguments
 from bench.cli.output import (
     EXIT_CODES,
     EXIT_ERROR,
@@ -46,81 +29,159 @@ from bench.cli.output import (
     OutputWriter,
     TextWriter,
 )
-from bench.cli.variadic_options import positionals_first
+
+
+class Command(NamedTuple):
+    """A command of the command line.
+
+    Attributes:
+        name: Name of the command.
+        place: Module of `bench.cli.commands` and its function that adds the options.
+        summary: What the command does, as the beginning of a sentence without a full stop.
+        example: A command line that works.
+    """
+
+    name: str
+    place: str
+    summary: str
+    example: str
+
 
 COMMANDS = (
-    (
+    Command(
         "compare",
-        add_compare_arguments,
-        "run an experiment: tuners x targets x seeds; write table and figure",
+        "compare:add_compare_arguments",
+        "run an experiment (tuners x targets x seeds); write tables, figures and a report",
+        "simgap compare ball-drop --tuners cma_es,least_squares --targets 10",
     ),
-    ("train", add_train_arguments, "train a learned tuner ahead of the comparisons that use it"),
-    ("status", add_status_arguments, "what a comparison's folder holds, and what is missing"),
-    (
+    Command(
+        "train",
+        "train:add_train_arguments",
+        "train a learned tuner before the comparisons that use it",
+        "simgap train tunenet ball --seeds 1",
+    ),
+    Command(
+        "status",
+        "status:add_status_arguments",
+        "show the runs in the folder of a comparison, and what is missing",
+        "simgap status results/ball-drop-2026-11-27-120000 --runs",
+    ),
+    Command(
         "verify",
-        add_verify_arguments,
-        "see whether a comparison, an explanation or an archive of one is what it says",
+        "verify:add_verify_arguments",
+        "check whether the results in a comparison, an explanation or an archive are reproducible",
+        "simgap verify results/ball-drop-2026-11-27-120000",
     ),
-    (
+    Command(
         "diff",
-        add_diff_arguments,
-        "two comparisons or two explanations: what changed, and significantly?",
+        "diff:add_diff_arguments",
+        "show the significant differences between two comparisons or two explanations",
+        "simgap diff results/before results/after --fail-on worse",
     ),
-    (
+    Command(
         "bundle",
-        add_bundle_arguments,
-        "pack a comparison or an explanation as one archive that verifies",
+        "bundle:add_bundle_arguments",
+        "pack a comparison or an explanation into one archive that can be verified",
+        "simgap bundle results/explain-swing --with swing.csv --out swing.zip",
     ),
-    (
+    Command(
         "check",
-        add_check_arguments,
+        "check:add_check_arguments",
         "run the conformance suite on a tuner, simulator, effect or diagnoser",
+        "simgap check corners --plugin corners.py",
     ),
-    (
+    Command(
         "plot",
-        add_plot_arguments,
-        "write table and figures of a comparison again, or of several together",
+        "plot:add_plot_arguments",
+        "write tables and figures of one comparison again, or of several together",
+        "simgap plot results/ball-drop-2026-11-27-120000 --behind ball-drop",
     ),
-    (
+    Command(
         "simulate",
-        add_simulate_arguments,
-        "write a recording of a simulated system, its truth apart",
+        "recordings:add_simulate_arguments",
+        "write a recording of a simulated system, with its true parameters in a separate file",
+        "simgap simulate pendulum --effect drag.linear=2e-4 --noise 0.002 --out swing.csv",
     ),
-    (
+    Command(
         "import",
-        add_import_arguments,
-        "describe a robot's logs as they lie, so that every command reads them",
+        "import_logs:add_import_arguments",
+        "describe a robot's logs where they are, so that every command can read them",
+        "simgap import log.csv --model arm.xml --out arm.toml",
     ),
-    ("inspect", add_inspect_arguments, "summarise and draw a recording"),
-    ("explain", add_explain_arguments, "show what a simulation gets wrong on a recording, and why"),
-    (
+    Command(
+        "inspect",
+        "recordings:add_inspect_arguments",
+        "summarise and draw a recording",
+        "simgap inspect swing.csv --check",
+    ),
+    Command(
+        "explain",
+        "explain:add_explain_arguments",
+        "find what a simulation gets wrong on a recording, and the cause",
+        "simgap explain swing.csv --out results/swing",
+    ),
+    Command(
         "design",
-        add_design_arguments,
-        "design the next recording, by which what is open would be settled",
+        "design:add_design_arguments",
+        "design the next recording, which answers the questions that remain open",
+        "simgap design swing.csv --seconds 4 --out next.csv",
     ),
-    (
+    Command(
         "datasheet",
-        add_datasheet_arguments,
+        "datasheet:add_datasheet_arguments",
         "make the data sheet of a joint or actuator from its logs",
+        "simgap datasheet swing.csv --out results/sheet",
     ),
-    ("score", add_score_arguments, "error of an extended simulator on another recording"),
-    ("film", add_film_arguments, "render a recorded ball as a video"),
-    ("track", add_track_arguments, "track a ball in a video; write a recording"),
-    (
+    Command(
+        "score",
+        "explain:add_score_arguments",
+        "compute the error of an extended simulator on another recording",
+        "simgap score results/swing/extended.toml other.csv --held-out",
+    ),
+    Command(
+        "film",
+        "film:add_film_arguments",
+        "render a recorded ball as a video",
+        "simgap film drop.csv --out drop.mp4",
+    ),
+    Command(
+        "track",
+        "film:add_track_arguments",
+        "track a ball in a video, and write a recording",
+        "simgap track drop.mp4 --ball-diameter 0.067 --out drop.csv",
+    ),
+    Command(
         "list",
-        add_list_arguments,
+        "list_catalogue:add_list_arguments",
         "list tuners, simulators, systems, effects, diagnosers, experiments, references or schemas",
+        "simgap list experiments",
     ),
-    ("download", add_download, "get a public data set that an experiment needs, or list them"),
-    ("schema", add_schema_arguments, "print the JSON schema of what a command prints with --json"),
-    ("info", add_info_arguments, "versions, engines, platform and paths, for a report of a fault"),
-    (
+    Command(
+        "download",
+        "download:add_download",
+        "download a public data set that an experiment needs, or list the data sets",
+        "simgap download so101",
+    ),
+    Command(
+        "schema",
+        "list_catalogue:add_schema_arguments",
+        "print the JSON schema of the output of a command with --json",
+        "simgap schema explain",
+    ),
+    Command(
+        "info",
+        "info:add_info_arguments",
+        "print versions, engines, platform and paths for a bug report",
+        "simgap info",
+    ),
+    Command(
         "completion",
-        add_completion_arguments,
+        "completion:add_completion_arguments",
         "print a script by which a shell completes simgap's commands",
+        "simgap completion bash > ~/.local/share/bash-completion/completions/simgap",
     ),
 )
-"""Name, function that adds the options, and help line of each command, in help order."""
+"""All commands, in the order of the help."""
 
 GARBAGE_THRESHOLD = 50_000
 """Number of new objects after which garbage is collected; Python's default is 700 or 2,000."""
@@ -140,16 +201,25 @@ class _Parser(argparse.ArgumentParser):
 
         raise _UsageError(f"{InputError(message)}; see {self.prog} --help")
 
-    # argparse declares this method with overloads; none of them takes None for both arguments.
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse a command line where positional arguments may follow an option with several values.
+    def refuse_unknown(self, kind: str, name: str, known: Iterable[str]) -> NoReturn:
+        """Report an unknown command or option with the most similar known ones.
 
         Args:
-            args: words of the command line; None for those of the process.
-            namespace: object that gets the values.
+            kind: What it is, for the message.
+            name: Unknown name.
+            known: Known names.
         """
-        words = sys.argv[1:] if args is None else list(args)
-        return super().parse_known_args(positionals_first(self, words), namespace)
+        from difflib import get_close_matches
+
+        from sims.core.value_limits import truncate_text
+
+        near = get_close_matches(name[:_LONGEST_NAME], list(known), cutoff=0.5)
+        hint = f"; did you mean {', '.join(near)}?" if near else ""
+        self.error(f"unknown {kind} '{truncate_text(name)}'{hint}")
+
+
+_LONGEST_NAME = 100
+"""Number of characters of an unknown name that are compared with the known ones."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -157,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     printer: OutputWriter = JsonWriter() if "--json" in words else TextWriter()
     try:
-        options = build_parser().parse_args(words)
+        options = _parse(words)
     except _UsageError as error:
         printer.print_error("usage", str(error), EXIT_ERROR)
         sys.exit(EXIT_ERROR)
@@ -213,29 +283,71 @@ def _name_glfw_library() -> None:
         os.environ["PYGLFW_LIBRARY"] = str(library)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Build the parser of the command line with all commands."""
-    codes = "\n".join(f"  {code:<4} {says}" for code, says in EXIT_CODES.items())
-    whole = _Parser(
+def _parse(words: Sequence[str]) -> argparse.Namespace:
+    """Parse the command line.
+
+    Raises:
+        _UsageError: The command or an option is unknown, or a value is wrong.
+    """
+    names = [command.name for command in COMMANDS]
+    chosen = words[0] if words and not words[0].startswith("-") else None
+    parser = build_parser(chosen)
+    if chosen is not None and chosen not in names:
+        parser.refuse_unknown("command", chosen, names)
+    options, unknown = parser.parse_known_args(words)
+    for word in unknown:
+        command = options.command_parser
+        if word.startswith("-"):
+            name = word.partition("=")[0]
+            command.refuse_unknown("option", name, command._option_string_actions)
+        command.error(f"unexpected argument '{word}'")
+    return options
+
+
+def build_parser(only: str | None = "") -> _Parser:
+    """Build the parser of the command line.
+
+    Args:
+        only: Name of the only command that gets its options, so that the modules of the others are
+            not imported; empty for all commands, None for no command.
+    """
+    codes = "\n".join(f"  {code:<4} {meaning}" for code, meaning in EXIT_CODES.items())
+    parser = _Parser(
         prog="simgap",
         description="Compare methods that tune simulator parameters; find what tuning cannot fix.",
-        epilog=f"exit codes:\n{codes}",
+        epilog=f"exit codes:\n{codes}\n\nexample: simgap explain swing.csv",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    whole.add_argument("--version", action="version", version=f"simgap {__version__}")
-    commands = whole.add_subparsers(required=True, metavar="COMMAND", title="commands")
-
-    for name, add, says in COMMANDS:
-        command = commands.add_parser(name, help=says)
-        add(command)
-        # Commands that describe commands use the parser.
-        command.set_defaults(parser=whole)
+    parser.add_argument("--version", action="version", version=f"simgap {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
+    for name, place, summary, example in COMMANDS:
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary[0].upper()}{summary[1:]}.",
+            epilog=f"example: {example}",
+            formatter_class=_HelpFormatter,
+        )
+        if only not in ("", name):
+            continue
+        module, _, add_arguments = place.partition(":")
+        getattr(import_module(f"bench.cli.commands.{module}"), add_arguments)(command)
+        command.set_defaults(command_parser=command)
         command.add_argument(
             "--json",
             action="store_true",
             help=f"print one JSON document, and nothing else (`simgap schema {name}`)",
         )
-    return whole
+    return parser
+
+
+class _HelpFormatter(argparse.HelpFormatter):
+    """Help whose example at the end is not wrapped, so that it can be copied."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if text.startswith("example: "):
+            return indent + text
+        return super()._fill_text(text, width, indent)
 
 
 if __name__ == "__main__":

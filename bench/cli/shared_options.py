@@ -1,15 +1,94 @@
-"""Options that several commands share, and parsers of their values."""
+"""Options of commands: those made from options dataclasses, those that several share, parsers."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from bench.benchmark.runner.worker_pools import Pool
+
+
+def add_options(
+    parser: argparse.ArgumentParser, options: type, **changed: Mapping[str, Any]
+) -> None:
+    """Add the options of a command that an options dataclass declares; see `bench.core.options`.
+
+    Fields of a type that has no parser here exist in Python only.
+
+    Args:
+        parser: Parser of the command.
+        options: Options dataclass.
+        changed: By field, arguments of `add_argument` that differ from those of the declaration.
+    """
+    from bench.core.options import read_option_texts
+
+    texts = read_option_texts(options)
+    # Inherited options are listed last.
+    for declared in sorted(fields(options), key=lambda each: each.name not in vars(options)):
+        kind = str(declared.type).removesuffix(" | None")
+        metadata = {"in_command": True, **declared.metadata}
+        if kind not in _PARSERS or not metadata["in_command"]:
+            continue
+        parse, metavar = _PARSERS[kind]
+        flags = metadata.get("flags") or [f"--{declared.name.replace('_', '-')}"]
+        text = texts[declared.name].rstrip(".").replace("`", "").replace("%", "%%")
+        settings: dict[str, Any] = {"help": text[0].lower() + text[1:]}
+        if kind == "bool":
+            settings["action"] = "store_true"
+        elif kind == "Files":
+            settings |= {"action": "append", "default": [], "type": parse, "metavar": metavar}
+        else:
+            default = None if declared.default == () else declared.default
+            if default is not None:
+                settings["help"] += f" (default: {default})"
+            settings |= {"type": parse, "default": default}
+            settings |= {"choices": metadata.get("choices")} if metadata.get("choices") else {}
+            settings |= {"metavar": metadata.get("metavar") or metavar}
+        parser.add_argument(*flags, **{**settings, **changed.get(declared.name, {})})
+
+
+def collect_options(values: argparse.Namespace, options: type) -> dict[str, Any]:
+    """Return the values of a dataclass's options on the command line, as keyword arguments."""
+    given = {}
+    for declared in fields(options):
+        flags = declared.metadata.get("flags") or [declared.name]
+        value = getattr(values, flags[0].strip("-"), None)
+        if value not in (None, ""):
+            given[declared.name] = value
+    return given
+
+
+def add_recordings_argument(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add the positional argument of one or more recordings; `text` is its help."""
+    parser.add_argument(
+        "recordings", metavar="RECORDING.csv", type=parse_path, nargs="+", help=text
+    )
+
+
+def add_system_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the system that a recording is of, ``--system`` and ``--model``."""
+    from bench.logs.data_frames import FrameDescription
+
+    add_options(parser, FrameDescription)
+
+
+def add_out_option(
+    parser: argparse.ArgumentParser, text: str, metavar: str = "DIR", required: bool = False
+) -> None:
+    """Add the option ``--out``.
+
+    Args:
+        parser: Parser of the command.
+        text: Help of the option.
+        metavar: Placeholder of the path.
+        required: Whether the command needs it.
+    """
+    parser.add_argument("--out", metavar=metavar, type=parse_path, required=required, help=text)
 
 
 def add_plugin_option(parser: argparse.ArgumentParser, more: str) -> None:
@@ -25,26 +104,13 @@ def add_plugin_option(parser: argparse.ArgumentParser, more: str) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help=f"Python file with more {more}",
+        help=f"Python file with further {more}",
     )
 
 
-def add_model_option(
-    parser: argparse.ArgumentParser,
-    text: str = "take it for this robot, whatever the .toml says: an MJCF or URDF",
-) -> None:
-    """Add the option ``--model FILE``; `text` is its help.
-
-    Args:
-        parser: Parser of the command.
-        text: Help of the option.
-    """
-    parser.add_argument(
-        "--model",
-        type=parse_path,
-        metavar="FILE",
-        help=text,
-    )
+def add_model_option(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add the option ``--model FILE``; `text` is its help."""
+    parser.add_argument("--model", type=parse_path, metavar="FILE", help=text)
 
 
 def add_force_option(parser: argparse.ArgumentParser) -> None:
@@ -52,16 +118,14 @@ def add_force_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force",
         action="store_true",
-        help="begin although it needs more than this machine has, or cannot be sound",
+        help="start even if it needs more than this machine has, or if the data are implausible",
     )
 
 
 def add_pdf(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--pdf``, which `bench.cli.main` handles for every command that has it."""
     parser.add_argument(
-        "--pdf",
-        action="store_true",
-        help="write every figure as PDF too (default: PNG only)",
+        "--pdf", action="store_true", help="write every figure as PDF too (default: PNG only)"
     )
 
 
@@ -70,8 +134,8 @@ def add_trust_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trust",
         action="store_true",
-        help="run the tuners inside the harness: quicker, nothing is out of their reach, and what "
-        "comes out is marked so",
+        help="run the tuners without isolation: faster, but they could read the true parameters, "
+        "and the results are marked",
     )
 
 
@@ -137,6 +201,24 @@ def parse_file_name(text: str) -> str:
 def parse_name_list(text: str) -> list[str]:
     """Parse a list of names separated by commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+_PARSERS: Mapping[str, tuple[Callable[[str], Any], str]] = {
+    "Count": (parse_positive_int, "N"),
+    "Natural": (parse_non_negative_int, "N"),
+    "Seconds": (parse_seconds, "S"),
+    "int": (int, "K"),
+    "float": (float, "X"),
+    "Name": (str, "NAME"),
+    "str": (str, "TEXT"),
+    "Names": (str, "A,B,..."),
+    "Tuners": (str, "A,B,..."),
+    "Files": (parse_file_name, "FILE"),
+    "str | Path": (parse_path, "FILE"),
+    "RecordingFile": (parse_path, "FILE"),
+    "bool": (bool, ""),
+}
+"""Parser and placeholder of an option's value, by the annotation of its field."""
 
 
 @contextmanager

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -23,9 +23,10 @@ from bench.diagnosis.evaluation.noise_floor import (
 from bench.diagnosis.evaluation.noise_free_runs import add_least_noise
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from bench.diagnosis.evaluation.search_control import STAGES, SearchControl
+from bench.diagnosis.evaluation.search_control import STAGES
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from bench.diagnosis.experiment_design.next_run import NextRunDesign, design_next_run
+from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.explanation import Explanation
 from bench.diagnosis.fitting.base_fit import (
     FINAL_ITERATIONS,
@@ -88,46 +89,21 @@ MAX_CHANNEL_SIZE_FACTOR = 1e9
 """Recorded values of at least this multiple of a channel's typical size are refused."""
 EXPLAINED = ("adequate", "named", "ambiguous")
 """Verdicts for which the model explains the data down to the noise."""
-PrintLine = Callable[[str], None]
 RecordingSource: TypeAlias = str | Path | Recording
 
 
 def explain(
     recording: RecordingSource | Sequence[RecordingSource],
-    system: str | None = None,
-    engine: str = "batch",
-    seed: int = 0,
-    free: Sequence[str] = (),
-    tuner: str | None = None,
-    say: PrintLine = lambda _: None,
-    force: bool = False,
-    watch: SearchControl | None = None,
-    jobs: int = 1,
-    model: str | Path | None = None,
-    whole: bool = False,
-    pieces: float | None = None,
-    thorough: bool = False,
+    options: ExplainOptions | None = None,
+    **changes: Any,
 ) -> Explanation:
     """Explain a recording.
 
     Args:
         recording: Path of the table, or a recording in memory; the runs of several recordings are
             explained together.
-        system: Name of the system to use instead of the one in the description.
-        engine: pybullet, mujoco or batch; a simulator with its own integrator uses that.
-        seed: Random seed of the surrogates and the bootstrap.
-        free: Constants of a system, or numbers of a robot's model file, to estimate with the
-            parameters.
-        tuner: Registered tuner that finds the starting values for the fit of the base parameters.
-        say: Callback for messages to the user about the recording and the base model.
-        force: Explain recordings that are otherwise refused.
-        watch: Search control with the time limit and the progress; by default without limit.
-        jobs: Number of worker processes; the result does not depend on it.
-        model: Model file of a robot to use instead of the one in the description.
-        whole: Use all of a long recording of a robot, not segments of it.
-        pieces: Duration in seconds of the segments that runs are cut into; None for an automatic
-            choice.
-        thorough: Continue the search while causes may be missing, and let held-out runs decide.
+        options: Options; None for the defaults in this process alone.
+        changes: Single options that differ from `options`.
 
     Returns:
         Verdict, report data and extended simulator.
@@ -136,13 +112,21 @@ def explain(
         InputError: The recording cannot be read or is too short, its simulator takes no effects, or
             the search was stopped before anything could be simulated.
     """
-    with closing(ForkedWorkerPool(jobs)) as crew:
-        sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
-        subject = _ExplainInput(sources, system, model, whole, pieces)
-        given = engine, seed, tuple(free), tuner, say, force
-        explainer = _ExplainRun(subject, *given, watch or SearchControl(), crew, thorough)
-        with closing(explainer):
-            return explainer.run()
+    with _explain_run(recording, replace(options or ExplainOptions(), **changes)) as run:
+        return run.run()
+
+
+@contextmanager
+def _explain_run(
+    recording: RecordingSource | Sequence[RecordingSource], options: ExplainOptions
+) -> Iterator[_ExplainRun]:
+    """Open the run of an explanation with its worker processes."""
+    sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
+    with (
+        closing(ForkedWorkerPool(options.jobs or 1)) as crew,
+        closing(_ExplainRun(sources, options, crew)) as run,
+    ):
+        yield run
 
 
 def _added_noise(channels: Sequence[str]) -> str:
@@ -166,12 +150,7 @@ def explain_and_design(
     recording: RecordingSource | Sequence[RecordingSource],
     seconds: float,
     longest: float,
-    system: str | None = None,
-    model: str | Path | None = None,
-    free: Sequence[str] = (),
-    say: PrintLine = lambda _: None,
-    watch: SearchControl | None = None,
-    jobs: int = 1,
+    options: ExplainOptions,
 ) -> ExplanationAndDesign:
     """Explain recordings, and design the next recording.
 
@@ -179,21 +158,12 @@ def explain_and_design(
         recording: See `explain`.
         seconds: Duration in seconds of the next recording.
         longest: Maximum duration in seconds, if `seconds` do not suffice.
-        system: See `explain`.
-        model: See `explain`.
-        free: See `explain`.
-        say: See `explain`.
-        watch: See `explain`.
-        jobs: See `explain`.
+        options: Options of the explanation.
     """
-    with closing(ForkedWorkerPool(jobs)) as crew:
-        sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
-        subject = _ExplainInput(sources, system, model, whole=False, pieces=None)
-        given = "batch", 0, tuple(free), None, say, False
-        with closing(_ExplainRun(subject, *given, watch or SearchControl(), crew)) as explainer:
-            explanation = explainer.run()
-            explainer.watch.stage("designing the next recording")
-            return ExplanationAndDesign(explanation, explainer.design(seconds, longest))
+    with _explain_run(recording, options) as run:
+        explanation = run.run()
+        run.watch.stage("designing the next recording")
+        return ExplanationAndDesign(explanation, run.design(seconds, longest))
 
 
 def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
@@ -204,16 +174,6 @@ def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Rec
     from bench.diagnosis.prediction_error.inactive_drives import without_inactive_drives
 
     return without_inactive_drives(recording, kind)
-
-
-class _ExplainInput(NamedTuple):
-    """Recordings to explain, what to use instead of their descriptions, and their segmentation."""
-
-    sources: Sequence[RecordingSource]
-    system: str | None
-    model: str | Path | None
-    whole: bool
-    pieces: float | None
 
 
 class _Worlds(NamedTuple):
@@ -236,23 +196,20 @@ class _Found(NamedTuple):
 class _ExplainRun:
     def __init__(
         self,
-        subject: _ExplainInput,
-        engine: str,
-        seed: int,
-        free: tuple[str, ...],
-        tuner: str | None,
-        say: PrintLine,
-        force: bool,
-        watch: SearchControl,
+        sources: Sequence[RecordingSource],
+        options: ExplainOptions,
         crew: ForkedWorkerPool,
-        thorough: bool = False,
     ) -> None:
         self.started = time.perf_counter()
-        self.seed = seed
-        self.tuner = tuner
-        self.say = say
+        self.seed = options.seed
+        self.tuner = options.tuner
+        self.say = say = options.say
+        self.force = force = options.force
+        self.thorough = options.thorough
+        self.watch = options.make_search_control()
+        self.crew = crew
         self.recording, kind = load_joined(
-            subject.sources, subject.system, subject.model, free, _without_inactive_drives
+            sources, options.system, options.model, options.free, _without_inactive_drives
         )
         self.path = self.recording.path
         if not issubclass(kind, SystemSimulator):
@@ -261,17 +218,17 @@ class _ExplainRun:
         extend.check_not_extended(kind)
         # A simulator with its own integrator has no choice of engine.
         usual = kind.default_engine if kind.has_model else None
-        self.engine = usual if kind.own_engine else engine
+        self.engine = usual if kind.own_engine else options.engine
         # A free number of a robot is a number of its model file, and so a parameter of its
         # simulator.
-        free = () if kind.has_model else free
+        self.free = () if kind.has_model else tuple(options.free)
         # This check precedes the run evaluators, which plan every step of every run.
         for odd in check_recording_plausible(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         self.recording, thinned = thin(self.recording, kind)
         self.recording, settled = leave_out_settling(self.recording, kind)
         self.recording, note = segment_recording(
-            self.recording, kind, subject.pieces, subject.whole
+            self.recording, kind, options.pieces, options.whole
         )
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
@@ -281,11 +238,6 @@ class _ExplainRun:
         for note in self.notes:
             say(note)
         check_recording_size(self.recording, kind(engine=self.engine), force)
-        self.watch = watch
-        self.force = force
-        self.crew = crew
-        self.thorough = thorough
-        self.free = tuple(free)
         # By name, the declared range of a base parameter and the wider range that replaced it.
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         # Base parameters of a robot, identified by prediction errors; starting values of the fit.

@@ -31,7 +31,7 @@ from bench.benchmark.runner.plugin_discovery import (
 )
 from bench.benchmark.runner.run_ids import check_unchanged
 from bench.benchmark.runner.sandboxed_tuner import find_preloadable_packages
-from bench.benchmark.runner.study_setup import prepare_study
+from bench.benchmark.runner.study_setup import PreparedStudy
 from bench.benchmark.runner.tuner_training import get_weights_folder as trained
 from bench.benchmark.runner.worker_pools import Call, Pool, PoolLostError, make_pool
 from bench.benchmark.storage.result_folder import read_configuration
@@ -100,31 +100,19 @@ class DiagnosisStudy:
         self._kept: AnswerStore | None = None
 
     @classmethod
-    def begin(
-        cls,
-        experiment: Experiment,
-        plugins: Sequence[str] = (),
-        folder: Path | None = None,
-        jobs: int = 2,
-        salt: str | None = None,
-    ) -> DiagnosisStudy:
-        """Create a comparison in a new folder, without running it; see `bench.studies.study.Study`.
+    def begin(cls, new: PreparedStudy) -> DiagnosisStudy:
+        """Create a comparison in a new folder, without running it; see `Study.begin`.
 
         Args:
-            experiment: experiment with a ``[diagnosis]`` table.
-            plugins: plugin files that the diagnosers need.
-            folder: new result folder; None for the default one.
-            jobs: number of worker processes that will be used; 0 runs everything in this process.
-            salt: random string from which cases are drawn; see `bench.studies.study.Study.begin`.
+            new: folder, experiment, plugins and salt, from `prepare_study`.
         """
-        settings = read_config(experiment)
-        new = prepare_study(experiment, folder, jobs, salt)
+        settings = read_config(new.experiment)
         build_case_set(settings)
-        if jobs:
+        if new.jobs:
             _refuse_unreachable(settings.diagnosers)
         for name in settings.diagnosers:
             _announced(name, new.experiment.trusted)
-        return cls(new.create_folder(plugins, _fingerprint(new.experiment, plugins)))
+        return cls(new.create_folder(_fingerprint(new.experiment, new.plugins)))
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> DiagnosisStudy:

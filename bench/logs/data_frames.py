@@ -3,35 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 from bench.core.plugin_registries import make_robot_simulator, simulators
+from sims.core.argument_checks import Expected, Name
 from sims.core.simulator import InputError, Simulator
 from sims.core.toml_validation import check_table
 from sims.recording.recording import Recording, recording_of_frame
 from sims.recording.recording_description import model_in
 from sims.recording.recording_frame import Frame
 
+Units: TypeAlias = Annotated[
+    Mapping[str, str], Expected("units of columns by their names, as {'q': 'rad'}")
+]
+"""Units of a data frame's columns, by column name."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class FrameDescription:
-    """Description of a data frame, which has no `NAME.toml` file.
+    """System of a recording, and the description of a data frame, which has no `NAME.toml` file.
 
     Attributes:
-        system: Registered name of the system.
-        model: Path of a robot's model file, instead of a system.
-        units: Units of columns, by name.
-        constants: Known numbers of the system, SI units.
-        description: Any further entries, with the keys of `NAME.toml`.
+        system: Name of the system, instead of the one that the .toml file states.
+        model: Model file of a robot, MJCF or URDF, instead of what the .toml file states.
+        units: Units of a DataFrame's columns by name (default: those in ``df.attrs["units"]``).
+        constants: Known numbers of the system in SI units, with a DataFrame.
+        description: Any further entries about a DataFrame, with the keys of ``NAME.toml``.
     """
 
-    system: str | None = None
+    system: Name | None = None
     model: str | Path | None = None
-    units: Mapping[str, str] = field(default_factory=dict)
-    constants: Mapping[str, float] = field(default_factory=dict)
-    description: Mapping[str, Any] = field(default_factory=dict)
+    units: Units | None = None
+    constants: Mapping[str, float] | None = None
+    description: Mapping[str, Any] | None = None
 
     def refuse_for_files(self, recording: object) -> None:
         """Reject a description of a data frame if the recording is not a data frame.
@@ -58,7 +64,7 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
     Raises:
         InputError: The data frame or its description is malformed; the message is one line.
     """
-    meta = dict(about.description)
+    meta = dict(about.description or {})
     if about.system is not None:
         meta.pop("model", None)
         meta["system"] = about.system
@@ -70,7 +76,7 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
         meta["constants"] = {**stated, **about.constants}
     kind = _kind(name, meta)
     meta.setdefault("title", f"{kind.name}, {name}")
-    return recording_of_frame(frame, kind, meta, about.units, name)
+    return recording_of_frame(frame, kind, meta, about.units or {}, name)
 
 
 def _kind(name: str, meta: Mapping[str, Any]) -> type[Simulator]:

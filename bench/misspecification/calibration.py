@@ -98,10 +98,9 @@ def run_explain(recording: Path, experiment: Experiment, jobs: int) -> ExtendedS
         experiment: the experiment.
         jobs: number of worker processes.
     """
-    from bench.diagnosis.evaluation.search_control import SearchControl
     from bench.diagnosis.explain import explain  # a local import, because it imports all of explain
 
-    found = explain([recording], free=experiment.free, watch=SearchControl(), jobs=max(jobs, 1))
+    found = explain([recording], free=experiment.free, jobs=max(jobs, 1))
     found.write(recording.parent / "explain")
     return found.extended
 

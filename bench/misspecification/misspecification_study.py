@@ -37,6 +37,7 @@ from bench.misspecification.calibration import (
 if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.experiment_runner import ProgressFactory
+    from bench.benchmark.runner.study_setup import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
 
 PrintLine = Callable[[str], None]
@@ -69,36 +70,23 @@ class MisspecificationStudy:
         self.plugins = self.configuration.plugins
 
     @classmethod
-    def begin(
-        cls,
-        experiment: Experiment,
-        plugins: Sequence[str] = (),
-        folder: Path | None = None,
-        jobs: int = 2,
-        salt: str | None = None,
-    ) -> MisspecificationStudy:
+    def begin(cls, new: PreparedStudy) -> MisspecificationStudy:
         """Create a study in a new folder, without running it; see `Study.begin`.
 
         Args:
-            experiment: experiment with a calibration table.
-            plugins: plugin files that it needs.
-            folder: new result folder; None for the default one.
-            jobs: number of worker processes that will be used; 0 runs everything in this process.
-            salt: random string from which targets are drawn; see `bench.studies.study.Study.begin`.
+            new: folder, experiment, plugins and salt, from `prepare_study`.
         """
         from bench.benchmark.runner.experiment_runner import (
             check_classes_importable,
             prepare_experiment,
         )
         from bench.benchmark.runner.run_ids import compute_fingerprint
-        from bench.benchmark.runner.study_setup import prepare_study
 
-        new = prepare_study(experiment, folder, jobs, salt)
         # Validated before the folder is created: an error of the user leaves no files.
         prepare_experiment(make_base_experiment(new.experiment), new.secret)
-        if jobs:
+        if new.jobs:
             check_classes_importable(new.experiment)
-        return cls(new.create_folder(plugins, compute_fingerprint(new.experiment, plugins)))
+        return cls(new.create_folder(compute_fingerprint(new.experiment, new.plugins)))
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> MisspecificationStudy:
@@ -184,7 +172,9 @@ class MisspecificationStudy:
             # A public salt is already part of the experiment.
             secret = read_salt(self.folder, experiment)
             plan = replace(self.get_experiment(model), salt_sha256="")
-            comparison = Comparison.begin(plan, self.plugins, place, jobs, secret)
+            from bench.benchmark.runner.study_setup import prepare_study
+
+            comparison = Comparison.begin(prepare_study(plan, self.plugins, place, jobs, secret))
         if comparison.results is not None:
             # The folder of the other simulator contains the same truths, so it must be inaccessible
             # too.

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from bench.benchmark.comparison import PrintLine
     from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.experiment_runner import ProgressFactory
+    from bench.benchmark.runner.study_setup import PreparedStudy
     from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.result_folder import FolderConfiguration
     from bench.benchmark.storage.study_progress import StudyOutcome, StudyProgress
@@ -31,7 +32,7 @@ class Study(Protocol):
     """A study in its result folder.
 
     ``Kind(folder)`` opens a study for status and report, without disturbing a process that runs it.
-    `begin_study` and `resume_study` give a study that can be run.
+    `begin_studies` and `resume_study` give a study that can be run.
 
     Attributes:
         folder: result folder.
@@ -44,25 +45,14 @@ class Study(Protocol):
     def __init__(self, folder: Path) -> None: ...
 
     @classmethod
-    def begin(
-        cls,
-        experiment: Experiment,
-        plugins: Sequence[str] = (),
-        folder: Path | None = None,
-        jobs: int = 2,
-        salt: str | None = None,
-    ) -> Study:
+    def begin(cls, new: PreparedStudy) -> Study:
         """Check and plan a study in a new folder.
 
         Args:
-            experiment: configuration of the study.
-            plugins: plugin files that it needs; the caller has loaded them.
-            folder: new or empty folder; None for one below results/ that is named after the time.
-            jobs: number of worker processes; 0 for none, and tuners without isolation.
-            salt: salt of the targets, secret until the study is complete; None for a new one.
+            new: folder, experiment, plugins and salt, from `prepare_study`.
 
         Raises:
-            InputError: the experiment has an error, or the folder is not free.
+            InputError: the experiment has an error.
         """
         ...
 
@@ -110,25 +100,6 @@ class Study(Protocol):
         ...
 
 
-def begin_study(
-    experiment: Experiment,
-    plugins: Sequence[str] = (),
-    folder: Path | None = None,
-    jobs: int = 2,
-    salt: str | None = None,
-) -> Study:
-    """Check and plan the study of an experiment; see `Study.begin`.
-
-    Args:
-        experiment: configuration of the study.
-        plugins: plugin files that it needs.
-        folder: new or empty folder; None for a default name.
-        jobs: number of worker processes.
-        salt: salt of the targets; None for a new one.
-    """
-    return get_study_class(experiment).begin(experiment, plugins, folder, jobs, salt)
-
-
 def begin_studies(
     experiment: Experiment,
     plugins: Sequence[str] = (),
@@ -140,22 +111,26 @@ def begin_studies(
 
     Args:
         experiment: configuration of the study or studies.
-        plugins: as in `Study.begin`.
+        plugins: plugin files that they need; the caller has loaded them.
         folder: folder of the study; for several studies the folder that contains one subfolder for
             each, with the name of its experiment.
-        jobs: as in `Study.begin`.
-        salt: as in `Study.begin`; several studies of one sweep share it, so that they have the same
-            targets.
+        jobs: number of worker processes; 0 for none, and tuners without isolation.
+        salt: salt of the targets, secret until the study is complete; None for a new one. Several
+            studies of one sweep share it, so that they have the same targets.
 
     Raises:
         InputError: one of the studies has an error, or the folder is not free; no files are left
             behind.
     """
     from bench.benchmark.problem.experiment import expand_sweep
+    from bench.benchmark.runner.study_setup import prepare_study
+
+    def begin(one: Experiment, place: Path | None) -> Study:
+        return get_study_class(one).begin(prepare_study(one, plugins, place, jobs, salt))
 
     wanted = expand_sweep(experiment)
     if len(wanted) == 1:
-        return [begin_study(wanted[0], plugins, folder, jobs, salt)]
+        return [begin(wanted[0], folder)]
     # Separate experiments have separate salts, so that a complete one does not reveal another's.
     if salt is None and not experiment.salt and not experiment.experiments:
         salt = generate_salt()
@@ -164,7 +139,7 @@ def begin_studies(
     try:
         # All are planned before the first is run, so that an error in the last one shows at once.
         for one in wanted:
-            begun.append(begin_study(one, plugins, parent / one.name, jobs, salt))
+            begun.append(begin(one, parent / one.name))
     except BaseException:
         for study in begun:
             study.close()

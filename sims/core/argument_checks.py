@@ -8,7 +8,7 @@ that lower layers check, such as names of tuners, are not checked here.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, wraps
 from numbers import Integral, Real
@@ -79,29 +79,68 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        bound = _bound(function, signature, args, kwargs)
-        hints = _hints(function)
-        for name, value in bound.arguments.items():
-            if name in hints:
-                try:
-                    bound.arguments[name] = _fitted(name, value, hints[name])
-                except _MismatchError as error:
-                    raise InputError(
-                        f"{error.place}: expected {error.words}, found {_shown(error.value)}"
-                    ) from None
+        bound = bind_checked(function.__name__, signature, get_hints(function), args, kwargs)
         return function(*bound.args, **bound.kwargs)
 
     return call
 
 
-@cache
-def _hints(function: Callable[..., object]) -> dict[str, Any]:
-    return get_type_hints(function, include_extras=True)
-
-
-def _bound(
-    function: Callable[..., object],
+def bind_checked(
+    called: str,
     signature: inspect.Signature,
+    hints: Mapping[str, Any],
+    args: Sequence[object],
+    kwargs: Mapping[str, object],
+) -> inspect.BoundArguments:
+    """Bind the arguments of a call to their names, checked and converted to their annotations.
+
+    Args:
+        called: Name of the function, for messages.
+        signature: Its parameters.
+        hints: Annotations by name; other arguments are not checked.
+        args: Arguments without a name.
+        kwargs: Arguments by name.
+
+    Raises:
+        InputError: An argument is wrong, unknown or missing, or there are too many.
+    """
+    bound = _bind(called, signature, hints, args, kwargs)
+    for name, value in bound.arguments.items():
+        if name in hints:
+            try:
+                bound.arguments[name] = _fitted(name, value, hints[name])
+            except _MismatchError as error:
+                raise InputError(
+                    f"{error.place}: expected {error.words}, found {_shown(error.value)}"
+                ) from None
+    return bound
+
+
+def check_options(options: Callable[..., R], given: Mapping[str, object]) -> R:
+    """Make an options dataclass from checked and converted values.
+
+    Args:
+        options: Dataclass, whose annotations describe the values.
+        given: Values by field.
+
+    Raises:
+        InputError: A value is wrong.
+    """
+    signature = inspect.signature(options)
+    bound = bind_checked("options", signature, get_hints(options), (), given)
+    return options(**bound.arguments)
+
+
+@cache
+def get_hints(annotated: Hashable) -> dict[str, Any]:
+    """Return the annotations of a function or of the fields of a class, by name."""
+    return get_type_hints(annotated, include_extras=True)
+
+
+def _bind(
+    called: str,
+    signature: inspect.Signature,
+    hints: Mapping[str, Any],
     args: Sequence[object],
     kwargs: Mapping[str, object],
 ) -> inspect.BoundArguments:
@@ -110,7 +149,6 @@ def _bound(
     Raises:
         InputError: An argument is unknown or missing, or there are too many.
     """
-    called = function.__name__
     names = [name for name in signature.parameters if name != "self"]
     for name in kwargs:
         if name not in names:
@@ -121,7 +159,7 @@ def _bound(
         for name, parameter in signature.parameters.items():
             required = parameter.default is parameter.empty
             if required and "missing" in str(error) and f"'{name}'" in str(error):
-                wanted = _words(_hints(function)[name])
+                wanted = _words(hints[name])
                 raise InputError(f"{called}: expected {name}, {wanted}; found none") from None
         most = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
         plural = "s" * (most != 1)

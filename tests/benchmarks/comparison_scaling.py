@@ -20,6 +20,7 @@ from bench.benchmark.comparison import Comparison
 from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS, write_report
 from bench.benchmark.runner.experiment_runner import prepare_experiment
 from bench.benchmark.runner.result_rows import build_rows, make_status
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.runner.tuner_loop import RunTrace
 from bench.benchmark.runner.worker_pools import LocalPool
 from bench.benchmark.runner.worker_tasks import RunOutcome
@@ -53,7 +54,7 @@ def measure(targets, budget, figures):
     with tempfile.TemporaryDirectory() as place:
         before, started = memory(), perf_counter()
         folder = Path(place) / "out"
-        results = Comparison.begin(experiment, [], folder).results
+        results = Comparison.begin(prepare_study(experiment, [], folder)).results
         planned = perf_counter() - started
         plan_memory = memory() - before
         rng = np.random.default_rng(0)

@@ -3,6 +3,11 @@
 import inspect
 
 import simgap
+from bench.api.comparison_options import ComparisonOptions, StudyOptions
+from bench.api.datasheet import DatasheetOptions
+from bench.api.design import DesignOptions
+from bench.diagnosis.explain_options import ExplainOptions
+from bench.logs.data_frames import FrameDescription
 
 GROUPS = {
     "Commands": (
@@ -36,6 +41,15 @@ GROUPS = {
     "Faults": ("What is the user's to mend.", "InputError"),
 }
 """Headings of the page: introductory sentence and names."""
+OPTIONS = (
+    ExplainOptions,
+    DesignOptions,
+    DatasheetOptions,
+    FrameDescription,
+    ComparisonOptions,
+    StudyOptions,
+)
+"""Classes whose attributes are the keyword arguments of functions and the options of commands."""
 UNDOCUMENTED = {
     "Array",
     "TunerGenerator",
@@ -62,6 +76,9 @@ def sections():
     for heading, (says, names) in GROUPS.items():
         parts += [f"## {heading}", says]
         parts += [f"::: {address(getattr(simgap, name))}" for name in names.split()]
+        if heading == "Commands":
+            parts += ["## Keyword arguments", "The options of these functions, by name."]
+            parts += [f"::: {address(options)}" for options in OPTIONS]
     return parts
 
 

@@ -12,6 +12,7 @@ import tomli_w
 from bench.benchmark.comparison import Comparison
 from bench.benchmark.figures.comparison_figures import FIGURE_FILES
 from bench.benchmark.problem.experiment import load_experiment
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.statistics.error_table import ERROR_METRICS
 from bench.benchmark.statistics.paired_tests import PAIR_COLUMNS
 from bench.benchmark.statistics.training_amortisation import BREAK_EVEN_COLUMNS
@@ -88,7 +89,7 @@ def folder(tmp_path_factory, spring):
         tuners={"random": {}, "least_squares": {}, "small": SMALL},
     )
     path = tmp_path_factory.mktemp("results") / "spring"
-    comparison = Comparison.begin(experiment, [SPRING_PLUGIN], path, jobs=1)
+    comparison = Comparison.begin(prepare_study(experiment, [SPRING_PLUGIN], path, jobs=1))
     comparison.run(jobs=1)
     comparison.report(lambda _: None)
     return path

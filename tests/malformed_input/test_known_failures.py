@@ -33,7 +33,7 @@ CASES = {
         "--plugin: expected a path",
     ),
     "arguments that turn the line around": (said("list", "systems", "\u202eabc"), "\\u202eabc"),
-    "an endless argument": (said("compare", "swing.toml", "9" * 5000), "unrecognized"),
+    "an endless argument": (said("compare", "swing.toml", "9" * 5000), "unexpected argument"),
     "a world with parameters of its own": (
         compare({**valid_input.SWING, "world": {"effects": ["drag.linear"]}}),
         "fixed = { NAME",

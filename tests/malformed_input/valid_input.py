@@ -18,6 +18,7 @@ from bench.benchmark.comparison import Comparison
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.runner.experiment_runner import run_experiment
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import REGISTRIES
 from bench.logs.film_recording import write_film as film
@@ -125,7 +126,7 @@ def bases(folder: Path) -> dict[str, Path]:
             plugins = [str(LEARNER)] if name == "done" else []
             load_plugins_for_experiment(plugins, experiment)
             made[name] = folder / name
-            comparison = Comparison.begin(experiment, plugins, made[name], jobs=0)
+            comparison = Comparison.begin(prepare_study(experiment, plugins, made[name], jobs=0))
             if name == "half":
                 run_experiment(comparison.results, plugins, 0)
                 comparison.results.run_sink.close()

@@ -23,45 +23,52 @@ class PreparedStudy(NamedTuple):
     Attributes:
         folder: result folder to create.
         experiment: configuration that will be run.
+        plugins: plugin files that the study needs; the caller has loaded them.
         secret: secret salt; None if the salt is public.
-        jobs: number of worker processes.
+        jobs: number of worker processes; 0 for none, and tuners without isolation.
     """
 
     folder: Path
     experiment: Experiment
+    plugins: Sequence[str]
     secret: str | None
     jobs: int
 
-    def create_folder(
-        self, plugins: Sequence[str], hashes: Mapping[str, str], redraws: Redraws | None = None
-    ) -> Path:
+    def create_folder(self, hashes: Mapping[str, str], redraws: Redraws | None = None) -> Path:
         """Create the result folder and return it.
 
         Args:
-            plugins: plugin files that the study needs.
             hashes: hashes of everything that must not change while the study runs.
             redraws: number of targets that were drawn again, for environment.json.
         """
         held = () if self.experiment.trusted else list_active_isolation_layers()
-        configuration = FolderConfiguration(self.experiment, list(plugins), dict(hashes))
+        configuration = FolderConfiguration(self.experiment, list(self.plugins), dict(hashes))
         create_folder(self.folder, configuration, self.jobs, self.secret, held, redraws)
         return self.folder
 
 
 def prepare_study(
-    experiment: Experiment, folder: Path | None, jobs: int, salt: str | None
+    experiment: Experiment,
+    plugins: Sequence[str] = (),
+    folder: Path | None = None,
+    jobs: int = 2,
+    salt: str | None = None,
 ) -> PreparedStudy:
-    """Choose a free folder and the salt of a study; see `bench.studies.study.Study.begin`.
+    """Choose a free folder and the salt of a study.
 
     Args:
         experiment: configuration of the study.
-        folder: result folder; None for a default name.
-        jobs: number of worker processes; 0 for this process.
-        salt: given salt; None for the experiment's or a new one.
+        plugins: plugin files that it needs; the caller has loaded them.
+        folder: new or empty folder; None for one below results/ that is named after the time.
+        jobs: number of worker processes; 0 for none, and tuners without isolation.
+        salt: salt of the targets, secret until the study is complete; None for the experiment's or
+            a new one.
+
+    Raises:
+        InputError: the folder is not free, or the salt does not fit the experiment.
     """
-    place = choose_free_folder(experiment, folder)
+    free_folder = choose_free_folder(experiment, folder)
     experiment, secret = draw_salt_if_needed(experiment, salt)
     # Without worker processes tuners run in this process, without isolation.
-    return PreparedStudy(
-        place, experiment.chosen(trusted=experiment.trusted or not jobs), secret, jobs
-    )
+    experiment = experiment.chosen(trusted=experiment.trusted or not jobs)
+    return PreparedStudy(free_folder, experiment, plugins, secret, jobs)

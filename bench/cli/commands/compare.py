@@ -15,184 +15,71 @@ from bench.cli.output import (
     PrintLine,
 )
 from bench.cli.shared_options import (
-    add_force_option,
-    add_model_option,
-    add_pdf,
-    add_plugin_option,
-    add_trust_option,
+    add_options,
+    collect_options,
     make_cluster_pool,
-    parse_name_list,
-    parse_non_negative_int,
     parse_path,
-    parse_positive_int,
-    parse_seconds,
     prefix_errors_with_option,
 )
 
 if TYPE_CHECKING:
-    from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.runner.worker_pools import Pool
     from bench.benchmark.storage.study_progress import StudyOutcome
     from bench.studies.study import Study
 
-_EXPERIMENT_OPTIONS = ("targets", "budget", "training_budget", "timeout", "memory")
-"""Options that change the key of the same name in an experiment."""
+_UNCHANGED_BY_RESUME = ("jobs", "plugins", "cluster", "force", "pdf", "progress")
+"""Options that may be given together with ``--resume``."""
 
 
-def add_compare_arguments(compare: argparse.ArgumentParser) -> None:
+def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap compare`."""
-    compare.add_argument(
+    from bench.api.comparison_options import ComparisonOptions
+
+    parser.add_argument(
         "experiment",
         metavar="EXPERIMENT",
         nargs="?",
         help="name (see `simgap list experiments`) or TOML file",
     )
-    add_model_option(compare, "tune this robot in place of an experiment: an MJCF or URDF")
-    compare.add_argument(
-        "--recording",
-        metavar="FILE.csv",
-        type=parse_path,
-        help="tune it to this recording (default: to simulations of its own)",
-    )
-    compare.add_argument(
-        "--free",
-        metavar="A,B,...",
-        help="numbers of its model file to tune, as damping@* or mass@forearm",
-    )
-    compare.add_argument(
-        "--tuners",
-        "--diagnosers",
-        dest="tuners",
-        metavar="A,B,...",
-        help="only these tuners, by label or registered name; or only these diagnosers",
-    )
-    compare.add_argument(
-        "--targets",
-        type=parse_positive_int,
-        metavar="N",
-        help="targets in each range; of diagnosers: so many questions, drawn at random",
-    )
-    compare.add_argument(
-        "--seeds", type=parse_positive_int, metavar="N", help="seeds of each tuner that uses chance"
-    )
-    compare.add_argument(
-        "--budget", type=parse_positive_int, metavar="N", help="simulations on one target"
-    )
-    compare.add_argument(
-        "--training-budget",
-        type=parse_positive_int,
-        metavar="N",
-        help="simulations that a tuner may learn from",
-    )
-    compare.add_argument(
-        "--jobs",
-        type=parse_non_negative_int,
-        metavar="N",
-        default=2,
-        help="worker processes; 0 runs everything in this one, for prints and breakpoints "
-        "(default: 2)",
-    )
-    compare.add_argument(
-        "--out",
-        metavar="DIR",
-        type=parse_path,
-        help="folder to write (default: a new one below results/)",
-    )
-    add_plugin_option(compare, "tuners or diagnosers")
-    compare.add_argument(
+    add_options(parser, ComparisonOptions)
+    parser.add_argument(
         "--resume",
         metavar="DIR",
         type=parse_path,
-        help="finish what is missing in this folder instead",
+        help="run what is missing in this folder, instead of a new comparison",
     )
-    compare.add_argument(
-        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler"
+    parser.add_argument(
+        "--allow-failures", action="store_true", help="exit with 0 even if runs failed"
     )
-    compare.add_argument(
-        "--timeout",
-        type=parse_seconds,
-        metavar="S",
-        help="seconds that a run may take, then it is killed",
-    )
-    compare.add_argument(
-        "--memory", type=parse_positive_int, metavar="MIB", help="memory that a run may take"
-    )
-    add_trust_option(compare)
-    compare.add_argument(
-        "--isolation",
-        choices=("run", "tuner"),
-        help="a fresh process for every run of a tuner, or one for all with the same seed "
-        "(default: run)",
-    )
-    compare.add_argument(
-        "--salt",
-        "--secret",
-        dest="salt",
-        metavar="TEXT",
-        help="draw the targets from this, which is kept secret until the end; `public` gives the "
-        "published ones (default: a fresh one)",
-    )
-    compare.add_argument(
-        "--allow-failures", action="store_true", help="exit with 0 although runs failed"
-    )
-    add_pdf(compare)
-    add_force_option(compare)
-    compare.set_defaults(command=_run_compare)
-
-
-def _build_experiment(options: argparse.Namespace) -> Experiment:
-    """Build the experiment that the options of `compare` describe."""
-    from bench.api.compare import apply_changes, load_experiment_plugins, resolve_experiment
-
-    trust = options.trust or not options.jobs
-    asked = resolve_experiment(
-        options.experiment, options.model, options.recording, parse_name_list(options.free or "")
-    )
-    experiment = load_experiment_plugins(asked, options.plugin, trust, options.isolation)
-    labels = parse_name_list(options.tuners) if options.tuners else None
-    changes = {name: getattr(options, name) for name in _EXPERIMENT_OPTIONS}
-    return apply_changes(experiment, labels, options.seeds, **changes)
-
-
-def _refuse_beside_resume(options: argparse.Namespace) -> None:
-    """Reject options that would change the study to be resumed.
-
-    Raises:
-        InputError: There are such options.
-    """
-    from sims.core.simulator import InputError
-
-    robot = ("model", "recording", "free")
-    described = (
-        "experiment",
-        *robot,
-        "tuners",
-        "seeds",
-        "out",
-        "salt",
-        "isolation",
-        *_EXPERIMENT_OPTIONS,
-    )
-    given = [name for name in described if getattr(options, name) is not None]
-    given += ["trust"] if options.trust else []
-    if given:
-        raise InputError(
-            f"--resume takes the configuration of its folder as it is; leave out {', '.join(given)}"
-        )
+    parser.set_defaults(command=_run_compare)
 
 
 def _begin_or_resume(options: argparse.Namespace) -> list[Study]:
-    """Begin or resume the study, or the studies of a sweep."""
-    from bench.benchmark.runner.resource_checks import check_comparison_size
-    from bench.studies.study import begin_studies, list_study_folders, resume_study
+    """Begin or resume the study, or the studies of a sweep.
 
+    Raises:
+        InputError: Options are given that would change a study to be resumed.
+    """
+    from bench.api.compare import begin_studies, build_experiment
+    from bench.api.comparison_options import ComparisonOptions
+    from bench.studies.study import list_study_folders, resume_study
+    from sims.core.argument_checks import check_options
+    from sims.core.simulator import InputError
+
+    given = collect_options(options, ComparisonOptions)
     if options.resume:
-        _refuse_beside_resume(options)
+        changed = {"experiment": options.experiment, **given}
+        refused = [n for n, value in changed.items() if value and n not in _UNCHANGED_BY_RESUME]
+        if refused:
+            raise InputError(
+                "--resume uses the configuration of its folder unchanged; leave out "
+                f"{', '.join(refused)}"
+            )
         return [resume_study(part, options.plugin) for part in list_study_folders(options.resume)]
-    chosen, cluster = _build_experiment(options), options.cluster is not None
-    check_comparison_size(chosen, options.out, options.jobs, cluster, options.force)
+    comparison = check_options(ComparisonOptions, given)
+    chosen = build_experiment(options.experiment, comparison)
     with prefix_errors_with_option("--out", options.out):
-        return begin_studies(chosen, options.plugin, options.out, options.jobs, options.salt)
+        return begin_studies(chosen, comparison)
 
 
 def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:

@@ -22,12 +22,14 @@ _simgap_schemas() {{ compgen -W "{schemas}" -- "$1"; }}
 
 def add_completion_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap completion`."""
-    parser.add_argument("shell", choices=SHELLS, help="which shell the script is for")
+    parser.add_argument("shell", choices=SHELLS, help="shell that the script is for")
     parser.set_defaults(command=_completion)
 
 
 def _completion(options: argparse.Namespace, say: PrintLine) -> CommandResult:
-    script = build_completion_script(options.parser, options.shell)
+    from bench.cli.main import build_parser
+
+    script = build_completion_script(build_parser(), options.shell)
     say(script.rstrip("\n"))
     return CommandResult({"shell": options.shell, "script": script})
 

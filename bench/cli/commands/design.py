@@ -6,58 +6,32 @@ import argparse
 
 from bench.cli.output import EXIT_PROBLEMS_FOUND, CommandResult, PrintLine
 from bench.cli.shared_options import (
-    add_model_option,
+    add_options,
+    add_out_option,
     add_plugin_option,
-    parse_name_list,
-    parse_path,
-    parse_positive_int,
-    parse_seconds,
+    add_recordings_argument,
+    collect_options,
 )
 
 
 def add_design_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap design`."""
-    parser.add_argument(
-        "recordings",
-        metavar="RECORDING.csv",
-        type=parse_path,
-        nargs="+",
-        help="what there is so far, as for `simgap explain`",
-    )
-    parser.add_argument(
-        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
-    )
-    add_model_option(parser)
-    parser.add_argument(
-        "--out",
-        metavar="NAME.csv",
-        type=parse_path,
+    from bench.api.design import DesignOptions
+
+    add_recordings_argument(parser, "the existing recordings, as for `simgap explain`")
+    add_out_option(
+        parser,
+        "file of commands to write, a new one: t in s and a column for each input",
+        "NAME.csv",
         required=True,
-        help="commands to write, a new file: t in s and a column for each input",
     )
-    parser.add_argument(
-        "--seconds",
-        type=parse_seconds,
-        metavar="S",
-        default=4.0,
-        help="how long the next run is to last (default: 4)",
-    )
-    parser.add_argument(
-        "--longest",
-        type=parse_seconds,
-        metavar="S",
-        help="how long it may last where that does not settle what is open (default: five times)",
-    )
-    parser.add_argument("--free", metavar="A,B,...", default="", help="as for `simgap explain`")
-    parser.add_argument(
-        "--jobs", type=parse_positive_int, metavar="N", help="processes that work at once"
-    )
+    add_options(parser, DesignOptions)
     add_plugin_option(parser, "systems")
     parser.set_defaults(command=_run_design)
 
 
 def _run_design(options: argparse.Namespace, say: PrintLine) -> CommandResult:
-    from bench.api.design import design
+    from bench.api.design import DesignOptions, design
     from bench.cli.interrupt_handler import InterruptHandler
     from bench.cli.search_progress import ProgressDisplay
     from bench.core.plugin_registries import load_plugins
@@ -69,12 +43,7 @@ def _run_design(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     with display, InterruptHandler(display.note) as interrupts:
         proposed = design(
             options.recordings,
-            seconds=options.seconds,
-            longest=options.longest,
-            system=options.system,
-            model=options.model,
-            free=parse_name_list(options.free),
-            jobs=options.jobs,
+            **collect_options(options, DesignOptions),
             say=display.note,
             stop=interrupts.is_stop_requested,
             listener=display,

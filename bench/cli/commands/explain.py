@@ -16,14 +16,15 @@ from bench.cli.output import (
 )
 from bench.cli.shared_options import (
     add_force_option,
-    add_model_option,
+    add_options,
+    add_out_option,
     add_pdf,
     add_plugin_option,
+    add_recordings_argument,
+    collect_options,
     make_cluster_pool,
     parse_name_list,
     parse_path,
-    parse_positive_int,
-    parse_seconds,
 )
 
 _FIGURE_SUFFIXES = (".html", ".png", ".pdf")
@@ -38,98 +39,36 @@ _RESULT_RELEVANT_OPTIONS = (
 
 def add_explain_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap explain`."""
-    parser.add_argument(
-        "recordings",
-        metavar="RECORDING.csv",
-        type=parse_path,
-        nargs="+",
-        help="the table; its .toml stands beside it. Several of one system, in the order of time, "
-        "are explained together, and what each says by itself is compared",
+    from bench.diagnosis.explain_options import ExplainOptions
+
+    add_recordings_argument(
+        parser,
+        "table of the recording; its .toml is in the same folder. Several recordings of one "
+        "system, in the order of time, are explained together, and each separately",
     )
-    parser.add_argument(
-        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
-    )
-    add_model_option(parser)
-    parser.add_argument(
-        "--engine",
-        metavar="NAME",
-        default="batch",
-        help="pybullet, mujoco or batch (default: batch)",
-    )
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=parse_path,
-        help="folder to write (default: a new one below results/)",
-    )
-    parser.add_argument(
-        "--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)"
-    )
-    parser.add_argument(
-        "--free",
-        metavar="A,B,...",
-        default="",
-        help="constants to estimate with the parameters; "
-        "of a robot numbers of its model file, as damping@* or mass@forearm",
-    )
-    parser.add_argument(
-        "--tuner",
-        metavar="NAME",
-        help="a tuner that finds where the base fit begins (default: a grid)",
-    )
-    parser.add_argument(
-        "--budget",
-        type=parse_seconds,
-        metavar="S",
-        help="seconds after which the search ends with what it has (default: it comes to its end); "
-        "Ctrl-C ends it likewise",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=parse_positive_int,
-        metavar="N",
-        help="processes that work at once, where that pays; the answer is the same with any number "
-        "(default: one for each core)",
-    )
-    parser.add_argument(
-        "--whole",
-        action="store_true",
-        help="look at all of a long recording of a robot (default: at pieces from all over it)",
-    )
-    parser.add_argument(
-        "--pieces",
-        type=parse_seconds,
-        metavar="S",
-        help="cut runs into pieces of S seconds, each with an initial state of its own: for motion "
-        "that drifts or is unstable",
-    )
-    parser.add_argument(
-        "--thorough",
-        action="store_true",
-        help="search on where causes are found and something is left over: further causes are "
-        "taken that held-out runs bear out (about twice as long there)",
-    )
+    add_options(parser, ExplainOptions, free={"default": ""})
+    add_out_option(parser, "folder to write (default: a new one below results/)")
     parser.add_argument(
         "--each",
         action="store_true",
-        help="explain every recording by itself, --jobs of them at once: a folder for each and one "
-        "table of all; what --out holds of an earlier call is not made again",
+        help="explain every recording separately, --jobs of them at once: a folder for each and "
+        "one table of all; results of an earlier call in --out are reused",
     )
     parser.add_argument(
         "--cluster",
         metavar="ADDRESS",
-        help="with --each: on the Dask cluster with this scheduler, which must see the same files",
+        help="with --each: run on the Dask cluster with this scheduler, which must have access to "
+        "the same files",
     )
     parser.add_argument(
         "--ranges",
         action="store_true",
-        help="for a robot: also write ranges for domain randomisation, the 95 %% intervals of what "
-        "its model file then has, as ranges.toml, ranges.csv and code for Isaac Lab and MuJoCo "
-        "Playground",
+        help="for a robot: also write ranges for domain randomisation, the 95 %% intervals of the "
+        "numbers of the extended model file, as ranges.toml, ranges.csv and code for Isaac Lab and "
+        "MuJoCo Playground",
     )
     add_pdf(parser)
     add_plugin_option(parser, "systems")
-    add_force_option(parser)
     parser.set_defaults(command=_run_explain)
 
 
@@ -145,10 +84,10 @@ def add_score_arguments(parser: argparse.ArgumentParser) -> None:
         "recording",
         metavar="OTHER.csv",
         type=parse_path,
-        help="the recording; its .toml stands beside it",
+        help="the recording; its .toml is in the same folder",
     )
     parser.add_argument(
-        "--held-out", action="store_true", help="only the runs that are marked held_out"
+        "--held-out", action="store_true", help="use only the runs that are marked held_out"
     )
     add_plugin_option(parser, "systems")
     add_force_option(parser)
@@ -161,6 +100,7 @@ def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.benchmark.storage.provenance import get_utc_time, write_explanation_environment
     from bench.cli.search_progress import ProgressDisplay
     from bench.core.plugin_registries import load_plugins
+    from bench.diagnosis.explain_options import ExplainOptions
     from bench.diagnosis.report.summary_text import format_summary
     from sims.core.atomic_files import check_folder_empty, make_timestamped_path
     from sims.core.simulator import InputError
@@ -183,18 +123,7 @@ def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         with InterruptHandler(display.note) as interrupts:
             explanation = explain(
                 options.recordings,
-                system=options.system,
-                model=options.model,
-                engine=options.engine,
-                free=parse_name_list(options.free),
-                tuner=options.tuner,
-                seed=options.seed,
-                force=options.force,
-                budget=options.budget,
-                jobs=options.jobs,
-                whole=options.whole,
-                pieces=options.pieces,
-                thorough=options.thorough,
+                **collect_options(options, ExplainOptions),
                 say=display.note,
                 stop=interrupts.is_stop_requested,
                 listener=display,

@@ -35,6 +35,7 @@ def add_schema_arguments(parser: argparse.ArgumentParser) -> None:
 def _list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.cli import catalogue
     from bench.cli.catalogue_text import format_documents
+    from bench.cli.main import build_parser
     from bench.core.plugin_registries import load_plugins
     from sims.core.simulator import InputError
 
@@ -50,9 +51,9 @@ def _list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     if options.what is None:
         if not options.json:
             raise InputError(f"expected one of {', '.join(_LISTS)}; with --json all are listed")
-        return CommandResult(catalogue.build_catalogue(options.parser))
+        return CommandResult(catalogue.build_catalogue(build_parser()))
     if options.what == "commands":
-        found = catalogue.list_commands(options.parser)
+        found = catalogue.list_commands(build_parser())
     else:
         found = catalogue.CATALOGUE_SECTIONS[options.what]()
     for line in format_documents(options.what, found):

@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDocument, PrintLine
 from bench.cli.shared_options import (
     add_force_option,
     add_model_option,
+    add_out_option,
     add_pdf,
     add_plugin_option,
+    add_system_options,
     parse_name_list,
     parse_path,
     parse_positive_int,
@@ -24,20 +26,68 @@ if TYPE_CHECKING:
     from sims.recording.recording import Recording
 
 
-def add_simulate_arguments(simulate: argparse.ArgumentParser) -> None:
+class _SystemAction(argparse.Action):
+    """Store the system, which may also be the last word of an option with several values."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        _option: str | None = None,
+    ) -> None:
+        if values and namespace.system:
+            parser.error(f"unexpected argument '{values}'")
+        namespace.system = values or namespace.system
+
+
+class _ValuesAction(argparse._ExtendAction):
+    """Store the values of an option, and leave a last word that cannot be a value for SYSTEM.
+
+    argparse gives such an option every word up to the next option, as in ``--effect wind=1 ball``.
+    Values are NAME=VALUE or numbers.
+    """
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option: str | None = None,
+    ) -> None:
+        words = list(values)
+        if len(words) > 1 and not namespace.system and not _is_value(words[-1]):
+            namespace.system = words.pop()
+        super().__call__(parser, namespace, words, option)
+
+
+def _is_value(word: str) -> bool:
+    """Return whether a word is NAME=VALUE, or numbers separated by commas."""
+    try:
+        return "=" in word or bool([float(number) for number in word.split(",")])
+    except ValueError:
+        return False
+
+
+def add_simulate_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap simulate`."""
-    simulate.add_argument(
-        "system", metavar="SYSTEM", nargs="?", default="", help="see `simgap list systems`"
+    parser.add_argument(
+        "system",
+        metavar="SYSTEM",
+        nargs="?",
+        default="",
+        action=_SystemAction,
+        help="see `simgap list systems`",
     )
-    add_model_option(simulate, "simulate this robot in place of a system: an MJCF or URDF")
+    add_model_option(parser, "robot to simulate instead of a system, MJCF or URDF")
     for name, metavar, text in (
         (
             "theta",
             "NAME=VALUE",
-            "parameters, or all values in order with commas between (default: nominal)",
+            "parameters, or all values in order separated by commas (default: nominal)",
         ),
-        ("effect", "NAME=VALUE[,VALUE]", "effects that act, with their coefficients"),
-        ("constant", "NAME=VALUE", "constants other than the system's defaults"),
+        ("effect", "NAME=VALUE[,VALUE]", "active effects with their coefficients"),
+        ("constant", "NAME=VALUE", "constants that differ from the system's defaults"),
         ("noise", "S", "sensor noise, 1 sigma: of every channel, or NAME=S (default: none)"),
         (
             "input",
@@ -45,83 +95,66 @@ def add_simulate_arguments(simulate: argparse.ArgumentParser) -> None:
             "a number, sine:AMPLITUDE:HERTZ, square:A:HZ, steps:A:SECONDS, chirp:A:HZ:HZ, "
             "multisine:A:HZ:HZ; several are added with ' + ' between",
         ),
-        ("initial", "NAME=VALUE", "initial states, or NAME=LOW:HIGH to draw each run's"),
+        ("initial", "NAME=VALUE", "initial states, or NAME=LOW:HIGH to draw one for each run"),
     ):
-        simulate.add_argument(
-            f"--{name}", action="extend", nargs="+", default=[], metavar=metavar, help=text
+        parser.add_argument(
+            f"--{name}", action=_ValuesAction, nargs="+", default=[], metavar=metavar, help=text
         )
-    simulate.add_argument(
-        "--observe", metavar="A,B,...", help="channels to record (default: the system's usual ones)"
+    parser.add_argument(
+        "--observe", metavar="A,B,...", help="channels to record (default: those of the system)"
     )
-    simulate.add_argument(
+    parser.add_argument(
         "--runs",
         type=parse_positive_int,
         metavar="N",
         default=4,
         help="number of runs (default: 4)",
     )
-    simulate.add_argument(
-        "--seconds", type=float, metavar="T", default=4.0, help="length of a run (default: 4)"
-    )
-    simulate.add_argument(
-        "--rate", type=float, metavar="HZ", default=100.0, help="samples a second (default: 100)"
-    )
-    simulate.add_argument(
-        "--engine", metavar="NAME", help="pybullet, mujoco or batch (default: batch)"
-    )
-    simulate.add_argument(
-        "--seed", type=int, metavar="K", default=0, help="of all that is drawn (default: 0)"
-    )
-    simulate.add_argument(
-        "--held-out", type=int, metavar="M", help="mark the last M runs (default: a third)"
-    )
-    simulate.add_argument(
-        "--out", type=parse_path, metavar="FILE.csv", required=True, help="file to write, a new one"
-    )
-    add_plugin_option(simulate, "systems")
-    add_force_option(simulate)
-    simulate.set_defaults(command=_simulate)
+    for name, metavar, kind, default, text in (
+        ("seconds", "T", float, 4.0, "length of a run in seconds (default: 4)"),
+        ("rate", "HZ", float, 100.0, "samples per second (default: 100)"),
+        ("engine", "NAME", str, None, "pybullet, mujoco or batch (default: batch)"),
+        ("seed", "K", int, 0, "seed of all random numbers (default: 0)"),
+        ("held-out", "M", int, None, "mark the last M runs as held out (default: a third)"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, metavar=metavar, default=default, help=text)
+    add_out_option(parser, "file to write, a new one", "FILE.csv", required=True)
+    add_plugin_option(parser, "systems")
+    add_force_option(parser)
+    parser.set_defaults(command=_simulate)
 
 
-def add_inspect_arguments(inspect: argparse.ArgumentParser) -> None:
+def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap inspect`."""
-    inspect.add_argument(
+    parser.add_argument(
         "recording",
         metavar="FILE.csv",
         type=parse_path,
-        help="the table; its .toml stands beside it",
+        help="table of the recording; its .toml is in the same folder",
     )
-    inspect.add_argument(
-        "--system", metavar="NAME", help="take it for this system, whatever the .toml says"
-    )
-    add_model_option(inspect)
-    inspect.add_argument(
-        "--out",
-        metavar="DIR",
-        type=parse_path,
-        help="folder for the figure (default: results/inspect)",
-    )
-    inspect.add_argument(
+    add_system_options(parser)
+    add_out_option(parser, "folder of the figure (default: results/inspect)")
+    parser.add_argument(
         "--check",
         action="store_true",
-        help="say what the recording can fix, before any fit; exit code 1 if a free number is "
-        "not identifiable",
+        help="show what the recording can identify, before any fit; exit code 1 if a free number "
+        "is not identifiable",
     )
-    inspect.add_argument(
+    parser.add_argument(
         "--free",
         metavar="A,B,...",
-        help="with --check: constants, or numbers of a model file, that are to be estimated",
+        help="with --check: constants, or numbers of a model file, to be estimated",
     )
-    inspect.add_argument(
+    parser.add_argument(
         "--fix",
         metavar="NAME.toml",
         type=parse_path,
-        help="of a robot: write the description with the conventions that the model file means, "
-        "a new file",
+        help="for a robot: write the description with the conventions of the model file, a new "
+        "file",
     )
-    add_pdf(inspect)
-    add_plugin_option(inspect, "systems")
-    inspect.set_defaults(command=_inspect)
+    add_pdf(parser)
+    add_plugin_option(parser, "systems")
+    parser.set_defaults(command=_inspect)
 
 
 def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
@@ -188,7 +221,7 @@ def _inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     load_plugins(options.plugin)
     if options.free and not options.check:
-        raise InputError("--free says what --check asks about; give --check besides")
+        raise InputError("--free is used by --check; add --check, or leave out --free")
     recording, kind = load_recording(options.recording, options.system, options.model)
     about = list(robot_summary.format_robot_summary(kind))
     found = [

@@ -16,7 +16,6 @@ import numpy as np
 
 from bench.benchmark.runner.worker_pools import Pool
 from bench.diagnosis.batch.log_rows import LOGS_TABLE_FILE, LogResult, format_log_table
-from bench.diagnosis.evaluation.search_control import SearchControl
 from bench.diagnosis.explain import explain
 from bench.figures.figure_files import is_pdf_wanted
 from bench.logs.joined_recordings import make_log_names
@@ -125,8 +124,7 @@ def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -
         pdf: Also write each figure as PDF.
     """
     try:
-        given = {key: value for key, value in settings.items() if key != "budget"}
-        explanation = explain(log.path, watch=SearchControl(settings.get("budget")), **given)
+        explanation = explain(log.path, **settings)
         explanation.write(log.folder, pdf=pdf)
     except InputError as error:
         return LogResult(log.name, log.digest, error=get_first_line(error))

@@ -12,6 +12,7 @@ from scipy.stats import binomtest
 
 from bench.api.compare import ComparisonResult
 from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.runner.tuner_training import TrainingRequest, train_or_load
 from bench.benchmark.runner.worker_pools import PoolLostError
 from bench.bounce_shot import shot_planning, shot_study
@@ -506,7 +507,7 @@ def test_what_is_lost_on_the_way_is_said_and_no_untrained_tuner_is_shot_with(
     path = tmp_path / "mine.toml"
     path.write_text(SMALL.replace("least_squares = {}", "regressor = {}") + DROPS)
     begun = shot_study.BounceShotStudy.begin(
-        load_experiment(str(path)), folder=tmp_path / "out", jobs=1
+        prepare_study(load_experiment(str(path)), folder=tmp_path / "out", jobs=1)
     )
     made = begun.run(jobs=1, pool=Gone(PoolLostError("the scheduler is gone")))
     assert (made.finished, made.planned, made.stopped) == (0, 1, "the scheduler is gone")

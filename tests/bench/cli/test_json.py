@@ -346,9 +346,9 @@ def test_schemas_are_sound_and_refuse_what_is_damaged_deep_inside(run, capsys):
     ("arguments", "kind", "says"),
     [
         (["status", "nowhere"], "input", "expected the folder of a comparison"),
-        (["status", "--runz"], "usage", "unrecognized arguments: --runz"),
+        (["status", "--runz"], "usage", "unknown option '--runz'; did you mean --runs"),
         (["score"], "usage", "required: MODEL"),
-        (["nothing"], "usage", "invalid choice"),
+        (["nothing"], "usage", "unknown command 'nothing'"),
         (["schema", "verdikt"], "input", "verdict"),
         (["list"], None, ""),
     ],

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.diagnosis.evaluation.search_control import SearchControl
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
-from bench.diagnosis.explain import _ExplainInput, _ExplainRun, explain
+from bench.diagnosis.explain import _ExplainRun, explain
+from bench.diagnosis.explain_options import ExplainOptions
 from bench.diagnosis.fitting.base_fit import fit_base_model
 from bench.diagnosis.numerics_cause import (
     SURE,
@@ -56,10 +56,7 @@ def log(folder, change=("", ""), noise=NOISE, divide=1, integrator="Euler"):
 
 def chosen(path):
     """Return the explainer of a log after the base fit and the choice of the step."""
-    subject = _ExplainInput([path], None, None, whole=False, pieces=None)
-    said = []
-    given = "batch", 0, (), None, said.append, False, SearchControl(), ForkedWorkerPool(1)
-    explainer = _ExplainRun(subject, *given)
+    explainer = _ExplainRun([path], ExplainOptions(), ForkedWorkerPool(1))
     try:
         explainer._stepped(fit_base_model(explainer.fitting, explainer.noise))
     finally:

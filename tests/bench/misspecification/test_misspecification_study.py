@@ -21,6 +21,7 @@ from bench.benchmark.problem.experiment import (
 )
 from bench.benchmark.problem.recorded_runs import make_scenario
 from bench.benchmark.problem.tuning_problem import TuningProblem
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.cli.main import main
 from bench.core.plugin_registries import simulators
 from bench.misspecification import misspecification_scores
@@ -53,7 +54,7 @@ def small(**changes) -> Experiment:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     study = MisspecificationStudy.begin(
-        small(), folder=tmp_path_factory.mktemp("two") / "shot", jobs=0
+        prepare_study(small(), folder=tmp_path_factory.mktemp("two") / "shot", jobs=0)
     )
     assert study.run(jobs=0).is_complete
     said = []

@@ -15,6 +15,7 @@ from bench.benchmark.problem.fisher_information import (
 )
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.results_report import write_report
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.statistics.error_curves import select_primary_metric
 from bench.benchmark.storage.result_folder import read_comparison
 from sims.core.simulator import InputError, Parameter
@@ -173,7 +174,7 @@ def folder(tmp_path_factory):
         targets=2, budget=6, tuners={"random": {}, "nelder_mead": {}}, **changes
     )
     folder = tmp_path_factory.mktemp("found") / "run"
-    comparison = Comparison.begin(experiment, PLUGIN_FILES, folder)
+    comparison = Comparison.begin(prepare_study(experiment, PLUGIN_FILES, folder))
     assert comparison.run().is_complete
     return folder, comparison.results
 

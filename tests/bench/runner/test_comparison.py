@@ -294,12 +294,12 @@ def test_one_function_tells_which_study_an_experiment_or_a_folder_is(tmp_path, s
     from bench.benchmark.comparison import Comparison
     from bench.benchmark.problem.experiment import load_experiment
     from bench.bounce_shot.shot_study import BounceShotStudy
-    from bench.studies.study import begin_study, get_study_class, open_study
+    from bench.studies.study import begin_studies, get_study_class, open_study
     from tests.sample_experiments import spring_experiment
 
     assert get_study_class(load_experiment("bounce-shot")) is BounceShotStudy
     assert get_study_class(load_experiment("ball-drop")) is Comparison
-    begun = begin_study(spring_experiment(), [SPRING_PLUGIN], tmp_path / "out")
+    (begun,) = begin_studies(spring_experiment(), [SPRING_PLUGIN], tmp_path / "out")
     begun.results.run_sink.close()
     there = open_study(tmp_path / "out")
     assert isinstance(there, Comparison)

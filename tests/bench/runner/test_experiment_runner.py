@@ -9,6 +9,7 @@ from bench.benchmark.runner.experiment_runner import (
     run_experiment,
 )
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.core.plugin_registries import load_plugins
 from tests.conftest import PLUGINS
@@ -38,7 +39,7 @@ def frame(results):
 
 def tables(experiment, folder, jobs):
     load_plugins_for_experiment(PLUGIN_FILES, experiment)
-    comparison = Comparison.begin(experiment, PLUGIN_FILES, folder, jobs)
+    comparison = Comparison.begin(prepare_study(experiment, PLUGIN_FILES, folder, jobs))
     assert comparison.run(jobs).is_complete
     return read_comparison(folder)
 

@@ -10,6 +10,7 @@ import pytest
 from bench.benchmark.comparison import Comparison
 from bench.benchmark.runner.experiment_runner import prepare_experiment, run_experiment
 from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.runner.worker_pools import InProcessPool, WorkerDiedError, make_pool
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.core.plugin_registries import load_plugins, tuners
@@ -80,7 +81,11 @@ def test_table_is_the_same_without_workers_and_with_one_or_two(tmp_path, monkeyp
         monkeypatch.setenv("SIMGAP_CACHE", str(tmp_path / f"cache{jobs}"))
         folder = tmp_path / str(jobs)
         load_plugins_for_experiment(PLUGIN_FILES, experiment.chosen(trusted=not jobs))
-        assert Comparison.begin(experiment, PLUGIN_FILES, folder, jobs).run(jobs).is_complete
+        assert (
+            Comparison.begin(prepare_study(experiment, PLUGIN_FILES, folder, jobs))
+            .run(jobs)
+            .is_complete
+        )
         tables.append(read_comparison(folder))
     assert [table.experiment.trusted for table in tables] == [False, False, True]
     # An isolated tuner gives bitwise the same results as a tuner in this process.
@@ -122,7 +127,9 @@ def test_soft_time_limit_holds(monkeypatch):
 def test_interrupt_ends_it_and_what_was_finished_is_kept(tmp_path, monkeypatch):
     in_a_cell(monkeypatch, "raise KeyboardInterrupt")
     experiment = small(tuners={"random": {}, "mine": {}, "cma_es": {}})
-    made = Comparison.begin(experiment, PLUGIN_FILES, tmp_path / "out", jobs=0).run(jobs=0)
+    made = Comparison.begin(prepare_study(experiment, PLUGIN_FILES, tmp_path / "out", jobs=0)).run(
+        jobs=0
+    )
     assert (made.finished, made.planned, made.interrupted) == (1, 3, True)
     in_a_cell(monkeypatch, "raise KeyboardInterrupt")
     standing = Comparison(tmp_path / "out").status()
@@ -153,7 +160,7 @@ def test_class_of_a_notebook_is_refused_for_workers_before_anything_is_written(
     in_a_cell(monkeypatch, "return ''")
     experiment = small(tuners={"mine": {}})
     with pytest.raises(InputError, match="tuner mine: class Mine is defined in") as e:
-        Comparison.begin(experiment, PLUGIN_FILES, tmp_path / "out", jobs=2)
+        Comparison.begin(prepare_study(experiment, PLUGIN_FILES, tmp_path / "out", jobs=2))
     assert "jobs=0" in str(e.value)
     assert "\n" not in str(e.value)
     assert not (tmp_path / "out").exists()

@@ -12,6 +12,7 @@ from bench.benchmark.problem.experiment import parse_experiment
 from bench.benchmark.problem.recorded_runs import ObservedRuns
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.benchmark.runner.run_ids import RunIds
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.storage.journal_segments import read_finished_statuses, read_plan, write_plan
 from bench.benchmark.storage.result_folder import read_comparison
 from bench.benchmark.storage.run_journal import RunJournal
@@ -61,7 +62,7 @@ class Interrupting(simgap.Tuner):
 def begun(experiment, plugins, folder):
     """Run a comparison whose first run is finished and whose second is interrupted."""
     Interrupting.left = 1
-    made = Comparison.begin(experiment, plugins, folder, jobs=0).run(jobs=0)
+    made = Comparison.begin(prepare_study(experiment, plugins, folder, jobs=0)).run(jobs=0)
     assert made.interrupted
     assert len(read_finished_statuses(folder)) == 1
     return folder

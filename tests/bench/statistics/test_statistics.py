@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.statistics.error_curves import RunRowTable
 from bench.benchmark.statistics.expected_running_time import (
     ThresholdEffort,
@@ -233,7 +234,7 @@ def test_a_million_rows_are_read_for_the_table_within_five_seconds(tmp_path):
     experiment = spring_experiment(
         targets=200, seeds=5, budget=99, ranges=["in"], tuners=entries, noise={"x": 0.1}
     )
-    comparison = Comparison.begin(experiment, [], folder)
+    comparison = Comparison.begin(prepare_study(experiment, [], folder))
     comparison.results.run_sink.delete_segments()
     runs, k = 10_000, np.arange(100)
     tuners = np.repeat(labels, 1000)

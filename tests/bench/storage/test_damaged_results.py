@@ -12,6 +12,7 @@ from pyarrow import parquet
 from bench.api.compare import ComparisonResult
 from bench.benchmark.comparison import Comparison
 from bench.benchmark.runner.experiment_runner import run_experiment
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.statistics.error_table import ERROR_TABLE_COLUMNS
 from bench.benchmark.storage.journal_segments import read_plan
 from bench.benchmark.storage.result_folder import read_checked_comparison, read_comparison
@@ -58,9 +59,9 @@ def folders(tmp_path_factory, spring):
         targets=2, seeds=2, budget=3, tuners={"random": {}, "nelder_mead": {"seeds": 1}}
     )
     place = tmp_path_factory.mktemp("damage")
-    made = Comparison.begin(experiment, [SPRING_PLUGIN], place / "done", jobs=0)
+    made = Comparison.begin(prepare_study(experiment, [SPRING_PLUGIN], place / "done", jobs=0))
     made.run(jobs=0)
-    begun = Comparison.begin(experiment, [SPRING_PLUGIN], place / "half", jobs=0)
+    begun = Comparison.begin(prepare_study(experiment, [SPRING_PLUGIN], place / "half", jobs=0))
     results = begun.results
     results.run_sink.close()
     results.run_sink = RunJournal(place / "half", part_runs=5)

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import tomli_w
 
+from bench.benchmark.runner.study_setup import prepare_study
 from bench.benchmark.storage.result_folder import read_configuration
 from bench.cli.main import main
 from tests.conftest import PLUGINS
@@ -124,7 +125,7 @@ def test_the_salt_is_for_the_owner_alone_until_the_end_and_a_resumed_folder_goes
     held = read_configuration(sound)
     experiment = held.experiment.chosen(salt="", salt_sha256="")
     load_plugins_for_experiment(held.plugins, experiment)
-    begun = Comparison.begin(experiment, held.plugins, tmp_path / "out", 1, SECRET)
+    begun = Comparison.begin(prepare_study(experiment, held.plugins, tmp_path / "out", 1, SECRET))
     begun.close()
     kept = tmp_path / "out" / "segments" / "salt"
     assert kept.read_text() == SECRET
@@ -148,7 +149,13 @@ def test_a_folder_whose_salt_is_gone_is_not_resumed(sound, tmp_path, capsys):
     held = read_configuration(sound)
     load_plugins_for_experiment(held.plugins, held.experiment)
     begun = Comparison.begin(
-        held.experiment.chosen(salt="", salt_sha256=""), held.plugins, tmp_path / "out", 1, SECRET
+        prepare_study(
+            held.experiment.chosen(salt="", salt_sha256=""),
+            held.plugins,
+            tmp_path / "out",
+            1,
+            SECRET,
+        )
     )
     begun.close()
     for content in (None, "another"):

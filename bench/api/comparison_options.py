@@ -1,0 +1,87 @@
+"""Options of `simgap compare`, of its Python function and of `simgap.sweep`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+from bench.core.options import option
+from methods.tuner import Tuner
+from sims.core.argument_checks import Count, Expected, Files, Name, Names, Natural, Seconds
+
+Tuners: TypeAlias = Annotated[
+    Sequence[Name | type[Tuner]],
+    Expected("names of tuners or subclasses of Tuner, as ['cma_es', 'random']"),
+]
+"""The tuners to compare."""
+RecordingFile: TypeAlias = Annotated[
+    str | Path, Expected("the path of NAME.csv, which results are traced to")
+]
+"""A recording that must be a file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """Options of a comparison or of a sweep of comparisons.
+
+    Attributes:
+        jobs: Number of worker processes; 0 runs everything in this process, without isolation, so
+            that output of print appears, breakpoints work, and classes of a notebook can be used.
+        trust: Run the tuners without isolation: faster, but they could read the true parameters,
+            and the results are marked.
+        salt: Text from which the targets are drawn, secret until the end; `public` draws the
+            published targets (default: a new one).
+        out: Folder to write, new or empty; a sweep writes one folder in it for each experiment
+            (default: a new folder below results/).
+        plugins: Plugin file with further tuners, simulators, effects or diagnosers.
+        progress: Function that is called with a title and a number of steps; it returns the
+            function that is called after each step.
+        force: Start even if it needs more than this machine has, or if the data are implausible.
+        pdf: Write every figure as PDF too (default: PNG only).
+    """
+
+    jobs: Natural = 2
+    trust: bool = False
+    salt: str | None = option(None, "TEXT", flags=("--salt", "--secret"))
+    out: str | Path | None = option(None, "DIR")
+    plugins: Files = option((), flags=("--plugin",))
+    progress: Callable[[str, int], Callable[[], None]] | None = None
+    force: bool = False
+    pdf: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonOptions(StudyOptions):
+    """Options of a comparison.
+
+    Attributes:
+        model: Model file of a robot to tune instead of an experiment, MJCF or URDF.
+        recording: Recording of that robot to tune it to (default: simulated targets).
+        free: Numbers of the model file to tune, as damping@* or mass@forearm.
+        tuners: Tuners to run, by label or registered name, or in Python as classes; for a
+            comparison of diagnosers their names (default: all of the experiment).
+        targets: Number of targets in each range; for diagnosers, number of cases drawn at random.
+        seeds: Number of seeds for each tuner that uses random numbers.
+        budget: Number of simulations on one target.
+        training_budget: Number of simulations that a learned tuner may train on.
+        timeout: Time limit of a run in seconds.
+        memory: Memory limit of a run in MiB; 0 is no limit.
+        isolation: `run` starts a new process for every run of a tuner, `tuner` one for all runs
+            with the same seed (default: run).
+        cluster: Address of a Dask scheduler to run on.
+    """
+
+    model: str | Path | None = None
+    recording: RecordingFile | None = option(None, "FILE.csv")
+    free: Names = ()
+    tuners: Tuners | None = option(None, flags=("--tuners", "--diagnosers"))
+    targets: Count | None = None
+    seeds: Count | None = None
+    budget: Count | None = None
+    training_budget: Count | None = None
+    timeout: Seconds | None = None
+    memory: Natural | None = option(None, "MIB")
+    isolation: Name | None = option(None, "ISOLATION", choices=("run", "tuner"))
+    cluster: str | None = option(None, "ADDRESS")
