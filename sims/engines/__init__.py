@@ -23,19 +23,20 @@ HIDDEN_STATE_ENGINES = ("batch",)
 
 
 def describe_stepping() -> str:
-    """Return how the engine `batch` steps in this process, for a record of the run.
+    """Return how forces are computed in this process, for a record of the run.
 
     If the machine code does not exist yet, it is compiled, once after an installation. Therefore
     call this before starting processes that would each wait for it.
 
     Returns:
-        ``machine code``, ``numpy``, or ``none`` if the engine is not in use.
+        ``machine code``, or ``none`` if no declared system is in use.
     """
-    if ENGINE_MODULES["batch"] not in sys.modules:
+    if "sims.system_simulator" not in sys.modules:
         return "none"
     from sims.engines.compiled import kernel
 
-    return "numpy" if kernel.get_kernel() is None else "machine code"
+    kernel.get_kernel()
+    return "machine code"
 
 
 def missing_packages(name: str) -> list[str]:

@@ -32,7 +32,7 @@ from sims.core.system import (
     System,
     Trajectories,
 )
-from sims.engines.batch.batch_slicing import join_trajectories, slice_batch
+from sims.engines.batch_slicing import join_trajectories, slice_batch
 
 
 class AugmentedSystem(System):

@@ -1,19 +1,22 @@
-"""Measure the cost of stepping in machine code and in NumPy, in one process on one core.
+"""Measure the cost of stepping with traced forces and with forces that NumPy evaluates.
 
 Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.stepping_speed``; prints a table. Runs have
 4 s at 100 Hz. The number is the processor time of the engine's own work, the minimum of some
-repetitions. The variants alternate, so that changes of the machine affect both. The last rows are
-the times of MuJoCo alone, without reading results.
+repetitions, in one process on one core. The variants alternate, so that changes of the machine
+affect both. The last rows are the times of MuJoCo alone, without reading results.
 """
 
 from __future__ import annotations
 
+import contextlib
 from itertools import chain
 from time import process_time
+from unittest import mock
 
 import numpy as np
 
 from sims.core.simulator import Scenario
+from sims.engines.compiled import compilability
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -69,19 +72,18 @@ class Noted:
 
 
 def seconds(cls, effects, lanes, repeats=REPEATS):
-    """Return processor seconds (2, 2): NumPy and machine code, each for the engine and the call."""
+    """Return processor seconds (2, 2): evaluated and traced, each for the engine and the call."""
     simulator, theta, scenarios = work(cls, effects, lanes)
-    engines = [
-        Noted(cls(engine="batch", compiled=compiled, effects=effects).engine)
-        for compiled in (False, True)
-    ]
+    simulator.engine = engine = Noted(simulator.engine)
     best = np.full((2, 2), np.inf)
+    evaluated = mock.patch.object(compilability, "_get_tracer", return_value=None)
     for repeat in range(repeats + 1):
-        for k, engine in enumerate(engines):
-            simulator.engine, engine.seconds = engine, 0.0
-            started = process_time()
-            simulator.simulate_batch(theta, scenarios)
-            found = engine.seconds, process_time() - started
+        for k, way in enumerate((evaluated, contextlib.nullcontext())):
+            with way:
+                engine.seconds = 0.0
+                started = process_time()
+                simulator.simulate_batch(theta, scenarios)
+                found = engine.seconds, process_time() - started
             if repeat:  # The first call includes imports and tracing.
                 best[k] = np.minimum(best[k], found)
     return best
@@ -89,7 +91,7 @@ def seconds(cls, effects, lanes, repeats=REPEATS):
 
 def table():
     """Yield the rows of the table."""
-    yield "| system and effects | lanes | numpy, ms a lane | compiled | ratio | of the whole call |"
+    yield "| system and effects | elements | evaluated, ms | traced | ratio | of the whole call |"
     yield "|---|---|---|---|---|---|"
     for cls, effects in CASES:
         for lanes in LANES:

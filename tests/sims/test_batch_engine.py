@@ -1,7 +1,5 @@
 """Tests of the batch engine against SciPy, closed forms and itself."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -11,8 +9,7 @@ from sims.core.simulator import InputError, Parameter, Scenario
 from sims.core.system import IntegrationBatch, System
 from sims.effects.friction import CoulombFriction
 from sims.engines.batch import make_engine
-from sims.engines.batch.element_clock import ElementClocks
-from sims.engines.compiled import kernel
+from sims.engines.compiled import compilability
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
@@ -24,15 +21,11 @@ from tests.sims.simulation_cases import FORCES, SIMULATORS, errors, simulated, s
 T = np.arange(201) / 100
 
 
-@pytest.fixture(autouse=True, params=["machine code", "numpy"])
-def way(request, monkeypatch):
-    """Run each test with machine code and with numpy, the fallback for code that does not
-    compile.
-    """
-    if request.param == "numpy":
-        monkeypatch.setattr(kernel, "get_kernel", lambda: None)
-    elif kernel.get_kernel() is None:
-        pytest.skip("no compiler is installed")
+@pytest.fixture(autouse=True, params=["traced", "evaluated"])
+def force_program(request, monkeypatch):
+    """Run each test with traced forces, and with forces that NumPy evaluates."""
+    if request.param == "evaluated":
+        monkeypatch.setattr(compilability, "_get_tracer", lambda *_: None)
 
 
 @pytest.mark.slow
@@ -413,27 +406,3 @@ def test_an_effect_becomes_the_one_it_contains(simple, rich):
     np.testing.assert_allclose(
         other.simulate(theta, scenario), one.simulate(np.array([[1.0, 0.4]]), scenario), atol=1e-9
     )
-
-
-def test_a_lane_given_up_holds_nobody_up():
-    """The remaining time of an abandoned element is zero. Before, an element that an impact at zero
-    speed had set back in time continued for minutes.
-    """
-    lanes = SimpleNamespace(
-        steps=np.full((2, 3), 0.1), inputs={}, steps_per_sample=1, x=np.zeros((2, 1))
-    )
-    clock, state = ElementClocks(lanes), np.ones((3, 2))
-    clock.shift_time(np.array([0]), np.array([[-50.0]]))
-    assert clock.left[:, 0] == pytest.approx([50.1, 0.1])
-    clock.abandon(np.array([True, False]), np.full((3, 2), np.nan))
-    assert clock.left[0, 0] == 0.0
-    for _ in range(3):
-        assert not clock.over
-        clock.record_states(state)
-        clock.advance_time(clock.left)
-        clock.finish_step(np.array([False, True]))
-    assert clock.over
-    clock.record_states(state)
-    motion = clock.get_trajectories()
-    assert np.isnan(motion.x[0, -1]).all()
-    assert motion.x[1].tolist() == [[1.0]] * 4

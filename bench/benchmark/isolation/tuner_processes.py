@@ -205,9 +205,7 @@ def _environment(folder: str) -> dict[str, str]:
     # Libraries would otherwise compute differently, and results would differ in the last digits.
     told |= {name: value for name, value in os.environ.items() if name.startswith(_NUMERICAL)}
     # Compiled steps are loaded from the cache folder before the process is isolated.
-    told["SIMGAP_COMPILED"] = (
-        "off" if compiled.is_compilation_disabled() else str(compiled.get_cache_folder())
-    )
+    told["SIMGAP_COMPILED"] = str(compiled.get_cache_folder())
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return {**one, **told, "HOME": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
 

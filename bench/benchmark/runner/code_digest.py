@@ -24,7 +24,6 @@ from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.recorded_runs import find_recording
 from sims import effects
 from sims.core.simulator import InputError
-from sims.engines.compiled import code_cache
 
 PROJECT_ROOT = Path(__file__).resolve().parents[3]
 """Root folder of this project's packages."""
@@ -123,7 +122,7 @@ def _contents(folder: Path, root: Path) -> list[tuple[str, bytes]]:
 def hash_package_versions() -> str:
     """Hash the versions of Python and of the numerical packages."""
     packages = [get_package_version(name) for name in NUMERICAL_PACKAGES]
-    return compute_digest(platform.python_version(), packages, code_cache.is_compilation_disabled())
+    return compute_digest(platform.python_version(), packages)
 
 
 def get_package_version(name: str) -> str:

@@ -467,17 +467,10 @@ class RunEvaluator:
         kinds: Indices = shifting + 2 * filtering
         return kinds
 
-    @cached_property
+    @property
     def is_cheap_to_split(self) -> bool:
         """Whether splitting a batch into several calls costs no time, as with compiled steps."""
-        if self.kind.has_model:
-            return True
-        if self.engine != "batch":
-            return False
-        # Loaded only when needed, because importing the compiler package takes time.
-        from sims.engines.compiled import kernel
-
-        return kernel.get_kernel() is not None
+        return self.kind.has_model or self.engine == "batch"
 
     def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
         """Return the scenarios of batch elements with their freed constants.

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from sims.core.simulator import Array
 from sims.core.system import Contact, Effect, Force, Friction, IntegrationBatch, Trajectories
-from sims.engines.batch.force_field import is_active
-from sims.engines.batch.step_size import MAX_STEP_DIVISIONS
-from sims.engines.compiled import compilability
-from sims.engines.compiled.data_layout import BLOCK_WIDTH, BatchArrays
-from sims.engines.compiled.force_program import CompiledModel
-from sims.engines.compiled.kernel import CompiledKernel
+from sims.engines.compiled.compilability import get_force_program
+from sims.engines.compiled.data_layout import DRY, GUIDED, BatchArrays
+from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram
+from sims.engines.compiled.kernel import get_kernel
+from sims.engines.compiled.kernel_entry import FLY_ELEMENTS, STEP_BLOCK, STEP_IN_LOCKSTEP
+from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
 from sims.engines.ground_contact import Indices
+from sims.engines.time_grid import is_active
 
 _SIMD_WIDTH = 8
 """SIMD width: the number of used slots is a multiple of it."""
@@ -23,30 +24,45 @@ _MIN_ELEMENTS_PER_THREAD = 256
 """Minimum number of batch elements per thread."""
 
 
-class _Job:
-    """Batch of stepped elements that the compiled kernel integrates.
+def integrate_batch(
+    lanes: IntegrationBatch, turn: float, patience: float, jobs: int
+) -> Trajectories:
+    """Integrate a batch on the compiled kernel.
+
+    Args:
+        lanes: batch to integrate.
+        turn: maximum phase of an oscillation per step in radians.
+        patience: maximum number of steps of an element, as a multiple of the planned ones.
+        jobs: number of threads.
+
+    Returns:
+        The trajectories.
+    """
+    runner = _BatchRunner(lanes, turn, patience, jobs)
+    for chosen, effects in _group_by_effects(lanes):
+        runner.integrate(chosen, effects)
+    return Trajectories(*np.split(runner.records, 3, axis=2))
+
+
+class _BatchRunner:
+    """Arrays of a batch that the compiled kernel integrates.
+
+    Attributes:
+        records: (L, R, 3 D) recorded positions, velocities and accelerations.
 
     Args:
         lanes: whole batch.
-        turn: maximum phase of an oscillation per step in radians; see `batch.step_size`.
+        turn: maximum phase of an oscillation per step in radians; see `step_size`.
         patience: maximum number of steps; see `sims.engines.batch.BatchEngine`.
-        machine: compiled kernel.
         jobs: number of threads.
     """
 
-    def __init__(
-        self,
-        lanes: IntegrationBatch,
-        turn: float,
-        patience: float,
-        machine: CompiledKernel,
-        jobs: int,
-    ) -> None:
+    def __init__(self, lanes: IntegrationBatch, turn: float, patience: float, jobs: int) -> None:
+        self._kernel = get_kernel()
         self._jobs = jobs
         self._lanes = lanes
         self._turn = turn
         self._patience = patience
-        self._machine = machine
         count, dimensions = lanes.x.shape
         shared = lanes.steps.strides[0] == 0
         steps = lanes.steps[:1] if shared else lanes.steps
@@ -57,33 +73,21 @@ class _Job:
         self._inputs = _stacked(list(lanes.inputs.values()), self._steps.shape[1])
         self._mass = _column(lanes.system.mass(lanes.theta, lanes.constants), count)
         self._ground = _ground(lanes)
-        records = self._steps.shape[1] // lanes.steps_per_sample + 1
-        self._kept = np.empty((count, records, 3 * dimensions))
-        hidden = np.ceil(lanes.system.fastest * self._spans / turn)
-        self._parts = np.clip(hidden, 1.0, MAX_STEP_DIVISIONS)
-        self._longest = np.empty(count)
+        record_count = self._steps.shape[1] // lanes.steps_per_sample + 1
+        self.records = np.empty((count, record_count, 3 * dimensions))
+        self._longest = self._spans.copy()
         self._x = np.ascontiguousarray(lanes.x, dtype=np.float64)
         self._v = np.ascontiguousarray(lanes.v, dtype=np.float64)
 
-    def motion(self) -> Trajectories:
-        """Return the recorded trajectories."""
-        x, v, a = np.split(self._kept, 3, axis=2)
-        return Trajectories(x, v, a)
-
-    def step(self, chosen: Indices, effects: Sequence[tuple[Effect, Array]]) -> bool:
-        """Step the elements `chosen`, on which exactly these effects act.
+    def integrate(self, chosen: Indices, effects: Sequence[tuple[Effect, Array]]) -> None:
+        """Integrate some elements.
 
         Args:
             chosen: (n,) indices of the elements.
-            effects: active effects with their coefficients (K, L, 1).
-
-        Returns:
-            Whether system and effects can be compiled; if not, nothing is done.
+            effects: effects that act on them, with their coefficients (K, L, 1).
         """
         lanes = self._lanes
-        made = compilability.get_compiled_model(lanes, chosen, [effect for effect, _ in effects])
-        if made is None:
-            return False
+        program = get_force_program(lanes, chosen, [effect for effect, _ in effects])
         columns = [lanes.theta[chosen], *(c[chosen] for c in lanes.constants.values())]
         columns += [c[:, chosen, 0].T for _, c in effects]
         parameters = np.concatenate(columns, axis=1)
@@ -100,20 +104,27 @@ class _Job:
             ground=self._ground,
             every=lanes.steps_per_sample,
             patience=self._patience,
-            kept=self._kept,
+            kept=self.records,
         )
-        self._machine.choose_step_divisions(
-            made.program,
-            work,
-            made.allocate_buffers(),
-            _width(work),
-            self._spans,
-            self._turn,
-            self._parts,
+        if lanes.system.uniform and not any(isinstance(e, (Force, Friction)) for e, _ in effects):
+            self._run(FLY_ELEMENTS, program, work)
+        else:
+            self._step(program, work)
+
+    def _step(self, program: ForceProgram | NumpyForceProgram, work: BatchArrays) -> None:
+        """Integrate elements in steps."""
+        chosen = work.order
+        all_parts = np.ceil(self._lanes.system.fastest * self._spans / self._turn)
+        all_parts = np.clip(all_parts, 1.0, MAX_STEP_DIVISIONS)
+        width = _width(program, work)
+        prepared = program.prepare(width)
+        self._kernel.choose_step_divisions(
+            prepared.arrays, work, prepared.block, width, self._spans, self._turn, all_parts
         )
-        parts = self._parts[chosen]
+        prepared.raise_error()
+        parts = all_parts[chosen]
         spans = self._spans[chosen]
-        if lanes.system.bends:
+        if self._lanes.system.bends:
             # The fine steps that hidden states need count as planned steps.
             self._planned[chosen] *= parts
         # Slightly longer than the part, so that rounding does not leave a tiny step after the last
@@ -121,43 +132,49 @@ class _Job:
         self._longest[chosen] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
         # Elements with many steps begin first; the others fill the remaining slots meanwhile.
         order = np.argsort(-parts, kind="stable")
-        apart = len(order)
-        if made.has_no_events and len(self._steps) == 1 and self._patience >= 1.0:
-            apart = int(np.count_nonzero(parts > 1))
-        self._shared(self._machine.step_block, made, _some(work, order[:apart]))
-        self._shared(self._machine.step_in_lockstep, made, _some(work, order[apart:]))
-        return True
+        separate = len(order)
+        has_events = program.arrays.flags[DRY:GUIDED].any()
+        if not has_events and len(self._steps) == 1 and self._patience >= 1.0:
+            separate = int(np.count_nonzero(parts > 1))
+        self._run(STEP_BLOCK, program, _select(work, order[:separate]))
+        self._run(STEP_IN_LOCKSTEP, program, _select(work, order[separate:]))
 
-    def _shared(self, way: Callable[..., None], made: CompiledModel, work: BatchArrays) -> None:
-        """Make all steps, on several threads if there are enough elements."""
-        lanes = len(work.order)
-        count = min(self._jobs, max(lanes // _MIN_ELEMENTS_PER_THREAD, 1))
+    def _run(
+        self, function: int, program: ForceProgram | NumpyForceProgram, work: BatchArrays
+    ) -> None:
+        """Run a function of the kernel, on several threads if there are enough elements."""
+        count = len(work.order)
+        threads = min(self._jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
+
+        def run(part: BatchArrays) -> None:
+            width = _width(program, part)
+            prepared = program.prepare(width)
+            self._kernel.integrate(function, prepared.arrays, part, prepared.block, width)
+            prepared.raise_error()
+
         # Every thread gets some elements with many steps and its own buffers. No two threads write
         # the same element, and the result of an element does not depend on any other.
-        works = [_some(work, np.arange(k, lanes, count)) for k in range(count)] if lanes else []
-        if count == 1:
-            for part in works:
-                way(made.program, part, made.allocate_buffers(), _width(part))
+        parts = [_select(work, np.arange(k, count, threads)) for k in range(threads)]
+        if not count:
             return
-        with ThreadPoolExecutor(count) as threads:
-            done = [
-                threads.submit(way, made.program, part, made.allocate_buffers(), _width(part))
-                for part in works
-            ]
-        for one in done:
-            one.result()
+        if threads == 1:
+            run(work)
+            return
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run, parts))
 
 
-def _some(work: BatchArrays, places: Indices) -> BatchArrays:
+def _select(work: BatchArrays, places: Indices) -> BatchArrays:
     """Return the work on the elements at these places of its order."""
     if len(places) == len(work.order) and (places == np.arange(len(places))).all():
         return work
     return work._replace(order=work.order[places], parameters=work.parameters[places])
 
 
-def _width(work: BatchArrays) -> int:
+def _width(program: ForceProgram | NumpyForceProgram, work: BatchArrays) -> int:
     """Return the number of slots in use."""
-    return min(BLOCK_WIDTH, -(-len(work.order) // _SIMD_WIDTH) * _SIMD_WIDTH)
+    needed = -(-len(work.order) // _SIMD_WIDTH) * _SIMD_WIDTH
+    return min(program.block_width, needed)
 
 
 def _column(values: Array, count: int) -> Array:
@@ -190,32 +207,11 @@ def _ground(lanes: IntegrationBatch) -> Array:
     return ground
 
 
-def step_batch(
-    lanes: IntegrationBatch, turn: float, patience: float, machine: CompiledKernel, jobs: int = 1
-) -> tuple[Trajectories, Indices]:
-    """Integrate stepped elements on the compiled kernel.
-
-    Args:
-        lanes: batch of elements that are all stepped.
-        turn: maximum phase of an oscillation per step in radians.
-        patience: maximum number of steps of an element, as a multiple of the planned ones.
-        machine: compiled kernel.
-        jobs: number of threads.
-
-    Returns:
-        The trajectories, and the indices of elements left out because their effects cannot be
-        compiled.
-    """
-    job = _Job(lanes, turn, patience, machine, jobs)
-    left = [chosen for chosen, effects in _groups(lanes) if not job.step(chosen, effects)]
-    return job.motion(), np.sort(np.concatenate([np.empty(0, dtype=np.intp), *left]))
-
-
-def _groups(lanes: IntegrationBatch) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
+def _group_by_effects(lanes: IntegrationBatch) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
     """Return groups of elements (n,) with the same active effects, and these effects."""
     hooks = (Force, Friction, Contact)
     there: list[tuple[Effect, Array]] = [(e, c) for e, c in lanes.effects if isinstance(e, hooks)]
-    on = [is_active(c) for _, c in there]
+    on = [is_active(c)[:, 0] for _, c in there]
     if not on:
         return [(np.arange(len(lanes.x)), [])]
     patterns = np.ascontiguousarray(np.array(on).T)

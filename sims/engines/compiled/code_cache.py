@@ -15,11 +15,6 @@ from pathlib import Path
 _DIGEST = hashlib.sha256().digest_size
 
 
-def is_compilation_disabled() -> bool:
-    """Return whether the user has disabled compilation."""
-    return os.environ.get("SIMGAP_COMPILED") == "off"
-
-
 def get_cache_folder() -> Path:
     """Return the cache folder: $SIMGAP_COMPILED, else simgap/ in the user's cache folder."""
     if named := os.environ.get("SIMGAP_COMPILED"):

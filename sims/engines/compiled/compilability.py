@@ -1,204 +1,167 @@
-"""Compilability of systems and effects.
+"""Force programs of batch elements, traced where possible.
 
-Those that cannot be compiled are reported once and stepped in NumPy.
+Systems and effects that cannot be traced are reported once, and NumPy evaluates their functions.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from threading import Lock
 
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.core.system import Contact, Effect, IntegrationBatch, System
-from sims.engines.batch.batch_slicing import slice_batch
-from sims.engines.batch.force_field import ForceField
-from sims.engines.compiled import interpreter
+from sims.core.system import Effect, IntegrationBatch, System
 from sims.engines.compiled.data_layout import (
+    DRY,
     IN_E,
-    IN_MU,
     IN_P,
-    IN_SPEED,
     IN_T,
-    IN_U,
-    IN_V,
-    IN_X,
     OUT_E,
     OUT_LIMIT,
     OUT_MU,
+    InputNames,
 )
-from sims.engines.compiled.force_program import CompiledModel, InputNames, SystemTracer
+from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, SystemTracer
+from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.node_arrays import NotTraceableError
 from sims.engines.ground_contact import Indices
 
-_tracings: dict[tuple[type[System], InputNames], SystemTracer | None] = {}
+_tracers: dict[tuple[type[System], InputNames], SystemTracer | None] = {}
 _effects: dict[tuple[type[System], InputNames, type[Effect]], bool] = {}
 _lock = Lock()
 _TOLERANCE = 1e-9
 """Largest relative difference between a program and the functions from which it was traced."""
-_PLAIN = 0.6, 0.2
+_RESTITUTION, _FRICTION = 0.6, 0.2
 """Restitution and friction of the ground with which effects are tested."""
 
 
-def get_compiled_model(
+def get_force_program(
     lanes: IntegrationBatch, chosen: Indices, effects: Sequence[Effect]
-) -> CompiledModel | None:
-    """Return the program for some elements; None if it cannot be compiled.
+) -> ForceProgram | NumpyForceProgram:
+    """Return the program for some elements.
 
     Args:
         lanes: whole batch.
         chosen: (n,) indices of the elements.
         effects: effects that act on them.
     """
-    # The lock prevents that a trace in progress in another thread is taken as not compilable.
+    names = InputNames(
+        tuple(lanes.constants), tuple(lanes.inputs), lanes.theta.shape[1], lanes.x.shape[1]
+    )
+    # The lock prevents that a trace in progress in another thread is taken as not traceable.
     with _lock:
-        tracing = _traced(lanes, chosen)
-        if tracing is None:
-            return None
-        for effect in effects:
-            if not _compiles(tracing, effect, lanes, chosen):
-                return None
-        return tracing.build_model(effects)
+        tracer = _get_tracer(lanes, chosen, names)
+        if tracer is not None and all(
+            _is_traceable(tracer, effect, lanes, chosen, names) for effect in effects
+        ):
+            try:
+                return tracer.build_program(effects)
+            except NotTraceableError as reason:  # the program would be too long
+                _report("this set of effects", reason)
+    return NumpyForceProgram(lanes.system, names, effects)
 
 
-def _traced(lanes: IntegrationBatch, chosen: Indices) -> SystemTracer | None:
-    system = lanes.system
-    key = type(system), _names(lanes)
-    if key not in _tracings:
-        _tracings[key] = None
+def _get_tracer(lanes: IntegrationBatch, chosen: Indices, names: InputNames) -> SystemTracer | None:
+    key = type(lanes.system), names
+    if key not in _tracers:
+        _tracers[key] = None
         try:
-            tracing = SystemTracer(system, key[1])
-            _check(tracing.build_model([]), lanes, chosen, [], system)
-            _tracings[key] = tracing
+            tracer = SystemTracer(lanes.system, names)
+            _check(tracer, lanes, chosen, names, None)
+            _tracers[key] = tracer
         # A user's system may raise any error when called with traced arrays.
         except Exception as reason:
-            _warn_not_compiled(f"system {system.name}", reason)
-    return _tracings[key]
+            _report(f"system {lanes.system.name}", reason)
+    return _tracers[key]
 
 
-def _compiles(
-    tracing: SystemTracer, effect: Effect, lanes: IntegrationBatch, chosen: Indices
+def _is_traceable(
+    tracer: SystemTracer,
+    effect: Effect,
+    lanes: IntegrationBatch,
+    chosen: Indices,
+    names: InputNames,
 ) -> bool:
-    key = type(lanes.system), _names(lanes), type(effect)
+    key = type(lanes.system), names, type(effect)
     if key not in _effects:
         _effects[key] = False
         try:
-            _check(tracing.build_model([effect]), lanes, chosen, [effect], effect)
+            _check(tracer, lanes, chosen, names, effect)
             _effects[key] = True
         except Exception as reason:
-            _warn_not_compiled(f"effect {effect.name}", reason)
+            _report(f"effect {effect.name}", reason)
     return _effects[key]
 
 
-def _names(lanes: IntegrationBatch) -> InputNames:
-    return InputNames(
-        tuple(lanes.constants), tuple(lanes.inputs), lanes.theta.shape[1], lanes.x.shape[1]
-    )
-
-
-def _warn_not_compiled(what: str, reason: Exception) -> None:
+def _report(subject: str, reason: Exception) -> None:
     """Write one line to the standard error output, once per process."""
     text = str(reason) or type(reason).__name__
-    sys.stderr.write(f"simgap: {what} is stepped without the compiler: {text}\n")
+    sys.stderr.write(f"simgap: {subject} cannot be compiled, and NumPy evaluates it: {text}\n")
 
 
 def _check(
-    made: CompiledModel,
+    tracer: SystemTracer,
     lanes: IntegrationBatch,
     chosen: Indices,
-    effects: Sequence[Effect],
-    of: System | Effect,
+    names: InputNames,
+    effect: Effect | None,
 ) -> None:
-    """Check that the program agrees with the array functions, on one element at two states.
+    """Check that a program agrees with the array functions, on one element.
 
     Args:
-        made: traced program.
+        tracer: traced system.
         lanes: whole batch.
         chosen: (n,) indices of the elements.
-        effects: effects in the program.
-        of: system or effect under test.
+        names: input names and sizes.
+        effect: effect under test; None to test the system.
 
     Raises:
         NotTraceableError: the results differ, or the traced object has its own state.
     """
-    if getattr(of, "__dict__", None):
+    if getattr(effect or lanes.system, "__dict__", None):
         raise NotTraceableError("it has a state of its own")
-    one = slice_batch(lanes, chosen[:1])
-    there = tuple((effect, c) for effect, c in one.effects if effect in effects)
-    one = replace(one, effects=there)
-    inputs = {name: values[:, :1] for name, values in one.inputs.items()}
-    with np.errstate(all="ignore"):
-        field = ForceField(one)
-        field.set_inputs(inputs)
-        r = _registers(made, one, inputs)
-        for t, moved in ((0.0, 0.0), (0.37, 0.1)):
-            x = one.x + moved
-            v = one.v - 2.0 * moved
-            force, limit = _at(made, r, t, x[0], v[0])
-            time = np.full((1, 1), t)
-            _same(force, field.compute_force(time, x, v)[0])
-            if field.has_dry_friction:
-                _same(limit, field.compute_friction_limit(time, x, v)[0])
-        for speed in (0.3, 2.0):
-            _same(_compute_program_impact(made, r, speed), _compute_reference_impact(there, speed))
+    effects = [] if effect is None else [effect]
+    lane = chosen[:1]
+    coefficients = [c[:, lane, 0].T for acting, c in lanes.effects if acting is effect]
+    constants = [values[lane] for values in lanes.constants.values()]
+    parameters = np.concatenate([lanes.theta[lane], *constants, *coefficients], axis=1)[0]
+    inputs = np.array([values[lane[0], 0] for values in lanes.inputs.values()])
+    states = [
+        np.concatenate([[t], lanes.x[lane[0]] + shift, lanes.v[lane[0]] - 2.0 * shift, inputs])
+        for t, shift in ((0.0, 0.0), (0.37, 0.1))
+    ]
+    programs = tracer.build_program(effects), NumpyForceProgram(lanes.system, names, effects)
+    values, expected_values = (_evaluate(program, parameters, states) for program in programs)
+    for value, expected in zip(values, expected_values, strict=True):
+        size = _TOLERANCE * np.abs(expected).max()
+        if not np.allclose(value, expected, rtol=_TOLERANCE, atol=size, equal_nan=True):
+            raise NotTraceableError("compiled it gives other numbers")
 
 
-def _registers(made: CompiledModel, one: IntegrationBatch, inputs: Mapping[str, Array]) -> Array:
-    """Return the registers of a program with the values of one element."""
-    rows = made.program.rows
-    r = made.allocate_buffers().r
-    columns = [one.theta, *one.constants.values(), *(c[:, :, 0].T for _, c in one.effects)]
-    parameters = np.concatenate(columns, axis=1)[0]
-    if parameters.size != rows[IN_E] - rows[IN_P]:
-        raise NotTraceableError("its constants or coefficients are not one number each")
-    r[rows[IN_P] : rows[IN_P] + parameters.size] = parameters[:, None]
-    for k, values in enumerate(inputs.values()):
-        r[rows[IN_U] + k] = values
-    interpreter.run_instructions(
-        made.program.code, made.program.ends[0], made.program.ends[1], r, 1
+def _evaluate(
+    program: ForceProgram | NumpyForceProgram, parameters: Array, states: Sequence[Array]
+) -> list[Array]:
+    """Return force and friction limit at states, and contact parameters of two impacts."""
+    prepared = program.prepare(1)
+    (code, ends, rows, out, flags), r = prepared.arrays, prepared.block.r
+    run_lane, run_moment, run_impact = (
+        get_kernel().make_instruction_runner(code, ends[part], ends[part + 1], r)
+        for part in range(3)
     )
-    return r
-
-
-def _at(made: CompiledModel, r: Array, t: float, x: Array, v: Array) -> tuple[Array, Array]:
-    """Return the force (D,) and the limit of dry friction (1,) of a program at one state."""
-    rows = made.program.rows
-    r[rows[IN_T], 0] = t
-    r[rows[IN_X] : rows[IN_X] + x.size, 0] = x
-    r[rows[IN_V] : rows[IN_V] + v.size, 0] = v
-    interpreter.run_instructions(
-        made.program.code, made.program.ends[1], made.program.ends[2], r, 1
-    )
-    return r[made.program.out, 0], r[rows[OUT_LIMIT], :1]
-
-
-def _compute_program_impact(made: CompiledModel, r: Array, speed: float) -> Array:
-    """Return restitution and friction (2,) of an impact, computed by the program."""
-    rows = made.program.rows
-    r[rows[IN_E]], r[rows[IN_MU]], r[rows[IN_SPEED]] = *_PLAIN, speed
-    interpreter.run_instructions(
-        made.program.code, made.program.ends[2], made.program.ends[3], r, 1
-    )
-    found: Array = r[rows[[OUT_E, OUT_MU]], 0]
-    return found
-
-
-def _compute_reference_impact(effects: Sequence[tuple[Effect, Array]], speed: float) -> Array:
-    """Return restitution and friction (2,) of an impact, computed by the array functions."""
-    e, mu = (np.full((1, 1), value) for value in _PLAIN)
-    for effect, c in effects:
-        if isinstance(effect, Contact):
-            own = c[:, :1]
-            e = effect.restitution(own, e, np.full((1, 1), speed))
-            mu = mu + effect.friction(own)
-    found: Array = np.concatenate([e, mu], axis=1)[0]
-    return found
-
-
-def _same(found: Array, expected: Array) -> None:
-    largest = np.abs(expected).max()
-    if not np.allclose(found, expected, rtol=_TOLERANCE, atol=_TOLERANCE * largest, equal_nan=True):
-        raise NotTraceableError("compiled it gives other numbers")
+    r[rows[IN_P] : rows[IN_P] + parameters.size, 0] = parameters
+    run_lane()
+    results = []
+    for state in states:
+        r[rows[IN_T] : rows[IN_P], 0] = state
+        run_moment()
+        results.append(r[out, 0])
+        if flags[DRY]:
+            results.append(r[rows[OUT_LIMIT], :1].copy())
+    for speed in (0.3, 2.0):
+        r[rows[IN_E] : rows[IN_E] + 3, 0] = _RESTITUTION, _FRICTION, speed
+        run_impact()
+        results.append(r[rows[[OUT_E, OUT_MU]], 0])
+    prepared.raise_error()
+    return results

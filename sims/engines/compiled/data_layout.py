@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sims.core.system import Effect, Force, Friction, System
+from sims.engines.compiled.expression_graph import EXTERNAL
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
@@ -15,7 +19,7 @@ IntTable = NDArray[np.int64]
 
 BLOCK_WIDTH = 32
 """Number of slots of a block: elements that are stepped together."""
-MAX_COORDINATES = 6
+MAX_COORDINATES = 15
 """Maximum number of coordinates of a system."""
 
 
@@ -79,9 +83,9 @@ class BlockBuffers(NamedTuple):
     """Buffers of a block.
 
     Attributes:
-        r: (., WIDTH) registers.
-        a: (., WIDTH) floating-point numbers of each slot; rows as below.
-        n: (., WIDTH) integers of each slot; rows as below.
+        r: (., W) registers.
+        a: (., W) floating-point numbers of each slot; rows as below.
+        n: (., W) integers of each slot; rows as below.
     """
 
     r: FloatArray
@@ -127,11 +131,38 @@ NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
 """Event to which a slot's next step leads."""
 
 
-def allocate_block(registers: int) -> BlockBuffers:
-    """Allocate the buffers of a block with this number of registers."""
-    r = np.zeros((registers, BLOCK_WIDTH))
+class InputNames(NamedTuple):
+    """Input names and sizes of batch elements, in the order of the parameters.
+
+    Attributes:
+        constants: names of the constants.
+        inputs: names of the inputs.
+        parameters: number of the system's parameters.
+        coordinates: number of coordinates.
+    """
+
+    constants: tuple[str, ...]
+    inputs: tuple[str, ...]
+    parameters: int
+    coordinates: int
+
+
+def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> IntTable:
+    """Return `ProgramArrays.flags` of a system with these effects."""
+    rubs, pushes = (
+        any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)
+    )
+    guided = system.guided or names.coordinates
+    flags = names.coordinates, rubs, pushes or system.bends, system.bounces, guided
+    return np.array(flags, dtype=np.int64)
+
+
+def allocate_block(registers: int, width: int = BLOCK_WIDTH) -> BlockBuffers:
+    """Allocate the buffers of a block with these numbers of registers and slots."""
     return BlockBuffers(
-        r, np.zeros((ROWS, BLOCK_WIDTH)), np.zeros((STATE_ROW_COUNT, BLOCK_WIDTH), dtype=np.int64)
+        np.zeros((registers, width)),
+        np.zeros((ROWS, width)),
+        np.zeros((STATE_ROW_COUNT, width), dtype=np.int64),
     )
 
 
@@ -159,11 +190,12 @@ def check_array_layout(
     lanes, d = work.x.shape
     chosen, columns = work.parameters.shape
     steps = work.steps.shape[1]
+    width = block.r.shape[1]
     rows = program.rows
     whole = [
         *((program.code, (len(program.code), 5)), (program.ends, (4,)), (rows, (11,))),
         *((program.out, (d,)), (program.flags, (5,))),
-        *((work.order, (chosen,)), (block.n, (STATE_ROW_COUNT, BLOCK_WIDTH))),
+        *((work.order, (chosen,)), (block.n, (STATE_ROW_COUNT, width))),
     ]
     real = [
         *((work.parameters, (chosen, columns)), (work.x, (lanes, d)), (work.v, (lanes, d))),
@@ -172,7 +204,7 @@ def check_array_layout(
         (work.steps, (1 if len(work.steps) == 1 else lanes, steps)),
         (work.inputs, (len(work.inputs), 1 if work.inputs.shape[1] == 1 else lanes, steps)),
         (work.kept, (lanes, steps // work.every + 1, 3 * d)),
-        *((block.r, (len(block.r), BLOCK_WIDTH)), (block.a, (ROWS, BLOCK_WIDTH))),
+        *((block.r, (len(block.r), width)), (block.a, (ROWS, width))),
     ]
     for arrays, kind in ((whole, np.int64), (real, np.float64)):
         for array, shape in arrays:
@@ -181,8 +213,14 @@ def check_array_layout(
     groups = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
     if (
         groups != (d, len(work.inputs), columns)
-        or not (1 <= w <= BLOCK_WIDTH and 1 <= d <= MAX_COORDINATES and chosen and steps)
+        or not (1 <= w <= width and 1 <= d <= MAX_COORDINATES and chosen and steps)
         or not 0 <= work.order.min() <= work.order.max() < lanes
-        or program.code.max(initial=0) >= len(block.r)
+        or not uses_registers(program.code, len(block.r))
     ):
         raise ValueError("the program is not one for these lanes")
+
+
+def uses_registers(code: IntTable, count: int) -> bool:
+    """Return whether the instructions (n, 5) use only the first `count` registers."""
+    called = code[:, 0] == EXTERNAL
+    return bool(code.min(initial=0) >= 0 and code[~called, 1:].max(initial=-1) < count)

@@ -1,6 +1,16 @@
 """Accelerations of the elements in a block, with dry friction and ground support.
 
-The rules and the equation numbers are those of `sims.engines.batch.dynamics`.
+Dry friction opposes motion with its full limit. Its direction is fixed during a step, so that the
+step is smooth. An element at rest sticks while the pulling force is within the limit, otherwise it
+slips in the direction of that force. With generalised inertia M, pulling force F (all forces except
+dry friction), limit L and the unit vector d of the motion,
+
+    M a = F - L d          while it moves, d = v / |v|                     (1)
+    a = 0                  at rest, as long as |F| <= L                    (2)
+    M a = F - L F / |F|    at rest, where |F| > L                          (3)
+
+(C. Coulomb's law; see E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations
+I, 1993, section II.6, on such discontinuities: a step must not extend across one).
 """
 
 from __future__ import annotations

@@ -1,6 +1,25 @@
 """Step the elements of one program, a block of them together, each with its own clock.
 
-The method and its equations are those of `sims.engines.batch.runge_kutta`. The slot of a finished
+The method is the classical Runge-Kutta method of fourth order, written for x'' = a(t, x, v) (E.
+Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sections II.1
+and, for second order, II.14, doi:10.1007/978-3-540-78862-1). With step h,
+
+    k1 = a(t, x, v)                                                        (1)
+    k2 = a(t + h/2, x + h/2 v, v + h/2 k1)                                 (2)
+    k3 = a(t + h/2, x + h/2 v + h^2/4 k1, v + h/2 k2)                      (3)
+    k4 = a(t + h, x + h v + h^2/2 k2, v + h k3)                            (4)
+    x' = x + h v + h^2/6 (k1 + k2 + k3)                                    (5)
+    v' = v + h/6 (k1 + 2 k2 + 2 k3 + k4)                                   (6)
+
+The nonlinearity of the acceleration within the step is estimated by the difference between (6) and
+the midpoint rule, v + h/2 (k2 + k3), per second:
+
+    b = (k1 - k2 - k3 + k4) / 6                                            (7)
+
+Steps are the planned ones, divided where the motion of an element is too fast for them
+(`step_size`). Steps in which friction or the forces of effects are too nonlinear (Stribeck's peak,
+the ripples of a fast motor) are rejected and shortened, and steps that contain an event are cut
+(`events`). The slot of a finished
 element is given to the next one, so that slots stay in use although elements need different numbers
 of steps. The result of an element does not depend on any other.
 """

@@ -1,14 +1,32 @@
 """Events of one element: impacts, standstill, break-away and step-size control.
 
-The rules are those of `sims.engines.batch.runge_kutta`, `sims.engines.batch.event_roots` and
-`sims.engines.ground_contact`; equation numbers refer to these modules. `i` is the index of a slot.
+A step that contains an event is rejected and repeated up to the event time, which is estimated by
+interpolation and corrected to second order afterwards; the state is changed there, and the rest of
+the step follows. `i` is the index of a slot. Equation (7) is that of `element_stepping`, equations
+of impacts are those of `sims.engines.ground_contact`.
+
+For a quantity with value p and rate r at the beginning of a step of length h, and value q at its
+end, the parabola through these values is
+
+    p(s) = p + r s - b s^2,    b = (p + h r - q) / h^2                     (8)
+
+Its root is computed in the form without cancellation (W. H. Press et al., Numerical Recipes, 3rd
+edition, 2007, section 5.6):
+
+    s = (r + w) / (2 b) = 2 p / (w - r),    w = sqrt(r^2 + 4 b p)          (9)
+
+With distance d to the event after the second attempt, its rate r and its acceleration a, the event
+is
+
+    s = -d / r (1 + d a / (2 r^2))                                         (10)
+
+seconds away, which solves d + r s + a s^2 / 2 = 0 up to terms of third order in d.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from sims.engines.batch import runge_kutta
 from sims.engines.compiled.data_layout import (
     AFTER,
     BEFORE,
@@ -66,14 +84,32 @@ from sims.engines.compiled.data_layout import (
 from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
 
-MAX_EVENTS_PER_STEP = runge_kutta.MAX_EVENTS_PER_STEP
-FRICTION_NONLINEARITY_TOLERANCE = 6.0 * runge_kutta.FRICTION_NONLINEARITY_TOLERANCE
-FORCE_NONLINEARITY_TOLERANCE = (6.0 * runge_kutta.FORCE_NONLINEARITY_TOLERANCE) ** 2
-NEGLIGIBLE_ACCELERATION_SHARE = runge_kutta.NEGLIGIBLE_ACCELERATION_SHARE
-STEP_REDUCTION_FACTOR = runge_kutta.STEP_REDUCTION_FACTOR
-MIN_STEP_SHARE = runge_kutta.MIN_STEP_SHARE
-BREAK_AWAY_TIME_TOLERANCE = runge_kutta.BREAK_AWAY_TIME_TOLERANCE
-REST_SPEED_SHARE = runge_kutta.REST_SPEED_SHARE
+MAX_EVENTS_PER_STEP = 256
+"""Maximum number of events in one step of one element; further events are ignored."""
+FRICTION_NONLINEARITY_TOLERANCE = 6.0 * 0.05
+"""Tolerance of six times the nonlinearity (7) of dry friction.
+
+It is a fraction of the largest friction so far: the tail of a Stribeck peak, almost zero at speed,
+is strongly nonlinear in relation to itself.
+"""
+FORCE_NONLINEARITY_TOLERANCE = (6.0 * 0.005) ** 2
+"""Tolerance of the square of six times the nonlinearity (7) of the acceleration.
+
+It is a fraction of the square of the largest acceleration so far.
+"""
+NEGLIGIBLE_ACCELERATION_SHARE = 1e-5
+"""Fraction of the largest acceleration so far below which friction is negligible.
+
+Nonlinearity of negligible friction does not shorten a step.
+"""
+STEP_REDUCTION_FACTOR = 0.25
+"""Reduction factor of the length of a step in which forces are too nonlinear."""
+MIN_STEP_SHARE = 1.0 / 256.0
+"""Fraction of a full step below which steps are not shortened."""
+BREAK_AWAY_TIME_TOLERANCE = 1e-4
+"""Time tolerance of break-away, as a fraction of a step."""
+REST_SPEED_SHARE = 1e-9
+"""Fraction of the speed change in a full step below which a stopped element is at rest."""
 
 
 def dot(a: FloatArray, one: int, other: int, d: int, i: int) -> float:
@@ -107,7 +143,9 @@ def compute_norm(a: FloatArray, one: int, d: int, i: int) -> float:
 
 
 def find_event_time(value: float, rate: float, later: float, h: float) -> float:
-    """Return the seconds to the last root of a parabola; see `sims.engines.batch.event_roots`.
+    """Return the seconds to the last root of the interpolating parabola.
+
+    The error is of third order in h; it is corrected when the root is reached.
 
     Args:
         value: value >= 0 at the beginning.
@@ -115,9 +153,11 @@ def find_event_time(value: float, rate: float, later: float, h: float) -> float:
         later: value < 0 after h seconds.
         h: step size in seconds.
     """
-    bend = (value + h * rate - later) / (h * h)
+    bend = (value + h * rate - later) / (h * h)  # (8)
     turn = np.sqrt(rate * rate + 4.0 * bend * value)
+    # (9): the form that adds numbers of equal sign is used.
     seconds = 2.0 * value / (turn - rate) if rate < 0.0 else (turn + rate) / (2.0 * bend)
+    # Without a root, which only rounding can cause, the event is at the end of the step.
     return float(seconds if abs(seconds) < np.inf else h)
 
 
@@ -289,7 +329,7 @@ def handle_impact(
     late = 0.0
     if rate < 0.0:
         late = (floor - a[high, i]) / rate
-        late *= 1.0 - 0.5 * late * pull / rate  # (8)
+        late *= 1.0 - 0.5 * late * pull / rate  # (10)
     late = shift_time(block, i, late)
     for j in range(d):
         acceleration = a[k + j, i]
@@ -326,9 +366,8 @@ def compute_rebound_velocity(
     lane = block.n[LANE, i]
     up = V + d - 1
     speed = abs(a[up, i])
-    # The program runs on all slots although only this one has an impact; the results of the others
-    # are not used.
-    width = r.shape[1]
+    # The program runs on all slots up to this one; the results of the others are not used.
+    width = i + 1
     for s in range(width):
         r[rows[IN_E], s] = work.ground[RESTITUTION, lane]
         r[rows[IN_MU], s] = work.ground[RUBBING, lane]

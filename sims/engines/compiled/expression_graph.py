@@ -21,6 +21,11 @@ OPERATIONS: tuple[str, ...] = (
 )
 """Operations in the order of their codes; all except `where` are NumPy functions of that name."""
 OPERATION_CODES = {name: code for code, name in enumerate(OPERATIONS)}
+EXTERNAL = len(OPERATIONS)
+"""Code of the instruction that calls a function of Python.
+
+Its last two arguments are the part of the program and the address of the function.
+"""
 
 CONSTANT, LANE, MOMENT, IMPACT = range(4)
 """Change frequency of a value: never, per batch element, per evaluation, or per impact."""

@@ -8,21 +8,21 @@ contact parameters with effects, computed at impacts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from sims.core.system import Contact, Effect, Force, Friction, StateSnapshot, System
 from sims.engines.compiled.data_layout import (
     BLOCK_WIDTH,
-    DRY,
-    GUIDED,
-    MAX_COORDINATES,
     BlockBuffers,
     FloatArray,
+    InputNames,
     IntTable,
     ProgramArrays,
     allocate_block,
+    make_flags,
 )
 from sims.engines.compiled.expression_graph import (
     IMPACT,
@@ -33,6 +33,7 @@ from sims.engines.compiled.expression_graph import (
     ExpressionNode,
 )
 from sims.engines.compiled.node_arrays import NotTraceableError, make_constant_nodes
+from sims.engines.compiled.numpy_forces import NUMPY_BLOCK_WIDTH, NumpyForces, lay_out_registers
 from sims.engines.compiled.traced_array import TracedArray
 
 MAX_REGISTERS = 4000
@@ -41,47 +42,69 @@ MAX_CACHED_PROGRAMS = 2000
 """Maximum number of cached programs of a system."""
 
 
-class CompiledModel(NamedTuple):
-    """Program with its constants.
+class PreparedProgram(NamedTuple):
+    """Program with buffers in which its constants are set.
 
     Attributes:
-        program: instructions and layout.
-        constants: (C, WIDTH) values of the registers from `first` on.
+        arrays: instructions and layout.
+        block: buffers of the slots.
+        numpy_forces: functions that the instructions call; None for traced programs.
+    """
+
+    arrays: ProgramArrays
+    block: BlockBuffers
+    numpy_forces: NumpyForces | None = None
+
+    def raise_error(self) -> None:
+        """Raise the exception of an array function that the instructions have called."""
+        if self.numpy_forces is not None and self.numpy_forces.error is not None:
+            raise self.numpy_forces.error
+
+
+@dataclass(frozen=True)
+class ForceProgram:
+    """Traced force program.
+
+    Attributes:
+        arrays: instructions and layout.
+        constants: (C,) values of the registers from `first` on.
         first: first register of the constants.
         registers: number of registers.
     """
 
-    program: ProgramArrays
+    arrays: ProgramArrays
     constants: FloatArray
     first: int
     registers: int
+    block_width: ClassVar[int] = BLOCK_WIDTH
 
-    @property
-    def has_no_events(self) -> bool:
-        """Whether no event can occur within a step."""
-        return not self.program.flags[DRY:GUIDED].any()
-
-    def allocate_buffers(self) -> BlockBuffers:
-        """Allocate buffers in which the constants are set."""
-        block = allocate_block(self.registers)
-        block.r[self.first : self.first + len(self.constants)] = self.constants
-        return block
+    def prepare(self, width: int) -> PreparedProgram:
+        """Allocate buffers of `width` slots."""
+        block = allocate_block(self.registers, width)
+        block.r[self.first : self.first + len(self.constants)] = self.constants[:, None]
+        return PreparedProgram(self.arrays, block)
 
 
-class InputNames(NamedTuple):
-    """Input names and sizes of batch elements, in the order of the parameters.
+class NumpyForceProgram:
+    """Force program of a system and effects that cannot be traced; see `numpy_forces`.
 
-    Attributes:
-        constants: names of the constants.
-        inputs: names of the inputs.
-        parameters: number of the system's parameters.
-        coordinates: number of coordinates.
+    Args:
+        system: system whose forces are evaluated.
+        names: input names and sizes.
+        effects: effects that act.
     """
 
-    constants: tuple[str, ...]
-    inputs: tuple[str, ...]
-    parameters: int
-    coordinates: int
+    block_width: ClassVar[int] = NUMPY_BLOCK_WIDTH
+
+    def __init__(self, system: System, names: InputNames, effects: Sequence[Effect]) -> None:
+        self.arrays, self._registers = lay_out_registers(system, names, effects)
+        self._source = system, names, effects
+
+    def prepare(self, width: int) -> PreparedProgram:
+        """Allocate buffers of `width` slots, and instructions that read and write them."""
+        block = allocate_block(self._registers, width)
+        forces = NumpyForces(*self._source, self.arrays.rows, self.arrays.out, block.r)
+        return PreparedProgram(self.arrays._replace(code=forces.code), block, forces)
 
 
 class EffectProgram(NamedTuple):
@@ -110,13 +133,10 @@ class SystemTracer:
     """
 
     def __init__(self, system: System, names: InputNames) -> None:
-        if not 1 <= names.coordinates <= MAX_COORDINATES:
-            raise NotTraceableError(f"it has {names.coordinates} coordinates")
         graph = ExpressionGraph()
         self.graph = graph
-        self.bounces = system.bounces
-        self.bends = system.bends
-        self.guided = system.guided or names.coordinates
+        self._system = system
+        self._names = names
         self.t = make_input_vector(graph, 1, MOMENT)
         self.x = make_input_vector(graph, names.coordinates, MOMENT)
         self.v = make_input_vector(graph, names.coordinates, MOMENT)
@@ -136,20 +156,20 @@ class SystemTracer:
         self._shape = 1, names.coordinates
         self._force = self._shaped(system.force(self._moment), self._shape)
         self._pieces: dict[type[Effect], EffectProgram] = {}
-        self._models: dict[tuple[type[Effect], ...], CompiledModel] = {}
+        self._programs: dict[tuple[type[Effect], ...], ForceProgram] = {}
 
-    def build_model(self, effects: Sequence[Effect]) -> CompiledModel:
+    def build_program(self, effects: Sequence[Effect]) -> ForceProgram:
         """Return the program of the system with these effects.
 
         Raises:
             NotTraceableError: an effect cannot be traced.
         """
         key = tuple(map(type, effects))
-        if key not in self._models:
-            if len(self._models) == MAX_CACHED_PROGRAMS:
-                self._models.clear()
-            self._models[key] = _model(self._composed(effects))
-        return self._models[key]
+        if key not in self._programs:
+            if len(self._programs) == MAX_CACHED_PROGRAMS:
+                self._programs.clear()
+            self._programs[key] = _write_program(self._composed(effects))
+        return self._programs[key]
 
     def trace_effect(self, effect: Effect) -> EffectProgram:
         """Return the traced effect.
@@ -185,26 +205,17 @@ class SystemTracer:
             if isinstance(effect, Contact):
                 e = self._shaped(effect.restitution(c, e, self.speed), (1, 1))
                 mu = self._shaped(mu + effect.friction(c), (1, 1))
-        has = [any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)]
         return _Composed(
             inputs=[
-                *(
-                    collect_nodes(self.t),
-                    collect_nodes(self.x),
-                    collect_nodes(self.v),
-                    collect_nodes(*self.u.values()),
-                ),
-                *(
-                    parameters,
-                    collect_nodes(self.e),
-                    collect_nodes(self.mu),
-                    collect_nodes(self.speed),
-                ),
+                *map(collect_nodes, (self.t, self.x, self.v)),
+                collect_nodes(*self.u.values()),
+                parameters,
+                *map(collect_nodes, (self.e, self.mu, self.speed)),
             ],
             force=collect_nodes(force),
             limit=[] if limit is None else collect_nodes(limit),
             impact=collect_nodes(e, mu),
-            flags=[self._shape[1], has[0], has[1] or self.bends, self.bounces, self.guided],
+            flags=make_flags(self._system, self._names, effects),
         )
 
     def _shaped(self, values: Any, shape: tuple[int, int]) -> TracedArray:
@@ -221,24 +232,23 @@ class _Composed(NamedTuple):
     force: list[ExpressionNode]
     limit: list[ExpressionNode]
     impact: list[ExpressionNode]
-    flags: list[int]
+    flags: IntTable
 
 
-def _model(composed: _Composed) -> CompiledModel:
+def _write_program(composed: _Composed) -> ForceProgram:
     """Return the composed expressions as a program."""
     outputs = [*composed.force, *composed.limit, *composed.impact]
     written = emit_instructions(composed.inputs, outputs)
     limit = written.place[composed.limit[0]] if composed.limit else -1
     rows = [*written.rows, limit, *(written.place[node] for node in composed.impact)]
-    program = ProgramArrays(
+    arrays = ProgramArrays(
         code=written.code,
         ends=written.ends,
         rows=np.array(rows, dtype=np.int64),
         out=np.array([written.place[node] for node in composed.force], dtype=np.int64),
-        flags=np.array(composed.flags, dtype=np.int64),
+        flags=composed.flags,
     )
-    constants = np.repeat(written.values[:, None], BLOCK_WIDTH, axis=1)
-    return CompiledModel(program, constants, written.first, len(written.place))
+    return ForceProgram(arrays, written.values, written.first, len(written.place))
 
 
 class InstructionList(NamedTuple):

@@ -1,7 +1,8 @@
 """Vector interpreter of force programs: each instruction is one loop over the slots of a block.
 
-The code is plain Python that the compiler accepts unchanged (`sims.engines.compiled.kernel_build`);
-without compilation it gives the same results, but slowly. A register is a row, a slot a column.
+The functions are compiled once for all programs (`sims.engines.compiled.kernel_build`). A register
+is a row, a slot a column. Forces that cannot be written as instructions are evaluated by a function
+of Python, which an instruction calls by its address (`sims.engines.compiled.numpy_forces`).
 Sine, cosine and exponential are computed in the same way for every element, with the argument
 reductions and coefficients of fdlibm (Sun Microsystems, 1993): x = k pi/2 + r with |r| <= pi/4, and
 x = k ln 2 + r with |r| <= ln 2 / 2,
@@ -12,10 +13,18 @@ x = k ln 2 + r with |r| <= ln 2 / 2,
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sims.engines.compiled.data_layout import FloatArray, IntTable
-from sims.engines.compiled.expression_graph import OPERATION_CODES
+from sims.engines.compiled.expression_graph import EXTERNAL, OPERATION_CODES
+
+if TYPE_CHECKING:
+
+    def call_external(address: int, part: int, w: int) -> None:
+        """Call the C function at an address with two integers; the compiler inserts the call."""
+
 
 ROUNDING_OFFSET = 6755399441055744.0
 """Number whose addition and subtraction rounds to the nearest integer: 1.5 * 2^52."""
@@ -212,6 +221,8 @@ def run_instructions(code: IntTable, first: int, last: int, r: FloatArray, w: in
             evaluate_sine(r, o, a, w, 1.0)
         elif op == EXP:
             evaluate_exponential(r, o, a, w)
+        elif op == EXTERNAL:
+            call_external(c, b, w)
         else:
             run_rare_instruction(op, r, o, a, b, w)
 

@@ -1,16 +1,14 @@
 """Compiled kernel of the batch engine: loaded from the user's cache, or compiled once.
 
-numba translates the functions (`build`), which takes 20 s. LLVM's machine code is stored
-(`code_cache`)
-and loaded with llvmlite alone (`llvm_code`), in a few hundredths of a second and without numba.
+numba translates the functions (`kernel_build`), which takes 20 s. The machine code is stored
+(`code_cache`) and loaded with llvmlite alone (`llvm_code`), in a few hundredths of a second and
+without numba.
 """
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
-import importlib.util
-import inspect
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -19,6 +17,7 @@ from threading import Lock
 
 import numpy as np
 
+from sims.core.simulator import InputError
 from sims.engines.compiled import code_cache, kernel_entry, llvm_code
 from sims.engines.compiled.data_layout import (
     Array,
@@ -28,23 +27,16 @@ from sims.engines.compiled.data_layout import (
     IntTable,
     ProgramArrays,
     check_array_layout,
+    uses_registers,
 )
 
 KERNEL_SOURCE_MODULES = (
-    *(
-        "element_stepping",
-        "kernel_build",
-        "element_clock",
-        "dynamics",
-        "kernel_entry",
-        "interpreter",
-    ),
-    *("events", "expression_graph", "data_layout", "lockstep_stepping", "llvm_code", "step_size"),
+    *("ballistic_motion", "data_layout", "dynamics", "element_clock", "element_stepping", "events"),
+    *("expression_graph", "interpreter", "kernel_build", "kernel_entry", "llvm_code"),
+    *("lockstep_stepping", "step_size"),
 )
 """Modules of this package on which the compiled code depends."""
-ENGINE_SOURCE_FILES = ("batch/runge_kutta.py", "batch/step_size.py", "ground_contact.py")
-"""Files of `sims/engines` on which the compiled code depends."""
-_SECONDS = 20
+_COMPILE_SECONDS = 20
 """Approximate compilation time in seconds."""
 _lock = Lock()
 
@@ -74,33 +66,21 @@ class CompiledKernel:
             turn: maximum phase of an oscillation per step in radians.
             parts: (L,) numbers of parts, updated in place.
         """
-        self._call(0, program, work, block, w, spans, turn, parts)
+        self._call(kernel_entry.CHOOSE_STEP_DIVISIONS, program, work, block, w, spans, turn, parts)
 
-    def step_block(
-        self, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int
+    def integrate(
+        self, function: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int
     ) -> None:
-        """Step all elements, each with its own clock; see `sims.engines.compiled.element_stepping`.
+        """Integrate all elements with one of the functions of `kernel_entry`.
 
         Args:
+            function: `STEP_BLOCK`, `STEP_IN_LOCKSTEP` or `FLY_ELEMENTS`.
             program: program of the system and its effects.
             work: batch of elements.
             block: buffers of the slots.
             w: number of slots in use.
         """
-        self._call(1, program, work, block, w, work.mass, 1.0, work.mass)
-
-    def step_in_lockstep(
-        self, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int
-    ) -> None:
-        """Step all elements in lockstep; see `sims.engines.compiled.lockstep_stepping`.
-
-        Args:
-            program: program of the system and its effects.
-            work: batch of elements.
-            block: buffers of the slots.
-            w: number of slots in use.
-        """
-        self._call(2, program, work, block, w, work.mass, 1.0, work.mass)
+        self._call(function, program, work, block, w, work.mass, 1.0, work.mass)
 
     def make_instruction_runner(
         self, code: IntTable, first: int, last: int, r: FloatArray
@@ -121,50 +101,47 @@ class CompiledKernel:
         """
         whole = code.flags.c_contiguous and code.dtype == np.int64 and code.shape[1:] == (5,)
         real = r.flags.c_contiguous and r.dtype == np.float64 and r.ndim == 2
-        inside = 0 <= first <= last <= len(code) and code[:, 1:].max(initial=0) < len(r)
-        if not (whole and real and inside and code.min(initial=0) >= 0):
+        if not (
+            whole and real and 0 <= first <= last <= len(code) and uses_registers(code, len(r))
+        ):
             raise ValueError("the instructions are not for these registers")
-        sizes = [3, first, last, 1, len(code), *[0] * 6, *r.shape]
-        keep = (ctypes.c_int64 * kernel_entry.SIZE_ARGUMENT_COUNT)(*sizes), code, r
-        addresses: list[int | None] = [None] * (kernel_entry.ARRAY_ARGUMENT_COUNT + 1)
-        addresses[0] = ctypes.addressof(keep[0])
-        addresses[_CODE], addresses[_REGISTERS] = _address(code), _address(r)
-        pointers = [ctypes.c_void_p(address) for address in addresses]
+        arguments = np.zeros(kernel_entry.ARGUMENT_COUNT, dtype=np.int64)
+        arguments[:5] = kernel_entry.RUN_INSTRUCTIONS, first, last, 1, len(code)
+        arguments[11:14] = len(r), r.shape[1], r.shape[1]
+        arguments[kernel_entry.SIZE_COUNT] = _address(code)
+        arguments[kernel_entry.SIZE_COUNT + kernel_entry.INT_ARRAY_COUNT] = _address(r)
+        owners = arguments, code, r
+        function = self._function
+        pointer = ctypes.c_void_p(_address(arguments))
 
         def run() -> None:
-            assert keep  # the owners of the memory at the pointers
-            self._function(*pointers)
+            assert owners  # keeps the memory at the addresses
+            function(pointer)
 
         return run
 
     def _call(
-        self, what: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int,
+        self, function: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int,
         spans: FloatArray, turn: float, parts: FloatArray,
     ) -> None:  # fmt: skip
         # The compiled code does not check array bounds.
         check_array_layout(program, work, block, w, spans, parts)
         lanes, dimensions = work.x.shape
         chosen, columns = work.parameters.shape
-        rows = work.inputs.shape[:2]
-        sizes = [what, lanes, chosen, dimensions, len(program.code), columns, *work.steps.shape]
-        sizes += [*rows, work.every, len(block.r), w]
-        arrays = [
-            *program,
-            *(work.order, block.n, work.parameters, work.mass, work.x, work.v, work.steps),
+        sizes = [function, lanes, chosen, dimensions, len(program.code), columns, *work.steps.shape]
+        sizes += [*work.inputs.shape[:2], work.every, len(block.r), w, block.r.shape[1]]
+        limits = np.array([work.patience, turn])
+        ints = [*program, work.order, block.n]
+        reals = [
+            *(block.r, block.a, work.parameters, work.mass, work.x, work.v, work.steps),
             *(work.inputs, work.longest, work.planned, work.ground, work.kept),
-            *(block.r, block.a, spans, parts),
+            *(spans, parts, limits),
         ]
-        reals = (ctypes.c_double * 2)(work.patience, turn)
-        self._function(
-            ctypes.byref((ctypes.c_int64 * kernel_entry.SIZE_ARGUMENT_COUNT)(*sizes)),
-            ctypes.byref(reals),
-            *map(_address, arrays),
-        )
+        arguments = np.array([*sizes, *map(_address, ints), *map(_address, reals)], dtype=np.int64)
+        self._function(_address(arguments))
 
 
 _NullArray = ctypes.c_char * 0
-_names = list(inspect.signature(kernel_entry.kernel_entry).parameters)
-_CODE, _REGISTERS = _names.index("code_at"), _names.index("r_at")
 
 
 def _address(array: Array) -> int:
@@ -174,58 +151,62 @@ def _address(array: Array) -> int:
     return int(array.ctypes.data)
 
 
-def get_kernel() -> CompiledKernel | None:
+def get_kernel() -> CompiledKernel:
     """Return the compiled kernel, compiled on first use.
 
-    Returns:
-        The kernel; None without a compiler or a folder for the cache.
+    Raises:
+        InputError: the compiler or its machine code cannot be used.
     """
     with _lock:
-        return _machine()
+        return _load_kernel()
 
 
 @cache
-def _machine() -> CompiledKernel | None:
-    if code_cache.is_compilation_disabled() or importlib.util.find_spec("llvmlite") is None:
-        return None
-    # The engine also works without the compiler, so any error of a compiler that does not match
-    # this Python or its NumPy is only reported.
+def _load_kernel() -> CompiledKernel:
     try:
-        data = _data()
-        if data is None:
-            return None
-        return CompiledKernel(
-            llvm_code.load_machine_code(
-                llvm_code.MachineCode.unpack(data), kernel_entry.ARRAY_ARGUMENT_COUNT + 1
-            )
-        )
-    except Exception as reason:
-        text = str(reason) or type(reason).__name__
-        _say(f"the batch engine is not compiled, and slower: {text.splitlines()[0]}")
-        return None
+        code = llvm_code.MachineCode.unpack(_get_machine_code())
+        return CompiledKernel(llvm_code.load_machine_code(code))
+    # A compiler that does not match this Python or its NumPy may raise any error.
+    except Exception as error:
+        text = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(
+            f"the batch engine cannot be compiled: {text}; expected working versions of numba and"
+            " llvmlite: install simgap again with the versions of requirements.lock"
+        ) from error
 
 
-def _data() -> bytes | None:
-    """Return the cached code, compiled if necessary; None without numba, which compiles it."""
-    path = code_cache.get_cache_folder() / f"stepping-{_key()}.bin"
+def _get_machine_code() -> bytes:
+    """Return the machine code: from the cache, or compiled."""
+    folder = code_cache.get_cache_folder()
+    path = folder / f"stepping-{_key()}.bin"
     data = code_cache.read_cached(path)
-    if data is None and importlib.util.find_spec("numba") is not None:
-        data = code_cache.make_cached(path, _build_or_load, _wait)
-    return data
+    if data is not None:
+        return data
+    try:
+        return code_cache.make_cached(path, _build, _report_wait)
+    except OSError as error:
+        _report(
+            f"machine code cannot be stored in {folder} ({error.strerror or error}), so each"
+            " process compiles it; set SIMGAP_COMPILED to a folder that can be written"
+        )
+        return _build()
 
 
-def _build_or_load() -> bytes:
-    _say(f"compiling the batch engine, once after an install: about {_SECONDS} s")
+def _build() -> bytes:
+    _report(f"compiling the batch engine, once after an install: about {_COMPILE_SECONDS} s")
     from sims.engines.compiled.kernel_build import build_kernel
 
     return build_kernel()
 
 
-def _wait() -> None:
-    _say(f"another process compiles the batch engine, once after an install: {_SECONDS} s at most")
+def _report_wait() -> None:
+    _report(
+        "another process compiles the batch engine, once after an install:"
+        f" {_COMPILE_SECONDS} s at most"
+    )
 
 
-def _say(text: str) -> None:
+def _report(text: str) -> None:
     """Write one line to the standard error output."""
     sys.stderr.write(f"simgap: {text}\n")
     sys.stderr.flush()
@@ -243,6 +224,5 @@ def _key() -> str:
 def list_source_files() -> list[Path]:
     """Return the source files from which the code is compiled."""
     here = Path(__file__).parent
-    return [here / f"{name}.py" for name in KERNEL_SOURCE_MODULES] + [
-        here.parent / name for name in ENGINE_SOURCE_FILES
-    ]
+    files = [here / f"{name}.py" for name in KERNEL_SOURCE_MODULES]
+    return [*files, here.parent / "ground_contact.py"]

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sims.engines.compiled import (
+    ballistic_motion,
     data_layout,
     dynamics,
     element_clock,
@@ -36,6 +37,7 @@ KERNEL_MODULES: tuple[ModuleType, ...] = (
     dynamics,
     element_stepping,
     lockstep_stepping,
+    ballistic_motion,
     step_size,
 )
 """Modules that contain the compiled functions."""
@@ -96,6 +98,7 @@ def emit_llvm() -> tuple[str, str]:
     space: dict[str, Any] = {}
     for module in (*KERNEL_MODULES, kernel_entry):
         space.update({k: v for k, v in vars(module).items() if not k.startswith("__")})
+    space.update(_make_intrinsics(numba))
     functions = {
         name: thing
         for module in KERNEL_MODULES
@@ -120,12 +123,40 @@ def emit_llvm() -> tuple[str, str]:
         made.disable_compile()
         space[name] = made
     space["carray"] = numba.carray
-    whole = types.CPointer(types.int64)
-    real = types.CPointer(types.float64)
-    pointers = [whole, real, *[whole] * 7, *[real] * (kernel_entry.ARRAY_ARGUMENT_COUNT - 8)]
     bound = FunctionType(kernel_entry.kernel_entry.__code__, space, "integrate")
-    made = numba.cfunc(types.void(*pointers), error_model="numpy")(bound)
+    made = numba.cfunc(types.void(types.CPointer(types.int64)), error_model="numpy")(bound)
     return made.inspect_llvm(), made.native_name
+
+
+def _make_intrinsics(numba: Any) -> dict[str, Any]:
+    """Return functions that numba itself does not have: addresses as pointers and functions."""
+    from llvmlite import ir
+
+    types = numba.types
+    word = ir.IntType(64)
+
+    def make_pointer_function(kind: Any, target: Any) -> Any:
+        def to_pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
+            def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+                return builder.inttoptr(values[0], target.as_pointer())
+
+            return types.CPointer(kind)(types.int64), generate
+
+        return numba.extending.intrinsic(to_pointer)
+
+    def call_external(context: Any, address: Any, part: Any, w: Any) -> Any:  # noqa: ARG001
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+            function = ir.FunctionType(ir.VoidType(), [word, word])
+            builder.call(builder.inttoptr(values[0], function.as_pointer()), values[1:])
+            return context.get_dummy_value()
+
+        return types.void(types.int64, types.int64, types.int64), generate
+
+    return {
+        "call_external": numba.extending.intrinsic(call_external),
+        "to_int_pointer": make_pointer_function(types.int64, word),
+        "to_real_pointer": make_pointer_function(types.float64, ir.DoubleType()),
+    }
 
 
 def _arguments(numba: Any) -> dict[str, Any]:

@@ -1,11 +1,11 @@
-"""Exported function of the kernel: it receives pointers and steps the elements."""
+"""Exported function of the kernel: it receives addresses and runs one of the kernel's functions."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from sims.engines.compiled.ballistic_motion import fly_elements
 from sims.engines.compiled.data_layout import (
-    BLOCK_WIDTH,
     ROWS,
     STATE_ROW_COUNT,
     BatchArrays,
@@ -22,91 +22,81 @@ if TYPE_CHECKING:
     def carray(pointer: Any, shape: Any) -> Any:
         """Return the array at a pointer; the compiler's own function."""
 
+    def to_real_pointer(address: int) -> Any:
+        """Return an address as a pointer to floating-point numbers; an intrinsic function."""
 
-SIZE_ARGUMENT_COUNT = 13
-"""Number of integers in the first argument of `kernel_entry`."""
-ARRAY_ARGUMENT_COUNT = 22
-"""Number of array pointers of `kernel_entry`, including that of the two floating-point numbers."""
+    def to_int_pointer(address: int) -> Any:
+        """Return an address as a pointer to integers; an intrinsic function."""
 
 
-def kernel_entry(
-    sizes_at: Any,
-    reals_at: Any,
-    code_at: Any,
-    ends_at: Any,
-    rows_at: Any,
-    out_at: Any,
-    flags_at: Any,
-    order_at: Any,
-    n_at: Any,
-    parameters_at: Any,
-    mass_at: Any,
-    x_at: Any,
-    v_at: Any,
-    steps_at: Any,
-    inputs_at: Any,
-    longest_at: Any,
-    planned_at: Any,
-    ground_at: Any,
-    kept_at: Any,
-    r_at: Any,
-    a_at: Any,
-    spans_at: Any,
-    parts_at: Any,
-) -> None:
-    """Run a function of the kernel with arrays given by their addresses.
+CHOOSE_STEP_DIVISIONS, STEP_BLOCK, STEP_IN_LOCKSTEP, FLY_ELEMENTS, RUN_INSTRUCTIONS = range(5)
+"""Functions of the kernel, by the first argument of `kernel_entry`."""
+SIZE_COUNT = 14
+"""Number of integers before the addresses in the argument of `kernel_entry`."""
+INT_ARRAY_COUNT = 7
+"""Number of arrays of integers, which are the first."""
+REAL_ARRAY_COUNT = 15
+"""Number of arrays of floating-point numbers."""
+ARGUMENT_COUNT = SIZE_COUNT + INT_ARRAY_COUNT + REAL_ARRAY_COUNT
+"""Number of integers in the argument of `kernel_entry`."""
 
-    The first integer selects the function: `choose_step_divisions` (0), `step_block` (1),
-    `step_in_lockstep` (2) or `run_instructions` (3).
+
+def kernel_entry(arguments_at: Any) -> None:
+    """Run a function of the kernel.
+
+    The argument is the address of `ARGUMENT_COUNT` integers: the function, sizes, and the addresses
+    of all arrays, in the order in which `sims.engines.compiled.kernel` writes them.
     """
-    sizes = carray(sizes_at, (SIZE_ARGUMENT_COUNT,))
-    if sizes[0] == 3:
-        code, r = carray(code_at, (sizes[4], 5)), carray(r_at, (sizes[11], sizes[12]))
-        run_instructions(code, sizes[1], sizes[2], r, sizes[12])
+    sizes = carray(arguments_at, (ARGUMENT_COUNT,))
+    ints = sizes[SIZE_COUNT:]
+    reals = sizes[SIZE_COUNT + INT_ARRAY_COUNT :]
+    code = carray(to_int_pointer(ints[0]), (sizes[4], 5))
+    width = sizes[13]
+    w = sizes[12]
+    r = carray(to_real_pointer(reals[0]), (sizes[11], width))
+    if sizes[0] == RUN_INSTRUCTIONS:
+        run_instructions(code, sizes[1], sizes[2], r, w)
         return
-    reals = carray(reals_at, (2,))
     lanes = sizes[1]
     chosen = sizes[2]
     d = sizes[3]
+    steps = sizes[7]
+    every = sizes[10]
+    limits = carray(to_real_pointer(reals[14]), (2,))
     program = ProgramArrays(
-        carray(code_at, (sizes[4], 5)),
-        carray(ends_at, (4,)),
-        carray(rows_at, (11,)),
-        carray(out_at, (d,)),
-        carray(flags_at, (5,)),
+        code,
+        carray(to_int_pointer(ints[1]), (4,)),
+        carray(to_int_pointer(ints[2]), (11,)),
+        carray(to_int_pointer(ints[3]), (d,)),
+        carray(to_int_pointer(ints[4]), (5,)),
     )
     work = BatchArrays(
-        carray(order_at, (chosen,)),
-        carray(parameters_at, (chosen, sizes[5])),
-        carray(mass_at, (lanes,)),
-        carray(x_at, (lanes, d)),
-        carray(v_at, (lanes, d)),
-        carray(steps_at, (sizes[6], sizes[7])),
-        carray(inputs_at, (sizes[8], sizes[9], sizes[7])),
-        carray(longest_at, (lanes,)),
-        carray(planned_at, (lanes,)),
-        carray(ground_at, (4, lanes)),
-        sizes[10],
-        reals[0],
-        carray(kept_at, (lanes, sizes[7] // sizes[10] + 1, 3 * d)),
+        carray(to_int_pointer(ints[5]), (chosen,)),
+        carray(to_real_pointer(reals[2]), (chosen, sizes[5])),
+        carray(to_real_pointer(reals[3]), (lanes,)),
+        carray(to_real_pointer(reals[4]), (lanes, d)),
+        carray(to_real_pointer(reals[5]), (lanes, d)),
+        carray(to_real_pointer(reals[6]), (sizes[6], steps)),
+        carray(to_real_pointer(reals[7]), (sizes[8], sizes[9], steps)),
+        carray(to_real_pointer(reals[8]), (lanes,)),
+        carray(to_real_pointer(reals[9]), (lanes,)),
+        carray(to_real_pointer(reals[10]), (4, lanes)),
+        every,
+        limits[0],
+        carray(to_real_pointer(reals[11]), (lanes, steps // every + 1, 3 * d)),
     )
     block = BlockBuffers(
-        carray(r_at, (sizes[11], BLOCK_WIDTH)),
-        carray(a_at, (ROWS, BLOCK_WIDTH)),
-        carray(n_at, (STATE_ROW_COUNT, BLOCK_WIDTH)),
+        r,
+        carray(to_real_pointer(reals[1]), (ROWS, width)),
+        carray(to_int_pointer(ints[6]), (STATE_ROW_COUNT, width)),
     )
-    w = sizes[12]
-    if sizes[0] == 0:
-        choose_step_divisions(
-            program,
-            work,
-            block,
-            w,
-            carray(spans_at, (lanes,)),
-            reals[1],
-            carray(parts_at, (lanes,)),
-        )
-    elif sizes[0] == 1:
+    if sizes[0] == CHOOSE_STEP_DIVISIONS:
+        spans = carray(to_real_pointer(reals[12]), (lanes,))
+        parts = carray(to_real_pointer(reals[13]), (lanes,))
+        choose_step_divisions(program, work, block, w, spans, limits[1], parts)
+    elif sizes[0] == STEP_BLOCK:
         step_block(program, work, block, w)
-    else:
+    elif sizes[0] == STEP_IN_LOCKSTEP:
         step_in_lockstep(program, work, block, w)
+    else:
+        fly_elements(program, work, block)

@@ -86,15 +86,14 @@ def compile_llvm(text: str, name: str) -> MachineCode:
     return MachineCode(name, needs, target.emit_object(module))
 
 
-def load_machine_code(code: MachineCode, pointers: int) -> Callable[..., None]:
+def load_machine_code(code: MachineCode) -> Callable[..., None]:
     """Load the machine code of a function.
 
     Args:
         code: machine code.
-        pointers: number of pointer arguments of the function.
 
     Returns:
-        The function.
+        The function of one pointer.
 
     Raises:
         CodeNotLoadableError: a required symbol is missing; LLVM itself would end the process.
@@ -111,8 +110,7 @@ def load_machine_code(code: MachineCode, pointers: int) -> Callable[..., None]:
     engine.add_object_file(llvm.ObjectFileRef.from_data(code.body))
     engine.finalize_object()
     _owners.append((engine, nowhere))
-    kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers)
-    return kind(engine.get_function_address(code.name))
+    return ctypes.CFUNCTYPE(None, ctypes.c_void_p)(engine.get_function_address(code.name))
 
 
 def _target(llvm: Any) -> Any:

@@ -250,7 +250,7 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
     """Compile effect forces; return None if an effect cannot be compiled."""
     run_by = get_kernel()
     groups = [[effect for effect, _ in group] for group in _groups(forces)]
-    if run_by is None or not any(groups):
+    if not any(groups):
         return None
     inputs = tuple(forces.felt)
     tracings = forces.system.traced

@@ -1,0 +1,114 @@
+"""Batch engine of the project: many simulations of a small system together, in machine code.
+
+The trajectory of each batch element depends on that element alone, bit for bit, and an effect that
+is inactive on an element changes nothing there. Elements on which only a constant force acts are
+integrated in closed form (`compiled.ballistic_motion`); the others are stepped
+(`compiled.element_stepping`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.core.simulator import InputError
+from sims.core.system import IntegrationBatch, System, Trajectories
+from sims.core.value_limits import is_plausible_number, truncate_text
+from sims.engines.compiled.batch_runner import integrate_batch
+from sims.engines.compiled.data_layout import MAX_COORDINATES
+from sims.engines.compiled.step_size import MAX_PHASE_PER_STEP
+
+REQUIRED_PACKAGES: tuple[str, ...] = ()
+DEFAULT_TIME_STEP = 5e-3
+"""Default longest step in seconds."""
+
+
+class BatchEngine:
+    """Engine that integrates batches of any system.
+
+    Args:
+        time_step: longest step in seconds; steps are shorter where the motion of an element is too
+            fast for it.
+        turn: maximum phase in radians of an oscillation per step; see `compiled.step_size`.
+        patience: maximum number of steps of an element, as a multiple of the planned ones; beyond
+            it, the element becomes NaN. It bounds the time of a search through forces that are
+            strongly nonlinear at every reversal. The default is no limit.
+        jobs: number of threads on which many elements are stepped; the results do not depend on it.
+
+    Raises:
+        InputError: a setting is not a positive number.
+    """
+
+    name = "batch"
+    requires = REQUIRED_PACKAGES
+
+    def __init__(
+        self,
+        time_step: float = DEFAULT_TIME_STEP,
+        turn: float = MAX_PHASE_PER_STEP,
+        patience: float = np.inf,
+        jobs: int = 1,
+    ) -> None:
+        if not (is_plausible_number(time_step) and time_step > 0):
+            raise InputError(
+                "engine batch: time_step must be a positive number of seconds, found"
+                f" {truncate_text(str(time_step))}"
+            )
+        for name, value in (("turn", turn), ("patience", patience)):
+            if value != np.inf and not (is_plausible_number(value) and value > 0):
+                raise InputError(
+                    f"engine batch: {name} must be a positive number, "
+                    f"found {truncate_text(str(value))}"
+                )
+        if not (isinstance(jobs, int) and jobs >= 1):
+            raise InputError(
+                f"engine batch: jobs must be a number of threads, found {truncate_text(str(jobs))}"
+            )
+        self.largest_step = float(time_step)
+        self._turn = float(turn)
+        self._patience = float(patience)
+        self._jobs = jobs
+
+    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+        """Integrate every element over its steps; an element that overflows is NaN throughout."""
+        trajectories = integrate_batch(lanes, self._turn, self._patience, self._jobs)
+        # Values that are not finite stay so; therefore the last state shows whether the whole run
+        # is.
+        is_finite = np.isfinite(trajectories.x[:, -1]) & np.isfinite(trajectories.v[:, -1])
+        failed = ~is_finite.all(axis=1)
+        if failed.any():
+            for values in (trajectories.x, trajectories.v, trajectories.a):
+                values[failed] = np.nan
+        return trajectories
+
+    def find_unsupported_reason(self, system: type[System]) -> str:
+        """Return why the engine cannot integrate a system; empty if it can."""
+        count = len(system.coordinates)
+        if count > MAX_COORDINATES:
+            return f"it has {count} coordinates, and the engine at most {MAX_COORDINATES}"
+        return ""
+
+    def close(self) -> None:
+        """Do nothing: the engine holds no resources."""
+
+
+def make_engine(
+    system: type[System],  # noqa: ARG001
+    *,
+    time_step: float = DEFAULT_TIME_STEP,
+    turn: float = MAX_PHASE_PER_STEP,
+    patience: float = np.inf,
+    jobs: int = 1,
+) -> BatchEngine:
+    """Make a new batch engine.
+
+    Args:
+        system: system that the engine will integrate.
+        time_step: longest step in seconds.
+        turn: maximum phase in radians of an oscillation per step.
+        patience: maximum number of steps of an element, as a multiple of the planned ones.
+        jobs: number of threads.
+
+    Returns:
+        The engine; see `BatchEngine`.
+    """
+    return BatchEngine(time_step, turn, patience, jobs)

@@ -1,0 +1,146 @@
+"""Closed-form motion under a constant force, with bounces, without steps.
+
+Between impacts every coordinate is a parabola. A time s after state x, v,
+
+    x(s) = x + v s + a s^2 / 2                                             (1)
+    v(s) = v + a s                                                         (2)
+
+and a ball at height H with upward speed u and downward acceleration g meets the ground after
+
+    s = (u + w) / g = 2 H / (w - u),    w = sqrt(u^2 + 2 g H)              (3)
+
+of which the first form has cancellation for u < 0 and the second for u > 0 (W. H. Press et al.,
+Numerical Recipes, 3rd edition, 2007, section 5.6). Elements are integrated one after the other, in
+the first slot of the block.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims.engines.compiled.data_layout import (
+    BOUNCES,
+    DIMENSIONS,
+    K1,
+    LANE,
+    LEVEL,
+    BatchArrays,
+    BlockBuffers,
+    ProgramArrays,
+    T,
+    V,
+    X,
+)
+from sims.engines.compiled.dynamics import compute_frictionless_acceleration, evaluate_forces
+from sims.engines.compiled.element_clock import load_element
+from sims.engines.compiled.element_stepping import resolve_initial_ground_contact
+from sims.engines.compiled.events import compute_rebound_velocity
+from sims.engines.compiled.interpreter import run_instructions
+
+
+def fly_elements(program: ProgramArrays, work: BatchArrays, block: BlockBuffers) -> None:
+    """Integrate elements on which only a constant force acts.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+    """
+    for place in range(work.order.size):
+        load_element(program, work, block, 0, place)
+        run_instructions(program.code, program.ends[0], program.ends[1], block.r, 1)
+        if program.flags[BOUNCES] != 0:
+            resolve_initial_ground_contact(program, work, block, 1)
+        evaluate_forces(program, block, 1)
+        compute_frictionless_acceleration(program, block, 1, K1)
+        record_flight(program, work, block)
+
+
+def record_flight(program: ProgramArrays, work: BatchArrays, block: BlockBuffers) -> None:
+    """Record the states of the element at all sample times.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+    """
+    lane = block.n[LANE, 0]
+    row = lane if work.steps.shape[0] > 1 else 0
+    time = 0.0
+    impact = compute_impact_time(program, block)
+    for step in range(work.steps.shape[1] + 1):
+        if step % work.every == 0:
+            while impact <= time:
+                bounce(program, work, block, impact)
+                impact = compute_impact_time(program, block)
+            record_arc(program, work, block, step // work.every, time)
+        if step < work.steps.shape[1]:
+            time += work.steps[row, step]
+
+
+def record_arc(
+    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, record: int, time: float
+) -> None:
+    """Record the state on the present parabola at a time.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        record: index of the record.
+        time: seconds since the start of the run.
+    """
+    a = block.a
+    d = program.flags[DIMENSIONS]
+    lane = block.n[LANE, 0]
+    s = time - a[T, 0]
+    for k in range(d):
+        v = a[V + k, 0]
+        acceleration = a[K1 + k, 0]
+        work.kept[lane, record, k] = a[X + k, 0] + s * (v + s * (0.5 * acceleration))  # (1)
+        work.kept[lane, record, d + k] = v + s * acceleration  # (2)
+        work.kept[lane, record, 2 * d + k] = acceleration
+
+
+def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
+    """Return the time of the next impact in seconds since the start; infinite if there is none.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+    """
+    if program.flags[BOUNCES] == 0:
+        return np.inf
+    a = block.a
+    last = program.flags[DIMENSIONS] - 1
+    height = a[X + last, 0] - a[LEVEL, 0]
+    up = a[V + last, 0]
+    down = -a[K1 + last, 0]
+    root = np.sqrt(up * up + 2.0 * down * height)  # NaN if it does not reach the ground
+    if up < 0.0:
+        seconds = 2.0 * height / (root - up)  # (3)
+    else:
+        seconds = (up + root) / down if down > 0.0 else np.inf
+    return float(np.inf if seconds != seconds else a[T, 0] + seconds)
+
+
+def bounce(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, impact: float) -> None:
+    """Move the element to its impact and begin the parabola after it.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        impact: time of the impact in seconds since the start of the run.
+    """
+    a = block.a
+    last = program.flags[DIMENSIONS] - 1
+    s = impact - a[T, 0]
+    for k in range(last + 1):
+        acceleration = a[K1 + k, 0]
+        a[X + k, 0] += s * (a[V + k, 0] + s * (0.5 * acceleration))  # (1)
+        a[V + k, 0] += s * acceleration  # (2)
+    a[T, 0] = impact
+    a[X + last, 0] = a[LEVEL, 0]  # removes the rounding of (1) and (3)
+    compute_rebound_velocity(program, work, block, 0, a[K1 + last, 0])
+    compute_frictionless_acceleration(program, block, 1, K1)

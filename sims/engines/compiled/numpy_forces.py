@@ -1,0 +1,175 @@
+"""Force programs of systems and effects that cannot be traced: NumPy evaluates their functions.
+
+The program has one instruction for each of its parts, which calls a function of Python. It reads
+the inputs from the registers of all slots, evaluates the array functions, and writes the results.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array
+from sims.core.system import Contact, Effect, Force, Friction, StateSnapshot, System
+from sims.engines.compiled.data_layout import (
+    IN_E,
+    IN_MU,
+    IN_P,
+    IN_SPEED,
+    IN_T,
+    IN_U,
+    IN_V,
+    IN_X,
+    OUT_E,
+    OUT_LIMIT,
+    OUT_MU,
+    InputNames,
+    IntTable,
+    ProgramArrays,
+    make_flags,
+)
+from sims.engines.compiled.expression_graph import EXTERNAL
+
+NUMPY_BLOCK_WIDTH = 1024
+"""Number of slots of a block: a call of NumPy costs more than its rows."""
+PART_COUNT = 3
+"""Number of parts of a program: per element, per evaluation, per impact."""
+_Callback = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
+
+
+class NumpyForces:
+    """Forces of a system and its effects, evaluated on registers by the array functions.
+
+    Attributes:
+        error: first exception of an array function; all later results are NaN.
+
+    Args:
+        system: system whose forces are evaluated.
+        names: input names and sizes.
+        effects: effects that act.
+        rows: registers of inputs and outputs; see `ProgramArrays`.
+        out: registers of the force.
+        r: (registers, W) registers.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        names: InputNames,
+        effects: Sequence[Effect],
+        rows: IntTable,
+        out: IntTable,
+        r: Array,
+    ) -> None:
+        self.error: BaseException | None = None
+        self._system = system
+        self._names = names
+        self._effects = effects
+        self._rows = rows
+        self._out = out
+        self._r = r
+        self._snapshots: dict[int, tuple[StateSnapshot, list[Array]]] = {}
+        self.callback = _Callback(self._evaluate)
+
+    @property
+    def code(self) -> IntTable:
+        """Instructions (3, 5) that call this object, one for each part of the program."""
+        address = ctypes.cast(self.callback, ctypes.c_void_p).value
+        return np.array(
+            [[EXTERNAL, 0, 0, part, address] for part in range(PART_COUNT)], dtype=np.int64
+        )
+
+    def _evaluate(self, part: int, width: int) -> None:
+        """Evaluate a part of the program for the first `width` slots."""
+        # An exception cannot pass through machine code; the caller raises it afterwards.
+        if self.error is None:
+            try:
+                with np.errstate(all="ignore"):
+                    if part == 1:
+                        self._evaluate_forces(width)
+                    elif part == PART_COUNT - 1:
+                        self._evaluate_impact(width)
+            except BaseException as error:
+                self.error = error
+        if self.error is not None:
+            self._r[self._out] = np.nan
+            self._r[self._rows[OUT_LIMIT:]] = np.nan
+
+    def _evaluate_forces(self, width: int) -> None:
+        moment, coefficients = self._view(width)
+        force = self._system.force(moment)
+        limit: Any = 0.0
+        for effect, c in zip(self._effects, coefficients, strict=True):
+            if isinstance(effect, Force):
+                force = force + effect.force(c, moment)
+            elif isinstance(effect, Friction):
+                limit = limit + effect.limit(c, moment)
+        self._r[self._out, :width] = force.T
+        self._r[self._rows[OUT_LIMIT], :width] = np.broadcast_to(limit, (width, 1))[:, 0]
+
+    def _evaluate_impact(self, width: int) -> None:
+        _, coefficients = self._view(width)
+        e, mu, speed = (self._read(row, 1, width) for row in (IN_E, IN_MU, IN_SPEED))
+        for effect, c in zip(self._effects, coefficients, strict=True):
+            if isinstance(effect, Contact):
+                e = effect.restitution(c, e, speed)
+                mu = mu + effect.friction(c)
+        self._r[self._rows[OUT_E], :width] = e[:, 0]
+        self._r[self._rows[OUT_MU], :width] = mu[:, 0]
+
+    def _view(self, width: int) -> tuple[StateSnapshot, list[Array]]:
+        """Return snapshot and coefficients (K, W, 1) as views of the registers."""
+        if width not in self._snapshots:
+            names = self._names
+            first = int(self._rows[IN_P])
+            parameters = [names.parameters, *(1 for _ in names.constants)]
+            parameters += [len(effect.coefficients) for effect in self._effects]
+            parts = np.split(
+                self._r[first : first + sum(parameters), :width], np.cumsum(parameters)[:-1]
+            )
+            theta, *columns = (part.T for part in parts)
+            constants = dict(zip(names.constants, columns, strict=False))
+            coefficients = [part[:, :, None] for part in parts[1 + len(names.constants) :]]
+            t, x, v = (
+                self._read(row, count, width)
+                for row, count in ((IN_T, 1), (IN_X, names.coordinates), (IN_V, names.coordinates))
+            )
+            u = self._read(IN_U, len(names.inputs), width)
+            inputs = {name: u[:, k, None] for k, name in enumerate(names.inputs)}
+            moment = StateSnapshot(self._system, theta, constants, t, x, v, inputs)
+            self._snapshots[width] = moment, coefficients
+        return self._snapshots[width]
+
+    def _read(self, row: int, count: int, width: int) -> Array:
+        """Return a view (W, count) of input registers."""
+        first = self._rows[row]
+        values: Array = self._r[first : first + count, :width].T
+        return values
+
+
+def lay_out_registers(
+    system: System, names: InputNames, effects: Sequence[Effect]
+) -> tuple[ProgramArrays, int]:
+    """Return the arrays of a program without code, and its number of registers.
+
+    Args:
+        system: system whose forces are evaluated.
+        names: input names and sizes.
+        effects: effects that act.
+    """
+    parameters = names.parameters + len(names.constants)
+    parameters += sum(len(effect.coefficients) for effect in effects)
+    d = names.coordinates
+    sizes = [1, d, d, len(names.inputs), parameters, 1, 1, 1, 1, 1, 1, d]
+    ends = np.cumsum(sizes)
+    program = ProgramArrays(
+        code=np.zeros((PART_COUNT, 5), dtype=np.int64),
+        ends=np.arange(PART_COUNT + 1),
+        rows=np.array([0, *ends[:10]]),
+        out=np.arange(ends[10], ends[11]),
+        flags=make_flags(system, names, effects),
+    )
+    return program, int(ends[-1])
