@@ -230,15 +230,14 @@ def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
 def _started(
     code: TunerSpec, memory: int, hidden: tuple[str, ...], more: tuple[str, ...] = ()
 ) -> IsolatedProcess:
-    house = get_fork_server()
     own = code.module.startswith("bench.")
-    # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
-    house.preload_modules(
-        [PRELOAD_MODULE, *more, *code.modules, *([code.module] if own and not code.file else [])]
-    )
-    files = [code.file] if code.file else []
-    child = house.start_process(
-        "bench.diagnosis_benchmark.diagnoser_process:serve_requests", files, memory, hidden
+    child = get_fork_server().start_process(
+        "bench.diagnosis_benchmark.diagnoser_process:serve_requests",
+        [code.file] if code.file else [],
+        memory,
+        hidden,
+        # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
+        [PRELOAD_MODULE, *more, *code.modules, *([code.module] if own and not code.file else [])],
     )
     try:
         child.wait_until_ready()

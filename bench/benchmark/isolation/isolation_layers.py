@@ -11,7 +11,8 @@ import os
 import resource
 import site
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -100,17 +101,16 @@ def enter_namespaces() -> list[str]:
         Names of the active isolation layers.
     """
     user, group = os.geteuid(), os.getegid()
-    held = []
-    if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWUSER)) and _try_layer(
-        lambda: linux_syscalls.map_identity(user, group)
-    ):
-        held.append("memory")
+    active: list[str] = []
+    with _layer(active, "memory"):
+        linux_syscalls.unshare(linux_syscalls.CLONE_NEWUSER)
+        linux_syscalls.map_identity(user, group)
     # A superuser can enter these namespaces without a user namespace.
-    if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWNET)):
-        held.append("network")
-    if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWIPC)):
-        held.append("names")
-    return held
+    with _layer(active, "network"):
+        linux_syscalls.unshare(linux_syscalls.CLONE_NEWNET)
+    with _layer(active, "names"):
+        linux_syscalls.unshare(linux_syscalls.CLONE_NEWIPC)
+    return active
 
 
 def mount_empty_folder(folder: str) -> list[str]:
@@ -119,18 +119,18 @@ def mount_empty_folder(folder: str) -> list[str]:
     Returns:
         Names of the active isolation layers.
     """
-
-    def put() -> None:
-        _leave(linux_syscalls.CLONE_NEWNS)
+    active: list[str] = []
+    with _layer(active, "disk"):
+        linux_syscalls.unshare(linux_syscalls.CLONE_NEWNS)
         linux_syscalls.make_mounts_private()
         # This comes before the mount of its own writable folder. File times and permissions could
         # pass information to other runs.
-        _try_layer(linux_syscalls.make_mounts_read_only)
+        with _layer(active):
+            linux_syscalls.make_mounts_read_only()
         linux_syscalls.mount_filesystem(
             "tmpfs", folder, f"size={MAX_FOLDER_BYTES},nr_inodes=4096,mode=700"
         )
-
-    return ["disk"] if _try_layer(put) else []
+    return active
 
 
 def enter_process_namespace() -> list[str]:
@@ -139,55 +139,47 @@ def enter_process_namespace() -> list[str]:
     Returns:
         Names of the active isolation layers.
     """
-    return ["processes"] if _try_layer(lambda: _leave(linux_syscalls.CLONE_NEWPID)) else []
+    active: list[str] = []
+    with _layer(active, "processes"):
+        linux_syscalls.unshare(linux_syscalls.CLONE_NEWPID)
+    return active
 
 
-def lock_down(reach: AccessPolicy, own_user: bool) -> list[str]:
+def lock_down(policy: AccessPolicy, has_user_namespace: bool) -> list[str]:
     """Apply the remaining restrictions to this process permanently.
 
     Args:
-        reach: access policy.
-        own_user: True if the process has a user namespace.
+        policy: access policy.
+        has_user_namespace: True if the process has a user namespace.
 
     Returns:
         Names of the active isolation layers.
     """
-    held = []
+    active: list[str] = []
     # If its own /proc cannot be mounted, Landlock allows only this process's part of the old one.
-    _try_layer(lambda: linux_syscalls.mount_filesystem("proc", "/proc"))
-    os.chdir(reach.folder)
-    _set_resource_limits(own_user)
+    with _layer(active):
+        linux_syscalls.mount_filesystem("proc", "/proc")
+    os.chdir(policy.folder)
+    _set_resource_limits(has_user_namespace)
     # This comes before Landlock, which may deny this process access to its own /proc entries.
-    limit_memory(reach.memory)
+    limit_memory(policy.memory)
     # If memory is exhausted, the kernel kills the tuner first, and no other process.
-    _try_layer(lambda: _write("/proc/self/oom_score_adj", "1000"))
-    if _try_layer(
-        lambda: linux_syscalls.restrict_file_access(
-            reach.readable_paths, [reach.folder, *_DEVICE_PATHS]
-        )
-    ):
-        held.append("files")
-    _try_layer(seccomp_filter.drop_capabilities)
-    if _try_layer(lambda: seccomp_filter.install_syscall_filter(limited=reach.memory > 0)):
-        held += ["calls", "network"]
-    return held
+    with _layer(active):
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+    with _layer(active, "files"):
+        writable = [policy.folder, *_DEVICE_PATHS]
+        linux_syscalls.restrict_file_access(policy.readable_paths, writable)
+    with _layer(active, "calls", "network"):
+        seccomp_filter.install_syscall_filter(has_memory_limit=policy.memory > 0)
+    return active
 
 
-def _leave(flags: int) -> None:
-    linux_syscalls.unshare(flags)
-
-
-def _write(path: str, text: str) -> None:
-    Path(path).write_text(text, encoding="ascii")
-
-
-def _try_layer(seal: Callable[[], None]) -> bool:
-    """Return whether an isolation layer could be applied."""
-    try:
-        seal()
-    except (OSError, KeyError, AttributeError):
-        return False
-    return True
+@contextmanager
+def _layer(active: list[str], *names: str) -> Iterator[None]:
+    """Apply a restriction in the block; if the kernel permits it, add the names to `active`."""
+    with suppress(OSError, KeyError, AttributeError):
+        yield
+        active.extend(names)
 
 
 def _set_resource_limits(own_user: bool) -> None:

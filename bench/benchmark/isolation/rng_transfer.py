@@ -1,30 +1,32 @@
-"""Convert the state of a random generator to integers that can be sent through a pipe."""
+"""Convert the state of a random generator to bytes that can be sent through a pipe."""
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 
-def encode_rng_state(state: Any) -> NDArray[np.int64]:
-    """Return the state of a PCG64 generator as six integers."""
-    inner, mask = state["state"], (1 << 64) - 1
-    wide = [part for n in (inner["state"], inner["inc"]) for part in (n & mask, n >> 64)]
-    whole = np.array([*wide, state["has_uint32"], state["uinteger"]], dtype="<u8")
-    return whole.view(np.int64)
+def encode_rng_state(state: Any) -> NDArray[np.uint8]:
+    """Return the state of a PCG64 generator as JSON in an array of bytes."""
+    return np.frombuffer(json.dumps(state).encode(), dtype=np.uint8)
 
 
-def decode_rng_state(stream: NDArray[Any]) -> dict[str, Any]:
-    """Return the state of a PCG64 generator from the integers of `encode_rng_state`.
+def decode_rng_state(text: NDArray[Any]) -> dict[str, Any]:
+    """Return the state of a PCG64 generator from the result of `encode_rng_state`.
 
     Raises:
-        ValueError: the integers are not a valid state.
+        ValueError: the text is not a valid state.
     """
-    low, high, low_step, high_step, has, held = (int(n) & (1 << 64) - 1 for n in stream)
-    # With an even increment the stream may be constant, and rejection sampling would never end.
-    if has not in (0, 1) or held >> 32 or not low_step & 1:
-        raise ValueError("no state of a random stream")
-    inner = {"state": high << 64 | low, "inc": high_step << 64 | low_step}
-    return {"bit_generator": "PCG64", "state": inner, "has_uint32": has, "uinteger": held}
+    generator = np.random.PCG64()
+    try:
+        state = json.loads(text.tobytes())
+        generator.state = state
+        # With an even increment the stream may be constant, and rejection sampling would never end.
+        if generator.state == state and state["state"]["inc"] & 1:
+            return dict(state)
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
+        pass
+    raise ValueError("no state of a random stream")

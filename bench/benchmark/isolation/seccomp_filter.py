@@ -12,7 +12,8 @@ import os
 import platform
 import struct
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from bench.benchmark.isolation.linux_syscalls import (
     IS_LINUX,
@@ -66,32 +67,13 @@ one run to another. Landlock does not restrict any of them.
 """
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 """AUDIT_ARCH of each machine; calls with the numbers of another architecture are blocked."""
-_OPTIONAL_SYSCALLS = ("clone3", "io_uring_setup")
-"""Calls that libraries try first, and replace if the kernel reports that they do not exist."""
-_UNLIMITED_MEMORY_SYSCALLS = ("memfd_create", "memfd_secret")
-"""Calls that allocate memory which is not counted by a process's memory limit."""
-_ARGUMENT_FILTERED_SYSCALLS = (
-    "clone", "socketpair", "capset", "kill", "tgkill", "prctl", "prlimit64", "fcntl", "flock",
-    "mmap",
-)  # fmt: skip
-"""Calls that are allowed depending on their arguments, or that only the harness uses."""
-
-
-def drop_capabilities() -> None:
-    """Give up all capabilities of a superuser, including those in a namespace."""
-    version_3 = struct.pack("<Ii", 0x20080522, 0)
-    call_system(_NUMBERS[platform.machine()]["capset"], version_3, bytes(24))
-
-
-_LOAD, _AND, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x45, 0x06
-"""BPF instructions: load a word, AND, jump if equal, if at least, if a bit is set; return."""
 _ALLOW, _KILL, _FAIL = 0x7FFF0000, 0x80000000, 0x00050000
-"""Return values of a filter: allow, kill the process, fail the call.
+"""Verdicts of a filter: allow, kill the process, fail the call.
 
 The last one is combined with an error number; with 0 the call does nothing and succeeds.
 """
 _EPERM, _ENOMEM, _ENOSYS = _FAIL | 1, _FAIL | 12, _FAIL | 38
-"""Return values for the errors EPERM, ENOMEM and ENOSYS."""
+"""Verdicts for the errors EPERM, ENOMEM and ENOSYS."""
 _THREAD = 0x00010000
 """CLONE_THREAD: the new task is a thread of this process."""
 _STREAMS = tuple(1 | flags for flags in (0, 0x800, 0x80000, 0x80800))
@@ -107,115 +89,136 @@ _BLOCKED_FCNTL_COMMANDS = (8, 10, 15, 1024, 1026, 1036, 1038)
 
 F_SETOWN, F_SETSIG, F_SETOWN_EX, F_SETLEASE, F_NOTIFY and write hints of a file.
 """
-_FCNTL_RULES = {**dict.fromkeys(_LOCKS, _FAIL), **dict.fromkeys(_BLOCKED_FCNTL_COMMANDS, _EPERM)}
-"""Return values of the filter by fcntl command."""
 _SHARED_ANONYMOUS_MAP = 0x21
 """MAP_SHARED and MAP_ANONYMOUS: memory that is not counted by a process's memory limit."""
-_X32 = 0x40000000
-"""First call number of the x32 interface, which is not used."""
 
 
-def is_filter_supported() -> bool:
-    """Return whether `install_syscall_filter` supports this machine."""
-    return IS_LINUX and platform.machine() in _ARCHITECTURES and sys.byteorder == "little"
+class ArgumentRule(NamedTuple):
+    """Verdict on a call that depends on the lower half of one of its arguments.
+
+    Attributes:
+        argument: index of the argument, from 0.
+        verdicts: verdict by value of the argument.
+        otherwise: verdict for other values.
+        mask: bits of the argument that are compared.
+    """
+
+    argument: int
+    verdicts: Mapping[int, int]
+    otherwise: int
+    mask: int = 0xFFFFFFFF
 
 
-def install_syscall_filter(limited: bool = False) -> None:
-    """Install a filter that blocks new processes, signals to others, and the network.
-
-    Threads stay allowed.
+def list_rules(process: int, has_memory_limit: bool) -> dict[str, int | ArgumentRule]:
+    """Return the verdict or the rule for each system call that is not allowed in general.
 
     Args:
-        limited: True if the process has a memory limit; calls that allocate uncounted memory are
-            then blocked too.
+        process: process id of the process that is restricted.
+        has_memory_limit: True if calls that allocate uncounted memory are blocked too.
+    """
+    itself = ArgumentRule(0, {process: _ALLOW}, _EPERM)
+    rules: dict[str, int | ArgumentRule] = {
+        **dict.fromkeys(_NUMBERS["x86_64"], _EPERM),
+        # Libraries try these first, and use other calls if the kernel reports that they are absent.
+        **dict.fromkeys(("clone3", "io_uring_setup"), _ENOSYS),
+        "clone": ArgumentRule(0, {_THREAD: _ALLOW}, _EPERM, mask=_THREAD),
+        "kill": itself,
+        "tgkill": itself,
+        "prlimit64": ArgumentRule(0, {0: _ALLOW, process: _ALLOW}, _EPERM),
+        "prctl": ArgumentRule(0, {PR_SET_PDEATHSIG: _EPERM}, _ALLOW),
+        "socketpair": ArgumentRule(1, dict.fromkeys(_STREAMS, _ALLOW), _EPERM),
+        "fcntl": ArgumentRule(
+            1, {**dict.fromkeys(_LOCKS, _FAIL), **dict.fromkeys(_BLOCKED_FCNTL_COMMANDS, _EPERM)},
+            _ALLOW,
+        ),
+        "flock": _FAIL,
+        "capset": _ALLOW,  # capabilities can only be given up
+        **dict.fromkeys(("memfd_create", "memfd_secret", "mmap"), _ALLOW),
+    }  # fmt: skip
+    if has_memory_limit:
+        shared = {_SHARED_ANONYMOUS_MAP: _ENOMEM}
+        rules |= {
+            **dict.fromkeys(("memfd_create", "memfd_secret"), _ENOSYS),
+            "mmap": ArgumentRule(3, shared, _ALLOW, mask=_SHARED_ANONYMOUS_MAP),
+        }
+    return rules
+
+
+_LOAD, _AND, _EQUAL, _AT_LEAST, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x06
+"""BPF instructions: load a word, AND, jump if equal, jump if at least, return."""
+_ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
+"""AUDIT_ARCH of each machine; calls with the numbers of another architecture are blocked."""
+_X32 = 0x40000000
+"""First call number of the x32 interface, which is not used."""
+_NUMBER_OFFSET, _ARCHITECTURE_OFFSET, _ARGUMENTS_OFFSET = 0, 4, 16
+"""Positions of call number, architecture and arguments in the data of a filter, in bytes."""
+
+
+class BpfInstruction(NamedTuple):
+    """Instruction of a filter, with the numbers of instructions that a jump skips."""
+
+    opcode: int
+    operand: int
+    skip_if_true: int = 0
+    skip_if_false: int = 0
+
+
+def _when(opcode: int, operand: int, body: list[BpfInstruction]) -> list[BpfInstruction]:
+    """Return instructions that execute the body if a comparison with the operand holds."""
+    return [BpfInstruction(opcode, operand, skip_if_false=len(body)), *body]
+
+
+def _apply(rule: int | ArgumentRule) -> list[BpfInstruction]:
+    """Return instructions that end with the verdict of a rule."""
+    if isinstance(rule, int):
+        return [BpfInstruction(_RETURN, rule)]
+    return [
+        BpfInstruction(_LOAD, _ARGUMENTS_OFFSET + 8 * rule.argument),
+        BpfInstruction(_AND, rule.mask),
+        *(
+            instruction
+            for value, verdict in rule.verdicts.items()
+            for instruction in _when(_EQUAL, value, _apply(verdict))
+        ),
+        BpfInstruction(_RETURN, rule.otherwise),
+    ]
+
+
+def build_filter(machine: str, rules: Mapping[str, int | ArgumentRule]) -> list[BpfInstruction]:
+    """Build the filter program; calls without a rule are allowed.
+
+    Args:
+        machine: machine, as of `platform.machine`.
+        rules: verdict or rule by name of the call.
+    """
+    program = [BpfInstruction(_LOAD, _ARCHITECTURE_OFFSET)]
+    program += [BpfInstruction(_EQUAL, _ARCHITECTURES[machine], skip_if_true=1), *_apply(_KILL)]
+    program += [BpfInstruction(_LOAD, _NUMBER_OFFSET), *_when(_AT_LEAST, _X32, _apply(_ENOSYS))]
+    for name, number in _NUMBERS[machine].items():
+        program += _when(_EQUAL, number, _apply(rules[name]))
+    return [*program, *_apply(_ALLOW)]
+
+
+def install_syscall_filter(has_memory_limit: bool = False) -> None:
+    """Install a filter that blocks new processes, signals to others, and the network.
+
+    Threads stay allowed. All capabilities of a superuser are given up before.
+
+    Args:
+        has_memory_limit: True if the process has a memory limit; calls that allocate uncounted
+            memory are then blocked too.
 
     Raises:
         OSError: the kernel has no system call filters, or this machine is not supported.
     """
-    if not is_filter_supported():
-        raise OSError(f"no filter for {platform.machine()}")
     machine = platform.machine()
-    program = _build_filter(_ARCHITECTURES[machine], _NUMBERS[machine], os.getpid(), limited)
-    lines = ctypes.create_string_buffer(b"".join(struct.pack("<HBBI", *line) for line in program))
-    header = struct.pack("<HxxxxxxQ", len(program), ctypes.addressof(lines))
+    if not IS_LINUX or machine not in _ARCHITECTURES or sys.byteorder != "little":
+        raise OSError(f"no filter for {machine}")
+    version_3 = struct.pack("<Ii", 0x20080522, 0)
+    call_system(_NUMBERS[machine]["capset"], version_3, bytes(24))
+    program = build_filter(machine, list_rules(os.getpid(), has_memory_limit))
+    packed = b"".join(struct.pack("<HBBI", i[0], i[2], i[3], i[1]) for i in program)
+    buffer = ctypes.create_string_buffer(packed)
+    header = struct.pack("<HxxxxxxQ", len(program), ctypes.addressof(buffer))
     set_no_new_privileges()
     prctl(_PR_SET_SECCOMP, 2, ctypes.create_string_buffer(header))
-
-
-BpfInstruction = tuple[int, int, int, int]
-"""BPF instruction: opcode, lines to skip if true, lines to skip if false, operand."""
-
-
-def _build_filter(
-    architecture: int, numbers: Mapping[str, int], own: int, limited: bool
-) -> Sequence[BpfInstruction]:
-    """Build the filter program.
-
-    The data have the call number at offset 0, the architecture at 4, and the arguments from 16 on.
-
-    Args:
-        architecture: AUDIT_ARCH of the machine.
-        numbers: numbers of its system calls.
-        own: process id of this process.
-        limited: True if the process has a memory limit.
-    """
-    lines: list[BpfInstruction] = [
-        (_LOAD, 0, 0, 4),
-        (_EQUAL, 1, 0, architecture),
-        (_RETURN, 0, 0, _KILL),
-        (_LOAD, 0, 0, 0),
-        (_AT_LEAST, 0, 1, _X32),
-        (_RETURN, 0, 0, _ENOSYS),
-    ]
-    for name, number in numbers.items():
-        if name not in _ARGUMENT_FILTERED_SYSCALLS and (
-            limited or name not in _UNLIMITED_MEMORY_SYSCALLS
-        ):
-            verdict = (
-                _ENOSYS if name in (*_OPTIONAL_SYSCALLS, *_UNLIMITED_MEMORY_SYSCALLS) else _EPERM
-            )
-            lines += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, verdict)]
-    lines += [
-        # The first argument of clone has a flag for threads, which are allowed.
-        (_EQUAL, 0, 4, numbers["clone"]),
-        (_LOAD, 0, 0, 16),
-        (_ANY_BIT, 1, 0, _THREAD),
-        (_RETURN, 0, 0, _EPERM),
-        (_RETURN, 0, 0, _ALLOW),
-        *_build_argument_rule(numbers["kill"], 0, {own: _ALLOW}, _EPERM),
-        *_build_argument_rule(numbers["tgkill"], 0, {own: _ALLOW}, _EPERM),
-        *_build_argument_rule(numbers["prlimit64"], 0, {0: _ALLOW, own: _ALLOW}, _EPERM),
-        *_build_argument_rule(numbers["prctl"], 0, {PR_SET_PDEATHSIG: _EPERM}, _ALLOW),
-        *_build_argument_rule(numbers["socketpair"], 1, dict.fromkeys(_STREAMS, _ALLOW), _EPERM),
-        *_build_argument_rule(numbers["fcntl"], 1, _FCNTL_RULES, _ALLOW),
-        (_EQUAL, 0, 1, numbers["flock"]),
-        (_RETURN, 0, 0, _FAIL),
-    ]
-    if limited:
-        lines += [
-            (_EQUAL, 0, 5, numbers["mmap"]),
-            (_LOAD, 0, 0, 16 + 8 * 3),
-            (_AND, 0, 0, _SHARED_ANONYMOUS_MAP),
-            (_EQUAL, 0, 1, _SHARED_ANONYMOUS_MAP),
-            (_RETURN, 0, 0, _ENOMEM),
-            (_RETURN, 0, 0, _ALLOW),
-        ]
-    return [*lines, (_RETURN, 0, 0, _ALLOW)]
-
-
-def _build_argument_rule(
-    number: int, argument: int, verdicts: Mapping[int, int], otherwise: int
-) -> list[BpfInstruction]:
-    """Build the rule for a call that depends on the lower half of one of its arguments.
-
-    Args:
-        number: number of the call.
-        argument: index of the argument, from 0.
-        verdicts: return value of the filter by argument value.
-        otherwise: return value for other argument values.
-    """
-    cases: list[BpfInstruction] = []
-    for value, verdict in verdicts.items():
-        cases += [(_EQUAL, 0, 1, value), (_RETURN, 0, 0, verdict)]
-    load = (_LOAD, 0, 0, 16 + 8 * argument)
-    return [(_EQUAL, 0, len(cases) + 2, number), load, *cases, (_RETURN, 0, 0, otherwise)]

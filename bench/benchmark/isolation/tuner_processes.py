@@ -6,10 +6,11 @@ import atexit
 import contextlib
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -50,6 +51,8 @@ SIGKILL is also sent by the kernel if memory is exhausted.
 """
 
 
+_SHUTDOWN_TIMEOUT_SECONDS = 1.0
+"""Timeout in seconds for the end of a process that has closed its pipe."""
 _COURTESY = 1.0
 """Timeout in seconds for a process's report of the files that it has written."""
 _FILES = 1_000_000
@@ -83,44 +86,40 @@ class ForkServerClient:
         self._place: scratch_folders.LockedFolder | None = scratch_folders.create_locked_folder()
         self._folder = self._place.path
         self._loaded: set[str] = set()
-        self._link, theirs = socket.socketpair()
+        self._link, server_link = socket.socketpair()
         path = [place for place in sys.path if place not in ("", str(PROJECT_ROOT))] + [
             str(PROJECT_ROOT)
         ]
-        code = _BOOTSTRAP_CODE.format(path=path, descriptor=theirs.fileno())
-        nothing = subprocess.DEVNULL
+        code = _BOOTSTRAP_CODE.format(path=path, descriptor=server_link.fileno())
         self._process = subprocess.Popen(
             [sys.executable, "-c", code],
-            pass_fds=[theirs.fileno()],
+            pass_fds=[server_link.fileno()],
             env=_environment(self._folder),
             cwd=self._folder,
-            stdin=nothing,
-            stdout=nothing,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
             start_new_session=True,
         )
-        theirs.close()
+        server_link.close()
         atexit.register(self.close)
-        self.preload_modules(_PRELOADED)
+        self._send({}, _PRELOADED)
 
-    def _ask(self, request: dict[str, Any], descriptors: tuple[int, ...] = ()) -> Any:
+    def _send(
+        self, request: Mapping[str, Any], modules: Iterable[str], descriptors: tuple[int, ...] = ()
+    ) -> None:
+        """Send a request, with modules to be loaded that have not been loaded before."""
+        missing = [name for name in dict.fromkeys(modules) if name not in self._loaded]
         try:
-            fork_server.send_message(self._link, request, descriptors)
-            return fork_server.receive_message(self._link)[0]
-        except (EOFError, OSError):
+            fork_server.send_request(self._link, {**request, "modules": missing}, descriptors)
+        except OSError:
             self.close()
             raise KilledExternallyError("the process that starts tuners is gone") from None
+        self._loaded.update(missing)
 
     @property
     def is_alive(self) -> bool:
         """Whether the fork server can start another process."""
         return self._process.poll() is None
-
-    def preload_modules(self, modules: Iterable[str]) -> None:
-        """Preload modules in the fork server; modules of plugins are never preloaded."""
-        missing = [name for name in dict.fromkeys(modules) if name not in self._loaded]
-        if missing:
-            self._ask({"do": "load", "modules": missing})
-            self._loaded.update(missing)
 
     def start_process(
         self,
@@ -128,14 +127,18 @@ class ForkServerClient:
         files: Iterable[str] = (),
         memory: int = 0,
         hidden: Iterable[str] = (),
+        modules: Iterable[str] = (),
     ) -> IsolatedProcess:
         """Start an isolated process.
 
         Args:
-            service: purpose of the process, one of `fork_server.SERVICE_NAMES`.
+            service: module and function that the process runs, as ``MODULE:FUNCTION``; it gets a
+                message channel, the access policy and the active isolation layers.
             files: files that it may read, in addition to Python and its packages.
             memory: memory limit in MiB; 0 for no limit.
             hidden: folders that it must not access, in addition to the working directory.
+            modules: modules that the fork server loads first; never those of plugins, because the
+                next process would inherit their effects.
 
         Returns:
             Handle of the process.
@@ -143,37 +146,27 @@ class ForkServerClient:
         Raises:
             KilledExternallyError: the fork server is gone.
         """
-        to_child, to_us = os.pipe(), os.pipe()
         request = {
-            "do": "start",
             "service": service,
             "folder": self._folder,
             "readable": [*list_readable_paths((*hidden, str(Path.cwd()))), *files],
             "memory": memory,
         }
+        (reading, child_writing), (child_reading, writing) = os.pipe(), os.pipe()
+        control, child_control = socket.socketpair()
+        descriptors = child_control.fileno(), child_reading, child_writing
         try:
-            keeper = self._ask(request, (to_child[0], to_us[1]))["keeper"]
+            self._send(request, modules, descriptors)
         except KilledExternallyError:
-            os.close(to_us[0])
-            os.close(to_child[1])
+            control.close()
+            os.close(reading)
+            os.close(writing)
             raise
         finally:
-            os.close(to_child[0])
-            os.close(to_us[1])
-        return IsolatedProcess(self, keeper, MessageChannel(to_us[0], to_child[1]))
-
-    def end_process(self, keeper: int, kill: bool) -> int | None:
-        """End a process.
-
-        Args:
-            keeper: process id of its supervisor.
-            kill: True to kill it at once; False to let it end by itself first.
-
-        Returns:
-            Its exit code; None if it had to be killed.
-        """
-        code: int | None = self._ask({"do": "end", "keeper": keeper, "kill": kill})["exit"]
-        return code
+            child_control.close()
+            os.close(child_reading)
+            os.close(child_writing)
+        return IsolatedProcess(self, control, MessageChannel(reading, writing))
 
     def empty_shared_folder(self) -> None:
         """Delete the content of the folder that processes without their own folder share."""
@@ -218,8 +211,10 @@ class IsolatedProcess:
         seals: names of the active isolation layers, once the process is ready.
     """
 
-    def __init__(self, nursery_: ForkServerClient, keeper: int, channel: MessageChannel) -> None:
-        self._nursery, self._keeper, self.channel = nursery_, keeper, channel
+    def __init__(
+        self, server: ForkServerClient, control: socket.socket, channel: MessageChannel
+    ) -> None:
+        self._server, self._control, self.channel = server, control, channel
         self._open = True
         self.seals: list[str] = []
 
@@ -254,10 +249,32 @@ class IsolatedProcess:
             return None
         self._open = False
         self.channel.close()
-        code = self._nursery.end_process(self._keeper, kill)
+        code = None if kill else self._wait_for_exit_code(_SHUTDOWN_TIMEOUT_SECONDS)
+        if code is None:
+            # The supervisor kills the process.
+            with contextlib.suppress(OSError):
+                self._control.shutdown(socket.SHUT_WR)
+            self._wait_for_exit_code(START_TIMEOUT_SECONDS)
+        self._control.close()
         if "disk" not in self.seals:
-            self._nursery.empty_shared_folder()
+            self._server.empty_shared_folder()
         return code
+
+    def _wait_for_exit_code(self, seconds: float) -> int | None:
+        """Wait for the report of the supervisor.
+
+        Returns:
+            Exit code of the process; None if it has not ended in time. A supervisor without a
+            report was killed externally, and its process with it.
+        """
+        self._control.settimeout(seconds)
+        try:
+            report = self._control.recv(fork_server.EXIT_CODE.size)
+        except TimeoutError:
+            return None
+        except OSError:
+            report = b""
+        return fork_server.EXIT_CODE.unpack(report)[0] if report else -signal.SIGKILL
 
     def receive(self, limit: int = MAX_TEXT_BYTES, deadline: float = float("inf")) -> Message:
         """Receive the next message of the process.

@@ -260,20 +260,16 @@ class _RemoteTrainingSimulator:
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
         state = rng.bit_generator.state
-        plain = state["bit_generator"] == "PCG64"
+        is_sendable = state["bit_generator"] == "PCG64"
         # A generator of another type seeds a new PCG64 generator, which can be sent.
-        sent = state if plain else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
-        asked = np.array(points, dtype=np.float64)
-        asked = asked.reshape(-1, self.dim)
-        self._channel.send(b"P", *_stream(sent), asked, flags=2 + self._which, size=len(asked))
+        sent = state if is_sendable else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
+        requested = np.array(points, dtype=np.float64).reshape(-1, self.dim)
+        request = pack_arrays({"rng": encode_rng_state(sent), "points": requested})
+        self._channel.send(b"P", *request, flags=2 + self._which)
         given = self._take(self._channel.receive(_LIMIT))
-        if plain:
-            rng.bit_generator.state = decode_rng_state(given["stream"])
+        if is_sendable:
+            rng.bit_generator.state = decode_rng_state(given["rng"])
         return given["observations"]
-
-
-def _stream(state: Any) -> tuple[bytes]:
-    return (encode_rng_state(state).tobytes(),)
 
 
 class _RemoteTrainingCallback:

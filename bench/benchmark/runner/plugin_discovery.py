@@ -345,9 +345,9 @@ def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
 
 
 def _answer(question: dict[str, str], files: list[str]) -> Any:
-    house = get_fork_server()
-    house.preload_modules(["bench.benchmark.runner.plugin_discovery"])
-    child = house.start_process("bench.benchmark.runner.plugin_discovery:serve_inspection", files)
+    child = get_fork_server().start_process(
+        f"{__name__}:serve_inspection", files, modules=[__name__]
+    )
     deadline = perf_counter() + _INSPECTION_TIMEOUT_SECONDS
     try:
         child.wait_until_ready()

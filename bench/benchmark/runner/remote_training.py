@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.benchmark.isolation.message_channel import (
-    MAX_PROPOSAL_BYTES,
     MAX_STATE_BYTES,
     Message,
     ProtocolError,
@@ -25,8 +24,6 @@ from methods.tuner import BudgetExceededError, TrainingCallback
 from methods.tuner import TrainingSimulator as Ground
 from sims.core.simulator import Array
 
-_RNG_STATE_BYTES = 48
-"""Size in bytes of the random generator's state before the requested points."""
 _NO_DEADLINE = float("inf")
 """Deadline of a training, in seconds: none."""
 
@@ -128,15 +125,11 @@ def _simulated(message: Message, ground: Ground) -> dict[str, NDArray[Any]]:
     Returns:
         The observations, and the state of the random generator after drawing the scenario.
     """
-    body = bytes(message.body)
-    if (
-        len(body) > MAX_PROPOSAL_BYTES
-        or len(body) != _RNG_STATE_BYTES + 8 * message.size * ground.dim
-    ):
-        raise ProtocolError("it asked for no points")
-    bits = np.random.PCG64()
-    state: Any = decode_rng_state(np.frombuffer(body[:_RNG_STATE_BYTES], dtype="<i8"))
-    bits.state = state
-    points = np.frombuffer(body[_RNG_STATE_BYTES:], dtype="<f8").reshape(message.size, ground.dim)
-    observations = ground.simulate(np.random.Generator(bits), points.astype(np.float64))
-    return {"observations": observations, "stream": encode_rng_state(bits.state)}
+    request = unpack_arrays(message.body)
+    points = request.get("points", np.empty(0))
+    if points.dtype != np.float64 or points.ndim != 2 or points.shape[1] != ground.dim:
+        raise ProtocolError("it requested no points")
+    generator = np.random.Generator(np.random.PCG64())
+    generator.bit_generator.state = decode_rng_state(request.get("rng", np.empty(0)))
+    observations = ground.simulate(generator, points)
+    return {"observations": observations, "rng": encode_rng_state(generator.bit_generator.state)}

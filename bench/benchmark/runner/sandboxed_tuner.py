@@ -81,10 +81,10 @@ def _seals() -> tuple[str, ...]:
 
 def close_isolated_processes() -> None:
     """End all tuner processes of this process, and its fork server."""
-    _idle_tuners.clear()
-    for house in _fork_servers.values():
-        house.close()
-    _fork_servers.clear()
+    while _idle_tuners:
+        _idle_tuners.popitem()[1].child.end()
+    while _fork_servers:
+        _fork_servers.popitem()[1].close()
 
 
 def retry_if_killed(work: Callable[[], Result]) -> Result:
@@ -195,13 +195,13 @@ def start_isolated_tuner(
     if tuner is not None:
         tuner.import_seconds = 0.0
     if tuner is None or not tuner.child.is_alive:
-        house = get_fork_server()
-        house.preload_modules(
-            [*tuned.modules, *([tuned.module] if tuned.module.startswith("methods.") else [])]
-        )
-        files = [tuned.file] if tuned.file else []
-        child = house.start_process(
-            "bench.benchmark.isolation.tuner_server:serve_requests", files, memory, hidden
+        own_module = [tuned.module] if tuned.module.startswith("methods.") else []
+        child = get_fork_server().start_process(
+            "bench.benchmark.isolation.tuner_server:serve_requests",
+            [tuned.file] if tuned.file else [],
+            memory,
+            hidden,
+            [*tuned.modules, *own_module],
         )
         try:
             tuner = IsolatedTuner(child, tuned, state)

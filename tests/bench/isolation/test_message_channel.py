@@ -1,6 +1,7 @@
 """Tests of the message channel between harness and tuner process, and of invalid messages on it."""
 
 import os
+import socket
 import struct
 from time import perf_counter
 
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.benchmark.isolation.fork_server import EXIT_CODE
 from bench.benchmark.isolation.message_channel import (
     Message,
     MessageChannel,
@@ -121,28 +123,24 @@ def test_two_messages_at_once_are_foul(ends):
         ends.channel.receive()
 
 
-class Nobody:
+class Server:
     """Stand-in for a fork server."""
-
-    def __init__(self):
-        self.ended = []
-
-    def end_process(self, keeper, kill):
-        self.ended.append((keeper, kill))
 
     def empty_shared_folder(self):
         pass
 
 
 def test_an_answer_before_the_question_ends_the_run(ends):
-    nursery = Nobody()
     copies = (os.dup(one) for one in (ends.channel._reading, ends.channel._writing))
-    child = IsolatedProcess(nursery, 7, MessageChannel(*copies))
+    control, supervisor = socket.socketpair()
+    child = IsolatedProcess(Server(), control, MessageChannel(*copies))
     child.send(b"E", deadline=soon())
     ends.say(HEAD.pack(b"A", 0, 1, 8) + bytes(8))
+    supervisor.send(EXIT_CODE.pack(-9))
     with pytest.raises(RunEndedError, match="without having been asked"):
         child.send(b"E", deadline=soon())
-    assert nursery.ended == [(7, True)]
+    assert supervisor.recv(1) == b"", "the supervisor must kill the process"
+    supervisor.close()
 
 
 def test_who_does_not_read_makes_nobody_wait_for_ever(ends):
@@ -256,8 +254,16 @@ def test_a_stream_goes_through_as_numbers_and_one_that_stands_still_does_not():
     other.bit_generator.state = decode_rng_state(numbers)
     np.testing.assert_array_equal(other.random(5), rng.random(5))
     # With this increment, the generator would always give its first number.
-    still = numbers.copy()
-    still[2:4] = np.array([4, 0])
-    for wrong in (still, np.array([*numbers[:4], 2, 0]), np.array([*numbers[:4], 0, 1 << 40])):
+    still = {**rng.bit_generator.state["state"], "inc": 4}
+    for wrong in (
+        {"state": still},
+        {"has_uint32": 1 << 70},
+        {"bit_generator": "MT19937"},
+        {"x": 1},
+    ):
+        text = encode_rng_state({**rng.bit_generator.state, **wrong})
         with pytest.raises(ValueError, match="no state"):
-            decode_rng_state(wrong)
+            decode_rng_state(text)
+    for noise in (b"", b"{}", b"[" * 100_000, b'{"state": 1}'):
+        with pytest.raises(ValueError, match="no state"):
+            decode_rng_state(np.frombuffer(noise, dtype=np.uint8))
