@@ -50,6 +50,7 @@ from sims.robot.dynamics.batch_work import (
     group_by_run,
     list_last_read_times,
 )
+from sims.robot.dynamics.callback_stepping import step_in_callback
 from sims.robot.dynamics.compiled_forces import compile_forces
 from sims.robot.dynamics.disabled_drives import off_steps, working_servos
 from sims.robot.dynamics.drive_sensors import DriveSensorModel
@@ -458,9 +459,13 @@ class RobotSimulator(SystemSimulator):
                 asking.working = working_servos(bench.robot, places.velocities, given.off)
             else:
                 asked_of = compile_forces(asking)
-            done = bench.step_with_forces(
-                given.controls, forces, asked_of or asking, record, given.off
-            )
+            done = None
+            if asked_of is not None:
+                done = step_in_callback(bench, given.controls, forces, asked_of, record)
+            if done is None:
+                done = bench.step_with_forces(
+                    given.controls, forces, asked_of or asking, record, given.off
+                )
         else:
             forces = bench.map_forces(given.forces)
             done = bench.step(given.controls, forces, record, given.off)

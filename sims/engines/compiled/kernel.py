@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -33,7 +33,7 @@ from sims.engines.compiled.data_layout import (
 KERNEL_SOURCE_MODULES = (
     *("ballistic_motion", "data_layout", "dynamics", "element_clock", "element_stepping", "events"),
     *("expression_graph", "interpreter", "kernel_build", "kernel_entry", "llvm_code"),
-    *("lockstep_stepping", "step_size"),
+    *("lockstep_stepping", "mujoco_callback", "step_size"),
 )
 """Modules of this package on which the compiled code depends."""
 _COMPILE_SECONDS = 20
@@ -163,9 +163,27 @@ def get_kernel() -> CompiledKernel:
 
 @cache
 def _load_kernel() -> CompiledKernel:
+    return CompiledKernel(_load())
+
+
+def load_callback(offsets: Mapping[str, int]) -> Callable[..., None]:
+    """Return the compiled callback of MuJoCo's steps, compiled on first use.
+
+    Args:
+        offsets: offset of each field in MuJoCo's data, in words of eight bytes.
+
+    Raises:
+        InputError: the compiler or its machine code cannot be used.
+    """
+    with _lock:
+        return _load(offsets)
+
+
+def _load(offsets: Mapping[str, int] | None = None) -> Callable[..., None]:
+    """Return the function of the kernel, or with offsets the callback, see `load_callback`."""
     try:
-        code = llvm_code.MachineCode.unpack(_get_machine_code())
-        return CompiledKernel(llvm_code.load_machine_code(code))
+        code = llvm_code.MachineCode.unpack(_get_machine_code(offsets))
+        return llvm_code.load_machine_code(code, 1 if offsets is None else 2)
     # A compiler that does not match this Python or its NumPy may raise any error.
     except Exception as error:
         text = (str(error) or type(error).__name__).splitlines()[0]
@@ -175,28 +193,32 @@ def _load_kernel() -> CompiledKernel:
         ) from error
 
 
-def _get_machine_code() -> bytes:
+def _get_machine_code(offsets: Mapping[str, int] | None) -> bytes:
     """Return the machine code: from the cache, or compiled."""
     folder = code_cache.get_cache_folder()
-    path = folder / f"stepping-{_key()}.bin"
+    name = "stepping" if offsets is None else "callback"
+    path = folder / f"{name}-{_key(offsets)}.bin"
     data = code_cache.read_cached(path)
     if data is not None:
         return data
     try:
-        return code_cache.make_cached(path, _build, _report_wait)
+        return code_cache.make_cached(path, lambda: _build(offsets), _report_wait)
     except OSError as error:
         _report(
             f"machine code cannot be stored in {folder} ({error.strerror or error}), so each"
             " process compiles it; set SIMGAP_COMPILED to a folder that can be written"
         )
-        return _build()
+        return _build(offsets)
 
 
-def _build() -> bytes:
-    _report(f"compiling the batch engine, once after an install: about {_COMPILE_SECONDS} s")
+def _build(offsets: Mapping[str, int] | None) -> bytes:
+    if offsets is None:
+        _report(f"compiling the batch engine, once after an install: about {_COMPILE_SECONDS} s")
+    else:
+        _report("compiling the forces of effects, once after an install: about 10 s")
     from sims.engines.compiled.kernel_build import build_kernel
 
-    return build_kernel()
+    return build_kernel(offsets)
 
 
 def _report_wait() -> None:
@@ -212,12 +234,14 @@ def _report(text: str) -> None:
     sys.stderr.flush()
 
 
-def _key() -> str:
+def _key(offsets: Mapping[str, int] | None = None) -> str:
     """Return a hash of everything on which the code depends: sources, compiler, processor."""
     digest = hashlib.sha256()
     for source in list_source_files():
         digest.update(source.read_bytes())
     digest.update(repr(llvm_code.describe_processor()).encode())
+    if offsets is not None:
+        digest.update(repr(sorted(offsets.items())).encode())
     return digest.hexdigest()[:24]
 
 

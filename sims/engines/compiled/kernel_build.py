@@ -10,6 +10,7 @@ import inspect
 import os
 import subprocess
 import sys
+from collections.abc import Collection, Mapping, Sequence
 from graphlib import TopologicalSorter
 from types import FunctionType, ModuleType
 from typing import Any
@@ -27,6 +28,7 @@ from sims.engines.compiled import (
     kernel_entry,
     llvm_code,
     lockstep_stepping,
+    mujoco_callback,
     step_size,
 )
 
@@ -54,12 +56,16 @@ _WRITTEN_OUT = frozenset(
 """Functions that are inlined, because a call costs more than their body."""
 _START = (
     "import sys; sys.path[:] = {path!r}; "
-    "from sims.engines.compiled.kernel_build import main; main()"
+    "from sims.engines.compiled.kernel_build import main; main({offsets!r})"
 )
 
 
-def build_kernel() -> bytes:
-    """Return the packed machine code of the kernel.
+def build_kernel(offsets: Mapping[str, int] | None = None) -> bytes:
+    """Return the packed machine code of the kernel, or of MuJoCo's callback.
+
+    Args:
+        offsets: for the callback, the offset of each field in MuJoCo's data, in words of eight
+            bytes; None for the kernel.
 
     Raises:
         llvm_code.CodeNotLoadableError: the compilation failed; the message is the last line of
@@ -69,7 +75,7 @@ def build_kernel() -> bytes:
     # Everything is optimised once at the end, instead of each function with all its callees.
     environment["NUMBA_OPT"] = "0"
     done = subprocess.run(
-        [sys.executable, "-c", _START.format(path=sys.path)],
+        [sys.executable, "-c", _START.format(path=sys.path, offsets=offsets)],
         env=environment,
         capture_output=True,
         stdin=subprocess.DEVNULL,
@@ -83,9 +89,10 @@ def build_kernel() -> bytes:
     return done.stdout
 
 
-def main() -> None:
+def main(offsets: Mapping[str, int] | None = None) -> None:
     """Write the code to the standard output, where `build_kernel` reads it."""
-    sys.stdout.buffer.write(llvm_code.compile_llvm(*emit_llvm()).pack())
+    emitted = emit_llvm() if offsets is None else emit_callback(offsets)
+    sys.stdout.buffer.write(llvm_code.compile_llvm(*emitted).pack())
 
 
 def emit_llvm() -> tuple[str, str]:
@@ -94,14 +101,48 @@ def emit_llvm() -> tuple[str, str]:
 
     # numba is only partly typed, and its untyped functions would fail the type check.
     numba: Any = typed
-    types = numba.types
+    space = _compile_functions(numba, KERNEL_MODULES)
+    space.update(_names_of(kernel_entry, keep=space))
+    return _emit(numba, kernel_entry.kernel_entry, space, 1)
+
+
+def emit_callback(offsets: Mapping[str, int]) -> tuple[str, str]:
+    """Return the LLVM intermediate code of MuJoCo's callback and the name of its function.
+
+    Args:
+        offsets: offset of each field in MuJoCo's data, in words of eight bytes.
+    """
+    import numba as typed
+
+    numba: Any = typed
+    space = _compile_functions(numba, (interpreter,))
+    space.update(_names_of(mujoco_callback, keep=space))
+    space |= {name.upper(): offset for name, offset in offsets.items()}
+    limits = mujoco_callback.set_friction_limits
+    space["set_friction_limits"] = numba.njit(error_model="numpy")(
+        FunctionType(limits.__code__, space, "set_friction_limits")
+    )
+    return _emit(numba, mujoco_callback.add_effect_forces, space, 2)
+
+
+def _names_of(module: ModuleType, keep: Collection[str] = ()) -> dict[str, Any]:
+    """Return the names of a module, without those to keep."""
+    return {k: v for k, v in vars(module).items() if not k.startswith("__") and k not in keep}
+
+
+def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, Any]:
+    """Compile all functions of some modules, callees first.
+
+    Returns:
+        The compiled functions and all other names of the modules.
+    """
     space: dict[str, Any] = {}
-    for module in (*KERNEL_MODULES, kernel_entry):
-        space.update({k: v for k, v in vars(module).items() if not k.startswith("__")})
+    for module in modules:
+        space.update(_names_of(module))
     space.update(_make_intrinsics(numba))
     functions = {
         name: thing
-        for module in KERNEL_MODULES
+        for module in modules
         for name, thing in vars(module).items()
         if isinstance(thing, FunctionType) and thing.__module__ == module.__name__
     }
@@ -123,8 +164,15 @@ def emit_llvm() -> tuple[str, str]:
         made.disable_compile()
         space[name] = made
     space["carray"] = numba.carray
-    bound = FunctionType(kernel_entry.kernel_entry.__code__, space, "integrate")
-    made = numba.cfunc(types.void(types.CPointer(types.int64)), error_model="numpy")(bound)
+    return space
+
+
+def _emit(numba: Any, function: Any, space: dict[str, Any], pointers: int) -> tuple[str, str]:
+    """Return the LLVM intermediate code of a C function without result, and its name."""
+    types = numba.types
+    bound = FunctionType(function.__code__, space, "integrate")
+    arguments = [types.CPointer(types.int64)] * pointers
+    made = numba.cfunc(types.void(*arguments), error_model="numpy")(bound)
     return made.inspect_llvm(), made.native_name
 
 
@@ -155,6 +203,7 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
     return {
         "call_external": numba.extending.intrinsic(call_external),
         "to_int_pointer": make_pointer_function(types.int64, word),
+        "to_short_pointer": make_pointer_function(types.int32, ir.IntType(32)),
         "to_real_pointer": make_pointer_function(types.float64, ir.DoubleType()),
     }
 

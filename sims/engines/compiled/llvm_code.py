@@ -86,14 +86,15 @@ def compile_llvm(text: str, name: str) -> MachineCode:
     return MachineCode(name, needs, target.emit_object(module))
 
 
-def load_machine_code(code: MachineCode) -> Callable[..., None]:
+def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., None]:
     """Load the machine code of a function.
 
     Args:
         code: machine code.
+        pointers: number of pointer arguments of the function.
 
     Returns:
-        The function of one pointer.
+        The function.
 
     Raises:
         CodeNotLoadableError: a required symbol is missing; LLVM itself would end the process.
@@ -110,7 +111,8 @@ def load_machine_code(code: MachineCode) -> Callable[..., None]:
     engine.add_object_file(llvm.ObjectFileRef.from_data(code.body))
     engine.finalize_object()
     _owners.append((engine, nowhere))
-    return ctypes.CFUNCTYPE(None, ctypes.c_void_p)(engine.get_function_address(code.name))
+    kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers)
+    return kind(engine.get_function_address(code.name))
 
 
 def _target(llvm: Any) -> Any:

@@ -78,6 +78,42 @@ class _Program(NamedTuple):
     states: NDArray[np.intp]
 
 
+class ProgramLayout(NamedTuple):
+    """Instructions of a step, and the registers of its inputs and outputs.
+
+    Attributes:
+        code: instructions (n, 5).
+        begin: first instruction of a step.
+        end: index after the last instruction of a step.
+        t: register of the time at the beginning of a step.
+        midpoint: register of the time at the middle of a step.
+        past: register of the interval over which hidden states advance.
+        x: first register of the positions.
+        v: first register of the velocities.
+        a: first register of the accelerations.
+        first_input: first register of the inputs.
+        first_state: first register of the hidden states.
+        forces: registers (D,) of the forces.
+        limits: registers (D,) of the limits of dry friction.
+        next_states: registers (H,) of the hidden states after a step.
+    """
+
+    code: NDArray[np.int64]
+    begin: int
+    end: int
+    t: int
+    midpoint: int
+    past: int
+    x: int
+    v: int
+    a: int
+    first_input: int
+    first_state: int
+    forces: NDArray[np.intp]
+    limits: NDArray[np.intp]
+    next_states: NDArray[np.intp]
+
+
 class _Tracing:
     """Traced state of a robot, and programs of the effects that are evaluated at it.
 
@@ -223,6 +259,60 @@ class CompiledForces:
         """Applied inputs (S, U, L)."""
         return np.ascontiguousarray(np.stack(list(self._of.felt.values())).transpose(2, 0, 1))
 
+    @property
+    def registers(self) -> Array:
+        """Registers (registers, L) of the program."""
+        return self._r
+
+    @property
+    def input_values(self) -> Array:
+        """Applied inputs (S, U, L)."""
+        if not self._of.felt:
+            return np.zeros((1, 0, self._r.shape[1]))
+        return self._felt
+
+    @property
+    def step(self) -> float:
+        """Step length in seconds."""
+        return self._of.step
+
+    @property
+    def program_layout(self) -> ProgramLayout:
+        """Instructions of a step, and the registers of its inputs and outputs."""
+        written = self._program.written
+        _, begin, end, _ = written.ends.tolist()
+        x, v, a, *_ = (rows.start for rows in self._motion)
+        return ProgramLayout(
+            code=written.code,
+            begin=begin,
+            end=end,
+            t=self._t,
+            midpoint=self._after,
+            past=self._past,
+            x=x,
+            v=v,
+            a=a,
+            first_input=self._u.start,
+            first_state=self._states.start,
+            forces=self._program.force,
+            limits=self._program.limit,
+            next_states=self._program.states,
+        )
+
+    def begin(self, look: JointStates) -> None:
+        """Set the hidden states at the beginning of a motion.
+
+        Args:
+            look: joint states at the beginning.
+        """
+        hidden = self._of.hidden
+        if not hidden:
+            return
+        moment = self._of.make_step_snapshot(0, look)
+        states = [effect.begin(c, moment) for effect, c in hidden]
+        begun = [part for state in states for part in (state.x, state.v)]
+        self._r[self._states] = np.concatenate(begun, axis=1).T
+
     def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
         """Compute forces and friction limits over step k, see `EffectForces.compute`."""
         r = self._r
@@ -235,11 +325,8 @@ class CompiledForces:
         hidden = self._of.hidden
         if hidden and k < 2:
             r[self._past] = self._of.step if k else 0.5 * self._of.step
-        if hidden and not k:
-            moment = self._of.make_step_snapshot(0, look)
-            states = [effect.begin(c, moment) for effect, c in hidden]
-            begun = [part for state in states for part in (state.x, state.v)]
-            r[self._states] = np.concatenate(begun, axis=1).T
+        if not k:
+            self.begin(look)
         self._run()
         if hidden:
             r[self._states] = r[self._program.states]

@@ -7,7 +7,7 @@ without such a change keep exactly the constants of the file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -99,6 +99,8 @@ def compile_batch_model(robot: RobotModel, derived: bool) -> Any:
     import mujoco
 
     spec = make_batch_spec(robot) if derived else robot.spec.copy()
+    # The compiled callback of effect forces finds its simulation by the user data.
+    spec.nuserdata = max(spec.nuserdata, 1)
     for joint in robot.joints:
         if joint.has_one_coordinate and joint.name not in robot.series:
             spec.add_sensor(
@@ -284,7 +286,12 @@ class MujocoBatch:
             self.batch.bind("act")[: len(activations)] = activations
 
     def step(
-        self, controls: Array, forces: Array, record: Sequence[str], off: Mask | None = None
+        self,
+        controls: Array,
+        forces: Array,
+        record: Sequence[str],
+        off: Mask | None = None,
+        before_call: Callable[[int], None] | None = None,
     ) -> dict[str, Array]:
         """Step n batch elements S times.
 
@@ -293,6 +300,8 @@ class MujocoBatch:
             forces: (n, S, nv) generalised forces.
             record: fields of MuJoCo's data to record.
             off: (n, S, K) whether each actuator is switched off; none is by default.
+            before_call: called with the number of the first step of each call of MuJoCo, if a
+                callback changes the generalised forces.
 
         Returns:
             Recorded fields (n, S, ...) by name.
@@ -302,12 +311,14 @@ class MujocoBatch:
         state = mujoco.mjtState
         spec = int(state.mjSTATE_CTRL)
         given = controls
-        if forces.any():
+        if forces.any() or before_call is not None:
             spec |= int(state.mjSTATE_QFRC_APPLIED)
             given = np.concatenate([controls, forces], axis=2)
         n, steps, _ = controls.shape
         result = self._begun(n, steps, record)
         for part in self._switched(n, steps, off):
+            if before_call is not None:
+                before_call(part.start)
             done = self.batch.rollout(
                 part.stop - part.start, given[:, part], spec, tuple(record), self._ids(n)
             )
@@ -358,13 +369,8 @@ class MujocoBatch:
         bind = self.batch.bind
         ctrl, applied = bind("ctrl"), bind("qfrc_applied")
         loss = self.fields["dof_frictionloss"]
-        own = loss[:n, dofs].copy()
         rubs = bool(asking.has_dry_friction.any())
-        if rubs:
-            # Where no effect adds friction, the file's friction keeps its solver parameters.
-            lanes, joints = np.nonzero(asking.has_dry_friction)
-            write_friction_form(self.fields, self.robot, lanes, dofs[joints])
-            self._changed.update(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
+        own = self.begin_dry_friction(asking, n)
         result = self._begun(n, steps, record)
         shown = {name: bind(name)[:n] for name in record}
         ids = self._ids(n)
@@ -400,6 +406,26 @@ class MujocoBatch:
             ranges.restore()
         self._fails(n)
         return result
+
+    def begin_dry_friction(self, asking: StepwiseForces, n: int) -> Array:
+        """Set the solver parameters of dry friction where effects add it.
+
+        Where no effect adds friction, the file's friction keeps its solver parameters.
+
+        Args:
+            asking: effects to evaluate in every step.
+            n: number of batch elements in use.
+
+        Returns:
+            Dry friction (n, D) of the joints without these effects.
+        """
+        dofs = asking.addresses.velocities
+        own: Array = self.fields["dof_frictionloss"][:n, dofs].copy()
+        if asking.has_dry_friction.any():
+            lanes, joints = np.nonzero(asking.has_dry_friction)
+            write_friction_form(self.fields, self.robot, lanes, dofs[joints])
+            self._changed.update(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
+        return own
 
     def get_servo_stiffness(self, places: JointAddresses) -> Array:
         """Return the force of position servos per unit of their errors, with effects.

@@ -1,5 +1,7 @@
 """Tests of effect forces compiled to one program: numbers equal numpy's, or numpy is used."""
 
+import ctypes
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from sims import effects as library
 from sims.core.simulator import Scenario
 from sims.core.system import Coefficient, Force
 from sims.robot import robot_simulator
+from sims.robot.dynamics import mujoco_batch
 from sims.robot.dynamics.active_effects import is_evaluated_per_step
 from sims.robot.places.effect_places import make_placed_effect
 from tests.sims.robot.sample_arms import ARM
@@ -146,3 +149,59 @@ def test_a_sensor_of_the_drives_shows_what_one_battery_leaves_to_each(arm):
     shown = made.simulate(np.array([[0.3], [0.0]]), Scenario(TIMES, {}, inputs))[:, 0, 1:]
     np.testing.assert_allclose(shown[1], [60 * 0.05, 2.0])
     np.testing.assert_allclose(shown[0], np.array([3.0, 2.0]) / (1 + 0.3 * 5.0))
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
+def test_steps_in_the_callback_equal_steps_with_forces(arm, tmp_path, monkeypatch, integrator):
+    """MuJoCo's callback gives the same bits as forces that are set before each step.
+
+    Calls of MuJoCo are cut in the middle of the runs, and friction acts at two joints at once.
+    """
+    monkeypatch.setattr(mujoco_batch, "MAX_UNINTERRUPTED_STEPS", 70)
+    kind = arm.with_integrator_settings(arm.numerics._replace(integrator=integrator))
+    system = kind.system
+    names = [
+        *("friction.direction@elbow", "friction.stribeck@elbow", "friction.position@shoulder"),
+        *("friction.hysteresis@spin", "force.ripple@spin", "servo.deadband@m_shoulder"),
+    ]
+    made = kind(effects=[system.effect(name) for name in names])
+    theta = np.array([[np.mean(p.bounds) for p in made.parameters], [0.0] * len(made.parameters)])
+    theta = np.concatenate([theta, 0.5 * theta[:1]])
+    results = []
+    once = robot_simulator.step_in_callback
+    monkeypatch.setattr(
+        robot_simulator, "step_in_callback", lambda *a: results.append(once(*a)) or results[-1]
+    )
+    quick = made.simulate(theta, SCENARIO)
+    assert [result is not None for result in results] == [True]
+    monkeypatch.setattr(robot_simulator, "step_in_callback", lambda *_: None)
+    slow = made.simulate(theta, SCENARIO)
+    assert np.abs(slow[0] - slow[1]).max() > 0.01
+    np.testing.assert_array_equal(quick, slow)
+
+
+def test_forces_that_depend_on_loads_are_not_computed_in_the_callback(arm, monkeypatch):
+    made = arm(effects=[arm.system.effect("friction.load@elbow")])
+    results = []
+    once = robot_simulator.step_in_callback
+    monkeypatch.setattr(
+        robot_simulator, "step_in_callback", lambda *a: results.append(once(*a)) or results[-1]
+    )
+    made.simulate(np.array([[0.3]]), SCENARIO)
+    assert results == [None]
+
+
+def test_the_callback_does_not_replace_that_of_the_user(arm):
+    import mujoco
+
+    made = arm(effects=[arm.system.effect("friction.direction@elbow")])
+    theta = np.array([[np.mean(p.bounds) for p in made.parameters]])
+    first = made.simulate(theta, SCENARIO)
+    callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda *_: None)
+    mujoco.set_mjcb_control(callback)
+    try:
+        again = made.simulate(theta, SCENARIO)
+        assert mujoco.get_mjcb_control() is not None
+    finally:
+        mujoco.set_mjcb_control(None)
+    np.testing.assert_array_equal(again, first)

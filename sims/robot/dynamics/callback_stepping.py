@@ -1,0 +1,221 @@
+"""Steps of a batch with effect forces that MuJoCo's callback computes, without Python in between.
+
+`MujocoBatch.step_with_forces` returns to Python in each step, which takes ten times as long as a
+step of a small robot. Here the compiled program of the effects runs in the callback
+(`sims.engines.compiled.mujoco_callback`) with the same numbers.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.core.simulator import Array
+from sims.engines.compiled.kernel import load_callback
+from sims.engines.compiled.mujoco_callback import (
+    DATA_FIELDS,
+    HAS_ACCELERATION,
+    MAX_DATA_WORDS,
+    CallbackContext,
+)
+from sims.robot.dynamics.compiled_forces import CompiledForces
+from sims.robot.dynamics.midpoint_state import MidpointPredictor
+from sims.robot.dynamics.mujoco_batch import MujocoBatch
+from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
+
+LEAST_FRICTION = 1e-12
+"""Dry friction in N or N·m of the model where effects add friction.
+
+With it, MuJoCo makes a constraint whose limit the callback replaces.
+"""
+LAST_FIELD = "iefc_frictionloss"
+"""Last of `DATA_FIELDS` in MuJoCo's data."""
+_PROBE = """
+<mujoco><size nuserdata="1"/><worldbody><body>
+<joint name="slide" type="slide" axis="1 0 0" frictionloss="1"/><geom size="0.1" mass="1"/>
+</body></worldbody></mujoco>
+"""
+"""Model in which each of `DATA_FIELDS` has numbers."""
+
+
+def step_in_callback(
+    bench: MujocoBatch, controls: Array, forces: Array, compiled: CompiledForces, record: list[str]
+) -> dict[str, Array] | None:
+    """Step n batch elements S times as `MujocoBatch.step_with_forces`.
+
+    Args:
+        bench: the batch, with initial states and effects in its model.
+        controls: (n, S, nu) controls.
+        forces: (n, S, nv) generalised forces.
+        compiled: compiled forces of effects.
+        record: fields of MuJoCo's data to record.
+
+    Returns:
+        Recorded fields (n, S, ...) by name; None if the callback cannot compute these forces.
+    """
+    import mujoco
+
+    disable = mujoco.mjtDisableBit
+    lacking = int(disable.mjDSBL_ACTUATION) | int(disable.mjDSBL_FRICTIONLOSS)
+    # Loads of transmissions require evaluations within a step.
+    if compiled.loaded.any() or bench.model.opt.disableflags & lacking:
+        return None
+    callback = _get_callback()
+    if callback is None or mujoco.get_mjcb_control() is not None:
+        return None
+    n, steps, _ = controls.shape
+    own_losses = bench.begin_dry_friction(compiled, n)
+    rubs = compiled.has_dry_friction
+    if rubs.any():
+        loss = bench.fields["dof_frictionloss"]
+        lanes, joints = np.nonzero(rubs)
+        dofs = compiled.addresses.velocities[joints]
+        loss[lanes, dofs] = np.maximum(loss[lanes, dofs], LEAST_FRICTION)
+    bench.batch.bind("ctrl")[:n] = controls[:, 0]
+    predictor = MidpointPredictor(
+        bench.batch, compiled.addresses.positions, compiled.addresses.velocities, compiled.loaded
+    )
+    bench.batch.forward(None if n == bench.count else np.arange(n))
+    compiled.begin(predictor.read_joint_states(np.zeros(n, dtype=bool)))
+    contexts = _Contexts(bench, compiled, own_losses, steps)
+    user = bench.batch.bind("userdata")
+    user[:n, 0] = contexts.addresses
+    mujoco.set_mjcb_control(callback)
+    try:
+        return bench.step(controls, forces, record, before_call=contexts.renew)
+    finally:
+        mujoco.set_mjcb_control(None)
+        user[:] = 0.0
+
+
+class _Contexts:
+    """Contexts of the callback for all batch elements, and the arrays that they refer to.
+
+    Args:
+        bench: the batch.
+        compiled: compiled forces of effects, begun.
+        losses: (n, D) dry friction of the model without effects.
+        steps: number of steps S.
+    """
+
+    def __init__(
+        self, bench: MujocoBatch, compiled: CompiledForces, losses: Array, steps: int
+    ) -> None:
+        program = compiled.program_layout
+        places = compiled.addresses
+        joints = places.velocities.size
+        states = program.next_states
+        shared = {
+            "code": program.code,
+            "positions": _integers(places.positions),
+            "velocities": _integers(places.velocities),
+            "forces": _integers(program.forces),
+            "limits": _integers(program.limits),
+            "next_states": _integers(states),
+            "step": np.array([compiled.step]),
+        }
+        self._arrays: list[NDArray[Any]] = list(shared.values())
+        self._registers: list[Array] = []
+        self._a = slice(program.a, program.a + joints)
+        self._accelerations: Array = bench.batch.bind("qacc")
+        self._dofs = places.velocities
+        common = {name: values.ctypes.data for name, values in shared.items()}
+        inputs = compiled.input_values
+        loss = bench.fields["dof_frictionloss"]
+        table = []
+        for lane in range(len(losses)):
+            registers = np.ascontiguousarray(compiled.registers[:, lane : lane + 1])
+            own = {
+                "registers": registers,
+                "losses": np.ascontiguousarray(losses[lane]),
+                "input_values": np.ascontiguousarray(inputs[:, :, lane]),
+                "scratch": np.zeros(joints + states.size + 1),
+            }
+            self._registers.append(registers)
+            self._arrays += own.values()
+            addresses = {name: values.ctypes.data for name, values in own.items()}
+            rubs = bool(compiled.has_dry_friction.any())
+            context = CallbackContext(
+                **common,
+                **addresses,
+                code_rows=len(program.code),
+                begin=program.begin,
+                end=program.end,
+                register_count=len(registers),
+                joints=joints,
+                friction_rows=int((loss[lane] > 0).sum()) if rubs else 0,
+                states=states.size,
+                first_state=program.first_state,
+                inputs=inputs.shape[1],
+                first_input=program.first_input,
+                t=program.t,
+                midpoint=program.midpoint,
+                past=program.past,
+                x=program.x,
+                v=program.v,
+                a=program.a,
+                steps=steps,
+                evaluations_per_step=4 if bench.model.opt.integrator == RK4_INTEGRATOR_ID else 1,
+                evaluation=0,
+                has_acceleration=0,
+            )
+            table.append(context)
+        self._words = np.array(table, dtype=np.int64)
+        row = self._words.strides[0]
+        self.addresses: Array = self._words.ctypes.data + row * np.arange(float(len(table)))
+
+    def renew(self, first: int) -> None:
+        """Set the previous accelerations of all batch elements before a call of MuJoCo.
+
+        Args:
+            first: number of the first step of the call. The initial acceleration lacks the applied
+                forces, so it is not used.
+        """
+        self._words[:, HAS_ACCELERATION] = 0
+        for lane, registers in enumerate(self._registers):
+            registers[self._a] = self._accelerations[lane, self._dofs, None] if first else 0.0
+
+
+def _integers(values: Sequence[int] | NDArray[Any]) -> NDArray[np.int64]:
+    return np.ascontiguousarray(values, dtype=np.int64)
+
+
+@cache
+def _get_callback() -> Any:
+    """Return the compiled callback; None if it is not available."""
+    offsets = find_data_offsets()
+    return None if offsets is None else load_callback(offsets)
+
+
+def find_data_offsets() -> dict[str, int] | None:
+    """Find the offsets of fields in MuJoCo's data, in words of eight bytes.
+
+    They depend on MuJoCo's version. In the data of a model that has numbers in each of the fields,
+    the address of a field stands at the field, and at empty fields before it.
+
+    Returns:
+        The offsets by the name of the field; None if a field is not found.
+    """
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(_PROBE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    wanted = {getattr(data, name).ctypes.data: name for name in DATA_FIELDS}
+    if not hasattr(data, "_address") or len(wanted) < len(DATA_FIELDS):
+        return None
+    words = (ctypes.c_int64 * MAX_DATA_WORDS).from_address(data._address)
+    found: dict[str, int] = {}
+    for i in range(MAX_DATA_WORDS):
+        name = wanted.get(words[i])
+        if name is not None:
+            found[name] = i
+        # Nothing is read beyond the last of the fields.
+        if name == LAST_FIELD:
+            break
+    return found if len(found) == len(DATA_FIELDS) else None
