@@ -28,7 +28,7 @@ from sims.robot.dynamics.midpoint_state import MidpointPredictor
 from sims.robot.dynamics.mujoco_batch import MujocoBatch
 from sims.robot.model_field_effects import RK4_INTEGRATOR_ID
 
-LEAST_FRICTION = 1e-12
+MIN_FRICTION = 1e-12
 """Dry friction in N or N·m of the model where effects add friction.
 
 With it, MuJoCo makes a constraint whose limit the callback replaces.
@@ -75,7 +75,7 @@ def step_in_callback(
         loss = bench.fields["dof_frictionloss"]
         lanes, joints = np.nonzero(rubs)
         dofs = compiled.addresses.velocities[joints]
-        loss[lanes, dofs] = np.maximum(loss[lanes, dofs], LEAST_FRICTION)
+        loss[lanes, dofs] = np.maximum(loss[lanes, dofs], MIN_FRICTION)
     bench.batch.bind("ctrl")[:n] = controls[:, 0]
     predictor = MidpointPredictor(
         bench.batch, compiled.addresses.positions, compiled.addresses.velocities, compiled.loaded

@@ -299,17 +299,17 @@ class CompiledForces:
             next_states=self._program.states,
         )
 
-    def begin(self, look: JointStates) -> None:
+    def begin(self, joint_states: JointStates) -> None:
         """Set the hidden states at the beginning of a motion.
 
         Args:
-            look: joint states at the beginning.
+            joint_states: joint states at the beginning.
         """
         hidden = self._of.hidden
         if not hidden:
             return
-        moment = self._of.make_step_snapshot(0, look)
-        states = [effect.begin(c, moment) for effect, c in hidden]
+        snapshot = self._of.make_step_snapshot(0, joint_states)
+        states = [effect.begin(c, snapshot) for effect, c in hidden]
         begun = [part for state in states for part in (state.x, state.v)]
         self._r[self._states] = np.concatenate(begun, axis=1).T
 
