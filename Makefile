@@ -6,7 +6,7 @@
 # make test-rest the slow ones and those that depend on recordings beside the clone
 # make check     lint, types, import rules and language
 # make docs      the site, to be read without a network: site/html/index.html (Python 3.11 or newer)
-# make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
+# make exam      hides causes in hundreds of recordings and has explain find them (10 minutes; QUICK=--quick, EXAM=robots)
 # make benchmark measurements printed as ratios
 # make chaos     100 kills at random moments; what is resumed must equal what was never disturbed (about 10 minutes)
 # make malformed twelve thousand malformed files, folders and arguments to every command (about 5 minutes; KINDS="films weights")
@@ -120,8 +120,10 @@ docs: $(STAMP)
 	$(BIN)/python -m tests.docs.generate_pages
 	$(BIN)/python -m tests.docs.documentation_site --notebooks
 
+EXAM ?= systems
+
 exam: $(STAMP)
-	$(BIN)/python -m tests.simple_exam $(QUICK)
+	$(BIN)/python -m tests.exams $(EXAM) $(QUICK)
 
 wheel: $(STAMP)
 	$(BIN)/python -m tests.packaging $(if $(WITHOUT),--without $(WITHOUT)) $(PYTHON)

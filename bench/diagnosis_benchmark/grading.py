@@ -29,8 +29,8 @@ from bench.diagnosis_benchmark.case_catalogue import find_equivalent_effects, li
 from bench.diagnosis_benchmark.case_generation.benchmark_case import BenchmarkCase
 
 NamedSets = list[tuple[str, ...]]
-GradedAnswer = tuple[str, int, int]
 CoverageCheck = Callable[[str, tuple[str, ...]], bool]
+EquivalentEffects = Callable[[str], frozenset[str]]
 MAX_SET_SIZE = 2  # maximum size of a set in which a cause counts as identified
 
 
@@ -77,53 +77,75 @@ def grade_answer(item: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grad
     """
     if verdict is None:
         return Grade("failed", 0, 0, "", {})
-    sets = [(cause["effect"], *cause["alternatives"]) for cause in verdict["causes"]]
-    outcome, strict, loose = GRADERS_BY_KIND[item.kind](item, verdict["verdict"], sets)
-    if verdict["verdict"] == "unidentifiable":
-        outcome = "undecided"
+    sets = list_named_sets(verdict)
+    outcome, set_size, class_size = grade_sets(
+        item.kind, item.effects, verdict, lambda effect: find_equivalent_effects(item, effect)
+    )
     covered = (
         _count_covered_intervals(item, verdict, sets)
         if outcome in ("right", "set") and item.kind != "foreign"
         else {}
     )
-    return Grade(outcome, strict, loose, " + ".join("|".join(names) for names in sets), covered)
+    named = " + ".join("|".join(names) for names in sets)
+    return Grade(outcome, set_size, class_size, named, covered)
 
 
-def _grade_clean(item: BenchmarkCase, verdict: str, sets: NamedSets) -> GradedAnswer:
-    return "right" if verdict == "adequate" else "alarm", 0, 0
+def list_named_sets(verdict: Mapping[str, Any]) -> NamedSets:
+    """List every cause of an answer with its alternatives."""
+    return [(cause["effect"], *cause["alternatives"]) for cause in verdict["causes"]]
 
 
-def _grade_foreign(item: BenchmarkCase, verdict: str, sets: NamedSets) -> GradedAnswer:
-    if verdict == "adequate":
-        return "missed", 0, 0
-    return "right" if verdict in ("unknown", "partial") else "wrong", 0, 0
+def grade_sets(
+    kind: str, effects: Iterable[str], verdict: Mapping[str, Any], equivalents: EquivalentEffects
+) -> tuple[str, int, int]:
+    """Grade the named causes of an answer.
+
+    Args:
+        kind: kind of the case; every kind but clean and foreign hides effects of the library.
+        effects: the hidden effects, at most two.
+        verdict: the answer as a dictionary.
+        equivalents: returns an effect and all effects that are equivalent to it in any data.
+
+    Returns:
+        Outcome, number of effects in the set that contains them, and their number with
+        equivalent effects counted as one; see `Grade`.
+    """
+    word, size, class_size = verdict["verdict"], 0, 0
+    if kind == "clean":
+        outcome = "right" if word == "adequate" else "alarm"
+    elif word == "adequate":
+        outcome = "missed"
+    elif kind == "foreign":
+        outcome = "right" if word in ("unknown", "partial") else "wrong"
+    else:
+        sets = list_named_sets(verdict)
+        outcome, size, class_size = _grade_library(list(effects), word, sets, equivalents)
+    return ("undecided" if word == "unidentifiable" else outcome), size, class_size
 
 
-def _grade_library(item: BenchmarkCase, verdict: str, sets: NamedSets) -> GradedAnswer:
+def _grade_library(
+    effects: Sequence[str], word: str, sets: NamedSets, equivalents: EquivalentEffects
+) -> tuple[str, int, int]:
     """Grade an answer on one or two effects of the library.
 
     An answer is right if each effect is in a set of its own and no set is without an effect.
     """
-    if verdict == "adequate":
-        return "missed", 0, 0
-    if not sets or verdict == "unknown":  # effects listed with the verdict "unknown" are not named
+    if not sets or word == "unknown":  # effects listed with the verdict "unknown" are not named
         return "unnamed", 0, 0
-    strict = _match_sets_to_effects(item.effects, sets, lambda effect, names: effect in names)
+    strict = _match_sets_to_effects(effects, sets, lambda effect, names: effect in names)
     loose = _match_sets_to_effects(
-        item.effects,
-        sets,
-        lambda effect, names: bool(_same_up_to_equivalence(item, effect) & set(names)),
+        effects, sets, lambda effect, names: bool(equivalents(effect) & set(names))
     )
-    if len(loose) < len(item.effects):
-        return "one" if loose else "wrong", 0, 0
+    if len(loose) < len(effects):
+        return ("one" if loose else "wrong"), 0, 0
     sizes = max(len(sets[place]) for place in loose.values())
-    classes = max(_classes(item, sets[place]) for place in loose.values())
-    if len(sets) > len(item.effects):
+    classes = max(_count_classes(sets[place], equivalents) for place in loose.values())
+    if len(sets) > len(effects):
         return "extra", sizes, classes
-    if len(strict) < len(item.effects):
+    if len(strict) < len(effects):
         return "class", 0, classes  # only equivalent effects are named
     sizes = max(len(sets[place]) for place in strict.values())
-    return "right" if sizes == 1 else "set", sizes, classes
+    return ("right" if sizes == 1 else "set"), sizes, classes
 
 
 def _match_sets_to_effects(
@@ -155,26 +177,14 @@ def _match_sets_to_effects(
     return best
 
 
-def _same_up_to_equivalence(item: BenchmarkCase, effect: str) -> frozenset[str]:
-    return find_equivalent_effects(item, effect)
-
-
-def _classes(item: BenchmarkCase, names: Sequence[str]) -> int:
+def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:
     """Count the distinct names of a set, equivalent effects counted as one.
 
     The family of an effect (``effect@*``) is not counted if the set contains one of its places.
     """
     placed = {name.partition("@")[0] for name in names if not name.endswith("@*")}
     counted = [n for n in names if not n.endswith("@*") or n.partition("@")[0] not in placed]
-    return len({min(_same_up_to_equivalence(item, name)) for name in counted})
-
-
-GRADERS_BY_KIND = {
-    "clean": _grade_clean,
-    "foreign": _grade_foreign,
-    "single": _grade_library,
-    "double": _grade_library,
-}
+    return len({min(equivalents(name)) for name in counted})
 
 
 def _count_covered_intervals(

@@ -1,7 +1,7 @@
 """Does the run that ``simgap design`` proposes split what was open? ``python -m
 tests.benchmarks.next_recording_value [--sets 20] [--seed 0] [--out DIR]``.
 
-From the exam questions with one hidden cause (tests/simple_exam), sets of causes that explain
+From the exam questions with one hidden cause (tests/exams/systems), sets of causes that explain
 cannot distinguish are drawn by seed; the causes of a set are not all equivalent by
 `find_equivalent_effects`. The proposed run is recorded once by the exam's own simulators, with the
 hidden cause and new noise, and everything is explained together. A set is
@@ -43,7 +43,8 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
 from sims.core.simulator import Scenario
 from sims.recording.recording import Recording, Run
 from sims.recording.recording_writer import write_recording
-from tests.simple_exam.exam_questions import sheet
+from tests.exams.exam import UndrawableError
+from tests.exams.systems.system_cases import questions
 
 SECONDS = 4.0
 # Relative error of the initial states (absolute below 1 m or 1 rad), as in a real experiment.
@@ -64,7 +65,7 @@ def main(arguments):
     parser.add_argument("--only", default="", help="questions whose name holds this")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args(arguments)
-    asked = [q for q in sheet(given.offset) if q.part == "marks" and q.kind == "single"]
+    asked = [q for q in questions(given.offset) if q.part == "marks" and q.kind == "single"]
     asked = [q for q in asked if given.only in q.name]
     order = np.random.default_rng(given.seed).permutation(len(asked))
     rows = []
@@ -86,8 +87,9 @@ def _asked(call):
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"
     question, offset, longest = call
-    item = question.drawn(offset)
-    if item is None:
+    try:
+        item = question.draw(offset).item
+    except UndrawableError:
         return None
     with tempfile.TemporaryDirectory() as folder:
         before = write_case(item, folder, truth=False)

@@ -9,7 +9,9 @@ from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from tests.docs.page_numbers.number_sources import NUMBER, Account
-from tests.docs.page_numbers.source_tables import errors, frame, one, rows
+from tests.docs.page_numbers.source_tables import REFERENCE, errors, frame, one, rows
+from tests.exams import exam_report
+from tests.exams.answer_rows import read_table
 from tests.sims.test_engines import TOLERANCE
 
 STUDY = "tunenet-study"
@@ -202,7 +204,7 @@ def performance():
     """Check docs/performance.md."""
     page = Account("docs/performance.md")
     page.written("\n".join(cost_rows()))
-    items = frame("exam/items.csv").query("part == 'marks'")
+    items = exam_report.graded(read_table(REFERENCE / "exam/items.csv"))
     names = {
         "nothing hidden": "clean", "one cause": "single", "two causes": "double",
         "a foreign cause": "foreign",
@@ -210,7 +212,7 @@ def performance():
 
     def value(row, heading):
         """Return statistics of the seconds for cases of one kind."""
-        seconds = items[items.kind == names[row[""]]].seconds
+        seconds = items[items.kind == names[row[""]]].wall_s
         values = {
             "questions": len(seconds), "median, s": seconds.median(),
             "95th percentile": seconds.quantile(0.95), "most": seconds.max(),
@@ -303,12 +305,12 @@ def engines():
 def robots():
     """Check docs/robots.md: the results for robots with a floating base."""
     page = Account("docs/robots.md")
-    told = frame("robots/afloat.csv")
+    told = read_table(REFERENCE / "robots/afloat.csv")
     of = {kind: told[told.kind == kind] for kind in ("single", "clean", "foreign")}
     single, clean, foreign = of.values()
     good = {kind: rows.outcome.isin(["right", "set"]) for kind, rows in of.items()}
     alone = single.outcome == "right"
-    sets = single[~alone].named
+    sets = single[~alone].causes
     page.says("All {} cases were evaluated", len(told))
     page.says("| one cause | {} | {} |", len(single), good["single"].sum())
     page.says("| {} named alone; {} in sets", alone.sum(), len(sets))
@@ -321,13 +323,13 @@ def robots():
     page.says("another joint, encoder slip | {} | {} |", len(foreign), good["foreign"].sum())
     unknown = (foreign.verdict == "unknown").sum()
     page.says("| {} `unknown`, {} `partial` |", unknown, (foreign.verdict == "partial").sum())
-    held, count = told.intervals_holding.dropna().str.split("/", expand=True).astype(int).sum()
+    held, count = told.intervals_held.sum(), told.intervals.sum()
     page.says("Of {} intervals {} contain the true value ({} %)", count, held, 100 * held / count)
-    page.says("median processor time is {} s for a case with one", single.processor.median())
-    page.says("one cause, {} s for a clean one", clean.processor.median())
-    page.says("and {} s for a cause outside the library", foreign.processor.median())
+    page.says("median processor time is {} s for a case with one", single.cpu_s.median())
+    page.says("one cause, {} s for a clean one", clean.cpu_s.median())
+    page.says("and {} s for a cause outside the library", foreign.cpu_s.median())
     page.says("first {} clean recordings there were two", len(clean))
-    page.says("the {} cases of the hanging body", (clean.robot == "hung-motor").sum())
+    page.says("the {} cases of the hanging body", (clean.system == "hung-motor").sum())
     return page
 
 

@@ -1,7 +1,6 @@
 """Tests that the pages on the accuracy of explain agree with their summaries."""
 
 import json
-from operator import not_
 
 import pytest
 
@@ -9,61 +8,75 @@ from bench.bounce_shot.hit_rate_table import compute_wilson_interval
 from bench.diagnosis.search.verdict_rules import FAULTY, OPEN, VERDICT_MEANINGS
 from tests.docs.documentation_pages import quoted, section, tables, text_of
 from tests.docs.page_numbers.number_sources import NUMBER, Account
-from tests.docs.page_numbers.source_tables import document, frame
-from tests.robot_exam import robot_exam_report as robots_report
-from tests.simple_exam import exam_report
-from tests.simple_exam.exam_summary import share
+from tests.docs.page_numbers.source_tables import REFERENCE, frame
+from tests.exams import exam_report
+from tests.exams.answer_rows import read_table
+from tests.exams.robots import robot_cases
+from tests.exams.systems import system_cases
 
 
-def percent(share):
+def percent(got):
     """Return a fraction and its confidence limits in percent."""
-    return 100 * share["share"], 100 * share["low"], 100 * share["high"]
+    return [100 * part for part in got[2:]]
+
+
+def answers(path):
+    """Return the graded answers of a table below results/reference."""
+    return exam_report.graded(read_table(REFERENCE / path))
+
+
+def level(table, kind, name):
+    """Return the share of answers of a kind that reach a level, with its interval."""
+    return exam_report.share(table[table.kind == kind][name], exact=kind == "clean")
+
+
+def results(folder, exam):
+    """Check the generated part of the page of an exam."""
+    page = Account(f"results/reference/{folder}/README.md")
+    page.written(exam_report.format_page(exam, read_table(page.path.parent / "items.csv")))
+    return page
 
 
 def exam():
     """Check results/reference/exam."""
-    page = Account("results/reference/exam/README.md")
-    summary = document("exam/summary.json")
-    items = frame("exam/items.csv")
-    page.written(exam_report.page(summary))
-    single, double = (
-        summary["single"]["named as data tell"],
-        summary["double"]["named as data tell"],
-    )
-    page.says("no false alarm on {} clean recordings", summary["clean"]["alarms"]["of"])
-    assert summary["clean"]["alarms"]["count"] == 0
-    page.says("finds {} % of single hidden", 100 * single["share"])
-    page.says("Of pairs it finds {} of {},", double["count"], double["of"])
-    page.says("a median of {} s", summary["seconds"]["median"])
-    page.says("the slowest twentieth {} s", summary["seconds"]["p95"])
-    amiss = items[(items.part == "marks") & items.outcome.isin(["unnamed", "missed"])]
-    sizes = dict(zip(amiss.question.str.split("/").str[3], amiss["size"], strict=True))
+    page = results("exam", system_cases.EXAM)
+    items = answers("exam/items.csv")
+    seconds = exam_report.drawn(read_table(page.path.parent / "items.csv")).wall_s
+    alarms, foreign = level(items, "clean", "strict"), level(items, "foreign", "strict")
+    double = level(items, "double", "fair")
+    page.says("no false alarm on {} clean recordings", alarms[1])
+    assert alarms[0] == alarms[1]
+    page.says("finds {} % of single hidden", percent(level(items, "single", "fair"))[0])
+    page.says("Of pairs it finds {} of {},", *double[:2])
+    page.says("a median of {} s", seconds.median())
+    page.says("the slowest twentieth {} s", seconds.quantile(0.95))
+    amiss = items[items.outcome.isin(["unnamed", "missed"])]
+    sizes = dict(zip(amiss.effect, amiss["size"], strict=True))
     page.says("a flexible joint at {} times", sizes["joint.flexibility"])
     page.says("a ripple at {}, a slip at {},", sizes["force.ripple"], sizes["sensor.slip"])
     page.says("a limit of the input's rate at {}", sizes["input.rate"])
     page.known("All 883 cases were run with one version (d961f13, 56 effects) in 10", "of that day")
-    foreign = summary["foreign"]["right"]
-    page.says("outside the library all {}.", foreign["of"])
-    assert foreign["count"] == foreign["of"]
+    page.says("outside the library all {}.", foreign[1])
+    assert foreign[0] == foreign[1]
     return page
 
 
 def robots():
     """Check results/reference/robots."""
-    page = Account("results/reference/robots/README.md")
-    summary = document("robots/summary.json")
-    page.written(robots_report.page(summary))
-    told = frame("robots/items.csv")
-    asked = len(told) + len(summary["cannot show"])
-    page.says("the sheet of that day {} were asked", asked)
+    page = results("robots", robot_cases.EXAM)
+    told = read_table(REFERENCE / "robots/items.csv")
+    page.says("the sheet of that day {} were asked", len(told))
+    page.known("Recordings of robots of 2 to 7 joints", "the exam")
+    page.known("or in a set of\nat most 4; `fair`".replace("\n", " "), "the exam")
+    page.known("(error at most 5 % larger)", "the exam")
     page.known("Of the 726 questions", "the sheet of that day")
     page.known("with at most 900 s", "how it was asked")
     page.known("(that of 23 November)", "how it was asked")
     page.known("(the last 39 with 1,500)", "how it was asked")
-    assert len(summary["failed"]) == 3
+    assert (told.outcome == "failed").sum() == 3
     page.known("end in 900 s", "how it was asked")
-    between = frame("robots/transmission.csv")
-    right, play = between.outcome == "right", between.question.str.contains("backlash")
+    between = read_table(REFERENCE / "robots/transmission.csv")
+    right, play = between.outcome == "right", between.item.str.contains("backlash")
     drawn = between.outcome != "not drawn"
     page.says("{} of the sheet, `transmission.csv`", len(between))
     page.known("by a library of 24 November", "which library it was")
@@ -79,9 +92,9 @@ def robots():
 
 def asked_again(page):
     """Check the statements of the page about again.csv."""
-    again = frame("robots/again.csv")
+    again = read_table(REFERENCE / "robots/again.csv")
     single = again[(again.kind == "single") & (again.outcome != "not drawn")]
-    rubs = again.question.str.contains("friction")
+    rubs = again.item.str.contains("friction")
     clean = again[again.kind == "clean"]
     opening = "names {} of {} single causes with their place, and gives no false alarm on {} clean"
     page.says(opening, single.strict.sum(), len(single), len(clean))
@@ -89,16 +102,16 @@ def asked_again(page):
     page.known("with at most 1,500 s", "how it was asked")
     page.says("in the middle of a step): {} of 740", len(again))
     page.known("of 740 questions of the sheet", "the sheet of that day")
-    page.says("{} s of processor time at the median", again.processor.median())
+    page.says("{} s of processor time at the median", again.cpu_s.median())
     page.says("single causes {} of {} are named alone", single.strict.sum(), len(single))
     page.says("{} alone or in a set of at most", single.few.sum())
     page.known("a set of at most 4, 151", "`score.FEW`")
     page.says("{} ({} %) alone or in a set whose", single.fair.sum(), 100 * single.fair.mean())
-    held, count = again.held.sum(), again.intervals.sum()
+    held, count = again.intervals_held.sum(), again.intervals.sum()
     page.says("Of {} intervals {} hold ({} %", count, held, 100 * held / count)
     low, high = (100 * share for share in compute_wilson_interval(int(held), int(count)))
     page.says("%, {} to {})", low, high)
-    page.says("frictions {} of {}.", again[rubs].held.sum(), again[rubs].intervals.sum())
+    page.says("frictions {} of {}.", again[rubs].intervals_held.sum(), again[rubs].intervals.sum())
     assert (clean.outcome == "right").all()
     page.says("Of {} clean recordings none", len(clean))
     # Upper 95 % confidence limit of a fraction when none of n cases occurs: (1 - fraction)^n =
@@ -106,7 +119,7 @@ def asked_again(page):
     page.says("fewer than {} %; the goal", 100 * (1 - 0.05 ** (1 / len(clean))))
     page.known("alarm (with 95 % confidence", "as the share below")
     page.known("the goal is 1 %", "issue and page say it")
-    page.says("take {} s of processor", clean.processor.median())
+    page.says("take {} s of processor", clean.cpu_s.median())
     pairs, foreign = (again[again.kind == kind] for kind in ("double", "foreign"))
     count, found = len(pairs), pairs.fair.sum()
     page.says("Of {} pairs {} are right ({} %)", count, found, 100 * found / count)
@@ -161,20 +174,27 @@ def next_recording():
 def verdicts():
     """Check docs/verdicts.md."""
     page = Account("docs/verdicts.md")
-    exam, again = document("exam/summary.json"), frame("robots/again.csv")
-    again = again[again.outcome != "not drawn"]
+    exam, again = answers("exam/items.csv"), answers("robots/again.csv")
 
-    def of(kind, how="fair"):
-        return share(again[again.kind == kind][how], bool)
+    def pair(kind, name="fair"):
+        """Return the shares of both exams."""
+        return level(exam, kind, name), level(again, kind, name)
 
-    held = [n < row.held for row in again.itertuples() for n in range(row.intervals)]
+    def covered(table):
+        """Return the share of intervals that hold the truth."""
+        held, count = int(table.intervals_held.sum()), int(table.intervals.sum())
+        return exam_report.share([True] * held + [False] * (count - held))
+
+    # A false alarm is the complement of a right answer.
+    alarms = [exam_report.share(~t[t.kind == "clean"].strict, exact) for t, exact in
+              ((exam, True), (again, False))]  # fmt: skip
     counts = {
-        "nothing hidden": (exam["clean"]["alarms"], share(again[again.kind == "clean"].fair, not_)),
-        "one cause: named, or": (exam["single"]["named as data tell"], of("single")),
-        "one cause: named alone": (exam["single"]["named alone"], of("single", "strict")),
-        "two causes": (exam["double"]["named as data tell"], of("double")),
-        "a cause that": (exam["foreign"]["right"], of("foreign")),
-        "95 % intervals": (exam["coverage"]["all"], share(held, bool)),
+        "nothing hidden": alarms,
+        "one cause: named, or": pair("single"),
+        "one cause: named alone": pair("single", "strict"),
+        "two causes": pair("double"),
+        "a cause that": pair("foreign", "strict"),
+        "95 % intervals": (covered(exam), covered(again)),
     }
 
     def value(row, heading):
@@ -182,8 +202,8 @@ def verdicts():
         if heading == "":
             return None
         (shares,) = (pair for words, pair in counts.items() if row[""].startswith(words))
-        share = shares["robots" in heading]
-        numbers = [share["count"], share["of"], *percent(share)]
+        got = shares["robots" in heading]
+        numbers = [*got[:2], *percent(got)]
         return numbers[: len(NUMBER.findall(row[heading]))]
 
     assert page.table("| [ball", value) == 12 * 2 + 8

@@ -5,7 +5,7 @@ import pytest
 
 from sims import effects
 from sims.core.system import Signal
-from tests.robot_exam.excitation_signals import profiled
+from tests.exams.robots.excitation_signals import profiled
 from tests.sims.effects.effect_systems import lanes
 
 

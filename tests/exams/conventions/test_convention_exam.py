@@ -1,0 +1,138 @@
+"""Tests of conventions in logs from MuJoCo.
+
+Broken conventions are found and corrected, and causes are not mistaken for them.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.diagnosis.conventions.convention_comparison import (
+    ConventionComparison,
+    ConventionDifference,
+)
+from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis, SignalChange
+from bench.diagnosis.conventions.corrected_description import corrected, lines_of
+from bench.diagnosis.conventions.unit_check import Subject
+from bench.logs.inspection import load_recording
+from sims.recording.angle_unwrapping import unwrapped
+from sims.recording.recording_description import read_meta
+from tests.exams.conventions.convention_logs import BROKEN, CAUSES, write_log
+from tests.malformed_input import valid_input
+
+SEEDS = {
+    "sign of position": (12, "the sign of q.j1, qd.j1 looks reversed"),
+    "sign of command": (1, "the sign of u.m1 looks reversed"),
+    "sign of both": (14, "the axis of joint j0 looks reversed, command and position"),
+    "zero of position": (15, "position q.j1 looks counted from another zero"),
+    "zero of both": (40, "joint j1 looks counted from another zero, command and position"),
+    "unit of one": (5, "the numbers of q.j2 look like degrees, stated as radians"),
+    "unit of all": (18, "look like milliradians, stated as radians"),
+    "exchanged positions": (7, "the channels of j0, j1 look exchanged"),
+    "exchanged commands": (20, "the commands of j1, j2 look exchanged"),
+    "exchanged both": (33, "the channels and commands of j0, j1 look exchanged"),
+    "wrapped": (10, "position q.j2 looks wrapped: whole turns are left out"),
+    "late commands": (23, "commands look stamped 0.03 s late"),
+}
+"""By convention, the seed of a log that breaks it, and the expected message."""
+QUICK = ("exchanged positions",)
+"""Conventions of the fast tests."""
+
+
+def check(path):
+    recording, kind = load_recording(path)
+    return ConventionComparison(Subject(kind, recording, None))
+
+
+@pytest.mark.parametrize(
+    "broken", [b if b in QUICK else pytest.param(b, marks=pytest.mark.slow) for b in BROKEN]
+)
+def test_a_broken_convention_is_found_and_its_correction_leaves_none(broken, tmp_path, capsys):
+    seed, says = SEEDS[broken]
+    log = write_log(tmp_path / "log", seed, broken)
+    (found,) = check(log.path).differences()
+    assert says in found.hypothesis.description
+    if broken == "zero of both":
+        offset = found.hypothesis.changes["q.j1"].offset
+        assert offset == pytest.approx(-log.size, abs=0.03)
+    assert main(["explain", str(log.path), "--out", str(tmp_path / "out"), "--jobs", "1"]) == 2
+    assert says in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+    fixed = tmp_path / "log" / "fixed.toml"
+    told = ["inspect", str(log.path), "--fix", str(fixed), "--out", str(tmp_path / "look")]
+    assert main(told) == 0
+    assert "convention: " in capsys.readouterr().out
+    assert check(fixed.with_suffix(".csv")).differences() == []
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_a_cause_is_no_broken_convention(cause, tmp_path):
+    log = write_log(tmp_path / "log", 2000 + CAUSES.index(cause), None, cause)
+    assert check(log.path).differences() == []
+
+
+def test_a_change_that_transforms_nothing_finds_nothing(tmp_path, monkeypatch):
+    log = write_log(tmp_path / "log", *_seed("sign of command"))
+    assert check(log.path).differences() != []
+    monkeypatch.setattr(SignalChange, "applied", lambda change, signals: signals[change.source])
+    assert check(log.path).differences() == []
+
+
+def test_soft_friction_is_no_other_zero(tmp_path):
+    """With MuJoCo's soft friction, another zero improves the fit less than friction does."""
+    log = write_log(tmp_path / "log", 2002, None, "friction")
+    comparison = check(log.path)
+    assert comparison.differences() == []
+
+
+def test_a_model_that_diverges_between_samples_tells_nothing(tmp_path):
+    """Milliseconds read as seconds: in 20 s an unstable joint exceeds the range of numbers."""
+    model = valid_input.ARM.replace(b'name="hip"', b'name="hip" stiffness="-5e4"')
+    (tmp_path / "arm.xml").write_bytes(model)
+    (tmp_path / "log.csv").write_bytes(valid_input.logs()["log.csv"])
+    mapped = {**valid_input.MAPPED, "time": {"column": "stamp"}}
+    (tmp_path / "mapped.toml").write_bytes(valid_input.toml(mapped))
+    assert check(tmp_path / "mapped.toml").differences() == []
+
+
+def _seed(broken):
+    return SEEDS[broken][0], broken
+
+
+def test_whole_turns_are_put_back_beside_the_command():
+    angle = np.linspace(2.0, 9.0, 60)
+    wrapped = (angle + math.pi) % (2 * math.pi) - math.pi
+    wrapped[7] = np.nan
+    there = np.isfinite(wrapped)
+    assert unwrapped(wrapped)[there] == pytest.approx(angle[there])
+    later = unwrapped(wrapped, command=angle + 4 * math.pi + 0.1)
+    assert later[there] == pytest.approx(angle[there] + 4 * math.pi)
+
+
+def test_the_corrected_description_reads_as_the_change_says(tmp_path):
+    """The new keys make -1 times the old value, plus 0.5 rad.
+
+    The log has degrees with a scale and an offset. The joint counts in the opposite direction from
+    0.5 rad.
+    """
+    log = write_log(tmp_path / "log", 2001, None)
+    path = log.path.with_suffix(".toml")
+    text = path.read_text().replace(
+        '[channels."q.j1"]\nunit = "rad"',
+        '[channels."q.j1"]\nunit = "deg"\nscale = 2.0\noffset = 3.0',
+    )
+    path.write_text(text)
+    recording, kind = load_recording(log.path)
+    before = recording.runs[0].channels["q.j1"]
+    change = ConventionHypothesis("", {"q.j1": SignalChange("q.j1", -1.0, 0.5)})
+    differences = [ConventionDifference(change, 1.0)]
+    _, meta = read_meta(log.path)
+    after = corrected(meta, kind, differences)["channels"]["q.j1"]
+    degree = math.pi / 180.0
+    raw = before / degree / 2.0 - 3.0 / 2.0
+    assert degree * (after["scale"] * raw + after["offset"]) == pytest.approx(0.5 - before)
+    assert list(lines_of(meta, kind, differences)) == [
+        f'[channels."q.j1"] scale = -2, offset = {0.5 / degree - 3.0:.9g}'
+    ]

@@ -1,0 +1,216 @@
+"""Summary, page and text of an exam, all from the table of answers (items.csv)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from tests.exams.answer_rows import LEVELS, NOT_DRAWN
+
+BEGIN, END = "<!-- results -->", "<!-- /results -->"
+SIZES = (0.0, 1.0, 10**0.25, 10**0.5, 10**0.75, 10.0, np.inf)
+"""Limits of the sizes that are counted together, in units of the noise."""
+SUMMARY_COLUMNS = (
+    "version", "group", "value", "items", *LEVELS, "no_answer", "intervals_held", "intervals",
+    "cpu_median_s", "cpu_p95_s", "cpu_max_s", "wall_median_s", "memory_max_mb",
+)  # fmt: skip
+MAX_ALARMS = 0.01
+COVERAGE = (0.90, 0.98)
+
+
+def write_report(folder, exam, table):
+    """Write summary.csv, figures and the results in README.md.
+
+    Other text of README.md is kept.
+    """
+    from tests.exams import exam_figures
+
+    summarise(exam, table).to_csv(folder / "summary.csv", index=False)
+    path = folder / "README.md"
+    page = path.read_text() if path.exists() else f"# {exam.title}\n\n{exam.about}\n\n{BEGIN}{END}"
+    before, _, rest = page.partition(BEGIN)
+    after = rest.partition(END)[2]
+    path.write_text(f"{before}{BEGIN}\n{format_page(exam, table)}{END}{after}".rstrip() + "\n")
+    exam_figures.draw_figures(folder / "figures", table)
+
+
+def share(good, exact=False):
+    """Return (count, total, share, low, high) of a boolean column, with its 95 % interval.
+
+    The interval is Wilson's, or Clopper-Pearson's with `exact`.
+    """
+    count, total = int(np.sum(good)), len(good)
+    if not total:
+        return 0, 0, None, None, None
+    interval = binomtest(count, total).proportion_ci(0.95, method="exact" if exact else "wilson")
+    return count, total, count / total, interval.low, interval.high
+
+
+def drawn(table):
+    """Return the answers without questions that have no case."""
+    return table[table.outcome != NOT_DRAWN]
+
+
+def graded(table):
+    """Return the answers that the targets count: without those only of the power curve."""
+    table = drawn(table)
+    table = table[table.outcome != "unknown"]  # Nobody knows the right answer.
+    return table[table.part == "marks"] if "part" in table else table
+
+
+def groups(exam, table):
+    """Yield (group, value, answers) for all, for each kind, and for each group of hidden causes."""
+    table = graded(table)
+    yield "all", "", table
+    for kind, own in table.groupby("kind"):
+        yield "kind", kind, own
+    hidden = table[~table.kind.isin(["clean", "foreign"])]
+    for name in exam.groups:
+        if name == "size":
+            labels = pd.cut(hidden["size"], SIZES, right=False).map(
+                lambda limits: f"{limits.left:.2g} to {limits.right:.2g}"
+            )
+        else:
+            labels = hidden.get(name, pd.Series(dtype=str))
+        for value, own in hidden.groupby(labels, observed=True):
+            yield name, value, own
+
+
+def summarise(exam, table):
+    """Return a frame with counts and times of each group and version."""
+    lines = [
+        (version, group, value, *_totals(rows))
+        for version, own in table.groupby("version", sort=False)
+        for group, value, rows in groups(exam, own)
+        if len(rows)
+    ]
+    return pd.DataFrame(lines, columns=SUMMARY_COLUMNS)
+
+
+def _totals(rows):
+    """Return the cells of `SUMMARY_COLUMNS` from items on."""
+    cpu = rows.cpu_s.fillna(0.0)
+    sums = rows[[*LEVELS]].sum().astype(int)
+    times = cpu.median(), cpu.quantile(0.95), cpu.max(), rows.wall_s.median()
+    return (
+        len(rows), *sums, int((rows.outcome == "failed").sum()), int(rows.intervals_held.sum()),
+        int(rows.intervals.sum()), *(round(float(seconds), 1) for seconds in times),
+        rows.memory_mb.max().round(),
+    )  # fmt: skip
+
+
+def target_rows(exam, table):
+    """Return rows (description, required, share, whether it is met or None) of the targets."""
+    table = graded(table)
+    rows = []
+    for target in exam.targets:
+        own = table if target.kind is None else table[table.kind == target.kind]
+        got = share(own[target.level])
+        is_met = None if target.min_share is None or got[2] is None else got[2] >= target.min_share
+        wanted = "" if target.min_share is None else f"at least {target.min_share:.0%}"
+        rows.append((target.description, wanted, got, is_met))
+    if (table.kind == "clean").any():
+        alarms = share(table[table.kind == "clean"].outcome != "right", exact=True)
+        rows.append(("clean recordings: false alarms", f"at most {MAX_ALARMS:.0%}", alarms,
+                     alarms[2] <= MAX_ALARMS))  # fmt: skip
+    held, count = int(table.intervals_held.sum()), int(table.intervals.sum())
+    if count:
+        low, high = COVERAGE
+        got = share([True] * held + [False] * (count - held))
+        rows.append(("95 % intervals that hold the truth", f"{low:.0%} to {high:.0%}", got,
+                     low <= got[2] <= high))  # fmt: skip
+    return rows
+
+
+def passes(exam, table):
+    """Return whether a quick exam has no alarm, no failure and enough right answers."""
+    table = drawn(table)
+    hidden = table[table.kind != "clean"]
+    return (
+        not (table.outcome == "failed").any()
+        and bool(table[table.kind == "clean"].strict.all())
+        and hidden.equivalent.sum() >= exam.quick_share * len(hidden)
+    )
+
+
+def format_share(got):
+    count, total, ratio, low, high = got
+    if ratio is None:
+        return "none"
+    return f"{count}/{total} = {ratio:.1%} ({low:.1%} to {high:.1%})"
+
+
+def format_targets(exam, table):
+    """Return the targets and times of each version as lines of text."""
+    lines = []
+    words = {None: "", True: "yes", False: "NO"}
+    for version, own in table.groupby("version", sort=False):
+        lines.append(f"{version}:")
+        for description, wanted, got, is_met in target_rows(exam, own):
+            lines.append(f"{words[is_met]:4}{format_share(got):>34}  {description} {wanted}")
+        lines.append(format_times(own))
+    return "\n".join(lines)
+
+
+def format_times(table):
+    """Return quantiles of processor seconds as text."""
+    table = drawn(table)
+    column, word = ("cpu_s", "processor ") if table.cpu_s.notna().any() else ("wall_s", "")
+    seconds = table[column].dropna()
+    if not len(seconds):
+        return "no times"
+    middle, high, most = seconds.median(), seconds.quantile(0.95), seconds.max()
+    return (
+        f"{word}seconds an answer: median {middle:.1f}, 95th percentile {high:.1f}, most {most:.1f}"
+    )
+
+
+def format_answers(table):
+    """Return one line an answer."""
+    lines = []
+    for row in table.itertuples():
+        level = next((level for level in LEVELS if getattr(row, level)), "-")
+        lines.append(
+            f"{row.item:44} {row.outcome:9} {level:10} {row.cpu_s:6.1f} s  {row.hidden}  ->  "
+            f"{row.causes or row.message or '-'}"
+        )
+    return "\n".join(lines)
+
+
+def format_page(exam, table):
+    """Return the results as Markdown: targets, times, counts by group, outcomes."""
+    table = table[table.version == table.version.iloc[-1]]
+    words = {None: "", True: "yes", False: "no"}
+    lines = ["| mark | wanted | reached (95 % interval) | met |", "|---|---|---|---|"]
+    for description, wanted, got, is_met in target_rows(exam, table):
+        lines.append(f"| {description} | {wanted} | {format_share(got)} | {words[is_met]} |")
+    lines += ["", f"{format_times(table)[0].upper()}{format_times(table)[1:]}.", ""]
+    summary = summarise(exam, table)
+    for group in dict.fromkeys(summary.group):
+        if group != "all":
+            head = " | ".join(LEVELS)
+            lines += [f"## By {group}", "", f"| | answers | {head} |", "|---|---|" + "---|" * 5]
+            for row in summary[summary.group == group].itertuples():
+                cells = " | ".join(str(getattr(row, level)) for level in LEVELS)
+                lines.append(f"| {row.value} | {row.items} | {cells} |")
+            lines.append("")
+    lines += ["## Outcomes", ""]
+    for kind, own in graded(table).groupby("kind"):
+        counts = own.outcome.value_counts().sort_index()
+        lines.append(f"- {kind}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
+    undrawn = table[table.outcome == NOT_DRAWN]
+    if len(undrawn):
+        lines += ["", f"No drawing of {len(undrawn)} questions shows the cause: "
+                  + ", ".join(sorted(undrawn.item)) + "."]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def differing_recordings(rows):
+    """Yield a line if versions have answered different recordings of a question."""
+    digests = {}
+    for row in rows:
+        digests.setdefault(row["item"], set()).add(row.get("digest"))
+    names = sorted(name for name, found in digests.items() if len(found) > 1)
+    if names:
+        yield "recordings differ between versions (use --fresh): " + ", ".join(names)

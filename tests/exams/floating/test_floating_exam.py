@@ -1,0 +1,125 @@
+"""Tests of the floating-base world and of `simgap explain` on its recordings."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pinocchio", reason="pin has no wheel here")
+
+from bench.cli.main import main
+from tests.exams.floating import floating_robots, floating_settings
+from tests.exams.floating.floating_cases import FloatingQuestion
+from tests.exams.robots.reference_world import Run, World
+from tests.exams.robots.robot_cases import bare_case, setting_of, write_setting
+
+SECONDS = 1.5
+
+
+@pytest.fixture(scope="module", params=floating_robots.NAMES)
+def machine(request):
+    return floating_robots.machine(request.param, np.random.default_rng(5))
+
+
+def begun(machine):
+    """Return a run with zero commands."""
+    rng, hinges = np.random.default_rng(6), len(machine.hinges)
+    pose, rate = floating_settings._begun(machine, rng)
+    q = np.concatenate([rng.uniform(-0.4, 0.4, hinges), pose])
+    v = np.concatenate([rng.uniform(-1.0, 1.0, hinges), rate])
+    times = np.arange(0.0, SECONDS, 0.01)
+    return Run(times, {drive.name: 0 * times for drive in machine.drives}, q, v)
+
+
+def frictionless(machine):
+    """Return the machine without damping and with motors instead of servos."""
+    links = tuple(replace(link, damping=0.0) for link in machine.links)
+    drives = tuple(replace(drive, kind="motor", kp=0.0, kv=0.0) for drive in machine.drives)
+    return replace(machine, links=links, drives=drives)
+
+
+def test_the_world_keeps_energy_and_what_else_is_kept(machine):
+    """Without friction energy is constant; without gravity momentum is constant as well."""
+    import pinocchio
+
+    machine = frictionless(machine)
+    world, run = World(machine), begun(machine)
+    motion, plant = world.move(run, run.times), world.plant
+    energy = [plant.energy(q, v) for q, v in zip(motion.q, motion.v, strict=True)]
+    assert np.ptp(energy) < 1e-7 * np.ptp([plant.energy(run.q, s * run.v) for s in (0, 1)])
+    np.testing.assert_allclose(np.linalg.norm(motion.q[:, -4:], axis=1), 1.0, atol=1e-12)
+    assert np.ptp(motion.q, axis=0)[: len(machine.hinges)].min() > 0.1, "its hinges move"
+    if machine.gravity:
+        return
+    spins = []
+    for q, v in zip(motion.q, motion.v, strict=True):
+        pose, rate = plant._reordered(q, v)
+        pinocchio.computeCentroidalMomentum(plant.model, plant.data, pose, rate)
+        spins.append(plant.data.hg.np.copy())
+    np.testing.assert_allclose(spins, spins[0][None].repeat(len(spins), 0), atol=1e-8)
+
+
+def test_friction_makes_the_world_lose_energy(machine):
+    machine = frictionless(machine)
+    hinge = machine.hinges[0]
+    world, run = World(machine, {f"friction.coulomb@{hinge}": (0.05,)}), begun(machine)
+    motion = world.move(run, run.times)
+    energy = [world.plant.energy(q, v) for q, v in zip(motion.q, motion.v, strict=True)]
+    way = np.abs(np.diff(motion.q[:, 0])).sum()
+    assert energy[0] - energy[-1] == pytest.approx(0.05 * way, rel=0.02), "force times way"
+
+
+def test_simgap_begins_where_the_recording_says_and_moves_alike(machine, tmp_path):
+    """simgap and the reference world, with different pose conventions, make the same motion."""
+    from bench.core.plugin_registries import make_robot_simulator
+    from sims.core.simulator import Scenario
+
+    (tmp_path / "robot.xml").write_text(machine.mjcf())
+    run = begun(machine)
+    run = replace(run, commands={n: 0.05 * np.sin(6.0 * run.times) for n in run.commands})
+    motion = World(machine).move(run, run.times)
+    hinges = len(machine.hinges)
+    initial = machine.stated_initial_state(run)
+    for number, name in enumerate(machine.hinges):
+        initial |= {f"q.{name}": run.q[number], f"qd.{name}": run.v[number]}
+    inputs = {f"u.{name}": command for name, command in run.commands.items()}
+    simulator = make_robot_simulator(tmp_path / "robot.xml")(
+        observe=[f"q.{name}" for name in machine.hinges]
+    )
+    seen = simulator.simulate(np.empty((1, 0)), Scenario(run.times, initial, inputs))[0]
+    np.testing.assert_allclose(seen, motion.q[:, :hinges], atol=2e-6)
+    assert np.abs(seen - seen[0]).max() > 0.1
+
+
+@pytest.mark.slow
+def test_a_wrong_mass_below_a_ball_joint_is_found_by_the_command(tmp_path):
+    """The command finds a wrong mass from four runs of an exam question."""
+    name, truth = "single/hung-motor/mass.scale/0", 0.0787
+    case, setting = bare_case(name, {"mass.scale@upper": (truth,)}), setting_of(name)
+    log = write_setting(case, replace(setting, runs=setting.runs[2:]), tmp_path)
+    assert main(["explain", str(log), "--out", str(tmp_path / "out")]) == 0
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    (cause,) = verdict["causes"]
+    assert (cause["effect"], cause["alternatives"]) == ("mass.scale@upper", [])
+    (said,) = cause["coefficients"].values()
+    assert said["low"] <= truth <= said["high"]
+    assert said["high"] - said["low"] < 0.2 * truth
+    assert verdict["heldout"]["gap_closed"] > 0.9
+
+
+@pytest.mark.slow
+def test_a_held_out_run_that_is_chaotic_is_no_gap(tmp_path):
+    """A chaotic held-out run must not count as a discrepancy.
+
+    Errors of its initial state grow by a factor of 1,400. A fit with derivatives at the wrong state
+    ends at twice the noise.
+    """
+    case = FloatingQuestion("clean", "hung-motor", "any", 27).draw()
+    setting = setting_of(case.name)
+    log = write_setting(case, replace(setting, runs=setting.runs[3:]), tmp_path)
+    assert main(["explain", str(log), "--out", str(tmp_path / "out")]) == 0
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    heldout = verdict["heldout"]
+    assert verdict["verdict"] == "adequate"
+    assert heldout["rmse_base"] == pytest.approx(heldout["noise_floor"], rel=0.05)

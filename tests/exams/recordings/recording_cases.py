@@ -1,0 +1,107 @@
+"""All measured recordings and cases, with what is known of each (recordings.toml)."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+from sims.core.toml_validation import tomllib
+from tests.exams import exam
+from tests.exams.answer_rows import conditions_text
+from tests.exams.exam import Exam, Target, UndrawableError
+from tests.exams.explain_calls import Outcome
+from tests.exams.marking import Mark
+from tests.exams.recordings.answer_marking import faults
+
+RECORDINGS = Path(__file__).with_name("recordings.toml")
+SHARED = Path(os.environ.get("SIMGAP_SHARED", Path(__file__).parents[4] / "shared"))
+"""Folder with cases/, data/ and robots/."""
+
+
+@dataclass(frozen=True)
+class RecordingQuestion(exam.Question):
+    """A measured recording."""
+
+    name: str
+    kind = "measured"
+
+    @property
+    def expected(self):
+        return tomllib.loads(RECORDINGS.read_text())[self.name]
+
+    @property
+    def system(self):
+        return self.expected["folder"]
+
+    @property
+    def effect(self):
+        return " + ".join("|".join(c["effect"]) for c in self.expected.get("causes", []))
+
+    def draw(self, seed=0):
+        folder = SHARED / self.system
+        if not folder.is_dir():
+            raise UndrawableError(f"no folder {folder} (SIMGAP_SHARED names its parent)")
+        return RecordingCase(self.expected, folder)
+
+
+@dataclass(frozen=True)
+class RecordingCase(exam.Case):
+    """A measured recording, and the right answer as far as it is known."""
+
+    expected: dict
+    folder: Path
+
+    def write(self, folder):
+        """Write a description where the recording has none, and return what is to be explained."""
+        if "description" in self.expected:
+            text = self.expected["description"].replace("{folder}", str(self.folder))
+            (folder / "log.toml").write_text(text)
+            if "model" in self.expected:
+                (folder / "model.xml").write_text(self.expected["model"])
+            return folder / "log.toml"
+        if "import" in self.expected:
+            return folder / "log.toml"
+        return self.folder / self.expected.get("recording", "log.csv")
+
+    def answer(self, recording, out, call):
+        if "import" in self.expected:
+            options = [o.replace("{folder}", str(self.folder)) for o in self.expected["import"]]
+            command = [call.simgap, "import", self.folder, *options, "--out", recording]
+            done = subprocess.run(
+                [str(word) for word in command], capture_output=True, text=True, check=False
+            )
+            if done.returncode:
+                return Outcome(None, 2, output=done.stdout + done.stderr)
+        return call(recording, out, self.expected.get("options", ()))
+
+    def describe(self):
+        conditions = conditions_text(asked_s=self.expected.get("cpu", ""))
+        return {"hidden": "", "size": "", "noise": "", "conditions": conditions}
+
+    def mark(self, outcome):
+        found = faults(self.expected, outcome)
+        causes = " + ".join(map(_cause_text, (outcome.verdict or {}).get("causes", [])))
+        if found is None:
+            return Mark("unknown", causes, note=self.expected["plain"])
+        is_good = not found
+        levels = dict.fromkeys(("strict", "few", "equivalent", "fair", "any"), is_good)
+        return Mark("right" if is_good else "wrong", causes, note="; ".join(found), **levels)
+
+
+def _cause_text(cause):
+    values = " ".join(f"{c['value']:.4g}" for c in cause["coefficients"].values())
+    return f"{'|'.join([cause['effect'], *cause['alternatives']])} ({values})"
+
+
+def questions(seed=0):
+    """Return all recordings."""
+    return [RecordingQuestion(name) for name in tomllib.loads(RECORDINGS.read_text())]
+
+
+EXAM = Exam(
+    "Answers to all measured recordings and cases",
+    "`tests/exams/recordings/recordings.toml` says what is known of each.",
+    questions, (Target("right answers", "measured", "strict"),), groups=(), needs_command=True,
+)  # fmt: skip

@@ -1,0 +1,341 @@
+"""Simulate one run of a robot with its hidden effects.
+
+Between events, the integrator is the classical Runge-Kutta method of fourth order with fixed steps
+(E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, section II.1).
+Events are: a command reaches its actuator, a joint comes to rest (the step ends there, found by
+Brent's method), a held joint breaks away. A joint at rest has a velocity of exactly zero, therefore
+it does not creep.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import brentq
+
+from tests.exams.robots.excitation_signals import Drives, felt
+from tests.exams.robots.friction_laws import held
+from tests.exams.robots.reference_integration import Motion, Run
+from tests.exams.robots.reference_plant import plant
+
+__all__ = ["Motion", "Run", "World"]
+FINE, COARSE = 1e-3, 2e-3  # Maximum step in s for data, and for simulations that only choose sizes.
+ZENO = 100  # Maximum number of events in a step.
+LATER = 1e-9  # Smallest step after an event, as a fraction of the step.
+
+
+class World:
+    """A machine with its hidden effects.
+
+    Args:
+        machine: robot as its file describes it; it may have a floating base.
+        effects: coefficients by effect@place.
+        foreign: `Binding`, `Heated`, `Cogging` or None.
+        step: maximum step, s.
+    """
+
+    def __init__(self, machine, effects=None, foreign=None, step=FINE):
+        self.machine, self.effects, self.step = machine, dict(effects or {}), step
+        self.plant = plant(machine, self.effects, foreign)
+        self.drives = Drives.of(machine, self.effects)
+        if soft := self.plant.elastic:
+            self.step = min(step, 0.7 / soft.fastest)  # Runge-Kutta 4 is stable up to about 2.8.
+        self.rubs = self.plant.rubs
+        self.dry = bool(self.rubs.any())
+
+    def move(self, run, instants):
+        """Return the motion at increasing times, (K,)."""
+        course = _FloatingCourse if self.machine.floats else _Course
+        return course(self, run).through(np.asarray(instants, dtype=float))
+
+
+class _Course:
+    """State of a run during its simulation.
+
+    `way` is -1 or 1 for a sliding joint with friction, and 0 for a joint that is held or has no
+    friction. `stuck` is the mask of the held joints.
+    """
+
+    def __init__(self, world, run):
+        self.world, self.plant, self.drives = world, world.plant, world.drives
+        self.signals = felt(world.machine, run.times, run.commands, world.effects)
+        self.count, self.joints = self.plant.size, world.machine.driven
+        self.elastic, self.cogging = self.plant.elastic, self.plant.cogging
+        self.state = np.concatenate([run.q, run.v])
+        more = []
+        if self.elastic:
+            at = self.elastic.joint
+            # Before the run, the motor was held and the link was in equilibrium.
+            load = -self.plant.needed(run.q, run.v)[at]
+            more = [run.q[at], run.v[at]]
+            self.state[at] = run.q[at] + self.elastic.rests(load)
+        # The state has positions, velocities, rotor states, hysteresis states, heat, in this order.
+        self.memory = slice(2 * self.count + len(more), None)
+        more += [0.0] * len(self.plant.memory)
+        more += [0.0] if self.plant.heated else []
+        self.remembers = bool(more)
+        self.state = np.concatenate([self.state, more])
+        self.tooth = run.q[self.cogging.joint] if self.cogging else 0.0
+        self.target, self.lagged = self._arrived(0.0), self._arrived(0.0)
+        self.begin = 0.0
+        self.lags = np.zeros(self.count)
+        for joint, drive in zip(self.joints, world.machine.drives, strict=True):
+            self.lags[joint] = self.signals[drive.name].lag
+        self.dull = bool(self.lags.any())
+        self.way, self.stuck = np.zeros(self.count), np.zeros(self.count, dtype=bool)
+
+    def through(self, instants):
+        changes = np.concatenate([s.begins for s in self.signals.values()] + [instants])
+        marks = np.unique(np.round(changes[(changes > 0) & (changes <= instants[-1])], 12))
+        marks = np.concatenate([[0.0], marks])
+        rows, place = [], 0
+        for begin, end in pairwise([*marks.tolist(), marks[-1] + 1.0]):
+            self._enter(begin)
+            while place < instants.size and instants[place] <= begin + 1e-10:
+                rows.append(self._row())
+                place += 1
+            if place == instants.size:
+                break
+            self._advance(begin, end)
+        q, v, force = (np.array(part) for part in zip(*rows, strict=True))
+        return Motion(instants, q, v, force)
+
+    def _row(self):
+        q, v = self.state[: self.count].copy(), self.state[self.count : 2 * self.count].copy()
+        if self.elastic:
+            q[self.elastic.joint], v[self.elastic.joint] = self._rotor(self.state)
+        return q, v, self.drives.forces(self._commands(self.begin), q, v)
+
+    def _rotor(self, state):
+        return state[2 * self.count : 2 * self.count + 2]
+
+    def _arrived(self, t):
+        values = np.zeros(self.count)
+        for joint, drive in zip(self.joints, self.world.machine.drives, strict=True):
+            values[joint] = self.signals[drive.name].at(t)
+        return values
+
+    def _enter(self, begin):
+        """Begin a new interval, in which the command may differ."""
+        self.lagged = self._commands(begin)
+        self.target, self.begin = self._arrived(begin), begin
+        if self.world.dry:
+            self._decide(begin)
+
+    def _commands(self, t):
+        if not self.dull:
+            return self.target
+        left = np.exp(-(t - self.begin) / np.maximum(self.lags, 1e-12))
+        return self.target + (self.lagged - self.target) * np.where(self.lags > 0, left, 0.0)
+
+    def _advance(self, begin, end):
+        steps = int(np.ceil((end - begin) / self.world.step - 1e-6))
+        for now, after in pairwise(np.linspace(begin, end, steps + 1).tolist()):
+            self._step(now, after)
+            if self.cogging:
+                self.tooth = self.cogging.caught(self.tooth, self.state)
+
+    def _step(self, now, end):
+        """Advance from `now` to `end` through all events between them."""
+        if not self.world.dry:
+            self.state = self._moved(now, end - now)
+            return
+        whole = end - now
+        for _ in range(ZENO):
+            if end - now <= LATER * whole:
+                return
+            tried = self._moved(now, end - now)
+            event = self._first_event(now, end, tried)
+            if event is None:
+                self.state = tried
+                return
+            if event > now:
+                self._decide(event)
+            now = event
+        raise RuntimeError("it never gets through: too many standstills")
+
+    def _first_event(self, now, end, tried):
+        """Return the time of the first event, and move the state there; None without an event."""
+        span, n = end - now, self.count
+        speeds = tried[n : 2 * n]
+        turned = np.flatnonzero(self.way * speeds < 0)
+        loose = self._overloaded(end, tried)
+        if not turned.size and loose <= 0:
+            return None
+        first, stops = span, None
+        for joint in turned.tolist():
+
+            def speed(h, joint=joint):
+                return self.way[joint] * self._moved(now, h)[n + joint]
+
+            start = self._going(speed, span, self.state[n + joint])
+            if start is None:
+                self.way[joint], self.stuck[joint] = 0.0, True
+                return now
+            when = brentq(speed, start, span, xtol=1e-15)
+            if when < first:
+                first, stops = when, joint
+        if loose > 0:
+            if self._overloaded(now, self.state) >= 0:
+                when = min(1e-9, span)
+
+            else:
+
+                def excess(h):
+                    return self._overloaded(now + h, self._moved(now, h))
+
+                when = brentq(excess, 0.0, span, xtol=1e-10) + 1e-10
+            if when < first:
+                first, stops = when, None
+        self.state = self._moved(now, first)
+        if stops is not None:
+            self.state[n + stops] = 0.0
+            self.way[stops] = 0.0
+        return now + first
+
+    @staticmethod
+    def _going(speed, span, begins):
+        """Return a time in a step at which a joint still moves forward; None if there is none.
+
+        The joint moves backward at the end of the step.
+        """
+        if begins != 0.0:
+            return 0.0
+        return next((h for h in span * 0.5 ** np.arange(1, 20) if speed(h) > 0), None)
+
+    def _overloaded(self, t, state):
+        """Return the largest excess of needed over available friction; -1 if no joint is held."""
+        if not self.stuck.any():
+            return -1.0
+        need = np.abs(self._holding(t, state)[0])
+        limit = self._limit(t, state)[self.stuck]
+        return float(np.max(need - limit * (1 + 1e-9)))
+
+    def _limit(self, t, state):
+        """Return the largest dry friction of every joint, (N,)."""
+        q, v = state[: self.count], state[self.count : 2 * self.count]
+        loaded = self.plant.loads
+        if self.plant.heated:
+            return self.plant.limit(t, q, v, heat=max(state[-1], 0.0))
+        drive = self.drives.forces(self._commands(t), q, v) if loaded else None
+        return self.plant.limit(t, q, v, drive)
+
+    def _decide(self, t):
+        """Decide which joints at rest are held, and the direction of the others."""
+        n = self.count
+        q, v = self.state[:n], self.state[n : 2 * n]
+        rubs = self.world.rubs
+        limit = self._limit(t, self.state)
+        resting = rubs & (v == 0.0)
+        self.way = np.where(rubs & ~resting, np.sign(v), 0.0)
+        self.stuck[:] = False
+        if not resting.any():
+            return
+        force = self._force(t, self.state) - self.way * limit
+        free = self.plant.accelerations(q, v, force)[resting]
+        coupling = np.linalg.inv(self.plant.inertia(q))[np.ix_(resting, resting)]
+        forces, pull = held(coupling, free, limit[resting])
+        inside = np.abs(forces) < limit[resting]
+        places = np.flatnonzero(resting)
+        self.stuck[places[inside]] = True
+        goes = ~inside
+        self.way[places[goes]] = np.where(
+            pull[goes] != 0, np.sign(pull[goes]), -np.sign(forces[goes])
+        )
+
+    def _force(self, t, state):
+        """Return forces of actuators, damping, springs and biases, without dry friction, (N,)."""
+        n = self.count
+        q, v = state[:n], state[n : 2 * n]
+        if self.elastic:
+            return self._elastic_forces(t, state)[0]
+        force = self.drives.forces(self._commands(t), q, v) + self.plant.passive(q, v)
+        if self.cogging:
+            force[self.cogging.joint] += self.cogging.push(self.tooth, q)
+        for (joint, dry, _), w in zip(self.plant.memory, state[self.memory], strict=False):
+            force[joint] -= dry * w
+        return force
+
+    def _elastic_forces(self, t, state):
+        """Return the forces on arm and rotor; the damping of the file acts on the motor."""
+        n, soft = self.count, self.elastic
+        q, v = state[:n].copy(), state[n : 2 * n].copy()
+        link = q[soft.joint], v[soft.joint]
+        q[soft.joint], v[soft.joint] = self._rotor(state)
+        outer = self.drives.forces(self._commands(t), q, v) + self.plant.passive(q, v)
+        through = soft.through(q[soft.joint] - link[0], v[soft.joint] - link[1])
+        rotor = outer[soft.joint] - through
+        outer[soft.joint] = through
+        return outer, rotor
+
+    def _holding(self, t, state):
+        """Return friction of the held joints, (S,), and accelerations of all joints, (N,)."""
+        n = self.count
+        q, v = state[:n], state[n : 2 * n]
+        force = self._force(t, state) - self.way * self._limit(t, state)
+        rest = force - self.plant.needed(q, v)
+        mass, free = self.plant.inertia(q), ~self.stuck
+        a = np.zeros(n)
+        if free.any():
+            a[free] = np.linalg.solve(mass[np.ix_(free, free)], rest[free])
+        return mass[self.stuck] @ a - rest[self.stuck], a
+
+    def _rate(self, t, state):
+        n = self.count
+        q, v = state[:n], state[n : 2 * n]
+        if self.world.dry and self.stuck.any():
+            a = self._holding(t, state)[1]
+        else:
+            force = self._force(t, state)
+            if self.world.dry:
+                force = force - self.way * self._limit(t, state)
+            a = self.plant.accelerations(q, v, force)
+        if not self.remembers:
+            return np.concatenate((v, a))
+        more = []
+        if self.elastic:
+            more += [self._rotor(state)[1], self._elastic_forces(t, state)[1] / self.elastic.rotor]
+        # Dahl model of hysteresis: w' = v / d - |v / d| w.
+        for (joint, _, way), w in zip(self.plant.memory, state[self.memory], strict=False):
+            more.append((v[joint] - abs(v[joint]) * w) / way)
+        if hot := self.plant.heated:
+            drive = self.drives.forces(self._commands(t), q, v)[hot.other]
+            more.append(abs(drive * v[hot.other]) / hot.power - state[-1] / hot.time)
+        return np.concatenate([v, a, more])
+
+    def _moved(self, now, h):
+        """Return the state after a Runge-Kutta 4 step; held joints do not move."""
+        y = self.state
+        k1 = self._rate(now, y)
+        k2 = self._rate(now + h / 2, y + h / 2 * k1)
+        k3 = self._rate(now + h / 2, y + h / 2 * k2)
+        k4 = self._rate(now + h, y + h * k3)
+        return y + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+
+class _FloatingCourse(_Course):
+    """State of a run of a floating-base robot.
+
+    Positions are q = (hinges, pose), velocities v = (hinges, velocity in the body's axes, 0). A
+    pose (p, r) of a position and a unit quaternion with the velocity (u, w) follows
+
+        p' = r u r*,    r' = r (0, w) / 2.                                                    (1)
+    """
+
+    def _rate(self, t, state):
+        rate = super()._rate(t, state)
+        n, first = self.count, self.plant.hinges
+        pose, v = state[first:n], state[n + first : 2 * n - 1]
+        vector, real, w = pose[-4:-1], pose[-1], v[-3:]
+        if pose.size > 4:
+            turned = np.cross(vector, v[:3])
+            rate[first : first + 3] = v[:3] + 2 * (real * turned + np.cross(vector, turned))
+        rate[n - 4 : n - 1] = 0.5 * (real * w + np.cross(vector, w))
+        rate[n - 1] = -0.5 * vector @ w
+        return rate
+
+    def _moved(self, now, h):
+        state = super()._moved(now, h)
+        state[self.count - 4 : self.count] /= np.linalg.norm(state[self.count - 4 : self.count])
+        return state

@@ -1,0 +1,350 @@
+"""Tests of the reference world against closed-form solutions and against MuJoCo."""
+
+import numpy as np
+import pytest
+
+from sims.core.simulator import Scenario
+from sims.robot.parsing.read_model_file import read_robot
+from sims.robot.robot_simulator import make_robot_simulator
+from tests.exams.robots import reference_answers, robot_models
+from tests.exams.robots.exam_robots import Drive, Machine
+from tests.exams.robots.excitation_signals import Drives
+from tests.exams.robots.friction_laws import held
+from tests.exams.robots.reference_plant import Binding, Cogging, Heated
+from tests.exams.robots.reference_world import Run, World, _Course
+
+pytest.importorskip("pinocchio", reason="pin has no wheel here")
+STAMPS = np.arange(401) / 100
+ROLLER = robot_models.urdf(
+    "roller",
+    robot_models.link("disc", 2.0, (0, 0, 0), (0.1, 0.1, 0.4)),
+    robot_models.joint("axle", "revolute", "base", "disc", (0, 0, 0), "0 0 1", (-100, 100, 50)),
+)
+
+
+def roller(kind="motor"):
+    """Return a disc of 0.4 kg m^2 on a vertical axle, where gravity has no effect."""
+    return Machine("roller", ROLLER, (Drive("axle", kind, 30.0, 3.0, 50.0),), (0.0,))
+
+
+def driven(machine, amplitude, frequency=3.0, stamps=STAMPS):
+    """Return a run with sinusoidal commands around the values that hold the pose."""
+    pose = np.array(machine.pose)
+    hold = World(machine).plant.needed(pose, 0 * pose)
+    commands = {}
+    for joint, drive in zip(machine.driven, machine.drives, strict=True):
+        middle = pose[joint] + hold[joint] / drive.kp if drive.kp else hold[joint]
+        commands[drive.name] = middle + amplitude * np.sin(frequency * stamps + joint)
+    return Run(stamps, commands, pose, 0 * pose)
+
+
+def test_a_double_pendulum_without_friction_keeps_its_energy():
+    text = robot_models.hanging("two", (0.3, 0.25), (1.0, 0.6), ("a", "b"))
+    world = World(Machine("two", text, (), (0.0, 0.0)), step=5e-4)
+    start = Run(STAMPS, {}, np.array([1.2, -0.7]), np.array([0.5, 2.0]))
+    motion = world.move(start, STAMPS)
+    energy = np.array([world.plant.energy(q, v) for q, v in zip(motion.q, motion.v, strict=True)])
+    swing = energy[0] - world.plant.energy(np.zeros(2), np.zeros(2))
+    assert np.ptp(energy) < 1e-6 * swing
+    assert np.ptp(motion.q[:, 1]) > 1.0
+
+
+def test_a_joint_with_dry_friction_stops_where_and_when_theory_says():
+    world = World(roller(), {"friction.coulomb@axle": (0.47,)})
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
+    motion = world.move(start, STAMPS)
+    stop, distance = 2.0 * 0.4 / 0.47, 2.0**2 * 0.4 / (2 * 0.47)
+    moving = stop - 1e-9 > STAMPS
+    assert motion.q[-1, 0] == pytest.approx(distance, abs=1e-12)
+    assert np.all(motion.v[moving, 0] > 0)
+    assert np.all(motion.v[~moving, 0] == 0.0)
+    expected = 2.0 * STAMPS - 0.47 / 0.4 * STAMPS**2 / 2
+    np.testing.assert_allclose(motion.q[moving, 0], expected[moving], atol=1e-12)
+
+
+def test_friction_over_the_joint_takes_its_work():
+    least, sine, cosine, period, inertia = 0.2, 0.2, -0.3, 1.3, 0.4
+    world = World(roller(), {"friction.position@axle": (least, sine, cosine, period)})
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.5]))
+    motion = world.move(start, STAMPS)
+    q, v = motion.q[:, 0], motion.v[:, 0]
+    angle = 2 * np.pi * q / period
+    wave = period / (2 * np.pi) * (sine * (1 - np.cos(angle)) + cosine * np.sin(angle))
+    taken = 0.5 * inertia * (2.5**2 - v**2)
+    mean = least + np.hypot(sine, cosine)
+    np.testing.assert_allclose(taken, mean * q + wave, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "lifts"),
+    [
+        ({"friction.load@a": (0.2,)}, 1.2 / 0.8),
+        ({"friction.load_direction@a": (0.3, 0.1)}, 1.1 / 0.7),
+        ({"friction.load_quadratic@a": (0.1, 0.05)}, None),
+    ],
+)
+def test_a_loaded_gear_lifts_beyond_its_drive_line(effect, lifts):
+    text = robot_models.hanging("one", (0.3,), (1.0,), ("a",))
+    machine = Machine("one", text, (Drive("a", "motor", 0.0, 0.0, 50.0),), (0.5,))
+    pose = np.array([0.5])
+    weight = float(World(machine).plant.needed(pose, 0 * pose)[0])
+    if lifts is None:
+        lifts = (1.1 + 0.05 * abs(weight)) / 0.9
+    world = World(machine, effect)
+    for share, moves in ((1.01, True), (0.99, False)):
+        pulled = {"m_a": np.full(STAMPS.size, share * lifts * weight)}
+        motion = world.move(Run(STAMPS, pulled, pose, 0 * pose), STAMPS[:20])
+        assert (abs(motion.q[-1, 0] - 0.5) > 1e-4) == moves
+
+
+def test_a_joint_that_warms_loses_its_friction():
+    dry, viscous, time, inertia = 0.3, 0.2, 0.9, 0.4
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([3.0]))
+    cold = -np.expm1(-STAMPS / time) * time / inertia
+    for c, expected in (
+        ((dry, 0.0, time), 3.0 - dry * cold),
+        ((0.0, viscous, time), 3.0 * np.exp(-viscous * cold)),
+    ):
+        motion = World(roller(), {"friction.warming@axle": c}).move(start, STAMPS)
+        np.testing.assert_allclose(motion.v[:, 0], expected, atol=1e-9)
+
+
+def test_friction_holds_exactly_below_its_limit_and_breaks_loose_above_it():
+    pull = np.where(STAMPS < 2.0, 0.4999, 0.75)
+    world = World(roller(), {"friction.coulomb@axle": (0.5,)})
+    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    held_still = STAMPS <= 2.0
+    assert np.all(motion.q[held_still, 0] == 0.0)
+    expected = (0.75 - 0.5) / 0.4 * (STAMPS[-1] - 2.0) ** 2 / 2
+    assert motion.q[-1, 0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_servo_breaks_loose_when_its_lagging_command_pulls_enough():
+    """The joint breaks away when kp (1 - exp(-t / lag)) = friction."""
+    lag, friction, step = 0.5, 12.0, np.ones(STAMPS.size)
+    effects = {"friction.coulomb@axle": (friction,), "input.lag@m_axle": (lag,)}
+    world = World(roller("position"), effects)
+    command = np.where(STAMPS > 0, step, 0.0)
+    motion = world.move(Run(STAMPS, {"m_axle": command}, np.zeros(1), np.zeros(1)), STAMPS)
+    loose = 0.01 - lag * np.log(1 - friction / 30.0)
+    assert np.all(motion.q[loose > STAMPS, 0] == 0.0)
+    assert np.all(motion.q[loose + 0.01 < STAMPS, 0] > 0.0)
+
+
+def test_friction_of_coupled_joints_is_the_solution_of_its_complementarity_problem():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        root = rng.normal(size=(6, 6))
+        coupling, free = root @ root.T + 0.3 * np.eye(6), 3.0 * rng.normal(size=6)
+        limits = rng.uniform(0.0, 2.0, 6)
+        forces, pulls = held(coupling, free, limits)
+        inside = np.abs(forces) < limits
+        np.testing.assert_allclose(pulls[inside], 0.0, atol=1e-10)
+        assert np.all(forces[~inside] * pulls[~inside] <= 1e-12)
+        assert np.all(np.abs(forces) <= limits)
+
+
+def test_joints_that_stick_together_in_an_arm_do_not_creep():
+    machine = robot_models.machine("arm2-motor", np.random.default_rng(1))
+    effects = {f"friction.coulomb@{name}": (5.0,) for name in machine.joints}
+    motion = World(machine, effects).move(driven(machine, 1.0), STAMPS)
+    assert np.ptp(motion.q, axis=0).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("name", ["arm2-motor", "cartpole-motor", "ur5-servo", "iiwa-servo"])
+def test_a_clean_robot_moves_as_mujoco_says_at_a_tenth_of_its_step(name):
+    machine = robot_models.machine(name, np.random.default_rng(5))
+    run = driven(machine, 0.2, stamps=np.arange(201) / 100)
+    expected, _ = reference_answers.moved(machine, run, step=2e-4, integrator="RK4")
+    np.testing.assert_allclose(World(machine).move(run, run.times).q, expected, atol=1e-4)
+    assert np.ptp(expected, axis=0).max() > 0.03
+
+
+def test_halving_the_step_changes_nothing_that_a_sensor_sees():
+    machine = robot_models.machine("panda-servo", np.random.default_rng(2))
+    effects = {"friction.coulomb@panda_joint2": (3.0,), "friction.coulomb@panda_joint4": (1.0,)}
+    run = driven(machine, 0.2, stamps=np.arange(101) / 100)
+    first, second = (World(machine, effects, step=h).move(run, run.times).q for h in (1e-3, 5e-4))
+    np.testing.assert_allclose(first, second, atol=1e-6)
+
+
+def test_what_is_hidden_in_a_body_changes_its_inertia_as_stated():
+    machine = robot_models.machine("arm2-motor", np.random.default_rng(0))
+    plain, heavy = World(machine), World(machine, {"mass.scale@elbow_link": (0.2,)})
+    light, swollen = plain.plant.model.inertias[2], heavy.plant.model.inertias[2]
+    assert swollen.mass == pytest.approx(1.2 * light.mass)
+    np.testing.assert_allclose(swollen.inertia, 1.2 * light.inertia)
+    np.testing.assert_allclose(swollen.lever, light.lever)
+    shifted = World(machine, {"mass.offset@elbow_link": (0.01, 0.0, -0.02)}).plant.model.inertias[2]
+    np.testing.assert_allclose(shifted.lever, light.lever + np.array([0.01, 0.0, -0.02]))
+    np.testing.assert_allclose(shifted.inertia, light.inertia)
+
+
+def test_an_armature_slows_a_joint_by_what_it_adds():
+    pull = Run(STAMPS, {"m_axle": np.ones(STAMPS.size)}, np.zeros(1), np.zeros(1))
+    motion = World(roller(), {"inertia.armature@axle": (0.1,)}).move(pull, STAMPS)
+    assert motion.q[-1, 0] == pytest.approx(16.0 / (2 * 0.5), rel=1e-12)
+
+
+def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
+    """The frequency about the common motion is w^2 = k (1/J1 + 1/J2)."""
+    kick = np.where(STAMPS < 0.02, 10.0, 0.0)
+    world = World(roller(), {"joint.flexibility@axle": (1 / 20.0, 0.0, 0.25)})
+    motion = world.move(Run(STAMPS, {"m_axle": kick}, np.zeros(1), np.zeros(1)), STAMPS)
+    late = STAMPS > 0.5
+    line = np.polyfit(STAMPS[late], motion.q[late, 0], 1)
+    swing = motion.q[late, 0] - np.polyval(line, STAMPS[late])
+    turns = STAMPS[late][1:][np.diff(np.sign(swing)) != 0]
+    expected = np.sqrt(20.0 * (1 / 0.1 + 1 / 0.4))
+    assert np.pi / np.mean(np.diff(turns)) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_gap_is_passed_alone_and_a_flank_takes_the_link_along():
+    """The motor has a tenth of the roller's inertia and moves alone until it meets the flank."""
+    gap, pull = 0.02, np.full(STAMPS.size, 0.1)
+    world = World(roller(), {"joint.backlash@axle": (gap, 0.1)})
+    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    meets = np.sqrt(2 * 0.04 * gap / 2 / 0.1)
+    alone = meets > STAMPS
+    np.testing.assert_allclose(motion.q[alone, 0], 0.5 * 0.1 / 0.04 * STAMPS[alone] ** 2, atol=1e-9)
+    later, speed = STAMPS[-1] - meets, 0.1 * meets / 0.44
+    expected = gap / 2 + speed * later + 0.5 * 0.1 / 0.44 * later**2
+    assert motion.q[-1, 0] == pytest.approx(expected, rel=1e-2)
+
+
+def test_friction_that_remembers_takes_its_energy_over_its_way():
+    """Energy balance: J v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
+    dry, way, pull = 0.3, 0.1, np.full(STAMPS.size, 0.4)
+    world = World(roller(), {"friction.hysteresis@axle": (dry, way)})
+    motion = world.move(Run(STAMPS, {"m_axle": pull}, np.zeros(1), np.zeros(1)), STAMPS)
+    q, v = motion.q[:, 0], motion.v[:, 0]
+    work = 0.4 * q - dry * (q - way * (1 - np.exp(-q / way)))
+    np.testing.assert_allclose(0.5 * 0.4 * v**2, work, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "c", "close"),
+    [
+        ("joint.flexibility", (0.02, 0.05, 0.15), 2e-3),
+        ("joint.backlash", (0.01, 0.15), 0.03),
+        ("friction.hysteresis", (0.02, 0.03), 3e-3),
+    ],
+)
+def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
+    """The library agrees with the reference world for the second joint of an arm.
+
+    The difference is given as a fraction of the change that the effect causes. The effects are a
+    flexible drive, backlash and hysteresis.
+    """
+    machine = robot_models.machine("arm2-motor", np.random.default_rng(5))
+    off, changed = differs(machine, f"{effect}@{machine.joints[1]}", c, 0.5, tmp_path)
+    assert changed > 1e-3
+    assert off < close
+
+
+@pytest.mark.parametrize("robot", ["arm2-motor", "arm2-servo", "ur5-servo"])
+@pytest.mark.parametrize(
+    ("effect", "c", "close"),
+    [("joint.coupling", -0.3, 1e-3), ("supply.sag", 0.02, 0.03), ("supply.braking", 0.5, 0.11)],
+)
+def test_drives_of_the_library_move_as_those_of_this_world_do(robot, effect, c, close, tmp_path):
+    """The library agrees with the reference world for coupling, a shared battery and braking loss.
+
+    The tolerances are larger where the library uses values of the previous step, which is accurate
+    to first order in the step length.
+    """
+    machine = robot_models.machine(robot, np.random.default_rng(5))
+    last = {"joint.coupling": machine.joints[-1], "supply.braking": machine.drives[-1].name}
+    place = f"@{last[effect]}" if effect in last else ""
+    moves = 0.5 if robot.endswith("motor") else 0.2
+    off, changed = differs(machine, effect + place, (c,), moves, tmp_path)
+    assert changed > 1e-4
+    assert off < close
+
+
+def differs(machine, name, c, moves, folder):
+    """Compare the library with the reference world.
+
+    Returns:
+        The difference of the motions as a fraction of the effect's change, and the RMS change.
+    """
+    run = driven(machine, moves, stamps=np.arange(101) / 100)
+    bare, hidden = (World(machine, of).move(run, run.times).q for of in ({}, {name: c}))
+    (folder / "robot.urdf").write_text(machine.urdf)
+    drives = {
+        d.name: {"joint": d.joint, "kind": d.kind, "force_range": [-d.force, d.force]}
+        | ({"kp": d.kp, "kv": d.kv} if d.kind == "position" else {})
+        for d in machine.drives
+    }
+    engine = {"timestep": machine.step, "integrator": machine.integrator}
+    kind = make_robot_simulator(read_robot(folder / "robot.urdf", actuators=drives, engine=engine))
+    simulator = kind(observe=[f"q.{joint}" for joint in machine.joints], effects=[name])
+    initial = {f"q.{joint}": q for joint, q in zip(machine.joints, run.q, strict=True)}
+    inputs = {f"u.{drive}": u for drive, u in run.commands.items()}
+    seen = simulator.simulate(np.array([c]), Scenario(run.times, initial, inputs))[0]
+    changed = np.linalg.norm(hidden - bare)
+    return np.linalg.norm(seen - hidden) / changed, np.sqrt(np.mean((hidden - bare) ** 2))
+
+
+def test_a_shaft_turns_two_joints_and_one_battery_serves_all_drives():
+    machine = robot_models.machine("arm2-servo", np.random.default_rng(5))
+    q, v, u = np.array([0.3, -0.2]), np.array([1.0, 2.0]), np.array([0.5, 0.4])
+    (first, second), c = machine.drives, 0.4
+    turned = second.kp * (u[1] - q[1] - c * q[0]) - second.kv * (v[1] + c * v[0])
+    own = first.kp * (u[0] - q[0]) - first.kv * v[0]
+    coupled = Drives.of(machine, {f"joint.coupling@{second.joint}": (c,)})
+    np.testing.assert_allclose(coupled.forces(u, q, v), [own + c * turned, turned])
+    bare = Drives.of(machine).forces(u, q, v)
+    left = Drives.of(machine, {"supply.sag": (0.05,)}).forces(u, q, v)
+    np.testing.assert_allclose(left, bare * (1 - 0.05 * np.abs(left).sum()))
+    slack = Drives.of(machine, {f"supply.braking@{second.name}": (0.6,)})
+    for way in (1, -1):
+        whole = Drives.of(machine).forces(u, q, way * v)
+        share = np.where(whole * way * v < 0, [1.0, 0.4], 1.0)
+        np.testing.assert_allclose(slack.forces(u, q, way * v), share * whole)
+
+
+def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():
+    """Friction follows the heat of another joint, which grows with its work and decays in time."""
+    machine = robot_models.machine("arm2-motor", np.random.default_rng(1))
+    world = World(machine, foreign=Heated(1, 0, 0.5, 0.2, 1.0))
+    run = driven(machine, 0.5, stamps=np.arange(101) / 100)
+    motion, bare = world.move(run, run.times), World(machine).move(run, run.times)
+    apart = np.abs(motion.q - bare.q).max(axis=1)
+    assert 100 * apart[3] < apart[-1], "it begins cold"
+    power = np.abs(motion.force[:, 0] * motion.v[:, 0])
+    heat = np.zeros(power.size)
+    for k, step in enumerate(np.diff(run.times)):
+        middle = 0.5 * (power[k] + power[k + 1]) / 0.2
+        heat[k + 1] = heat[k] + step * (middle - (heat[k] + 0.5 * step * middle))
+    course = _Course(world, run)
+    course.through(run.times)
+    assert course.state[-1] == pytest.approx(heat[-1], rel=0.05)
+
+
+def test_teeth_follow_a_joint_half_a_tooth_behind():
+    teeth = Cogging(0, 0.3, 0.4)
+    assert teeth.caught(0.0, [0.1]) == 0.0
+    assert teeth.caught(0.0, [1.0]) == pytest.approx(0.8)
+    assert teeth.caught(0.8, [0.5]) == pytest.approx(0.7)
+    assert teeth.push(0.8, [1.0]) == pytest.approx(0.3 * np.sin(2 * np.pi * 2.0))
+
+
+def test_a_binding_range_rubs_only_where_it_is():
+    world = World(roller(), foreign=Binding(0, 0.5, 3.0, 0.5))
+    start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
+    v = world.move(start, STAMPS).v[:, 0]
+    assert v[STAMPS < 1.2].tolist() == [2.0] * int(np.sum(STAMPS < 1.2))
+    # Friction rises and falls over a tenth of the half width, which counts half.
+    assert v[-1] ** 2 == pytest.approx(4.0 - 2 * 0.5 * 0.95 / 0.4, rel=1e-4)
+
+
+def test_commands_arrive_late_and_dull_as_stated():
+    command = np.where(STAMPS >= 1.0, 1.0, 0.0)
+    run = Run(STAMPS, {"m_axle": command}, np.zeros(1), np.zeros(1))
+    late = World(roller(), {"input.delay@m_axle": (0.105,)}).move(run, STAMPS)
+    assert late.q[-1, 0] == pytest.approx((3.0 - 0.105) ** 2 / (2 * 0.4), rel=1e-9)
+    dull = World(roller(), {"input.gain@m_axle": (0.5,), "input.deadband@m_axle": (0.3,)})
+    moved = dull.move(run, STAMPS)
+    assert moved.q[-1, 0] == pytest.approx(1.2 * 9.0 / (2 * 0.4), rel=1e-9)
+    np.testing.assert_allclose(moved.force[STAMPS >= 1.0, 0], 1.2)

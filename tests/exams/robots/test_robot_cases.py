@@ -1,0 +1,137 @@
+"""Tests of robot cases: reproducible, of the stated size, with the cause in no file."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+import tomllib
+
+pytest.importorskip("pinocchio", reason="pin has no wheel here")
+
+from bench.diagnosis_benchmark.case_generation.recording_conditions import SensorNoise
+from tests.exams.robots import (
+    cause_sizing,
+    causes_outside_library,
+    planted_effects,
+    robot_cases,
+)
+from tests.exams.robots.equivalent_effects import Rivals
+from tests.exams.robots.reference_world import Run, World
+from tests.exams.robots.sensor_models import observed
+
+
+@pytest.fixture(scope="module")
+def item():
+    return robot_cases.draw_robot_case("single", "arm2-servo", "friction.coulomb", 0)
+
+
+@pytest.mark.slow
+def test_an_item_follows_from_its_name(item):
+    first = robot_cases.draw_robot_case("clean", "arm2-servo", "any", 0)
+    was = robot_cases.setting_of(first.name)
+    robot_cases.setting_of.cache_clear()
+    again = robot_cases.setting_of(first.name)
+    assert robot_cases.draw_robot_case("clean", "arm2-servo", "any", 0) == first
+    assert again.machine == was.machine != robot_cases.setting_of(item.name).machine
+    for run, other in zip(again.runs, was.runs, strict=True):
+        assert {name: u.tolist() for name, u in run.commands.items()} == {
+            name: u.tolist() for name, u in other.commands.items()
+        }
+
+
+def test_a_hidden_cause_is_as_large_as_it_says(item):
+    assert 2.9 < item.size < 10.3
+    gauge = robot_cases.gauge_of(item.name)
+    assert gauge.gap(item.effects) == pytest.approx(item.size, rel=1e-6)
+    assert gauge.gap({}) == 0.0
+
+
+def test_initial_states_absorb_what_they_can(item):
+    gauge, setting = robot_cases.gauge_of(item.name), robot_cases.setting_of(item.name)
+    base = [seen.copy() for seen in gauge.base]
+    for seen, basis in zip(base, gauge.free, strict=True):
+        seen += (7.0 * basis[:, 0]).reshape(seen.shape)
+    assert cause_sizing.rms(np.concatenate(gauge.beyond_states(base))) < 1e-9
+    assert all(basis.shape[1] == 2 * len(setting.machine.joints) for basis in gauge.free)
+
+
+def test_the_files_say_what_is_known_and_not_what_is_hidden(item, tmp_path):
+    path = item.write(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "recording.csv", "recording.toml", "robot.urdf",
+    ]  # fmt: skip
+    stated = tomllib.loads(path.with_suffix(".toml").read_text())
+    assert stated["model"] == "robot.urdf"
+    assert stated["engine"] == {"timestep": item.step, "integrator": "RK4"}
+    assert {name: a["kind"] for name, a in stated["actuators"].items()} == {
+        "m_shoulder": "position", "m_elbow": "position",
+    }  # fmt: skip
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6 * 401
+    assert {row["run"] for row in rows if row["run"] in stated["runs"]} == {"4", "5"}
+    text = path.with_suffix(".toml").read_text() + path.read_text()
+    assert "friction" not in text + (tmp_path / "robot.urdf").read_text().replace(
+        'friction="0"', ""
+    )
+
+
+@pytest.mark.parametrize("kind", ["white", "ar1", "quantised"])
+def test_noise_is_as_strong_as_it_says(kind):
+    noise = SensorNoise({"q.a": 1e-3, "qd.a": 5e-3}, kind, 0.6, 0.4)
+    smooth = np.column_stack([np.linspace(0, 3, 20_000), np.linspace(0, -7, 20_000)])
+    rest = noise.add_to(smooth, np.random.default_rng(0)) - smooth
+    np.testing.assert_allclose(rest.std(axis=0), [1e-3, 5e-3], rtol=0.04)
+
+
+def test_every_place_of_every_effect_can_be_drawn(item):
+    setting = robot_cases.setting_of(item.name)
+    rng = np.random.default_rng(0)
+    for effect in planted_effects.effects("servo"):
+        for place in planted_effects.places(setting.machine, effect):
+            c = planted_effects.shape(effect, place, setting, rng)(0.1)
+            assert np.isfinite(c).all()
+            assert any(c)
+    assert {q.kind for q in robot_cases.questions()} == set(robot_cases.KINDS)
+    assert sum(q.kind == "clean" for q in robot_cases.questions()) >= 200
+
+
+def test_a_slipping_encoder_jumps_and_stays(item):
+    setting = robot_cases.setting_of(item.name)
+    of = causes_outside_library.drawn("slip", 1, setting, np.random.default_rng(0))
+    slips = causes_outside_library.slips_of(of(0.5), 0)
+    assert 1 <= len(slips) <= 2
+    gauge = robot_cases.gauge_of(item.name)
+    jump = gauge.seen(of(0.5))[0][:, 1] - gauge.base[0][:, 1]
+    before = setting.runs[0].times < min(instant for _, instant, _ in slips)
+    assert np.all(jump[before] == 0.0)
+    total = sum(size for _, _, size in slips) / setting.sigma[1]
+    assert jump[-1] == pytest.approx(total)
+
+
+@pytest.mark.slow
+def test_what_is_alike_in_a_servo_is_found_so_and_a_sensor_of_force_splits_it(item):
+    """A constant force is equivalent to a command offset multiplied by kp."""
+    whole = robot_cases.setting_of(item.name)
+    runs = tuple(
+        Run(r.times[:60], {name: u[:60] for name, u in r.commands.items()}, r.q, r.v)
+        for r in whole.runs
+    )
+    for split, channels in enumerate((("q.shoulder", "q.elbow"), ("q.elbow", "tau.elbow"))):
+        noise = SensorNoise(
+            {"q.shoulder": 5e-4, "q.elbow": 5e-4, "tau.elbow": 5e-3}, "white", 0.0, 0.0
+        )
+        noise = dataclasses.replace(noise, sigma={name: noise.sigma[name] for name in channels})
+        setting = dataclasses.replace(whole, runs=runs, channels=channels, noise=noise)
+        hidden, rng = {"force.bias@elbow": (0.2,)}, np.random.default_rng(0)
+        world = World(setting.machine, hidden)
+        values = [noise.add_to(observed(world, run, channels), rng) for run in runs]
+        rivals = Rivals(setting, hidden, values)
+        assert rivals.truth() == pytest.approx(1.0, abs=0.2)
+        assert rivals.ratio("force.bias@elbow") == pytest.approx(1.0, abs=0.05)
+        assert (rivals.ratio("input.bias@m_elbow") > robot_cases.STANDARD.equal_below) == bool(
+            split
+        )
+        assert rivals.ratio("drag.linear@elbow") > 1.5
+    assert rivals.ratio("backlash@m_elbow") is None

@@ -1,0 +1,72 @@
+"""Tests that `explain` finds a wrong command time, together with another hidden cause."""
+
+import pytest
+
+from bench.diagnosis.explain import explain
+from bench.diagnosis_benchmark.case_generation import joint_reference
+from bench.diagnosis_benchmark.case_generation.case_sampling import write_case
+from tests.exams.systems.system_cases import questions
+
+EARLY = {"input.hold", "input.delay"}
+ASKED = (
+    ("slider", "friction.load", 2), ("slider", "wind", 2), ("pendulum", "spring.cubic", 3),
+    ("slider", "input.bias", 3),
+)  # fmt: skip
+USUAL = joint_reference.compute_applied_input
+
+
+def drawn(system, effect, index):
+    name = f"marks/single/{system}/{effect}/{index}"
+    (question,) = [q for q in questions() if q.name == name]
+    return question.draw().item
+
+
+def moved(monkeypatch, **besides):
+    """Add input effects to the simulation that the recorded table does not show."""
+
+    def felt(scenario, effects, until):
+        return USUAL(scenario, {**besides, **effects}, until)
+
+    monkeypatch.setattr(joint_reference, "compute_applied_input", felt)
+
+
+def sets_of(explained):
+    return [{cause.effect, *cause.alternatives} for cause in explained.causes]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("asked", ASKED, ids=[effect for _, effect, _ in ASKED])
+def test_commands_that_were_interpolated_are_named_and_so_is_what_is_hidden(
+    asked, tmp_path, monkeypatch
+):
+    item = drawn(*asked)
+    moved(monkeypatch, **{"input.hold": (1.0,)})
+    sets = sets_of(explain(write_case(item, tmp_path)))
+    assert any(names & EARLY for names in sets), sets
+    for hidden in item.effects:
+        assert any(hidden in names for names in sets), sets
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [-0.02, 0.02])
+def test_clocks_that_are_two_samples_apart_are_a_delay_of_either_sign(late, tmp_path, monkeypatch):
+    item = drawn("slider", "friction.load", 2)
+    moved(monkeypatch, **{"input.delay": (late,)})
+    explained = explain(write_case(item, tmp_path))
+    (delay,) = [c for c in explained.causes if "input.delay" in {c.effect, *c.alternatives}]
+    assert any("friction.load" in names for names in sets_of(explained))
+    if delay.effect == "input.delay":
+        (number,) = delay.coefficients.values()
+        assert number.value == pytest.approx(late, abs=2e-3)
+
+
+def test_what_the_description_states_is_not_asked_again(tmp_path, monkeypatch):
+    item = drawn("slider", "friction.load", 2)
+    moved(monkeypatch, **{"input.hold": (1.0,)})
+    path = write_case(item, tmp_path)
+    description = path.with_suffix(".toml")
+    text = description.read_text()
+    assert "[inputs.u]" in text
+    description.write_text(text.replace("[inputs.u]", '[inputs.u]\nhold = "linear"'))
+    (names,) = sets_of(explain(path))
+    assert "friction.load" in names
