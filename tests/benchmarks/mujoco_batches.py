@@ -1,4 +1,4 @@
-"""Measure the cost of a batch element in MuJoCo, together, one by one, and in MuJoCo alone.
+"""Measure the cost of a batch element in the engine `mujoco`, and in MuJoCo alone.
 
 Run with ``OMP_NUM_THREADS=1 python -m tests.benchmarks.mujoco_batches``; prints a Markdown table. A
 batch element is a pendulum for 4 s at 100 Hz, 1,600 steps of 2.5 ms. The variants alternate in one
@@ -7,17 +7,15 @@ process, and the minimum of some rounds counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from time import perf_counter, process_time
 
 import numpy as np
 
 from sims.core.simulator import Scenario
-from sims.engines.adapters import mujoco_joint_batch
 from sims.systems.pendulum import Pendulum
 
-LANES = (1, 16, 256, 1024)
+LANES = (1, 16, 256)
 STEPS = 1600
 STEP = 2.5e-3
 FRICTION = 0.01
@@ -79,17 +77,6 @@ def ours(effects: tuple[str, ...], lanes: int, **settings: int) -> Callable[[], 
     return lambda: np.testing.assert_equal(pendulum.simulate(theta, run).shape[:2], (lanes, 401))
 
 
-@contextmanager
-def one_by_one() -> Iterator[None]:
-    """Simulate batch elements one by one, as if MuJoCo had no batches."""
-    before = dict(mujoco_joint_batch.MIN_BATCH_SIZE)
-    mujoco_joint_batch.MIN_BATCH_SIZE.update(dict.fromkeys(before, 10**9))
-    try:
-        yield
-    finally:
-        mujoco_joint_batch.MIN_BATCH_SIZE.update(before)
-
-
 def once(work: Callable[[], None], lanes: int) -> Cost:
     """Return the cost per batch element."""
     processor, wall = process_time(), perf_counter()
@@ -97,28 +84,15 @@ def once(work: Callable[[], None], lanes: int) -> Cost:
     return 1e3 * (process_time() - processor) / lanes, 1e3 * (perf_counter() - wall) / lanes
 
 
-def row(effects: tuple[str, ...], lanes: int, rounds: int) -> list[Cost]:
-    """Return the costs one by one, together, and with MuJoCo alone."""
-    work, yardstick = ours(effects, lanes), native(lanes)
-    few = min(lanes, 16)  # The cost per element is constant one by one, so 16 are enough.
-    alone = ours(effects, few)
-    costs = []
-    for _ in range(rounds):
-        with one_by_one():
-            old = once(alone, few)
-        costs.append([old, once(work, lanes), once(yardstick, lanes)])
-    best: list[Cost] = [tuple(c) for c in np.min(costs, axis=0).tolist()]
-    return best
-
-
 def main() -> None:
     """Print the table."""
-    print("| pendulum | lanes | one by one, ms | together, ms | `batch.Batch` itself, ms |")
-    print("|---|---|---|---|---|")
+    print("| pendulum | elements | engine `mujoco`, ms | `batch.Batch` itself, ms |")
+    print("|---|---|---|---|")
     for name, effects in CASES.items():
         for lanes in LANES:
-            rounds = 5 if lanes < 100 else 2
-            cells = [f"{cpu:.2f} ({wall:.2f})" for cpu, wall in row(effects, lanes, rounds)]
+            variants = ours(effects, lanes), native(lanes)
+            costs = [[once(work, lanes) for work in variants] for _ in range(3)]
+            cells = [f"{cpu:.2f} ({wall:.2f})" for cpu, wall in np.min(costs, axis=0).tolist()]
             print(f"| {name} | {lanes:,} | {' | '.join(cells)} |", flush=True)
 
 

@@ -17,7 +17,6 @@ from sims import effects
 from sims.core.simulator import InputError, Scenario
 from sims.core.system import Coefficient, Force, Friction
 from sims.engines.external.external_engine import equalise_steps
-from sims.engines.external.resistance_laws import make_resistance
 from tests.sims.engine_agreement import (
     COEFFICIENTS,
     OTHERS,
@@ -209,51 +208,6 @@ def test_sliding_to_a_stop_takes_the_closed_distance(engine, step):
     t = np.minimum(np.arange(40) / 10, 2.06)
     np.testing.assert_allclose(v, 1.03 - 0.5 * t, atol=1e-12)
     np.testing.assert_allclose(x, 1.03 * t - 0.25 * t**2, atol=0.125 * 0.5 * step**2 + 1e-12)
-
-
-# ---------------------------------------------------------------------- scalar common effects
-
-
-class Linear(effects.get_effect("drag.linear")):
-    """The library's law under another name, without the engines' scalar shortcut."""
-
-    name = "elsewhere.linear"
-
-
-class Quadratic(effects.get_effect("drag.quadratic")):
-    name = "elsewhere.quadratic"
-
-
-class Coulomb(effects.get_effect("friction.coulomb")):
-    name = "elsewhere.coulomb"
-
-
-@pytest.fixture
-def elsewhere(fresh_registries):
-    for effect in (Linear, Quadratic, Coulomb):
-        effects.register_effect(effect)
-
-
-@pytest.mark.parametrize("engine", OTHERS)
-@pytest.mark.parametrize("system", ["ball", "pendulum", "slider"])
-def test_plain_numbers_are_what_the_effects_say(system, engine, elsewhere):
-    names = ["drag.linear", "drag.quadratic"] + ["friction.coulomb"] * (system != "ball")
-    fixed = {name: coefficients(system, name) for name in names}
-    asked = {f"elsewhere.{name.split('.')[1]}": c for name, c in fixed.items()}
-    assert apart(motion(system, engine, fixed), motion(system, engine, asked)) < 1e-7
-
-
-def test_only_the_librarys_own_laws_are_taken_for_known():
-    class Lane:
-        effects = (
-            (effects.get_effect("drag.linear")(), np.full((1, 1, 1), 0.2)),
-            (effects.get_effect("friction.coulomb")(), np.ones((1, 1, 1))),
-        )
-
-    found = make_resistance(Lane)
-    assert (found.compute(3.0), found.limit) == ((0.2, 0.2), 1.0)
-    Lane.effects = ((Linear(), np.ones((1, 1, 1))),)
-    assert make_resistance(Lane) is None
 
 
 # ---------------------------------------------------------------------- third-party effects

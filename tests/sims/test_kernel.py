@@ -105,14 +105,12 @@ def test_a_compiler_that_fails_is_reported_in_one_line(monkeypatch, tmp_path, ca
     assert "once after an install" in capsys.readouterr().err
 
 
-def test_without_a_cache_folder_the_code_is_compiled_for_this_process(
-    monkeypatch, tmp_path, capsys
-):
+def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, capsys):
     path = code_cache.get_cache_folder() / f"stepping-{kernel._key()}.bin"
     code = code_cache.read_cached(path)
     (tmp_path / "file").touch()
     monkeypatch.setenv("SIMGAP_COMPILED", str(tmp_path / "file"))
-    monkeypatch.setattr(kernel_build, "build_kernel", lambda: code)
+    monkeypatch.setattr(kernel_build, "build_kernel", lambda _: code)
     assert load_kernel() is not None
     assert "set SIMGAP_COMPILED to a folder that can be written" in capsys.readouterr().err
 

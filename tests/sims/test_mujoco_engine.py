@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sims.core.simulator import Scenario
+from sims.core.simulator import InputError, Scenario
+from sims.core.system import Coefficient, Force
 from sims.engines.adapters.mujoco_soft_contact import compute_damping_ratio
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
@@ -73,6 +74,47 @@ def test_an_interrupted_rollout_leaves_nothing_behind(monkeypatch):
         np.testing.assert_array_equal(
             simulator.simulate(theta, scenario), fresh.simulate(theta, scenario)
         )
+
+
+@pytest.mark.parametrize("effects", [{}, {"friction.stribeck": [0.3, 0.2, 0.1], "wind": 0.2}])
+@pytest.mark.parametrize("threads", [2, 3])
+def test_the_number_of_threads_changes_no_bit(effects, threads):
+    t = np.arange(40) / 100
+    runs = [Scenario(t, {"x": 0.1 * k, "v": 1.0}, {"u": np.sin(9 * t + k)}) for k in range(7)]
+    theta = np.linspace(0.5, 2.0, 7)[:, None]
+    one, many = (
+        Slider(engine="mujoco", fixed=effects, threads=count).simulate_batch(theta, runs)
+        for count in (1, threads)
+    )
+    np.testing.assert_array_equal(many, one)
+
+
+@pytest.mark.parametrize("threads", [0, 1.5, "all", 10**6])
+def test_impossible_numbers_of_threads_are_refused(threads):
+    with pytest.raises(InputError, match="threads must be a whole number from 1 to"):
+        Slider(engine="mujoco", threads=threads)
+
+
+class FiniteOnly(Force):
+    """A force that accepts finite numbers only, like a lookup table."""
+
+    name, says = "test.finite", "there is a table"
+    coefficients = (Coefficient("size", ("m/s^2", "N", "N*m"), ((0, 1), (0, 1), (0, 1))),)
+
+    def force(self, c, moment):
+        assert np.isfinite(moment.x).all()
+        return c[0] * np.sign(moment.x)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pybullet"])
+@pytest.mark.parametrize(("kind", "rate"), [(Pendulum, "qd"), (Ball, "vz")])
+def test_effects_are_evaluated_at_finite_states_only(kind, rate, engine):
+    simulator = kind(engine=engine, effects=[FiniteOnly], fixed={"drag.quadratic": 1e-4})
+    theta = np.array([[simulator.parameters[0].nominal, 0.1]] * 2)
+    runs = [Scenario(np.arange(20) / 100, {rate: value}) for value in (1.0, 1e300)]
+    found = simulator.simulate_batch(theta, runs)
+    assert np.isfinite(found[0]).all()
+    assert np.isnan(found[1]).all()
 
 
 @pytest.mark.parametrize("restitution", [0.1, 0.37, 0.7, 0.9, 1.0])

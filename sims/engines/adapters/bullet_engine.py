@@ -14,18 +14,12 @@ from typing import cast
 from sims.core.simulator import InputError
 from sims.core.system import Engine, IntegrationBatch, System, Trajectories
 from sims.engines.adapters import bullet_joints, bullet_world
-from sims.engines.external import (
-    ball_rollout,
-    batch_grouping,
-    joint_batch,
-    joint_rollout,
-    native_contact,
-)
-from sims.engines.external.ball_forces import BallState, Vector
+from sims.engines.external import ball_rollout, joint_rollout, native_contact
+from sims.engines.external.ball_rollout import BallState
+from sims.engines.external.element_forces import Vector
 from sims.engines.external.external_engine import (
     RolloutFunction,
     integrate_batch,
-    integrate_one_by_one,
     resolve_time_step,
 )
 from sims.engines.external.world_interface import (
@@ -104,8 +98,7 @@ def make_engine(
 class BulletEngine:
     """PyBullet engine for one system.
 
-    Batch elements are integrated one after the other in one world; where effects must be evaluated
-    at each step, several bodies may share one world.
+    Batch elements are integrated one after the other in one world.
     """
 
     name: str = "pybullet"
@@ -115,58 +108,39 @@ class BulletEngine:
         self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None
     ) -> None:
         self.largest_step = largest_step
-        self._rollouts: RolloutFunction | None = None
-        self._many: bullet_joints.BulletJointBatch | None = None
-        asked = BulletWorldModule if system.bounces else BulletJointWorldModule
+        self._rollout: RolloutFunction | None = None
+        protocol = BulletWorldModule if system.bounces else BulletJointWorldModule
         if own is not None:
-            asked = BulletBallWorldModule
-        module, self._reason = find_world_module(system, "bullet_world", asked)
+            protocol = BulletBallWorldModule
+        module, self._reason = find_world_module(system, "bullet_world", protocol)
         if module is None:
             return
+        build = cast(BulletWorldModule, module).build
         if own is not None:
             build = partial(cast(BulletBallWorldModule, module).build_native, settings=own)
-            self._world = bullet_world.PersistentBulletWorld(build)
-            rollout = partial(
-                native_contact.integrate_native_ball, BulletNativeBall(self._world, own)
-            )
-            self._rollouts = partial(integrate_one_by_one, rollout, self._world.invalidate)
+        self._world = bullet_world.PersistentBulletWorld(build)
+        if own is not None:
+            native_ball = BulletNativeBall(self._world, own)
+            self._rollout = partial(native_contact.integrate_native_ball, native_ball)
         elif system.bounces:
-            self._world = bullet_world.PersistentBulletWorld(cast(BulletWorldModule, module).build)
-            ball = partial(ball_rollout.integrate_ball, BulletBall(self._world))
-            self._rollouts = partial(integrate_one_by_one, ball, self._world.invalidate)
+            self._rollout = partial(ball_rollout.integrate_ball, BulletBall(self._world))
         else:
-            body = cast(BulletJointWorldModule, module)
-            self._world = bullet_world.PersistentBulletWorld(body.build)
-            alone = partial(
-                joint_rollout.integrate_joint, bullet_joints.BulletJoint(self._world, body)
-            )
-            self._many = bullet_joints.BulletJointBatch(body)
-            company = joint_batch.JointBatchIntegrator(self._many)
-            self._rollouts = partial(
-                batch_grouping.integrate_grouped, alone, company, self._world.invalidate
-            )
+            joint = bullet_joints.BulletJoint(self._world, cast(BulletJointWorldModule, module))
+            self._rollout = partial(joint_rollout.integrate_joint, joint)
 
     def integrate(self, lanes: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""
-        assert self._rollouts is not None, "a system that the engine refuses"
-        return integrate_batch(lanes, self._rollouts, self._discard)
-
-    def _discard(self) -> None:
-        """Discard the worlds, so that the next rollout builds new ones."""
-        self._world.invalidate()
-        if self._many is not None:
-            self._many.discard()
+        assert self._rollout is not None, "a system that the engine refuses"
+        return integrate_batch(lanes, [self._rollout], self._world.invalidate)
 
     def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
         """Return why the engine cannot integrate the system; see `Engine`."""
         return self._reason
 
     def close(self) -> None:
-        """Close the Bullet worlds; the next integration opens new ones."""
-        if self._rollouts is not None:
+        """Close the Bullet world; the next integration opens a new one."""
+        if self._rollout is not None:
             self._world.close()
-        if self._many is not None:
-            self._many.close()
 
 
 class _BulletMover:

@@ -31,7 +31,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from sims.engines.external import ball_rollout
-from sims.engines.external.ball_forces import BallState, Vector
+from sims.engines.external.ball_rollout import BallState
+from sims.engines.external.element_forces import Vector
 from sims.engines.external.world_interface import MujocoJointWorldModule
 
 _IMPACT = 1e-4
@@ -223,38 +224,11 @@ class MujocoBall(MujocoMover):
         super().reset_world(constants)
         self._held = False
 
-    @property
-    def model(self) -> Any:
-        """The compiled model that `reset_world` has prepared."""
-        return self._model
-
-    def load_state(self, held: bool, before: Any) -> None:
-        """Load the contact state of another ball; its step and position must be set afterwards.
-
-        Args:
-            held: whether contact supports the ball.
-            before: acceleration of the previous step, with which MuJoCo's solver is warm-started.
-        """
-        self._held = held
-        self._meets(held)
-        self._hertz = math.nan
-        self._data.qacc_warmstart[:] = before
-
-    @property
-    def exported_state(self) -> tuple[bool, int, Any]:
-        """State to continue as another ball: `held`, disable flags, `before` (`load_state`)."""
-        return self._held, self._model.opt.disableflags, self._data.qacc_warmstart
-
-    def get_resting_solref(self, step: float) -> tuple[float, float]:
-        """Return the ``solref`` of contact that supports a resting ball, for this step."""
-        hertz = 1.0 / step
-        return -0.1 * hertz**2, -hertz  # (4)
-
     def set_step(self, step: float) -> None:
         """Set the step in seconds."""
         super().set_step(step)
         if self._held:
-            self._model.geom_solref[:] = self.get_resting_solref(step)
+            self._contact(0.1 * self._hertz**2, self._hertz)  # (4)
 
     def solve_impact(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
         """Return the velocity after an impact, from MuJoCo's contact solver in one short step.

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from typing import Protocol, cast
+from typing import cast
 
 from sims.core.simulator import InputError
 from sims.core.system import Engine, IntegrationBatch, System, Trajectories
 from sims.core.value_limits import truncate_text
-from sims.engines.adapters import mujoco_ball_batch, mujoco_joint_batch
 from sims.engines.adapters.mujoco_bodies import (
     CompiledWorld,
     MujocoBall,
@@ -23,20 +22,10 @@ from sims.engines.adapters.mujoco_bodies import (
     import_mujoco,
 )
 from sims.engines.adapters.mujoco_soft_contact import MujocoSoftBall
-from sims.engines.external import (
-    ball_batch,
-    ball_rollout,
-    batch_grouping,
-    joint_batch,
-    joint_rollout,
-    native_contact,
-)
+from sims.engines.external import ball_rollout, joint_rollout, native_contact
 from sims.engines.external.external_engine import (
-    ElementWork,
     RolloutFunction,
-    Trajectory,
     integrate_batch,
-    integrate_one_by_one,
     resolve_time_step,
 )
 from sims.engines.external.world_interface import (
@@ -73,7 +62,7 @@ def make_engine(
             (`sims.engines.external.native_contact`).
         stiffness: with `native_contact`: stiffness of the contact in 1/s^2 (1e5: contacts of 10
             ms).
-        threads: number of threads for batch elements that are stepped together; the results do not
+        threads: number of threads, each of which steps some batch elements; the results do not
             depend on it. Use 1 if other processes use the other cores.
 
     Returns:
@@ -101,22 +90,13 @@ def make_engine(
         raise InputError(f"system {system.name} does not bounce: leave native_contact out")
     if stiffness is not None and not 0 < stiffness < math.inf:
         raise InputError(f"stiffness must be a positive number, found {stiffness}")
-    return MujocoEngine(system, step, stiffness or _STIFFNESS)
-
-
-class _Closable(Protocol):
-    """Object that is closed together with the engine."""
-
-    def close(self) -> None:
-        """Release stored worlds."""
-        ...
+    return MujocoEngine(system, step, stiffness or _STIFFNESS, threads)
 
 
 class MujocoEngine:
     """MuJoCo engine for one system.
 
-    Batch elements are integrated together if `mujoco.batch` is available and there are enough of
-    them, otherwise one after the other in one world.
+    Batch elements are integrated one after the other, in one world for each thread.
     """
 
     name: str = "mujoco"
@@ -130,51 +110,30 @@ class MujocoEngine:
         threads: int = 1,
     ) -> None:
         self.largest_step = largest_step
-        self._rollouts: RolloutFunction | None = None
-        self._many: _Closable | None = None
-        asked = MujocoWorldModule if system.bounces else MujocoJointWorldModule
-        module, self._reason = find_world_module(system, "mujoco_world", asked)
+        self._worlds: list[CompiledWorld] = []
+        self._rollouts: list[RolloutFunction] = []
+        protocol = MujocoWorldModule if system.bounces else MujocoJointWorldModule
+        module, self._reason = find_world_module(system, "mujoco_world", protocol)
         if module is None:
             return
-        self._world = CompiledWorld(cast(MujocoWorldModule, module).model)
-        if stiffness is not None:
-            self._alone(
-                partial(
-                    native_contact.integrate_native_ball, MujocoSoftBall(self._world, stiffness)
-                )
-            )
-        elif system.bounces:
-            alone = partial(ball_rollout.integrate_ball, MujocoBall(self._world))
-            balls = mujoco_ball_batch.MujocoBallBatch(
-                CompiledWorld(cast(MujocoWorldModule, module).model), threads
-            )
-            self._together(alone, balls, ball_batch.BallBatchIntegrator(balls))
-        else:
-            body = cast(MujocoJointWorldModule, module)
-            on_joint = partial(joint_rollout.integrate_joint, MujocoJoint(self._world, body))
-            bodies = mujoco_joint_batch.MujocoJointBatch(self._world, body, threads)
-            self._together(on_joint, bodies, joint_batch.JointBatchIntegrator(bodies))
-
-    def _alone(self, rollout: Callable[[ElementWork], Trajectory]) -> None:
-        """Set up integration of one element after the other."""
-        self._rollouts = partial(integrate_one_by_one, rollout, self.close)
-
-    def _together(
-        self,
-        alone: Callable[[ElementWork], Trajectory],
-        many: _Closable,
-        company: batch_grouping.BatchIntegrator,
-    ) -> None:
-        """Set up integration of elements together, if this MuJoCo version can step batches."""
-        if not mujoco_joint_batch.is_batch_available():
-            self._alone(alone)
-            return
-        self._many = many
-        self._rollouts = partial(batch_grouping.integrate_grouped, alone, company, self.close)
+        self._worlds = [
+            CompiledWorld(cast(MujocoWorldModule, module).model) for _ in range(threads)
+        ]
+        for world in self._worlds:
+            rollout: RolloutFunction
+            if stiffness is not None:
+                soft_ball = MujocoSoftBall(world, stiffness)
+                rollout = partial(native_contact.integrate_native_ball, soft_ball)
+            elif system.bounces:
+                rollout = partial(ball_rollout.integrate_ball, MujocoBall(world))
+            else:
+                joint = MujocoJoint(world, cast(MujocoJointWorldModule, module))
+                rollout = partial(joint_rollout.integrate_joint, joint)
+            self._rollouts.append(rollout)
 
     def integrate(self, lanes: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""
-        assert self._rollouts is not None, "a system that the engine refuses"
+        assert self._rollouts, "a system that the engine refuses"
         with _suppress_warnings():
             return integrate_batch(lanes, self._rollouts, self.close)
 
@@ -184,10 +143,8 @@ class MujocoEngine:
 
     def close(self) -> None:
         """Release the MuJoCo worlds; the next integration makes new ones."""
-        if self._rollouts is not None:
-            self._world.close()
-        if self._many is not None:
-            self._many.close()
+        for world in self._worlds:
+            world.close()
 
 
 @contextlib.contextmanager

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from sims.engines.adapters.mujoco_bodies import CompiledWorld, MujocoMover
-from sims.engines.external.ball_forces import BallState, Vector
+from sims.engines.external.ball_rollout import BallState
+from sims.engines.external.element_forces import Vector
 
 _MOST_DAMPED = 2.0
 """Largest damping ratio of a soft contact."""

@@ -24,7 +24,6 @@ from sims.engines.compiled.data_layout import (
     InputNames,
 )
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, SystemTracer
-from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.node_arrays import NotTraceableError
 from sims.engines.ground_contact import Indices
 
@@ -145,11 +144,8 @@ def _evaluate(
 ) -> list[Array]:
     """Return force and friction limit at states, and contact parameters of two impacts."""
     prepared = program.prepare(1)
-    (code, ends, rows, out, flags), r = prepared.arrays, prepared.block.r
-    run_lane, run_moment, run_impact = (
-        get_kernel().make_instruction_runner(code, ends[part], ends[part + 1], r)
-        for part in range(3)
-    )
+    (_, _, rows, out, flags), r = prepared.arrays, prepared.block.r
+    run_lane, run_moment, run_impact = prepared.make_runners()
     r[rows[IN_P] : rows[IN_P] + parameters.size, 0] = parameters
     run_lane()
     results = []
@@ -163,5 +159,4 @@ def _evaluate(
         r[rows[IN_E] : rows[IN_E] + 3, 0] = _RESTITUTION, _FRICTION, speed
         run_impact()
         results.append(r[rows[[OUT_E, OUT_MU]], 0])
-    prepared.raise_error()
     return results

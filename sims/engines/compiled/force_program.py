@@ -7,8 +7,9 @@ contact parameters with effects, computed at impacts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from sims.engines.compiled.expression_graph import (
     ExpressionGraph,
     ExpressionNode,
 )
+from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.node_arrays import NotTraceableError, make_constant_nodes
 from sims.engines.compiled.numpy_forces import NUMPY_BLOCK_WIDTH, NumpyForces, lay_out_registers
 from sims.engines.compiled.traced_array import TracedArray
@@ -59,6 +61,28 @@ class PreparedProgram(NamedTuple):
         """Raise the exception of an array function that the instructions have called."""
         if self.numpy_forces is not None and self.numpy_forces.error is not None:
             raise self.numpy_forces.error
+
+    def make_runners(self) -> tuple[Callable[[], None], ...]:
+        """Return functions that run the parts of the program on all slots.
+
+        The parts are the values of each element, the forces, and the contact parameters.
+        """
+        kernel, ends, r = get_kernel(), self.arrays.ends.tolist(), self.block.r
+        runners = [
+            kernel.make_instruction_runner(self.arrays.code, first, last, r)
+            for first, last in pairwise(ends)
+        ]
+        if self.numpy_forces is None:
+            return tuple(runners)
+
+        def make_checked(runner: Callable[[], None]) -> Callable[[], None]:
+            def run() -> None:
+                runner()
+                self.raise_error()
+
+            return run
+
+        return tuple(map(make_checked, runners))
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ import ctypes
 import hashlib
 import sys
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -110,15 +111,9 @@ class CompiledKernel:
         arguments[11:14] = len(r), r.shape[1], r.shape[1]
         arguments[kernel_entry.SIZE_COUNT] = _address(code)
         arguments[kernel_entry.SIZE_COUNT + kernel_entry.INT_ARRAY_COUNT] = _address(r)
-        owners = arguments, code, r
-        function = self._function
-        pointer = ctypes.c_void_p(_address(arguments))
-
-        def run() -> None:
-            assert owners  # keeps the memory at the addresses
-            function(pointer)
-
-        return run
+        run: Any = partial(self._function, ctypes.c_void_p(_address(arguments)))
+        run.owners = arguments, code, r  # keeps the memory at the addresses
+        return run  # type: ignore[no-any-return]
 
     def _call(
         self, function: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int,

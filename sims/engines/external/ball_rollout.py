@@ -32,15 +32,40 @@ import math
 from collections.abc import Sequence
 from typing import Protocol
 
-from sims.engines.external.ball_forces import (
-    BallState,
-    EffectForce,
-    ImpactParameters,
-    Vector,
-    get_gravity,
-    make_trajectory,
-)
+import numpy as np
+
+from sims.engines.external.element_forces import ElementForces, Vector
 from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
+from sims.engines.ground_contact import MAX_SHORT_FLIGHTS, MIN_FLIGHT_SECONDS, SHORT_FLIGHT_SECONDS
+
+BallState = tuple[Vector, Vector]
+"""Position and the engine's velocity."""
+
+
+def get_gravity(lane: ElementWork) -> Vector:
+    """Return the acceleration of gravity, which is constant."""
+    start = np.zeros((1, 1))
+    nothing = np.zeros((1, 3))
+    moment = lane.make_snapshot(start, nothing, nothing, {})
+    weight: list[float] = lane.system.weight(moment)[0].tolist()
+    return weight
+
+
+def make_trajectory(lane: ElementWork, rows: list[tuple[float, ...]]) -> Trajectory:
+    """Split rows of position, velocity and acceleration; all NaN if rows are missing.
+
+    Args:
+        lane: integrated batch element.
+        rows: nine numbers for each recorded state.
+
+    Returns:
+        Positions, velocities and accelerations (N, 3).
+    """
+    if len(rows) < lane.recorded_steps.size:
+        rows = [(math.nan,) * 9] * lane.recorded_steps.size
+    table = np.array(rows)
+    return table[:, :3], table[:, 3:6], table[:, 6:]
+
 
 _NO_TIME = 1e-12
 """Duration in seconds that is too short for a step."""
@@ -140,8 +165,8 @@ class BallRollout:
 
     def __init__(self, ball: BallWithImpacts, lane: ElementWork) -> None:
         self._ball = ball
-        self._contact = ImpactParameters(lane)
-        self._pull = EffectForce(lane)
+        self._forces = ElementForces(lane, 1)
+        self._short_flights = 0
         self._gravity = get_gravity(lane)
         self._floor = float(lane.system.floor(lane.constants)[0, 0])
         x, y, z = lane.x.tolist()
@@ -173,7 +198,7 @@ class BallRollout:
         Returns:
             Position, velocity and acceleration after each count.
         """
-        if self._pull.any:
+        if self._forces.acts:
             return [self._stepwise(step, count) for count in counts]
         states: list[tuple[float, ...]] = []
         left = list(counts)
@@ -225,7 +250,7 @@ class BallRollout:
             until = math.inf if self.rests else self._time_to_ground()
             if until > _NO_TIME:
                 part = min(until, left)
-                if self._pull.any:
+                if self._forces.acts:
                     self._forced(part)
                 else:
                     self._glide(part, (1,))
@@ -290,11 +315,8 @@ class BallRollout:
     def _look(self) -> None:
         """Evaluate the acceleration at the present state; at rest the vertical one is zero."""
         x, y, z = self._gravity
-        if self._pull.any:
-            felt = self._pull.compute(self.time, self.x, self.v)
-            x = x + felt[0]
-            y = y + felt[1]
-            z = z + felt[2]
+        if self._forces.acts:
+            x, y, z = self._forces.evaluate(self.time, self.x, self.v)
         self.lift = z
         self.a = x, y, 0.0 if self.rests else z
 
@@ -317,15 +339,38 @@ class BallRollout:
     def _strike(self) -> None:
         speed = -self.v[2]
         self.w = None  # contact changes the velocity, so the engine's state must be set again
-        restitution, friction, over = self._contact.compute_with_rest_condition(
-            max(speed, 0.0), -self.a[2]
-        )
+        restitution, friction, over = self._compute_impact(max(speed, 0.0), -self.a[2])
         if speed > 0.0:
             self.v = self._ball.solve_impact(self.x, self.v, restitution, friction)
             self.step = math.nan  # the engine's step is still that of the contact
         if over:
             self._rest()
         self._look()
+
+    def _compute_impact(self, speed: float, down: float) -> tuple[float, float, bool]:
+        """Return the parameters of an impact, and whether bouncing ends with it.
+
+        The friction of the last impact includes the friction of all omitted bounces.
+
+        Args:
+            speed: normal speed before the impact in m/s.
+            down: downward acceleration in m/s^2.
+
+        Returns:
+            Restitution, friction coefficient, and whether bouncing is finished.
+        """
+        # Equation numbers refer to `sims.engines.ground_contact`.
+        restitution, friction = self._forces.compute_impact(speed)
+        up = restitution * speed  # (1)
+        flight = 2.0 * up / down if down > 0.0 else math.inf  # (3)
+        self._short_flights = self._short_flights + 1 if flight < SHORT_FLIGHT_SECONDS else 0
+        if flight >= MIN_FLIGHT_SECONDS and self._short_flights <= MAX_SHORT_FLIGHTS:
+            return restitution, friction, False
+        # Engines remove mu (1 + e) |vn| with the returned e, which is 0. Therefore all of (4) and
+        # the factor 1 + e of this impact are included in the friction.
+        later = up / (1.0 - restitution) if restitution < 1.0 else 0.0  # (4), divided by mu (1 + e)
+        total = friction * (1.0 + restitution) * (1.0 + later / speed) if speed else 0.0
+        return 0.0, total, True
 
     def _rest(self) -> None:
         self.rests = True

@@ -15,15 +15,15 @@ doi:10.1017/S0962492902000144), with a(x) the acceleration at x:
     w = v - h/2 a(x)                                                       (3)
 
 `external.joint_rollout` and `external.ball_rollout` read it in this way: they choose F such that
-the engine's velocity becomes the velocity at x plus half a step of acceleration.
-
-`sims.engines.external.external_forces` evaluates the forces that the engine does not apply itself.
+the engine's velocity becomes the velocity at x plus half a step of acceleration. Forces are those
+of a force program (`external.element_forces`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,13 +33,16 @@ from sims.core.simulator import Array, InputError
 from sims.core.system import (
     ActiveEffects,
     Contact,
-    Effect,
+    Force,
+    Friction,
     IntegrationBatch,
     StateSnapshot,
     System,
     Trajectories,
 )
 from sims.core.value_limits import is_plausible_number, truncate_text
+from sims.engines.compiled.compilability import get_force_program
+from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram
 
 TIME_TOLERANCE = 1e-6
 """Largest deviation of sample times from the engine's steps, as a fraction of an interval.
@@ -51,7 +54,6 @@ DEFAULT_MAX_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
 """Default longest step in seconds, by the system's kind."""
 
 Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 Trajectory = tuple[Array, Array, Array]
 """Trajectory of one batch element: positions, velocities and accelerations, each (N, D)."""
 
@@ -69,8 +71,8 @@ class ElementWork:
         steps: (S,) step sizes in seconds, all > 0; steps of zero length are left out.
         inputs: (S,) inputs by name, at least one value.
         effects: active effects with coefficients (K, 1, 1).
-        declared: all effects of the call in their order, including those active only on other
-            elements.
+        program: force program of the system and these effects.
+        parameters: (P,) parameters of the program.
         recorded_steps: (N,) increasing step counts, beginning with 0, after which the state is
             recorded.
     """
@@ -83,18 +85,14 @@ class ElementWork:
     steps: Array
     inputs: Mapping[str, Array]
     effects: ActiveEffects
-    declared: tuple[Effect, ...]
+    program: ForceProgram | NumpyForceProgram
+    parameters: Array
     recorded_steps: Indices
 
     @property
     def plain_constants(self) -> dict[str, float]:
         """Constants as floats, by name."""
         return {name: float(value[0, 0]) for name, value in self.constants.items()}
-
-    @property
-    def contact_effects(self) -> list[tuple[Contact, Array]]:
-        """Contact effects of the element with their coefficients."""
-        return [(effect, c) for effect, c in self.effects if isinstance(effect, Contact)]
 
     def make_snapshot(
         self, t: Array, x: Array, v: Array, inputs: Mapping[str, Array]
@@ -116,37 +114,34 @@ class ElementWork:
         return StateSnapshot(self.system, theta, known, t, x, v, inputs)
 
 
-class NotBatchableError(Exception):
-    """The batch elements cannot be integrated together."""
+RolloutFunction = Callable[[ElementWork], Trajectory]
+"""Function that integrates one batch element.
 
-
-RolloutFunction = Callable[[Sequence[ElementWork]], Iterable[Trajectory]]
-"""Function that integrates batch elements and yields their trajectories.
-
-The rows of each trajectory are those of `ElementWork.recorded_steps`; they are NaN where the
+The rows of the trajectory are those of `ElementWork.recorded_steps`; they are NaN where the
 integration failed.
 """
 
 
 def integrate_batch(
-    lanes: IntegrationBatch, rollouts: RolloutFunction, discard: Callable[[], None]
+    lanes: IntegrationBatch, rollouts: Sequence[RolloutFunction], discard: Callable[[], None]
 ) -> Trajectories:
-    """Integrate all batch elements with `rollouts`.
+    """Integrate the batch elements one after the other.
 
     Args:
         lanes: batch to integrate.
-        rollouts: integrates the elements whose numbers are all finite.
-        discard: called after an interruption, which may leave the engine's world in any state.
+        rollouts: functions that integrate one element, each with its own world; with several of
+            them, each runs in its own thread.
+        discard: called after a failure or interruption, which may leave the engine's world in any
+            state.
 
     Returns:
         The trajectories. An element with a number or result that is not finite is all NaN.
     """
     count = lanes.steps.shape[1] // lanes.steps_per_sample + 1
-    shape = (len(lanes.theta), count, lanes.x.shape[1])
-    x = np.full(shape, np.nan)
-    motion = Trajectories(x, x.copy(), x.copy())
-    work: list[ElementWork] = []
-    places: list[tuple[int, Indices]] = []
+    trajectories = Trajectories(
+        *(np.full((len(lanes.theta), count, lanes.x.shape[1]), np.nan) for _ in range(3))
+    )
+    work: list[tuple[int, ElementWork, Indices]] = []
     for i in range(len(lanes.theta)):
         # Elements of one run are adjacent and have the same steps.
         if i == 0 or not np.array_equal(lanes.steps[i], lanes.steps[i - 1]):
@@ -154,36 +149,29 @@ def integrate_batch(
         lane = _lane(lanes, i, *timing[:3])
         # A rollout that is certain to fail would cost the engine its world.
         if all(np.isfinite(values).all() for values in _given(lane)):
-            work.append(lane)
-            places.append((i, timing[3]))
+            work.append((i, lane, timing[3]))
+
+    def integrate_share(k: int) -> None:
+        for i, lane, rows in work[k :: len(rollouts)]:
+            trajectory = rollouts[k](lane)
+            if not is_finite(trajectory):
+                discard()
+                continue
+            for result, values in zip(
+                (trajectories.x, trajectories.v, trajectories.a), trajectory, strict=True
+            ):
+                result[i] = values[rows]
+
     try:
-        for (i, rows), path in zip(places, rollouts(work), strict=True):
-            if is_finite(path):
-                for result, values in zip((motion.x, motion.v, motion.a), path, strict=True):
-                    result[i] = values[rows]
+        if len(rollouts) == 1:
+            integrate_share(0)
+        else:
+            with ThreadPoolExecutor(len(rollouts)) as pool:
+                list(pool.map(integrate_share, range(len(rollouts))))
     except BaseException:  # an interrupted rollout leaves applied forces in the world
         discard()
         raise
-    return motion
-
-
-def integrate_one_by_one(
-    rollout: Callable[[ElementWork], Trajectory],
-    discard: Callable[[], None],
-    lanes: Sequence[ElementWork],
-) -> Iterator[Trajectory]:
-    """Integrate one element after the other and yield their trajectories.
-
-    Args:
-        rollout: integrates one element.
-        discard: called after an element that failed.
-        lanes: batch elements to integrate.
-    """
-    for lane in lanes:
-        path = rollout(lane)
-        if not is_finite(path):
-            discard()
-        yield path
+    return trajectories
 
 
 def is_finite(path: Trajectory) -> bool:
@@ -216,6 +204,10 @@ def _lane(
 ) -> ElementWork:
     acting = [(effect, c[:, i : i + 1]) for effect, c in lanes.effects]
     effects = tuple((effect, c) for effect, c in acting if c.any())
+    forces = [(e, c) for e, c in effects if isinstance(e, Force | Friction | Contact)]
+    program = get_force_program(lanes, np.array([i]), [effect for effect, _ in forces])
+    numbers = [lanes.theta[i], *(value[i] for value in lanes.constants.values())]
+    parameters = np.concatenate([*numbers, *(c[:, 0, 0] for _, c in forces)])
     constants = {name: value[i : i + 1] for name, value in lanes.constants.items()}
     # An element without any step of positive length still has an input at its single time.
     felt = moving if moving.size else slice(1)
@@ -229,7 +221,8 @@ def _lane(
         steps,
         inputs,
         effects,
-        tuple(effect for effect, _ in lanes.effects),
+        program,
+        parameters,
         kept,
     )
 

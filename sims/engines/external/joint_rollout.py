@@ -13,7 +13,10 @@ where (1) is applied as one force over the step,
 
 and (3) is solved for v' by one Newton step, so that damping is stable however strong it is (the two
 halves together are the trapezoidal rule in v), and dry friction is exact in each half
-(`forces.kick`).
+(`integrate_velocity`). Dry friction with limit L changes a force F at velocity v to
+
+    F - L sign(v)                      where v is not 0                    (9)
+    F - L sign(F), or 0 if |F| <= L    where v is 0                        (10)
 
 If only inputs and viscous damping c act, the engine's own joint damping, explicit in w, represents
 it, and the engine runs without interruption. With J = M + h c / 2 in place of M,
@@ -36,21 +39,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.engines.external.element_forces import ElementForces
 from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
-from sims.engines.external.external_forces import integrate_velocity
-from sims.engines.external.joint_forces import (
-    ClosedFormJointForces,
-    EvaluatedJointForces,
-    JointForces,
-    compute_drive_forces,
-)
-from sims.engines.external.resistance_laws import Resistance, is_builtin_effect, make_resistance
+
+VELOCITY_STEP = 1e-3
+"""Velocity difference (m/s or rad/s) used to compute the slope of the force."""
 
 
 class JointBody(Protocol):
@@ -117,47 +115,10 @@ def integrate_joint(joint: JointBody, lane: ElementWork) -> Trajectory:
     """
     joint.reset_world(lane.plain_constants)
     inertia = float(lane.system.mass(lane.theta, lane.constants)[0, 0])
-    way = choose_integration_mode(lane, joint.open_loop)
-    if way.damping is not None:
-        return _integrate_open_loop(joint, lane, inertia, way.damping)
-    if way.opposing is not None:
-        return _integrate_stepwise(
-            joint,
-            lane,
-            inertia,
-            ClosedFormJointForces(joint.compute_gravity_force, lane, inertia, way.opposing),
-        )
-    return _integrate_stepwise(
-        joint, lane, inertia, EvaluatedJointForces(joint.compute_gravity_force, lane, inertia)
-    )
-
-
-@dataclass(frozen=True)
-class IntegrationMode:
-    """Integration mode of a batch element: the fastest of three that includes all active forces.
-
-    Evaluating effects takes longer than the engine's own step.
-
-    Attributes:
-        damping: viscous damping, if nothing else acts except inputs, so that the engine runs on its
-            own; None otherwise.
-        opposing: closed-form resistance, if all forces depend on speed alone; None if effects must
-            be evaluated at each step.
-    """
-
-    damping: float | None
-    opposing: Resistance | None
-
-
-def choose_integration_mode(lane: ElementWork, open_loop: bool) -> IntegrationMode:
-    """Choose the fastest integration mode of a batch element.
-
-    Args:
-        lane: batch element to integrate.
-        open_loop: whether the drive depends on the inputs alone.
-    """
-    opposing = make_resistance(lane) if open_loop else None
-    return IntegrationMode(None if opposing is None else _find_equivalent_damping(lane), opposing)
+    damping = _find_equivalent_damping(lane) if joint.open_loop else None
+    if damping is not None:
+        return _integrate_open_loop(joint, lane, inertia, damping)
+    return _integrate_stepwise(joint, lane, inertia)
 
 
 def _find_equivalent_damping(lane: ElementWork) -> float | None:
@@ -166,8 +127,113 @@ def _find_equivalent_damping(lane: ElementWork) -> float | None:
         return 0.0
     (effect, c), *others = lane.effects
     damping = float(c[0, 0, 0])
-    alone = is_builtin_effect(effect, "drag.linear") and not others
-    return damping if alone and damping > 0.0 else None
+    # A plugin may replace an effect of this name with another law.
+    is_drag = effect.name == "drag.linear" and type(effect).__module__ == "sims.effects.drag"
+    return damping if is_drag and not others and damping > 0.0 else None
+
+
+class LinearisedForces:
+    """Forces on one coordinate, linear in the velocity around the last evaluation.
+
+    Attributes:
+        weight: force of the engine's own gravity at the last evaluation.
+        limit: limit of dry friction.
+    """
+
+    def __init__(self, joint: JointBody, lane: ElementWork, inertia: float) -> None:
+        self._joint = joint
+        self._forces = ElementForces(lane, 2)
+        self._inertia = inertia
+        self.set_inputs = self._forces.set_inputs
+        self.weight = self.limit = self._velocity = self._force = self._slope = 0.0
+
+    def linearise(self, t: float, x: float, v: float) -> None:
+        """Evaluate all forces at this state and linearise them in the velocity."""
+        # The second velocity is farther from zero, where forces may be discontinuous.
+        change = math.copysign(VELOCITY_STEP, v)
+        force, changed = self._forces.evaluate_at_velocities(t, x, (v, v + change))
+        self.weight = self._joint.compute_gravity_force(x)
+        self.limit = self._forces.limit
+        self._velocity = v
+        self._force = force
+        self._slope = (changed - force) / change
+
+    def compute_force(self, v: float) -> float:
+        """Return all forces except dry friction, near the evaluated velocity."""
+        return self._force + self._slope * (v - self._velocity)
+
+    def compute_end_velocity(self, w: float, step: float) -> float:
+        """Return the velocity half a step after `w`, with the force at the end of the half step.
+
+        A force that increases with the velocity is taken without its slope.
+
+        Args:
+            w: the engine's velocity.
+            step: step size in seconds.
+        """
+        # Equation (3) with f linear in v: the slope is added to the inertia. An increasing force
+        # would reduce this inertia, possibly to zero.
+        slope = min(self._slope, 0.0)
+        force = self._force + slope * (w - self._velocity)
+        inverse = 1.0 / (self._inertia - 0.5 * step * slope)
+        return integrate_velocity(w, force, self.limit, inverse, 0.5 * step)
+
+    def compute_acceleration(self, v: float) -> float:
+        """Return the acceleration of the smooth motion; zero where dry friction holds the body."""
+        return subtract_dry_friction(v, self.compute_force(v), self.limit) / self._inertia
+
+
+def subtract_dry_friction(velocity: float, force: float, limit: float) -> float:
+    """Return a force minus dry friction, equations (9) and (10).
+
+    Args:
+        velocity: velocity of the body.
+        force: force without dry friction.
+        limit: limit of dry friction.
+    """
+    if not limit:
+        return force
+    if velocity:
+        return force - math.copysign(limit, velocity)  # (9)
+    return force - math.copysign(limit, force) if abs(force) > limit else 0.0  # (10)
+
+
+def integrate_velocity(
+    velocity: float, force: float, limit: float, inverse: float, duration: float
+) -> float:
+    """Return the velocity after a constant force and dry friction have acted for `duration`.
+
+    The result is exact: friction opposes the motion until the body stops, and then holds it if the
+    force is within the limit.
+
+    Args:
+        velocity: velocity before.
+        force: force without dry friction.
+        limit: limit of dry friction.
+        inverse: inverse of the inertia.
+        duration: time in seconds.
+    """
+    if velocity and limit:
+        slope = subtract_dry_friction(velocity, force, limit) * inverse
+        after = velocity + slope * duration
+        if after * velocity >= 0:
+            return after
+        # The body stops at time -v / slope; the remaining time begins there.
+        duration += velocity / slope
+        velocity = 0.0
+    return velocity + subtract_dry_friction(velocity, force, limit) * inverse * duration
+
+
+def _compute_drive_forces(lane: ElementWork) -> Array:
+    """Return the generalised force (S,) of the inputs over each step, at least one value."""
+    if not lane.inputs:
+        return np.zeros(max(lane.steps.size, 1))
+    signals = {name: values[:, None] for name, values in lane.inputs.items()}
+    size = len(next(iter(signals.values())))
+    nothing = np.zeros((size, 1))
+    moment = lane.make_snapshot(nothing, nothing, nothing, signals)
+    drive: Array = lane.system.drive(moment)[:, 0]
+    return drive
 
 
 def _integrate_open_loop(
@@ -177,7 +243,7 @@ def _integrate_open_loop(
 
     The engine runs on its own while the input is constant.
     """
-    drive = compute_drive_forces(lane)
+    drive = _compute_drive_forces(lane)
     forces = drive.tolist()
     steps = lane.steps.tolist()
     kept = set(lane.recorded_steps.tolist())
@@ -194,16 +260,17 @@ def _integrate_open_loop(
         if h != step:
             # The velocity half a step earlier depends on the step size.
             if begin:
-                v = to_full_step_velocity(
+                v = _to_full_step_velocity(
                     w, joint.compute_gravity_force(x) + felt, inertia, damping, step
                 )
             if not joint.set_step(h, inertia + 0.5 * h * damping, damping):  # (5)
                 break
             joint.set_state(
-                x, to_half_step_velocity(v, joint.compute_gravity_force(x) + u, inertia, damping, h)
+                x,
+                _to_half_step_velocity(v, joint.compute_gravity_force(x) + u, inertia, damping, h),
             )
         elif u != felt:
-            joint.advance(compute_transition_force(felt, u, inertia, damping, h))
+            joint.advance(_compute_transition_force(felt, u, inertia, damping, h))
             counts[0] -= 1
         states = joint.advance_freely(u, counts)
         x, w = states[-1]
@@ -216,11 +283,11 @@ def _integrate_open_loop(
             states.pop()
         rows.extend((*state, h, u) for state in states)
     if len(rows) < lane.recorded_steps.size:
-        return make_failed_trajectory(lane)
-    return read_trajectory(lane, np.array(rows), inertia, damping)
+        return _make_failed_trajectory(lane)
+    return _read_trajectory(lane, np.array(rows), inertia, damping)
 
 
-def read_trajectory(lane: ElementWork, rows: Array, inertia: float, damping: float) -> Trajectory:
+def _read_trajectory(lane: ElementWork, rows: Array, inertia: float, damping: float) -> Trajectory:
     """Convert the states of an uninterrupted run to a trajectory.
 
     Args:
@@ -235,13 +302,13 @@ def read_trajectory(lane: ElementWork, rows: Array, inertia: float, damping: flo
     """
     positions, w_at, step_at, felt_at = rows.T
     force = _weights(lane, positions) + felt_at
-    rates = to_full_step_velocity(w_at, force, inertia, damping, step_at)
+    rates = _to_full_step_velocity(w_at, force, inertia, damping, step_at)
     rates[0] = lane.v[0]
     accelerations = (force - damping * rates) / inertia
     return positions[:, None], rates[:, None], accelerations[:, None]
 
 
-def to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
+def _to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
     """Return the velocity at the time of the position, equation (6); numbers or arrays.
 
     Args:
@@ -255,10 +322,10 @@ def to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step: 
     return (w + half * force) / (1.0 + half * damping)  # (6)
 
 
-def to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
+def _to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
     """Return the engine's velocity, half a step before the position.
 
-    This is the inverse of `to_full_step_velocity`.
+    This is the inverse of `_to_full_step_velocity`.
 
     Args:
         v: velocity at the time of the position.
@@ -271,7 +338,7 @@ def to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step: 
     return (1.0 + half * damping) * v - half * force  # (7)
 
 
-def compute_transition_force(felt: Any, u: Any, inertia: Any, damping: Any, step: Any) -> Any:
+def _compute_transition_force(felt: Any, u: Any, inertia: Any, damping: Any, step: Any) -> Any:
     """Return the force over the step in which the input changes, equation (8).
 
     Args:
@@ -284,22 +351,20 @@ def compute_transition_force(felt: Any, u: Any, inertia: Any, damping: Any, step
     return u + (0.5 - 0.25 * step * damping / inertia) * (felt - u)  # (8)
 
 
-def _integrate_stepwise(
-    joint: JointBody, lane: ElementWork, inertia: float, forces: JointForces
-) -> Trajectory:
+def _integrate_stepwise(joint: JointBody, lane: ElementWork, inertia: float) -> Trajectory:
     """Integrate with forces that are evaluated at each step."""
+    forces = LinearisedForces(joint, lane, inertia)
     x = float(lane.x[0])
     v = float(lane.v[0])
     t = 0.0
     step = math.nan
     w = v
     inverse = 1.0 / inertia
-    forces.set_inputs(0)
     forces.linearise(t, x, v)
     kept = set(lane.recorded_steps.tolist())
     rows = [(x, v, forces.compute_acceleration(v))]
     for i, h in enumerate(lane.steps.tolist()):
-        if forces.set_inputs(i):
+        if i and forces.set_inputs(i):
             forces.linearise(t, x, v)
         start = integrate_velocity(
             v, forces.compute_force(v), forces.limit, inverse, 0.5 * h
@@ -321,7 +386,7 @@ def _integrate_stepwise(
         if i + 1 in kept:
             rows.append((x, v, forces.compute_acceleration(v)))
     if len(rows) < lane.recorded_steps.size:
-        return make_failed_trajectory(lane)
+        return _make_failed_trajectory(lane)
     x_at, v_at, a_at = np.array(rows).T[:, :, None]
     return x_at, v_at, a_at
 
@@ -334,7 +399,7 @@ def _weights(lane: ElementWork, x: Array) -> Array:
     return weights
 
 
-def make_failed_trajectory(lane: ElementWork) -> Trajectory:
+def _make_failed_trajectory(lane: ElementWork) -> Trajectory:
     """Return a trajectory of NaN for a failed element."""
     nothing = np.full((lane.recorded_steps.size, 1), np.nan)
     return nothing, nothing, nothing

@@ -20,14 +20,9 @@ from typing import Protocol
 import numpy as np
 
 from sims.core.simulator import Array
-from sims.engines.external.ball_forces import (
-    EffectForce,
-    ImpactParameters,
-    Vector,
-    get_gravity,
-    make_trajectory,
-)
-from sims.engines.external.ball_rollout import BallBody
+from sims.core.system import Contact
+from sims.engines.external.ball_rollout import BallBody, get_gravity, make_trajectory
+from sims.engines.external.element_forces import ElementForces, Vector
 from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs
 
 _SLOW = 0.2
@@ -59,38 +54,46 @@ def integrate_native_ball(ball: NativeContactBall, lane: ElementWork) -> Traject
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
     """
-    # Unlike in `flight`, velocity and contact of the engine are used without correction.
-    contact = ImpactParameters(lane)
-    felt = EffectForce(lane)
+    # Unlike in `ball_rollout`, velocity and contact of the engine are used without correction.
+    forces = ElementForces(lane, 1)
+    changes_impacts = any(isinstance(effect, Contact) for effect, _ in lane.effects)
+    gx, gy, gz = get_gravity(lane)
+
+    def compute_force(t: float, x: Vector, v: Vector) -> Vector:
+        if not forces.acts:
+            return 0.0, 0.0, 0.0
+        fx, fy, fz = forces.evaluate(t, x, v)
+        return fx - gx, fy - gy, fz - gz
+
     floor = float(lane.system.floor(lane.constants)[0, 0])
     ball.reset_world(lane.plain_constants)
     x: Vector = lane.x.tolist()
     w: Vector = lane.v.tolist()
-    ball.set_contact_parameters(*contact.compute(max(-w[2], 0.0)))
+    ball.set_contact_parameters(*forces.compute_impact(max(-w[2], 0.0)))
     ball.set_state(x, w)
     kept = set(lane.recorded_steps.tolist())
     steps = lane.steps.tolist()
     t = 0.0
     step = math.nan
-    rows = [(*x, *w, *felt.compute(t, x, w))]
+    rows = [(*x, *w, *compute_force(t, x, w))]
     for begin, counts in split_into_legs(lane):
         if steps[begin] != step:
             step = steps[begin]
             ball.set_step(step)
-        if felt.any or contact.has_contact_effects:
+        if forces.acts or changes_impacts:
             states = []
             for count in counts:
                 for _ in range(count):
                     # Contact can act only if the predicted end of the next step is near the ground.
                     if (
-                        contact.has_contact_effects
+                        changes_impacts
                         and w[2] < 0.0
                         and ball.is_near_contact(x[2] + step * w[2] - floor)
                     ):
-                        ball.set_contact_parameters(*contact.compute(-w[2]))
-                    x, w = ball.advance(felt.compute(t, x, w))
+                        ball.set_contact_parameters(*forces.compute_impact(-w[2]))
+                    x, w = ball.advance(compute_force(t, x, w))
                     t += step
-                states.append((*x, *w, *felt.compute(t, x, w)))
+                states.append((*x, *w, *compute_force(t, x, w)))
         else:
             # No force must be evaluated: the engine runs from sample to sample.
             states = [(*x, *w, 0.0, 0.0, 0.0) for x, w in ball.advance_freely(counts)]
@@ -99,7 +102,7 @@ def integrate_native_ball(ball: NativeContactBall, lane: ElementWork) -> Traject
             break
     at, v, pulled = make_trajectory(lane, rows)
     speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
-    a: Array = get_gravity(lane) + pulled - ball.damping * v * (1.0 + speed)  # (1)
+    a: Array = np.array([gx, gy, gz]) + pulled - ball.damping * v * (1.0 + speed)  # (1)
     for i in np.flatnonzero(np.abs(v[:, 2]) < _SLOW):
         if ball.is_near_contact(at[i, 2] - floor):
             a[i, 2] = 0.0

@@ -1,0 +1,129 @@
+"""Forces on one batch element that an external engine integrates, by its force program."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from sims.core.system import Force, Friction, System
+from sims.engines.compiled.data_layout import (
+    BOUNCES,
+    DRY,
+    IN_E,
+    IN_MU,
+    IN_P,
+    IN_SPEED,
+    IN_T,
+    IN_U,
+    IN_V,
+    IN_X,
+    OUT_E,
+    OUT_LIMIT,
+    OUT_MU,
+)
+from sims.engines.external.external_engine import ElementWork
+
+Vector = Sequence[float]
+"""Vector x, y, z."""
+
+
+class ElementForces:
+    """Forces of system and effects at one or several states of a batch element.
+
+    Attributes:
+        acts: whether forces act in addition to gravity.
+
+    Args:
+        lane: batch element.
+        states: number of states that are evaluated in one call.
+    """
+
+    def __init__(self, lane: ElementWork, states: int) -> None:
+        prepared = lane.program.prepare(states)
+        rows, flags = prepared.arrays.rows, prepared.arrays.flags
+        r = prepared.block.r
+        r[rows[IN_P] : rows[IN_E]] = lane.parameters[:, None]
+        run_lane, self._run_moment, self._run_impact = prepared.make_runners()
+        # Single numbers are read and written much faster by a memory view than by an array.
+        self._numbers = memoryview(r.data).cast("B").cast("d")
+        place = (rows * states).tolist()
+        self._t, self._x, self._v, self._u = (place[k] for k in (IN_T, IN_X, IN_V, IN_U))
+        self._e, self._mu, self._speed = (place[k] for k in (IN_E, IN_MU, IN_SPEED))
+        self._force = (prepared.arrays.out * states).tolist()
+        self._limit = place[OUT_LIMIT] if flags[DRY] else None
+        self._impact = place[OUT_E], place[OUT_MU]
+        self._states = states
+        self._signals = [values.tolist() for values in lane.inputs.values()]
+        self._restitution = (
+            float(lane.system.restitution(lane.theta)[0, 0]) if flags[BOUNCES] else 0.0
+        )
+        # Most systems have no passive force except gravity.
+        is_driven = bool(lane.inputs) or type(lane.system).passive is not System.passive
+        self.acts = is_driven or any(isinstance(e, Force | Friction) for e, _ in lane.effects)
+        self.set_inputs(0)
+        run_lane()
+
+    def set_inputs(self, step: int) -> bool:
+        """Set the inputs of a step; return whether any differs from the previous step."""
+        changes = step == 0
+        for k, values in enumerate(self._signals):
+            if step == 0 or values[step] != values[step - 1]:
+                changes = True
+                for state in range(self._states):
+                    self._numbers[self._u + k * self._states + state] = values[step]
+        return changes
+
+    def evaluate_at_velocities(
+        self, t: float, x: float, velocities: tuple[float, float]
+    ) -> tuple[float, float]:
+        """Return the generalised forces of a one-coordinate element at two velocities.
+
+        Dry friction is not included.
+
+        Args:
+            t: time in seconds.
+            x: position.
+            velocities: the two velocities.
+        """
+        numbers = self._numbers
+        numbers[self._t] = numbers[self._t + 1] = t
+        numbers[self._x] = numbers[self._x + 1] = x
+        numbers[self._v], numbers[self._v + 1] = velocities
+        self._run_moment()
+        force = self._force[0]
+        return numbers[force], numbers[force + 1]
+
+    def evaluate(self, t: float, x: Vector, v: Vector) -> tuple[float, float, float]:
+        """Return the force on a ball per unit mass in m/s^2, with gravity and dry friction.
+
+        Dry friction, which no effect of the library applies to a free ball, opposes the velocity.
+
+        Args:
+            t: time in seconds.
+            x: position.
+            v: velocity.
+        """
+        numbers = self._numbers
+        numbers[self._t] = t
+        numbers[self._x], numbers[self._x + 1], numbers[self._x + 2] = x
+        vx, vy, vz = numbers[self._v], numbers[self._v + 1], numbers[self._v + 2] = v
+        self._run_moment()
+        fx, fy, fz = (numbers[k] for k in self._force)
+        limit = self.limit
+        speed = math.sqrt(vx * vx + vy * vy + vz * vz) if limit else 0.0
+        # Dry friction has no direction at rest.
+        share = limit / speed if speed else 0.0
+        return fx - share * vx, fy - share * vy, fz - share * vz
+
+    @property
+    def limit(self) -> float:
+        """Limit of dry friction at the first state of the last evaluation."""
+        return 0.0 if self._limit is None else self._numbers[self._limit]
+
+    def compute_impact(self, speed: float) -> tuple[float, float]:
+        """Return restitution and friction coefficient of an impact at this speed (m/s)."""
+        numbers = self._numbers
+        numbers[self._e], numbers[self._mu], numbers[self._speed] = self._restitution, 0.0, speed
+        self._run_impact()
+        e, mu = self._impact
+        return numbers[e], numbers[mu]
