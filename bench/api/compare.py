@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from bench.api.comparison_options import ComparisonOptions, StudyOptions
-from bench.benchmark.figures import comparison_figures
+from bench.benchmark.figures import comparison_figures, comparison_view
 from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
 from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
 from bench.benchmark.problem.robot_experiment import make_robot_experiment
@@ -326,10 +326,10 @@ class ComparisonResult:
         return read_comparison(self.folder)
 
     @cached_property
-    def _labels(self) -> comparison_figures.AxisLabels:
+    def _labels(self) -> comparison_view.AxisLabels:
         problem = TuningProblem(self.experiment)
         try:
-            return comparison_figures.make_axis_labels(problem)
+            return comparison_view.make_axis_labels(problem)
         finally:
             problem.close()
 

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.figures import runtime_figures
 from bench.benchmark.figures.comparison_figures import compute_statistics
+from bench.benchmark.figures.rank_figure import draw_critical_difference_figure
 from bench.benchmark.problem.experiment import Experiment, TunerEntry
 from bench.benchmark.report_page.multi_problem_page import (
     MultiProblemPageData,
+    make_runtime_panel,
     render_multi_problem_page,
 )
 from bench.benchmark.results_report import REPORT_FILE, REQUIRED_RUN_COLUMNS
@@ -37,9 +38,11 @@ from bench.figures.style import (
     FigureFiles,
     TunerStyles,
     add_trust_note,
+    finish_figure,
     render_all_formats,
     write_figure_files,
 )
+from bench.pages.chart_figure import draw_chart
 from sims.core.atomic_files import write_atomically
 from sims.core.simulator import Array, InputError
 
@@ -252,7 +255,7 @@ class ComparisonCollection:
         drawn = {"runtime-distribution": self._joint_figure()}
         if self.has_enough_problems:
             friedman, p_values = self.rank_tests
-            drawn["critical-difference"] = runtime_figures.draw_critical_difference_figure(
+            drawn["critical-difference"] = draw_critical_difference_figure(
                 self.mean_ranks, p_values, friedman
             )
         return {
@@ -260,12 +263,19 @@ class ComparisonCollection:
         }
 
     def _joint_figure(self) -> Figure:
-        title = f"{len(self.mean_ranks)} problems"
-        experiment = Experiment("all", title, tuners=tuple(TunerEntry(t, t) for t in self.tuners))
-        style = TunerStyles(
-            experiment, list(self.mean_ranks.mean().sort_values(kind="stable").index)
+        order = list(self.mean_ranks.mean().sort_values(kind="stable").index)
+        experiment = Experiment(
+            "all",
+            f"{len(self.mean_ranks)} problems",
+            tuners=tuple(TunerEntry(t, t) for t in self.tuners),
         )
-        return runtime_figures.draw_joint_runtime_figure(experiment, style, self._shares())
+        style = TunerStyles(experiment, order)
+        looks = [(name, style.get_mark_style(name)) for name in style.order]
+        panel, table = make_runtime_panel(looks, self._shares())
+        figure, axes = draw_chart([panel], {panel.table: table})
+        caption = "Mean over problems, each with equal weight."
+        finish_figure(figure, axes, style, experiment, caption)
+        return figure
 
     def _shares(self) -> dict[str, Array]:
         """Compute each tuner's share reached after 0..100 % of the budget, mean over problems."""

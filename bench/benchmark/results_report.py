@@ -10,11 +10,8 @@ from pathlib import Path
 import pandas as pd
 
 from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_figures import (
-    AxisLabels,
-    compute_statistics,
-    make_axis_labels,
-)
+from bench.benchmark.figures.comparison_figures import compute_statistics
+from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView, make_axis_labels
 from bench.benchmark.isolation.process_exit import ISOLATED, without_isolation
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.numeric_warnings import numeric_warnings_silenced
@@ -104,9 +101,7 @@ def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None
     pictures = _drawn(stored, labels, statistics)
     figures = _kept(folder, pictures)
     results = ComparisonReportData(
-        stored,
-        labels,
-        statistics,
+        ComparisonView(stored, labels, statistics),
         made,
         pictures,
         read_environment(folder),
@@ -117,7 +112,7 @@ def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None
     write_atomically(folder / REPORT_FILE, render_page(results))
 
     lines = made["table"]
-    for text in _headlines(results):
+    for text in _headlines(results.view):
         say(text)
     for text in _results(lines, labels, statistics):
         say(text)
@@ -221,15 +216,15 @@ def _marks(experiment: Experiment) -> list[str]:
     if experiment.trusted:
         texts.append(f"\n{TRUSTED_TUNERS_NOTE}")
     if not experiment.salt_sha256:
-        texts.append("\nthe targets have a public salt: everybody can draw them")
+        texts.append("\nthe targets have a public salt, so anyone can draw them")
     return texts
 
 
-def _headlines(results: ComparisonReportData) -> list[str]:
+def _headlines(view: ComparisonView) -> list[str]:
     """Describe the best tuners after 1, 3, 10 and all simulations, one paragraph per range."""
-    statistics, texts = results.statistics, []
-    label = results.format_metric_label(results.shown_metric)
-    for kind in results.ranges:
+    statistics, texts = view.statistics, []
+    label = view.format_metric_label(view.shown_metric)
+    for kind in view.ranges:
         where = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
         lines = [f"\nbest tuners, {where} ({label}; {headline.floor_text(statistics)})"]
         for one in headline.standings(statistics, kind):

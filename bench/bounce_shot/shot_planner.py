@@ -37,7 +37,7 @@ class ShotPlan:
 
     @property
     def is_found(self) -> bool:
-        """Whether a drop height was found."""
+        """True if a drop height was found."""
         return bool(np.isfinite(self.height))
 
 

@@ -21,7 +21,7 @@ from bench.diagnosis.search.verdict_rules import VerdictName
 from bench.diagnosis.verdict import Cause, Verdict
 from bench.figures.figure_files import pdf_figures
 from bench.pages.csv_text import csv_text
-from bench.pages.html_elements import make_iframe
+from bench.pages.html_page import make_iframe
 from sims import extended_simulator as extending
 from sims.core.argument_checks import check_arguments
 from sims.core.atomic_files import Content, write_all_atomically

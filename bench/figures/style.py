@@ -405,7 +405,7 @@ def add_caption(figure: Figure, caption: str, letters: int) -> None:
 
 
 TRUSTED_TUNERS_NOTE = (
-    "trusted: the tuners ran inside the harness, where nothing is out of their reach"
+    "trusted: the tuners ran without isolation and could have read the true parameters"
 )
 """Warning for results whose tuners were not isolated."""
 

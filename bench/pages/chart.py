@@ -9,10 +9,10 @@ JavaScript, and to be saved as SVG and PNG, and as PDF if requested.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
-from bench.figures.style import MarkStyle
+from bench.figures.style import FigureFiles, MarkStyle
 
 Scale = Literal["linear", "log", "symlog"]
 """Scale of an axis; symlog is linear from 0 to 1 and logarithmic above."""
@@ -170,6 +170,26 @@ class PrintedFigure:
     alternative: str
     file: str
 
+    @classmethod
+    def from_files(
+        cls, figures: Mapping[str, FigureFiles], name: str, alternative: str, file: str = ""
+    ) -> PrintedFigure | None:
+        """Return a figure of a page; None if it was not drawn.
+
+        Args:
+            figures: Drawn figures by name.
+            name: Name of the figure.
+            alternative: Text description for readers who cannot see it.
+            file: Name of its files; empty for the name of the figure.
+        """
+        figure = figures.get(name)
+        return figure and cls(figure.svg, figure.pdf, alternative, file or name)
+
+    @property
+    def kind(self) -> str:
+        """Subtype of the image's media type."""
+        return "png" if self.image.startswith(b"\x89PNG") else "svg+xml"
+
 
 @dataclass(frozen=True)
 class Chart:
@@ -178,11 +198,10 @@ class Chart:
     Attributes:
         name: Name in the page's address and ids: letters, digits and hyphens.
         title: Title above the figure.
-        caption: Explanation of the figure; safe HTML.
         panels: Panels; those side by side share axes with the same label.
         static: Printed version; None if there is none, then the figure needs the script.
-        beside: Facet whose panels are initially side by side; of every other facet one panel is
-            shown.
+        side_by_side: Facet whose panels are initially side by side; of every other facet one panel
+            is shown.
         link: Charts with the same text share their cursors and horizontal zoom.
         columns: Number of panels side by side if there is space; 0 for as many as fit.
         along: Whether to zoom the horizontal axis only; the vertical axis follows the visible data.
@@ -195,10 +214,9 @@ class Chart:
 
     name: str
     title: str
-    caption: str
     panels: tuple[Panel, ...]
     static: PrintedFigure | None = None
-    beside: str = ""
+    side_by_side: str = ""
     link: str = ""
     columns: int = 0
     along: bool = False
@@ -209,16 +227,6 @@ class Chart:
 
     def build_spec(self) -> dict[str, Any]:
         """Build the chart's JSON specification for the page's script."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "panels": [asdict(panel) for panel in self.panels],
-            "beside": self.beside,
-            "link": self.link,
-            "columns": self.columns,
-            "along": self.along,
-            "toggles": self.toggles,
-            "off": self.off,
-            "lights": self.lights,
-            "notes": dict(self.notes),
-        }
+        spec = {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+        del spec["static"]
+        return spec | {"panels": [asdict(panel) for panel in self.panels]}

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from bench.pages import html_elements
-from bench.pages.html_elements import safe
 from bench.pages.page_table import Table, is_missing
-from bench.pages.text_format import format_number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,45 +69,36 @@ class DataGrid:
         """Build the grid's JSON specification for the page's script."""
         return {**asdict(self), "few": INITIAL_ROWS}
 
-    def to_html(self, frame: pd.DataFrame | Table) -> str:
-        """Render the table for a page without script: the first rows of the initial choice.
+    @property
+    def headings(self) -> list[str]:
+        """Headings of the columns, those of numbers with a hyphen before them."""
+        return [f"{'-' * bool(c.digits)}{c.head or c.name}" for c in self.columns]
 
-        Args:
-            frame: The table that the page contains as CSV.
-        """
-        table = (
-            frame
-            if isinstance(frame, Table)
-            else Table({str(name): frame[name].tolist() for name in frame})
-        )
-        part = table.rows()
-        for name, value in self.only.items():
-            part = [row for row in part if str(row[name]) == value]
-        if self.sort:
-            name, _, way = self.sort.partition(",")
-            missing = [row for row in part if is_missing(row[name])]
-            part = [row for row in part if not is_missing(row[name])]
-            part = sorted(part, key=lambda row: row[name], reverse=way == "down") + missing
-        heads = [
-            f"{html_elements.NUMERIC_HEADING_PREFIX * bool(c.digits)}{safe(c.head or c.name)}"
-            for c in self.columns
-        ]
-        shown = part[:INITIAL_ROWS]
-        rows = [self._cells(row) for row in shown]
-        marks = ["found" if self._stands_out(row) else "" for row in shown]
-        more = len(part) - INITIAL_ROWS
-        note = html_elements.make_paragraph(f"{more} more rows.", "soft") if more > 0 else ""
-        return html_elements.make_table(heads, rows, marks) + note
-
-    def _stands_out(self, row: Mapping[Any, Any]) -> bool:
+    def is_marked(self, row: Mapping[Any, Any]) -> bool:
+        """Return whether a row is highlighted."""
         return bool(self.marked) and str(row[self.marked[0]]).startswith(self.marked[1])
 
-    def _cells(self, row: Mapping[Any, Any]) -> Sequence[str]:
-        cells: list[str] = []
-        for column in self.columns:
-            value = row[column.name]
-            # Long texts are shortened here; the stored table has them in full.
-            cells.append(format_number(value, column.digits) if column.digits else safe(value, 300))
-        if self.links and row[self.links]:
-            cells[0] = f'<a href="{safe(row[self.links], 2000)}">{cells[0]}</a>'
-        return cells
+
+def select_initial_rows(grid: DataGrid, frame: pd.DataFrame | Table) -> list[dict[str, Any]]:
+    """Select the rows of a grid's initial choice, in its initial order.
+
+    Args:
+        grid: The grid.
+        frame: The table that the page contains as CSV.
+    """
+    table = (
+        frame
+        if isinstance(frame, Table)
+        else Table({str(name): frame[name].tolist() for name in frame})
+    )
+    rows = [
+        row
+        for row in table.rows()
+        if all(str(row[name]) == value for name, value in grid.only.items())
+    ]
+    if not grid.sort:
+        return rows
+    name, _, direction = grid.sort.partition(",")
+    missing = [row for row in rows if is_missing(row[name])]
+    present = [row for row in rows if not is_missing(row[name])]
+    return sorted(present, key=lambda row: row[name], reverse=direction == "down") + missing

@@ -1,4 +1,4 @@
-"""Self-contained HTML page: sections, tables and charts.
+"""Self-contained HTML page: a template with the tables, charts and grids of its script.
 
 Styles, scripts, tables and figures are inside the file, and its Content-Security-Policy forbids
 every request and every script but its own. The page is complete without JavaScript: figures are
@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.pages import html_elements
-from bench.pages.chart import Chart, PrintedFigure
-from bench.pages.data_grid import DataGrid
-from bench.pages.html_elements import safe
+from markupsafe import Markup, escape
+
+from bench.pages.chart import Chart, Panel, PrintedFigure
+from bench.pages.data_grid import INITIAL_ROWS, DataGrid, GridColumn, select_initial_rows
 from bench.pages.page_table import Table
+from bench.pages.page_template import TEMPLATES, load_template
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,40 +34,20 @@ _SCRIPTS = (
 
 
 class HtmlPage:
-    """A page that is assembled part by part.
+    """A page whose template asks it for sections, charts, figures and grids.
 
     Args:
-        title: Title of the window.
-        made: Text about its origin for the footer; safe HTML.
         style: CSS rules in addition to those of every page.
     """
 
-    def __init__(self, title: str, made: str, style: str = "") -> None:
-        self._title, self._made, self._own_style = title, made, style
-        self._parts: list[str] = []
+    def __init__(self, style: str = "") -> None:
+        self._own_style = style
         self._sections: list[tuple[str, str]] = []
         self._tables: dict[str, str] = {}
         self._frames: dict[str, pd.DataFrame | Table] = {}
         self._charts: list[dict[str, Any]] = []
         self._grids: list[dict[str, Any]] = []
-
-    def append(self, *parts: str) -> None:
-        """Append safe HTML to the page."""
-        self._parts += [part for part in parts if part]
-
-    def add_section(self, name: str, head: str, *parts: str) -> None:
-        """Append a section to the page, and a link to it in the navigation.
-
-        Args:
-            name: Name in the page's address: letters, digits and hyphens.
-            head: Title of the section; safe HTML.
-            parts: Content; safe HTML. A section without content is left out.
-        """
-        held = [part for part in parts if part]
-        if held:
-            self._sections.append((name, head))
-            body = "\n".join([f'<h2 id="{name}-head">{head}</h2>', *held])
-            self.append(f'<section id="{name}" aria-labelledby="{name}-head">\n{body}\n</section>')
+        self._parts: Any = load_template(TEMPLATES / "parts.html").module
 
     def add_table(self, name: str, frame: pd.DataFrame | Table, digits: int | None = None) -> None:
         """Store a table in the page for charts and grids, to be saved as NAME.csv.
@@ -77,81 +58,116 @@ class HtmlPage:
             digits: Significant digits of its numbers; None for all.
         """
         self._frames[name] = frame
-        style = None if digits is None else f"%.{digits}g"
-        self._tables[name] = frame.to_csv(index=False, float_format=style)
+        number_format = None if digits is None else f"%.{digits}g"
+        self._tables[name] = frame.to_csv(index=False, float_format=number_format)
 
-    def render_chart(self, chart: Chart) -> str:
-        """Return a chart as HTML; its tables must be in the page."""
-        self._charts.append(chart.build_spec())
-        still = _render_static_figure(chart.static) if chart.static else ""
-        caption = f"<figcaption>{chart.caption}</figcaption>"
-        kind = "chart" if chart.static else "chart alive"
-        return (
-            f'<figure class="{kind}" id="{chart.name}" aria-labelledby="{chart.name}-title">\n'
-            f'<h3 id="{chart.name}-title">{safe(chart.title)}</h3>\n'
-            f'<div class="live"></div>\n{still}\n{caption}\n</figure>'
-        )
+    def section(self, name: str, heading: str, caller: Callable[[], Markup]) -> Markup:
+        """Return a section, and add it to the navigation; empty without content.
 
-    def render_figure(
+        Args:
+            name: Name in the page's address: letters, digits and hyphens.
+            heading: Title of the section.
+            caller: Content, as the body of a template's call block.
+        """
+        content = Markup(caller().strip())
+        if not content:
+            return content
+        self._sections.append((name, heading))
+        return Markup(self._parts.section(name, heading, content))
+
+    def chart(
         self,
         name: str,
-        static: PrintedFigure,
-        caption: str,
+        title: str,
+        panels: Sequence[Panel],
+        static: PrintedFigure | None = None,
+        *,
+        caller: Callable[[], Markup],
+        **options: Any,
+    ) -> Markup:
+        """Return a chart whose tables are in the page.
+
+        Args:
+            name: Name in the page's address and ids: letters, digits and hyphens.
+            title: Title above the figure.
+            panels: Panels; without any there is no chart.
+            static: Printed version; None if there is none, then the figure needs the script.
+            caller: Caption, as the body of a template's call block.
+            **options: Further attributes of `Chart`.
+        """
+        if not panels:
+            return Markup()
+        chart = Chart(name, title, tuple(panels), static, **options)
+        self._charts.append(chart.build_spec())
+        return Markup(self._parts.chart(chart, Markup(caller().strip())))
+
+    def figure(
+        self,
+        name: str,
+        static: PrintedFigure | None,
         tables: Sequence[str] = (),
         spots: Sequence[tuple[str, float, float]] = (),
-    ) -> str:
+        *,
+        caller: Callable[[], Markup],
+    ) -> Markup:
         """Return a figure that is identical on screen and on paper, with its files for download.
 
         Args:
             name: Name in the page's address: letters, digits and hyphens.
-            static: The figure.
-            caption: Explanation of the figure; safe HTML.
+            static: The figure; None if it was not drawn.
             tables: Names of the page's tables with its numbers.
             spots: Names to highlight with their positions, as fractions of width and height from
                 the top left.
+            caller: Caption, as the body of a template's call block.
         """
-        of = f' data-tables="{safe(" ".join(tables))}"' if tables else ""
-        return (
-            f'<figure class="picture" id="{name}"{of}>\n{_render_static_figure(static, spots)}\n'
-            f"<figcaption>{caption}</figcaption>\n</figure>"
-        )
+        if static is None:
+            return Markup()
+        return Markup(self._parts.figure(name, static, Markup(caller().strip()), tables, spots))
 
-    def render_grid(self, grid: DataGrid) -> str:
-        """Return a grid as HTML; its table must be in the page."""
+    def grid(
+        self, name: str, title: str, table: str, columns: Sequence[Any], **options: Any
+    ) -> Markup:
+        """Return a grid whose table is in the page; empty if the table is not.
+
+        Args:
+            name: Name in the page's address and ids: letters, digits and hyphens.
+            title: Title above the table.
+            table: Name of the table in the page.
+            columns: Displayed columns, each a name or the fields of a `GridColumn`.
+            **options: Further attributes of `DataGrid`.
+        """
+        if table not in self._frames:
+            return Markup()
+        shown = (GridColumn(*([c] if isinstance(c, str) else c)) for c in columns)
+        grid = DataGrid(name, title, table, tuple(shown), **options)
         self._grids.append(grid.build_spec())
-        shown = grid.to_html(self._frames[grid.table])
-        head = f'<h3 id="{grid.name}-title">{safe(grid.title)}</h3>'
-        return f'<div class="grid" id="{grid.name}">\n{head}\n{shown}\n</div>'
+        rows = select_initial_rows(grid, self._frames[table])
+        return Markup(self._parts.grid(grid, rows[:INITIAL_ROWS], len(rows) - INITIAL_ROWS))
 
-    def to_html(self) -> str:
-        """Return the complete page as HTML."""
-        data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
+    def render(self, template: Path, **values: Any) -> str:
+        """Return the complete page as HTML.
+
+        Args:
+            template: Template of the content. It sets `title`, the title of the window, and
+                `footer`, the origin of the page.
+            **values: Values of the template, in addition to `page`, which is this object.
+        """
+        content: Any = load_template(template).make_module({"page": self, **values})
         library = (_LIBRARY / "uPlot.iife.min.js").read_text(encoding="utf-8")
-        own = "\n".join(_script(name) for name in _SCRIPTS)
+        own = "\n".join(_read(f"script/{name}.js") for name in _SCRIPTS)
         script = f'{library}\n(() => {{\n"use strict";\n{own}\n}})();\n'
-        styles = (_LIBRARY / "uPlot.min.css").read_text(encoding="utf-8"), _style()
-        style = "\n".join([*styles, self._own_style])
-        return "\n".join(
-            [
-                '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-                f'<meta http-equiv="Content-Security-Policy" content="{_policy(script)}">',
-                '<meta name="viewport" content="width=device-width, initial-scale=1">',
-                f"<title>{safe(self._title, 160)}</title>",
-                f"<style>\n{style}</style>\n</head>\n<body>",
-                '<a class="skip" href="#main">Skip to the results</a>',
-                self._navigation(),
-                '<main id="main">',
-                *self._parts,
-                "</main>\n"
-                f'<footer class="soft">{html_elements.make_paragraph(self._made)}</footer>',
-                f'<script type="application/json" id="data">{to_embeddable_json(data)}</script>',
-                f"<script>{script}</script>\n</body>\n</html>\n",
-            ]
+        styles = (_LIBRARY / "uPlot.min.css").read_text(encoding="utf-8"), _read("page.css")
+        data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
+        return load_template(TEMPLATES / "page.html").render(
+            title=content.title,
+            style=Markup("\n".join([*styles, self._own_style])),
+            digest=b64encode(sha256(script.encode()).digest()).decode("ascii"),
+            sections=self._sections,
+            body=Markup(content),
+            footer=content.footer,
+            data=Markup(to_embeddable_json(data)),
+            script=Markup(script),
         )
-
-    def _navigation(self) -> str:
-        links = [f'<a href="#{name}">{head}</a>' for name, head in self._sections]
-        return f'<nav aria-label="sections">{" ".join(links)}</nav>'
 
 
 def to_embeddable_json(value: object) -> str:
@@ -165,47 +181,18 @@ def to_embeddable_json(value: object) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _policy(script: str) -> str:
-    """Return the page's policy: run its single script, show embedded content, nothing else."""
-    digest = b64encode(sha256(script.encode()).digest()).decode("ascii")
-    return "; ".join(
-        [
-            "default-src 'none'",
-            f"script-src 'sha256-{digest}'",
-            # Styles cannot load anything that the other lines forbid.
-            "style-src 'unsafe-inline'",
-            "img-src data: blob:",
-            "base-uri 'none'",
-            "form-action 'none'",
-        ]
+def make_iframe(html: str) -> str:
+    """Embed a page in another one as a sandboxed frame.
+
+    Neither page's styles or scripts affect the other, and the frame's policy allows only its own
+    script.
+    """
+    frame = Markup(
+        '<iframe title="report" sandbox="allow-scripts allow-downloads" '
+        'style="width: 100%; height: 46rem; border: 0" srcdoc="{}"></iframe>'
     )
+    return str(frame.format(escape(html)))
 
 
-def _render_static_figure(
-    static: PrintedFigure, spots: Sequence[tuple[str, float, float]] = ()
-) -> str:
-    """Build the HTML of the printed figure, and of its PDF if there is one."""
-    kind = "png" if static.image.startswith(b"\x89PNG") else "svg+xml"
-    data = b64encode(static.image).decode("ascii")
-    file = safe(static.file)
-    image = (
-        f'<img class="still" src="data:image/{kind};base64,{data}" data-file="{file}" '
-        f'alt="{safe(static.alternative, 1000)}">'
-    )
-    link = ""
-    if static.pdf is not None:
-        pdf = b64encode(static.pdf).decode("ascii")
-        link = f'<a href="data:application/pdf;base64,{pdf}" download="{file}.pdf">PDF</a>'
-    for name, across, down in spots:
-        style = f"left:{100 * across:.2f}%;top:{100 * down:.2f}%"
-        image += f'<span class="spot" data-lights="{safe(name, 60)}" style="{style}"></span>'
-    # The script adds its buttons to this paragraph, so it is needed without a PDF, too.
-    return f'<div class="pictured">{image}</div>\n<p class="files">{link}</p>'
-
-
-def _script(name: str) -> str:
-    return (_HERE / "script" / f"{name}.js").read_text(encoding="utf-8")
-
-
-def _style() -> str:
-    return (_HERE / "page.css").read_text(encoding="utf-8")
+def _read(name: str) -> str:
+    return (_HERE / name).read_text(encoding="utf-8")

@@ -29,7 +29,10 @@ def sanitise(text: object, most: int = 400) -> str:
         text: Text or another value.
         most: Maximum length in characters.
     """
-    plain = "".join(_harmless(c) for c in str(text)).strip()
+    plain = str(text)
+    if not plain.isprintable():
+        plain = "".join(_harmless(c) for c in plain)
+    plain = plain.strip()
     return plain if len(plain) <= most else plain[: most - 1] + "…"
 
 

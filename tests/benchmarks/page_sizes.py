@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from bench.benchmark.figures import comparison_figures
-from bench.benchmark.figures.comparison_figures import AxisLabels
+from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.report_page.comparison_page import render_page
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
@@ -101,7 +101,7 @@ def ours(browser, place, targets, budget):
     drawn = process_time()
     environment = {"packages": {}, "plugins": []}
     results = ComparisonReportData(
-        stored, labels, statistics, frames, pictures, environment, "results/x", ""
+        ComparisonView(stored, labels, statistics), frames, pictures, environment, "results/x", ""
     )
     path = place / f"report-{targets}-{budget}.html"
     path.write_text(render_page(results), encoding="utf-8")

@@ -1,19 +1,33 @@
-"""Draw the figures of one comparison by name."""
+"""Printed figures of one comparison by name, drawn from the charts of its page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from bench.benchmark.figures import error_figures, identifiability_figures, runtime_figures
-from bench.benchmark.problem.experiment import Experiment
-from bench.benchmark.problem.tuning_problem import TuningProblem
+import numpy as np
+
+from bench.benchmark.figures.comparison_charts import CHARTS, list_directional_metrics
+from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView
+from bench.benchmark.figures.spectra_figure import draw_spectra_figure
 from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
+from bench.benchmark.statistics.error_floor import ERROR_FLOOR
+from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
 from bench.benchmark.storage.result_folder import StoredComparison
-from bench.figures.style import REFERENCE_GREYS, add_trust_note, style_of
-from sims.core.simulator import InputError, make_unknown_name_error
+from bench.figures.style import (
+    MEDIAN_LINE_CAPTION,
+    REFERENCE_GREYS,
+    TunerStyles,
+    add_trust_note,
+    finish_figure,
+    make_reference_id,
+)
+from bench.pages.chart import Panel
+from bench.pages.chart_figure import draw_chart, select_first_panels
+from sims.core.simulator import Array, InputError, make_unknown_name_error
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from bench.benchmark.storage.reference_results import ReferenceResult
@@ -34,27 +48,49 @@ OVERLAYABLE_FIGURES = ("error", "misfit", "directions")
 """Figures of errors against simulations, which can show references in grey."""
 
 
-class AxisLabels(NamedTuple):
-    """Axis labels of a comparison.
+class _Layout(NamedTuple):
+    """Layout and texts of a printed figure.
 
     Attributes:
-        channel: Error channel with unit, e.g. ``q [rad]``.
-        parameter: Name of the parameter, e.g. ``restitution``; empty for several parameters.
+        caption: Caption, in which ``{level}`` and ``{thresholds}`` are replaced.
+        size: Width and height of a panel in inches; None for the usual size.
+        legend: Title of the legend.
+        rows: Facet whose values are rows of panels; empty for one row.
+        horizontal: Whether categories are from top to bottom.
     """
 
-    channel: str
-    parameter: str
+    caption: str = MEDIAN_LINE_CAPTION
+    size: tuple[float, float] | None = None
+    legend: str = "best over all targets first"
+    rows: str = ""
+    horizontal: bool = False
 
 
-def make_axis_labels(problem: TuningProblem) -> AxisLabels:
-    """Make the axis labels for a comparison's problem."""
-    channel = problem.channels[problem.error_channel]
-    parameters = problem.cube.parameters
-    parameter = ""
-    if len(parameters) == 1:
-        unit = parameters[0].unit
-        parameter = parameters[0].name + (f" [{unit}]" if unit != "1" else "")
-    return AxisLabels(f"{channel.name} [{channel.unit}]", parameter)
+_LAYOUTS = {
+    "error": _Layout(),
+    "misfit": _Layout(),
+    "distance": _Layout(f"{MEDIAN_LINE_CAPTION} n: number of targets."),
+    "runtime": _Layout("{thresholds}"),
+    "cost": _Layout(
+        "To reach an error of {level:.2g} for good: ERT × seconds of a simulation + seconds of "
+        f"the tuner as measured; training shared by {TARGETS_PER_TRAINING} targets. "
+        "The strip names the tuner that needs the least time."
+    ),
+    "amortisation": _Layout(
+        "To reach an error of {level:.2g} for good. A mark: from this number of targets on, the "
+        "training and the expected simulations (ERT) of the trained tuner are fewer than those of "
+        "the tuner that searches. At once: the search never reaches the error. Never: not within "
+        "10 000 targets. Bar: 95 % bootstrap interval over targets.",
+        (4.3, 3.0),
+        "trained tuner",
+        horizontal=True,
+    ),
+    "directions": _Layout(
+        f"{MEDIAN_LINE_CAPTION} A sloppy direction is one that the target's data do not identify.",
+        (4.0, 2.4),
+        rows="error",
+    ),
+}
 
 
 def compute_statistics(stored: StoredComparison) -> ComparisonStatistics:
@@ -77,7 +113,7 @@ def list_figure_names(stored: StoredComparison) -> list[str]:
         "cost": True,
         "amortisation": any(simulations for simulations, _ in stored.costs.values()),
         "spectra": stored.spectra is not None,
-        "directions": bool(identifiability_figures.list_directional_metrics(experiment, runs)),
+        "directions": bool(list_directional_metrics(stored)),
     }
     return [name for name in FIGURE_FILES if allowed[name]]
 
@@ -94,8 +130,8 @@ def draw_figure(
     Args:
         stored: The comparison, as read by `bench.benchmark.storage.result_folder.read_comparison`.
         labels: Axis labels, see `make_axis_labels`.
-        name: One of `names(stored)`.
-        statistics: Result of `statistics_of(stored)`, to share it between several figures.
+        name: One of `list_figure_names(stored)`.
+        statistics: Result of `compute_statistics(stored)`, to share it between several figures.
         behind: Reference results that are drawn in grey, if the figure is one of
             `OVERLAYABLE_FIGURES`.
 
@@ -106,9 +142,13 @@ def draw_figure(
         raise make_unknown_name_error("figure", name, known)
     if behind:
         check_references_allowed(stored, name, behind)
-    return add_trust_note(
-        _figure(stored, labels, name, statistics, behind), stored.experiment.trusted
-    )
+    if name == "spectra":
+        assert stored.spectra is not None
+        figure = draw_spectra_figure(stored.experiment, stored.spectra)
+    else:
+        view = ComparisonView(stored, labels, statistics or compute_statistics(stored))
+        figure = _draw_chart_figure(view, name, behind)
+    return add_trust_note(figure, stored.experiment.trusted)
 
 
 def check_references_allowed(
@@ -135,40 +175,46 @@ def check_references_allowed(
         reference.find_mismatches(stored.experiment)
 
 
-def _figure(
-    stored: StoredComparison,
-    labels: AxisLabels,
-    name: str,
-    statistics: ComparisonStatistics | None,
-    behind: Sequence[ReferenceResult],
+def _draw_chart_figure(
+    view: ComparisonView, name: str, behind: Sequence[ReferenceResult]
 ) -> Figure:
-    experiment = stored.experiment
-    if name == "spectra":
-        assert stored.spectra is not None
-        return identifiability_figures.draw_spectra_figure(experiment, stored.spectra)
-    numbers = statistics or compute_statistics(stored)
-    if name == "error":
-        return error_figures.draw_error_figure(experiment, numbers, *labels, behind)
-    if name == "misfit":
-        return error_figures.draw_misfit_figure(experiment, numbers, labels.channel, behind)
-    if name == "distance":
-        return error_figures.draw_distance_figure(experiment, numbers, labels.parameter)
-    if name == "directions":
-        return identifiability_figures.draw_directions_figure(
-            experiment, numbers, labels.channel, behind
-        )
-    return _of_effort(experiment, name, numbers)
-
-
-def _of_effort(experiment: Experiment, name: str, statistics: ComparisonStatistics) -> Figure:
-    style = style_of(experiment, statistics)
-    if name == "runtime":
-        return runtime_figures.draw_runtime_figure(experiment, style, statistics)
-    # Tables contain every level; a figure shows the most informative one.
-    level = statistics.reference_level
-    draw = (
-        runtime_figures.draw_cost_figure
-        if name == "cost"
-        else runtime_figures.draw_amortisation_figure
+    chart, layout = CHARTS[name](view), _LAYOUTS[name]
+    panels = select_first_panels(chart.panels, (chart.side_by_side, layout.rows))
+    columns = len({panel.facets[chart.side_by_side] for panel in panels}) if layout.rows else 0
+    figure, axes = draw_chart(panels, chart.tables, columns, layout.size, layout.horizontal)
+    notes = {name: note.replace("; ", "\n") for name, note in chart.notes.items()}
+    style = TunerStyles(view.experiment, view.statistics.order, behind, notes)
+    for axis, panel in zip(axes, panels, strict=True):
+        for reference in behind:
+            _draw_reference_lines(axis, panel, reference, style)
+    caption = layout.caption.format(
+        level=view.statistics.reference_level,
+        thresholds=format_threshold_caption(view.statistics.spread),
     )
-    return draw(experiment, style, statistics.tuning_costs[level], level)
+    finish_figure(figure, axes, style, view.experiment, caption, layout.legend)
+    return figure
+
+
+def format_threshold_caption(spread: Array) -> str:
+    """Return a caption that explains a runtime distribution over these thresholds."""
+    span = f"from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale"
+    return (
+        f"{len(spread)} thresholds {span}. "
+        "Reached: the recommendation's error stays at or below it from there on. "
+        "A failed run reaches none."
+    )
+
+
+def _draw_reference_lines(
+    axis: Axes, panel: Panel, reference: ReferenceResult, style: TunerStyles
+) -> None:
+    """Draw each tuner's median of a reference, at the simulation counts of its table."""
+    where = panel.series[0].where
+    for tuner in reference.tuners:
+        curve = reference.get_curve(tuner, where["range"], where["metric"], style.experiment.budget)
+        if len(curve):
+            medians = np.maximum(curve["median"].to_numpy(dtype=np.float64), ERROR_FLOOR)
+            look = style.get_reference_style(reference, tuner)
+            axis.plot(
+                curve["simulations"], medians, gid=make_reference_id(reference, tuner), **look
+            )

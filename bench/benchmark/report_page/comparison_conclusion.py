@@ -1,182 +1,189 @@
-"""Headline sentences and warnings of a comparison's report."""
+"""Best, worse and undecided tuners of a comparison, and limitations of its results."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Hashable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.benchmark.figures.comparison_view import ComparisonView
 from bench.benchmark.report_page import headline
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
 from bench.benchmark.statistics.tuner_ranking import BEST, EQUAL, SIGNIFICANCE
-from bench.pages import html_elements
-from bench.pages.html_elements import make_paragraph, make_strong, safe
-from bench.pages.text_format import format_number, format_percent, joined
+from bench.benchmark.storage.run_status import FAILED_OR_SKIPPED_STATUSES, FAILED_STATUSES
+from bench.figures.style import TRUSTED_TUNERS_NOTE
+from bench.pages.text_format import format_number, joined
 
 SIGNIFICANCE_LEVEL = SIGNIFICANCE
 """Corrected p-value below which one tuner is called better than another."""
 
 
-def best_table(results: ComparisonReportData) -> str:
-    """Build a table of the best tuners after 1, 3, 10 and all simulations; safe HTML.
+class RangeResult(NamedTuple):
+    """Verdicts on the tuners in one range of targets.
 
-    The table has a column for each range.
+    Attributes:
+        where: The range in words, for the middle of a sentence.
+        title: The range with its number of targets, for the beginning of a sentence.
+        standings: Verdicts after 1, 3, 10 and all simulations.
+        has_failures: Whether a tuner failed in all of its runs.
+        notes: Failed runs, and how the verdicts were decided.
     """
-    columns = [headline.standings(results.statistics, kind) for kind in results.ranges]
-    if not all(columns):
-        return ""
-    rows = [
-        [str(together[0].simulations), *map(_best, together)]
-        for together in zip(*columns, strict=True)
-    ]
-    best = (f"best (median error), {headline.WHERE[kind]}" for kind in results.ranges)
-    return html_elements.make_table(["-simulations", *best], rows)
+
+    where: str
+    title: str
+    standings: list[headline.Standing]
+    has_failures: bool
+    notes: list[str]
 
 
-def write_conclusion(results: ComparisonReportData) -> list[str]:
-    """List the tuners that are worse than the best after all simulations, by range; safe HTML."""
-    return [_of_range(results, kind) for kind in results.ranges]
+def list_range_results(view: ComparisonView) -> list[RangeResult]:
+    """List the verdicts on the tuners by range of targets."""
+    results = []
+    for kind in view.ranges:
+        standings = headline.standings(view.statistics, kind)
+        notes = (
+            headline.failed_runs(view.statistics, kind),
+            headline.how_decided(view.statistics, kind),
+        )
+        results.append(
+            RangeResult(
+                headline.WHERE[kind],
+                _format_title(view, kind),
+                standings,
+                any(standing.failed for standing in standings),
+                [note for note in notes if note],
+            )
+        )
+    return results
 
 
-def standing_tables(results: ComparisonReportData) -> str:
-    """Build a table of best, worse and undecided tuners for each range; safe HTML."""
-    label = results.format_metric_label(results.shown_metric)
-    parts = []
-    for kind in results.ranges:
-        rows = [
-            [
-                str(one.simulations),
-                _best(one),
-                _named(one.worse),
-                _named(one.undecided),
-                _named(one.failed),
-            ]
-            for one in headline.standings(results.statistics, kind)
-        ]
-        heads = ["-simulations", "best (median error)", "worse", "not decided", "all runs failed"]
-        # Usually nothing failed, and the column would be empty.
-        width = len(heads) if any(row[-1] for row in rows) else len(heads) - 1
-        title = f"{_where(results, kind)}: {label}; {headline.floor_text(results.statistics)}"
-        how = headline.how_decided(results.statistics, kind)
-        parts.append(f"<h3>{safe(title, 400)}</h3>\n")
-        parts.append(html_elements.make_table(heads[:width], [row[:width] for row in rows]))
-        failed = headline.failed_runs(results.statistics, kind)
-        parts += [make_paragraph(safe(text, 1000), "soft") for text in (failed, how) if text]
-    return "".join(parts)
+def _format_title(view: ComparisonView, kind: str) -> str:
+    text = headline.WHERE[kind]
+    return f"{text[0].upper()}{text[1:]} ({headline.targets_text(view.statistics, kind)})"
 
 
-def _best(one: headline.Standing) -> str:
-    """Format the best tuners with their median error."""
-    return (
-        f"{_named(one.best, make_strong)} ({safe(one.error)})" if one.best else "every run failed"
-    )
+def write_conclusion(view: ComparisonView) -> list[str]:
+    """List the tuners that are worse than the best after all simulations, by range."""
+    return [_conclude_range(view, kind) for kind in view.ranges]
 
 
-def _of_range(results: ComparisonReportData, kind: str) -> str:
-    found, where = headline.standings(results.statistics, kind), _where(results, kind)
-    if not found:
-        return f"{where}: no target has an error that decides."
-    last = found[-1]
+def _conclude_range(view: ComparisonView, kind: str) -> str:
+    standings, title = headline.standings(view.statistics, kind), _format_title(view, kind)
+    if not standings:
+        return f"{title}: no target has an error that decides."
+    last = standings[-1]
     # The wording of the first one explains the format of the others.
     first = [
-        re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", one)
-        for one in last.worse[:1]
+        re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", text)
+        for text in last.worse[:1]
     ]
     parts = {
         "worse than the best": [*first, *last.worse[1:]],
         "not decided": last.undecided,
         "all runs failed": last.failed,
     }
-    said = "; ".join(f"{what}: {_named(names)}" for what, names in parts.items() if names)
-    return f"{where}, after {last.simulations} simulations: {said or 'no tuner is worse'}."
+    verdicts = "; ".join(f"{what}: {joined(names)}" for what, names in parts.items() if names)
+    return f"{title}, after {last.simulations} simulations: {verdicts or 'no tuner is worse'}."
 
 
-def _where(results: ComparisonReportData, kind: str) -> str:
-    text = headline.WHERE[kind]
-    return f"{text[0].upper()}{text[1:]} ({headline.targets_text(results.statistics, kind)})"
+def write_running_times(results: ComparisonReportData) -> list[str]:
+    """Describe how soon the best tuners of each range reach an error for good."""
+    texts = ((kind, _format_running_times(results, kind)) for kind in results.view.ranges)
+    return [f"{_format_title(results.view, kind)}: {text}" for kind, text in texts if text]
 
 
-def reaching(results: ComparisonReportData) -> list[str]:
-    """Describe how soon the best tuners of each range reach an error permanently; safe HTML."""
-    said = ((_where(results, kind), _reaching(results, kind)) for kind in results.ranges)
-    return [f"{where}: {text}" for where, text in said if text]
-
-
-def _reaching(results: ComparisonReportData, kind: str) -> str:
-    statistics, table = results.statistics, results.tables["ert"]
+def _format_running_times(results: ComparisonReportData, kind: str) -> str:
+    view, table = results.view, results.tables["ert"]
+    statistics, level = view.statistics, view.statistics.reference_level
     ranking = statistics.ranking[statistics.ranking["range"] == kind]
     last = ranking[ranking["simulations"] == ranking["simulations"].max()]
     best = list(last.loc[last["verdict"].isin((BEST, EQUAL)), "tuner"])
-    part = table[
+    rows = table[
         (table["range"] == kind)
-        & (table["threshold"] == statistics.reference_level)
+        & (table["threshold"] == level)
         & (table["successes"] > 0)
         & table["tuner"].isin(best)
     ]
-    if part.empty:
+    if rows.empty:
         return ""
-    lines = sorted(part.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
-    each = [
-        f"{safe(row['tuner'], 40)} {format_number(row['ert'])} "
-        f"({_ends(row)}; {int(row['successes'])} of {int(row['runs'])} runs"
-        f"{_training(results, row)})"
-        for row in lines
-    ]
+    ordered = sorted(rows.to_dict("records"), key=lambda row: statistics.order.index(row["tuner"]))
+    each = ", ".join(_format_running_time(view, row) for row in ordered)
+    unit = view.unit_of_levels or f" in {view.format_metric_label(statistics.metric)}"
     return (
         "expected simulations of the best tuners until the error stays at or below "
-        f"{format_number(statistics.reference_level)}{_unit(results)}: {', '.join(each)}."
+        f"{format_number(level)}{unit.replace('[', '').replace(']', '')}: {each}."
     )
 
 
-def _unit(results: ComparisonReportData) -> str:
-    """Return the unit of the deciding error."""
-    metric = results.statistics.metric
-    if metric in ("param_error", "stiff_error"):
-        return " training widths"
-    return f" in {safe(results.format_metric_label(metric))}"
+def _format_running_time(view: ComparisonView, row: Mapping[Any, Any]) -> str:
+    high = format_number(row["high"]) if np.isfinite(row["high"]) else "∞"
+    interval = f"95 % {format_number(row['low'])} to {high}"
+    simulations, _ = view.stored.costs.get(str(row["tuner"]), (0.0, 0.0))
+    training = f"; training {format_number(simulations, 6)}" if simulations else ""
+    successes = f"{int(row['successes'])} of {int(row['runs'])} runs"
+    return f"{row['tuner']} {format_number(row['ert'])} ({interval}; {successes}{training})"
 
 
-def _ends(line: Mapping[Any, Any]) -> str:
-    high = format_number(line["high"]) if np.isfinite(line["high"]) else "∞"
-    return f"95 % {format_number(line['low'])} to {high}"
+class FailureCounts(NamedTuple):
+    """Number of failed runs, of all runs, and of tuners that could not be used."""
+
+    failed: int
+    runs: int
+    skipped: int
 
 
-def _training(results: ComparisonReportData, line: Mapping[Any, Any]) -> str:
-    simulations, _ = results.stored.costs.get(str(line["tuner"]), (0.0, 0.0))
-    return f"; training {format_number(simulations, 6)}" if simulations else ""
+def count_failures(view: ComparisonView) -> FailureCounts:
+    """Count the runs that failed and the tuners that were skipped."""
+    statuses = view.stored.statuses
+    return FailureCounts(
+        int(statuses["status"].isin(FAILED_STATUSES).sum()),
+        len(statuses),
+        int(statuses[statuses["status"] == "skipped"]["tuner"].nunique()),
+    )
 
 
-def _named(names: Sequence[str], mark: Callable[[str], str] = str) -> str:
-    """Format names as safe HTML, with a mark-up function for each."""
-    shown = [mark(safe(name, 100)) for name in names]
-    return joined(shown)
+class Failure(NamedTuple):
+    """Kind of failure: its tuner, status, number of runs, a run and the reason of that run."""
+
+    tuner: str
+    status: str
+    run_count: int
+    run: str
+    reason: str
+
+    @property
+    def last_line(self) -> str:
+        """Last line of the reason."""
+        return (self.reason.strip().splitlines() or ["no reason was given"])[-1]
 
 
-def write_warnings(results: ComparisonReportData) -> Iterator[str]:
-    """Yield warnings about limitations of the results; safe HTML."""
-    few = (headline.too_few(results.statistics, kind) for kind in results.ranges)
-    yield from dict.fromkeys(safe(text) for text in few if text)
-    if results.missing:
-        yield f"Not finished: {results.missing} planned runs are not made yet."
-    statuses = results.stored.statuses
-    skipped = statuses[statuses["status"] == "skipped"]["tuner"].nunique()
-    failed = int(statuses["status"].isin(["crashed", "timeout", "diverged"]).sum())
-    if failed:
-        share = format_percent(failed / len(statuses))
-        yield f'{failed} of {len(statuses)} runs failed ({share}): <a href="#failures">why</a>.'
-    if skipped:
-        tuners = f"{skipped} tuner{'s' * (skipped > 1)}"
-        yield f'{tuners} could not be used here: <a href="#failures">why</a>.'
+def list_failures(view: ComparisonView) -> list[Failure]:
+    """List every kind of failure with its first reason, the most frequent one first."""
+    statuses = view.stored.statuses
+    failed = statuses[statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
+    failures = [
+        Failure(str(tuner), str(status), len(group), str(group["run"].iloc[0]), str(reason))
+        for (tuner, status, reason), group in failed.groupby(
+            ["tuner", "status", "reason"], sort=False
+        )
+    ]
+    return sorted(failures, key=lambda failure: -failure.run_count)
+
+
+def list_small_samples(view: ComparisonView) -> list[str]:
+    """List warnings about ranges with too few targets for a significant difference."""
+    texts = (headline.too_few(view.statistics, kind) for kind in view.ranges)
+    return list(dict.fromkeys(text for text in texts if text))
 
 
 def redraws_text(results: ComparisonReportData) -> str:
-    """Describe how many targets were drawn again, as plain text; empty for none."""
+    """Describe how many targets were drawn again; empty for none."""
     redrawn, draws = (
         results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
     )
-    targets = sum(results.statistics.target_counts.values())
+    targets = sum(results.view.statistics.target_counts.values())
     if not redrawn:
         return ""
     return (
@@ -187,9 +194,18 @@ def redraws_text(results: ComparisonReportData) -> str:
 
 def write_provenance_notes(results: ComparisonReportData) -> Iterator[str]:
     """Yield notes on isolation, salt and targets that limit the results."""
-    if results.experiment.trusted:
-        yield "Trusted: the tuners ran inside the harness, where nothing is out of their reach."
-    if not results.experiment.salt_sha256:
-        yield "The targets have a public salt: everybody can draw them."
+    experiment = results.view.experiment
+    if experiment.trusted:
+        yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
+    if not experiment.salt_sha256:
+        yield "The targets have a public salt, so anyone can draw them."
     if redrawn := redraws_text(results):
         yield redrawn
+
+
+def list_mean_seconds(results: ComparisonReportData) -> list[tuple[str, dict[Hashable, Any]]]:
+    """List the tuners, best first, each with the row of table.csv at the end of its budget."""
+    table = results.tables["table"]
+    last = table[table["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
+    order = [tuner for tuner in results.view.statistics.order if tuner in last.index]
+    return list(zip(order, last.loc[order].to_dict("records"), strict=True))

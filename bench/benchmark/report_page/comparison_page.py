@@ -1,91 +1,72 @@
-"""Assemble the page of one comparison, report.html."""
+"""Page of one comparison, report.html: the values of the template `comparison.html`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from pathlib import Path
 
-from bench.benchmark.report_page import comparison_charts, headline, tables_and_failures
-from bench.benchmark.report_page.comparison_conclusion import (
-    best_table,
-    reaching,
-    standing_tables,
-    write_conclusion,
-    write_provenance_notes,
-    write_warnings,
-)
+from markupsafe import Markup
+
+from bench.benchmark.figures.comparison_charts import CHARTS
+from bench.benchmark.figures.comparison_figures import format_threshold_caption
+from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
+from bench.benchmark.report_page import comparison_conclusion as conclusion
+from bench.benchmark.report_page import headline
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
-from bench.pages.html_elements import make_code, make_list, make_paragraph, safe
+from bench.benchmark.statistics.training_amortisation import TARGETS_PER_TRAINING
 from bench.pages.html_page import HtmlPage
+from bench.pages.text_format import joined
+
+_TEMPLATE = Path(__file__).with_name("comparison.html")
+_DIGITS = 7
+"""Number of significant digits of values that are in no file next to the page."""
 
 
 def render_page(results: ComparisonReportData) -> str:
-    """Build the page as HTML: results first, then the evidence, then how it was made."""
-    name = results.experiment.title or results.experiment.name
-    made = f"Made by {make_code('simgap')} from the runs in {make_code(safe(results.folder, 300))}."
-    page = HtmlPage(f"{name}: comparison of tuners", made)
-    page.append(*_opening(results))
-    page.append(_concluded(results), comparison_charts.render_error_chart(results, page))
-    page.add_section("ranking", "Best, worse and not decided", standing_tables(results))
-    page.add_section(
-        "all-numbers", "Numbers", tables_and_failures.render_error_table(results, page)
+    """Render the page as HTML."""
+    view, page = results.view, HtmlPage()
+    for name, table in results.tables.items():
+        if len(table):
+            page.add_table(name, table)
+    charts = {
+        name: make(view) if name in results.pictures or name == "ert" else None
+        for name, make in CHARTS.items()
+    }
+    for chart in charts.values():
+        for name, table in chart.tables.items() if chart else ():
+            page.add_table(name, table, _DIGITS)
+    range_results = conclusion.list_range_results(view)
+    standings = [result.standings for result in range_results]
+    equal_errors = headline.floor_text(view.statistics)
+    return page.render(
+        _TEMPLATE,
+        results=results,
+        view=view,
+        charts=charts,
+        tuner_count=view.stored.runs["tuner"].nunique(),
+        run_count=view.stored.runs["run"].nunique(),
+        equal_errors=equal_errors.capitalize(),
+        floor_text=equal_errors,
+        range_results=range_results,
+        together=list(zip(*standings, strict=True)) if all(standings) else [],
+        best_headings=[f"best (median error), {result.where}" for result in range_results],
+        conclusion=conclusion.write_conclusion(view),
+        small_samples=conclusion.list_small_samples(view),
+        failure_counts=conclusion.count_failures(view),
+        failures=conclusion.list_failures(view),
+        provenance_notes=list(conclusion.write_provenance_notes(results)),
+        running_times=conclusion.write_running_times(results),
+        mean_seconds=conclusion.list_mean_seconds(results),
+        shown_label=view.format_metric_label(view.shown_metric),
+        last_simulations=str(int(results.tables["table"]["simulations"].max())),
+        threshold_caption=format_threshold_caption(view.statistics.spread),
+        stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
+        targets_per_training=TARGETS_PER_TRAINING,
+        joined=joined,
+        separator=_separate,
     )
-    page.add_section("pairs", "Pairs", tables_and_failures.render_pairs_table(results, page))
-    page.add_section(
-        "further",
-        "More errors",
-        comparison_charts.render_distance_chart(results, page),
-        comparison_charts.render_misfit_chart(results, page),
-        comparison_charts.render_directions_chart(results, page),
-        tables_and_failures.render_identifiability_table(results, page),
-    )
-    times = tables_and_failures.render_ert_table(results, page)
-    page.add_section(
-        "reaching",
-        "Reaching an error",
-        make_list(reaching(results)),
-        comparison_charts.render_runtime_chart(results, page),
-        comparison_charts.render_ert_chart(results, page),
-        times,
-    )
-    page.add_section(
-        "costs",
-        "Seconds",
-        comparison_charts.render_cost_chart(results, page),
-        tables_and_failures.render_winners_table(results, page),
-        tables_and_failures.render_time_table(results),
-    )
-    page.add_section(
-        "training",
-        "Training",
-        comparison_charts.render_amortisation_chart(results, page),
-        tables_and_failures.render_break_even_table(results, page),
-    )
-    page.add_section("failures", "Failures", *tables_and_failures.render_failures(results))
-    page.add_section("making", "How it was made", *tables_and_failures.render_reproduction(results))
-    return page.to_html()
 
 
-def _opening(results: ComparisonReportData) -> Iterator[str]:
-    experiment = results.experiment
-    yield f"<header>\n<h1>{safe(experiment.title or experiment.name, 200)}</h1>"
-    tuners = results.stored.runs["tuner"].nunique()
-    runs = results.stored.runs["run"].nunique()
-    counts = (
-        f"{make_code(safe(experiment.name, 100))}: {tuners} tuner{'s' * (tuners != 1)}, "
-        f"{runs} runs of up to {experiment.budget} simulations."
-    )
-    equal = headline.floor_text(results.statistics)
-    yield make_paragraph(f"{counts} {safe(experiment.says)} {safe(equal.capitalize())}.", "soft")
-    yield "</header>"
-
-
-def _concluded(results: ComparisonReportData) -> str:
-    said = (
-        f'<div class="conclusion">{best_table(results)}{make_list(write_conclusion(results))}</div>'
-    )
-    warned = (
-        make_paragraph(" ".join(write_warnings(results)), "warning")
-        if any(write_warnings(results))
-        else ""
-    )
-    return said + warned + make_paragraph(" ".join(write_provenance_notes(results)), "soft")
+def _separate(loop: object) -> Markup:
+    """Return what follows an item of a list: a comma, ``and``, or nothing after the last one."""
+    remaining = int(getattr(loop, "revindex0", 0))
+    return Markup({0: "", 1: " and "}.get(remaining, ", "))

@@ -1,46 +1,49 @@
-"""HTML page of many logs that are explained separately: report.html next to logs.csv."""
+"""Page of many logs that are explained separately: the values of the template `summary.html`."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
 from bench.diagnosis.batch import summary_tables
 from bench.diagnosis.batch.log_rows import LOGS_TABLE_FILE, LogResult, format_cause
-from bench.diagnosis.batch.summary_figures import (
-    MAX_NAMED_LOGS,
-    MAX_PANELS,
-    draw_held_out_figure,
-    draw_numbers_figure,
-)
-from bench.diagnosis.report.next_steps import render_command
 from bench.diagnosis.report.wording import (
     append_unit,
     format_effect_name,
     format_number,
-    format_percent,
     format_sentence,
     joined,
 )
 from bench.figures import style
-from bench.pages.chart import Axis, Chart, Panel, PrintedFigure, ReferenceLine, Series
-from bench.pages.data_grid import DataGrid, GridColumn
-from bench.pages.html_elements import make_code, make_list, make_paragraph, make_strong, safe
+from bench.figures.style import add_caption
+from bench.figures.text_layout import break_name
+from bench.pages.chart import Axis, Panel, PrintedFigure, ReferenceLine, Series
+from bench.pages.chart_figure import draw_chart
 from bench.pages.html_page import HtmlPage
 from sims.core.atomic_files import write_atomically
 from sims.core.simulator import InputError
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_TEMPLATE = Path(__file__).with_name("summary.html")
 _NAMED_LETTERS = 120
 """Maximum total number of characters of log names on an axis; with more, the logs are numbered."""
-_SAID = 6
+MAX_NAMED = 6
 """Maximum number of causes, and of failed logs, that are listed before the tables."""
-_ORDER = ("named", "ambiguous", "partial", "adequate", "unknown", "unidentifiable")
+MAX_PANELS = 4
+"""Maximum number of numbers that the printed figure shows."""
+_TITLE_LINE = 34
+"""Maximum line length of a panel's title, in characters."""
+_NAME_HEIGHT = 0.3
+"""Height of a log in the printed figures, in inches."""
+_VERDICT_ORDER = ("named", "ambiguous", "partial", "adequate", "unknown", "unidentifiable")
 _BEFORE = style.make_mark_style(style.VERMILION, (), "s")
 _AFTER = style.make_mark_style(style.BLUE, (), "o")
 
@@ -64,12 +67,12 @@ class BatchPageInput:
     left: int = 0
 
 
-def write_summary_page(rows: Sequence[LogResult], asked: BatchPageInput) -> Path:
+def write_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> Path:
     """Write the page next to the table.
 
     Args:
         rows: Result of each log.
-        asked: Input of the page in addition to the rows.
+        batch: Input of the page in addition to the rows.
 
     Returns:
         Path of the page.
@@ -77,228 +80,219 @@ def write_summary_page(rows: Sequence[LogResult], asked: BatchPageInput) -> Path
     Raises:
         InputError: The page cannot be written.
     """
-    path = asked.out / summary_tables.REPORT_FILE
+    path = batch.out / summary_tables.REPORT_FILE
     try:
-        write_atomically(path, render_summary_page(rows, asked))
+        write_atomically(path, render_summary_page(rows, batch))
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
     return path
 
 
-def render_summary_page(rows: Sequence[LogResult], asked: BatchPageInput) -> str:
-    """Render the page as HTML: a summary of the causes over all logs, then the logs one by one.
+def render_summary_page(rows: Sequence[LogResult], batch: BatchPageInput) -> str:
+    """Render the page as HTML.
 
     Args:
         rows: Result of each log, in the order given.
-        asked: Input of the page in addition to the rows.
+        batch: Input of the page in addition to the rows.
     """
-    logs = summary_tables.build_log_table(rows, asked.folders)
-    found = summary_tables.build_number_table(rows)
-    made = (
-        f"Made by simgap explain --each; the table is {make_code(LOGS_TABLE_FILE)} in "
-        f"{make_code(safe(asked.out))}."
+    logs = summary_tables.build_log_table(rows, batch.folders)
+    numbers = summary_tables.build_number_table(rows)
+    charts = make_summary_charts(logs, numbers)
+    page = HtmlPage()
+    tables = {"each": logs, "logs": summary_tables.read_log_table(rows), **charts.tables}
+    for name, table in tables.items():
+        page.add_table(name, table)
+    closed = logs["gap_closed"][logs["causes"] != ""].dropna()
+    return page.render(
+        _TEMPLATE,
+        rows=rows,
+        batch=batch,
+        table_file=LOGS_TABLE_FILE,
+        verdicts=_format_verdicts(rows),
+        causes=_list_causes(rows, numbers, batch),
+        closed=_ClosedShare(closed.median(), closed.min(), closed.max(), len(closed))
+        if len(closed)
+        else None,
+        failed=[row for row in rows if row.error],
+        is_numbered=not charts.has_names,
+        number_panels=charts.numbers,
+        number_figure=_make_still(
+            charts.numbers[:MAX_PANELS],
+            charts.tables,
+            "numbers",
+            "Each number of the causes over the logs.",
+            "Point: the value from one log. Bar: its 95 % interval.",
+        ),
+        held_out_panels=charts.held_out,
+        held_out_figure=_make_still(
+            charts.held_out,
+            charts.tables,
+            "held-out",
+            "Error on held-out runs of each log before and after, in noise floors.",
+            "Dashed: the noise floor, the best that any model can reach.",
+        ),
+        MAX_NAMED=MAX_NAMED,
+        MAX_PANELS=MAX_PANELS,
     )
-    page = HtmlPage(f"{_counted(len(rows))}, each explained by itself", made)
-    page.add_table("each", logs)
-    page.add_table("logs", summary_tables.read_log_table(rows))
-    page.append(f"<header>\n<h1>{_counted(len(rows))}, each explained by itself</h1>\n</header>")
-    page.append(f'<div class="conclusion">{make_list(_conclusion(rows, logs, found, asked))}</div>')
-    page.add_section("next", "What to do next", *_next(rows, asked))
-    page.add_section("logs", "Log by log", page.render_grid(_render_log_table()))
-    page.add_section(
-        "numbers", "The numbers of the causes", *_render_numbers_section(page, logs, found)
-    )
-    page.add_section("gap", "What the causes explain", _held_out(page, logs))
-    page.add_section("making", "How it was made", render_command(*asked.words))
-    return page.to_html()
 
 
-def _counted(count: int) -> str:
-    return "One log" if count == 1 else f"{count} logs"
+class _ClosedShare(NamedTuple):
+    """Share of the gap that the causes close: median and range, and the number of logs."""
+
+    median: float
+    low: float
+    high: float
+    log_count: int
 
 
-def _conclusion(
-    rows: Sequence[LogResult], logs: pd.DataFrame, found: pd.DataFrame, asked: BatchPageInput
-) -> Iterator[str]:
-    """Yield sentences on verdicts, the commonest causes, the gap closed and the missing logs."""
-    words = Counter(row.verdict for row in rows if row.verdict)
-    said = [f"{words[word]} {safe(word)}" for word in _ORDER if words[word]]
-    said += [f"{count} {safe(word)}" for word, count in words.items() if word not in _ORDER]
+def _format_verdicts(rows: Sequence[LogResult]) -> str:
+    counts = Counter(row.verdict for row in rows if row.verdict)
+    ordered = [*_VERDICT_ORDER, *(verdict for verdict in counts if verdict not in _VERDICT_ORDER)]
+    parts = [f"{counts[verdict]} {verdict}" for verdict in ordered if counts[verdict]]
     failed = sum(1 for row in rows if row.error)
     if failed:
-        said.append(f"{failed} could not be explained")
-    yield f"Verdicts: {make_strong(joined(said) or 'none yet')}."
-    causes = Counter(format_cause(cause) for row in rows for cause in row.causes)
-    for name, count in causes.most_common(_SAID):
-        words_of = joined([format_effect_name(part) for part in name.split(" or ")], "or")
-        what = make_strong(safe(format_sentence(words_of)[:-1], 300))
-        where = f"({make_code(safe(name, 200))}) in {count} of {len(rows)} logs"
-        yield f"{what} {where}{safe(_spans(found[found['cause'] == name]))}."
-    if len(causes) > _SAID:
-        yield f"{len(causes) - _SAID} causes more, each in fewer logs or as many."
-    closed = logs["gap_closed"][logs["causes"] != ""].dropna()
-    if len(closed):
-        ends = dict.fromkeys([format_percent(closed.min()), format_percent(closed.max())])
-        middle = f"{format_percent(closed.median())} of the held-out gap (median)"
-        yield f"What was found closes {middle}; {' to '.join(ends)} in {len(closed)} logs."
-    if asked.left:
-        yield f"{make_strong(f'{asked.left} logs are left')}: the same command goes on with them."
+        parts.append(f"{failed} could not be explained")
+    return joined(parts)
 
 
-def _spans(found: pd.DataFrame) -> str:
+class _CommonCause(NamedTuple):
+    """Cause in words, its name, its logs and their recordings, and the ranges of its numbers."""
+
+    text: str
+    name: str
+    logs: list[str]
+    recordings: list[Path]
+    ranges: str
+
+
+def _list_causes(
+    rows: Sequence[LogResult], numbers: pd.DataFrame, batch: BatchPageInput
+) -> list[_CommonCause]:
+    """List the causes over all logs, the most common first."""
+    counts = Counter(format_cause(cause) for row in rows for cause in row.causes)
+    causes = []
+    for name, _ in counts.most_common():
+        logs = [row.log for row in rows if name in map(format_cause, row.causes)]
+        text = joined([format_effect_name(part) for part in name.split(" or ")], "or")
+        recordings = [batch.recordings[log] for log in logs]
+        ranges = _format_ranges(numbers[numbers["cause"] == name])
+        causes.append(_CommonCause(format_sentence(text)[:-1], name, logs, recordings, ranges))
+    return causes
+
+
+def _format_ranges(numbers: pd.DataFrame) -> str:
     """Format the range of each coefficient of a cause, such as ``: 0.3 to 0.7 N``."""
     parts = []
-    for name, mine in found.groupby("name", sort=False):
+    for name, values in numbers.groupby("name", sort=False):
         ends = dict.fromkeys(
-            format_number(end) for end in (mine["value"].min(), mine["value"].max())
+            format_number(end) for end in (values["value"].min(), values["value"].max())
         )
         label = "" if name == "coefficient" else f"{summary_tables.place_of(str(name))} "
-        parts.append(label + append_unit(" to ".join(ends), str(mine["unit"].iloc[0])))
+        parts.append(label + append_unit(" to ".join(ends), str(values["unit"].iloc[0])))
     return f": {joined(parts)}" if parts else ""
 
 
-def _next(rows: Sequence[LogResult], asked: BatchPageInput) -> Iterator[str]:
-    """Yield the next steps: logs to repair or continue, and logs to explain together."""
-    failed = [row for row in rows if row.error]
-    if failed:
-        yield make_paragraph(make_strong("Not explained:"))
-        more = len(failed) - _SAID
-        told = [f"{make_code(safe(row.log, 100))}: {safe(row.error)}" for row in failed[:_SAID]]
-        yield make_list([*told, *([f"and {more} more, in the table below"] if more > 0 else [])])
-    if failed or asked.left:
-        again = '<a href="#making">The same command</a>'
-        yield make_paragraph(f"{again} explains what is mended or left, and nothing twice.")
-    causes = Counter(format_cause(cause) for row in rows for cause in row.causes)
-    commonest = causes.most_common(1)
-    if commonest and commonest[0][1] > 1:
-        name, _ = commonest[0]
-        having = [row.log for row in rows if name in map(format_cause, row.causes)]
-        yield make_paragraph(
-            f"{make_strong('Do the numbers differ from log to log by more than chance?')} "
-            f"Explained together, the {len(having)} logs with {make_code(safe(name, 200))} say so, "
-            "and with what a number moves:"
-        )
-        yield render_command("simgap", "explain", *(asked.recordings[log] for log in having))
-    if not causes and not failed:
-        yield make_paragraph("Nothing: no log shows a cause.")
+class SummaryCharts(NamedTuple):
+    """Charts of the page.
+
+    Attributes:
+        numbers: Panels of each number of a cause over the logs, the most common first.
+        held_out: Panel of the errors on held-out runs; empty without errors.
+        tables: Tables of the panels.
+        has_names: Whether the logs have their names on the axis.
+    """
+
+    numbers: list[Panel]
+    held_out: list[Panel]
+    tables: dict[str, pd.DataFrame]
+    has_names: bool
 
 
-def _render_log_table() -> DataGrid:
-    columns = (
-        GridColumn("log", says="leads to its own report"),
-        GridColumn("number", "#", 6),
-        GridColumn("verdict"),
-        GridColumn("causes"),
-        GridColumn(
-            "gap_closed", "gap closed", 3, "share of the held-out error above its noise floor"
-        ),
-        GridColumn("low", "95 % low", 3),
-        GridColumn("high", "95 % high", 3),
-        GridColumn("before", "before [floors]", 3, "error on held-out runs, in noise floors"),
-        GridColumn("after", "after [floors]", 3, "the same with what was found"),
-        GridColumn("seconds", "s", 3),
-        GridColumn("error", "why not"),
-    )  # fmt: skip
-    return DataGrid("each", "Every log", "each", columns, ("verdict",), links="report")
+def make_summary_charts(logs: pd.DataFrame, numbers: pd.DataFrame) -> SummaryCharts:
+    """Make the charts of the page.
+
+    Args:
+        logs: Table of `summary_tables.build_log_table`.
+        numbers: Table of `summary_tables.build_number_table`.
+    """
+    across = _make_log_axis(logs)
+    # Named logs have the positions 0, 1, 2, ... on their axis.
+    first = 1 if across.names else 0
+    errors = logs[["number", "log", "before", "after"]]
+    tables = {
+        "found": numbers.assign(place=numbers["number"] - first),
+        "held-out": errors.assign(place=errors["number"] - first),
+    }
+    number_panels = _make_number_panels(numbers, across)
+    held_out_panels = _make_held_out_panels(logs, across)
+    return SummaryCharts(number_panels, held_out_panels, tables, bool(across.names))
 
 
-def _across(logs: pd.DataFrame) -> Axis:
-    """Make the axis of the logs."""
-    if not _has_names(logs):
-        ends = (0.5, len(logs) + 0.5)
-        return Axis("log, by its number", scales=("linear",), ends=ends)
-    return Axis("log", names=tuple(str(name) for name in logs["log"]))
-
-
-def _has_names(logs: pd.DataFrame) -> bool:
-    """Return whether the names of the logs fit on an axis."""
+def _make_log_axis(logs: pd.DataFrame) -> Axis:
+    """Make the axis of the logs: with their names if they fit, otherwise with their numbers."""
     names = [str(name) for name in logs["log"]]
-    return len(names) * max(map(len, names), default=0) <= _NAMED_LETTERS
+    if len(names) * max(map(len, names), default=0) <= _NAMED_LETTERS:
+        return Axis("log", names=tuple(names))
+    return Axis("log, by its number", scales=("linear",), ends=(0.5, len(logs) + 0.5))
 
 
-def _placed(frame: pd.DataFrame, logs: pd.DataFrame) -> pd.DataFrame:
-    """Add the position on the axis; named logs have the positions 0, 1, 2, ..."""
-    return frame.assign(place=frame["number"] - (1 if _has_names(logs) else 0))
-
-
-def _render_numbers_section(
-    page: HtmlPage, logs: pd.DataFrame, found: pd.DataFrame
-) -> Iterator[str]:
-    """Yield the chart of each number over the logs, and the table of all numbers."""
-    columns = (
-        GridColumn("log"),
-        GridColumn("verdict"),
-        GridColumn("cause"),
-        GridColumn("alternatives"),
-        GridColumn("coefficient", "number"),
-        GridColumn("value", digits=4),
-        GridColumn("low", "95 % low", 4),
-        GridColumn("high", "95 % high", 4),
-        GridColumn("unit"),
-    )  # fmt: skip
-    if found.empty:
-        return
-    page.add_table("found", _placed(found, logs))
+def _make_number_panels(numbers: pd.DataFrame, across: Axis) -> list[Panel]:
+    """Make a panel for each number of a cause, the most common first."""
     panels = []
-    for what in dict.fromkeys(found["what"]):
-        name, _, label = str(what).rpartition(": ")
-        where = {"what": str(what)}
-        series = (Series("each log", "value", _AFTER, where, "low", "high", "points"),)
+    for what in dict.fromkeys(numbers["what"].astype(str)):
+        name, _, label = what.rpartition(": ")
+        series = (Series("each log", "value", _AFTER, {"what": what}, "low", "high", "points"),)
         up = Axis(label, scales=("linear",))
-        panels.append(Panel(name, "found", "place", series, _across(logs), up, {"number": what}))
-    caption = (
-        "A point is what a log gives by itself, the bar its 95 % interval. Bars that do not "
-        "overlap are numbers that moved."
-    )
-    if len(panels) > MAX_PANELS:
-        caption += f" In print the {MAX_PANELS} commonest numbers."
-    # Too many panels next to each other cannot be compared.
-    beside = "number" if len(panels) <= MAX_PANELS else ""
-    still = _still(
-        draw_numbers_figure(logs, found), "Each number of the causes over the logs.", "numbers"
-    )
-    title = "What each log gives"
-    yield page.render_chart(Chart("found", title, caption, tuple(panels), still, beside))
-    filters = ("log", "cause", "coefficient")
-    yield page.render_grid(
-        DataGrid("all-numbers", f"All numbers: {LOGS_TABLE_FILE}", "logs", columns, filters)
-    )
+        panels.append(Panel(name, "found", "place", series, across, up, {"number": what}))
+    return panels
 
 
-def _held_out(page: HtmlPage, logs: pd.DataFrame) -> str:
-    """Chart the errors on held-out runs before and after, in noise floors."""
-    measured = logs[logs[["before", "after"]].map(lambda x: isfinite(x) and x > 0).all(axis=1)]
-    if measured.empty:
-        return ""
-    page.add_table("held-out", _placed(logs[["number", "log", "before", "after"]], logs))
+def _make_held_out_panels(logs: pd.DataFrame, across: Axis) -> list[Panel]:
+    """Make the panel of the errors on held-out runs, in noise floors; none without errors."""
+    errors = logs[["before", "after"]]
+    measured = int(errors.map(lambda error: isfinite(error) and error > 0).all(axis=1).sum())
+    if not measured:
+        return []
     series = (
         Series("before: tuned simulation", "before", _BEFORE, draw="points"),
-        Series("after: with what was found", "after", _AFTER, draw="points"),
+        Series("after: with the causes found", "after", _AFTER, draw="points"),
     )
     up = Axis("error on held-out runs [noise floors]", "log", holds=(1.0,))
+    title = "One log" if measured == 1 else f"{measured} logs"
     rules = (ReferenceLine(1.0, "noise floor"),)
-    title = "Error on held-out runs"
-    panel = Panel(
-        _counted(len(measured)), "held-out", "place", series, _across(logs), up, rules=rules
-    )
-    caption = (
-        "Squares: the tuned simulation as it is. Circles: with what was found. 1 is the noise "
-        "floor, the best that any model can reach."
-    )
-    if len(logs) > MAX_NAMED_LOGS:
-        caption += " Logs have the numbers of the table above."
-    shows = "Error on held-out runs of each log before and after, in noise floors."
-    return page.render_chart(
-        Chart(
-            "held-out",
-            title,
-            caption,
-            (panel,),
-            _still(draw_held_out_figure(measured), shows, "held-out"),
-        )
-    )
+    return [Panel(title, "held-out", "place", series, across, up, rules=rules)]
 
 
-def _still(figure: Any, shows: str, name: str) -> PrintedFigure:
-    picture = style.render_all_formats(figure)
-    return PrintedFigure(picture.svg, picture.pdf, shows, name)
+def draw_summary_figure(
+    panels: Sequence[Panel], tables: Mapping[str, pd.DataFrame], caption: str
+) -> Figure:
+    """Draw the printed version of a chart, with the logs from top to bottom.
+
+    Args:
+        panels: Panels of the chart.
+        tables: Tables of the panels.
+        caption: Caption below the figure.
+    """
+    height = 1.2 + _NAME_HEIGHT * len(panels[0].across.names) if panels[0].across.names else 4.0
+    figure, axes = draw_chart(panels, tables, size=(3.4, height), horizontal=True)
+    for axis, panel in zip(axes, panels, strict=True):
+        axis.set_title(break_name(panel.title, _TITLE_LINE), fontsize=8.5, parse_math=False)
+    if len(panels[0].series) > 1:
+        entries = axes[0].get_legend_handles_labels()
+        figure.legend(*entries, loc="outside upper center", fontsize=8, frameon=False)
+    add_caption(figure, caption, letters=17)
+    return figure
+
+
+def _make_still(
+    panels: Sequence[Panel],
+    tables: Mapping[str, pd.DataFrame],
+    name: str,
+    alternative: str,
+    caption: str,
+) -> PrintedFigure | None:
+    """Render the printed version of a chart; None without panels."""
+    if not panels:
+        return None
+    files = style.render_all_formats(draw_summary_figure(panels, tables, caption))
+    return PrintedFigure(files.svg, files.pdf, alternative, name)

@@ -66,9 +66,13 @@ def format_evidence(row: SheetRow, short: bool = False) -> str:
         short: Whether to use the short form for print.
     """
     if row.state == "derived":
-        return "follows from those below"
+        return "computed from the numbers below"
     if row.state == "fitted":
-        return "fitted" if row.number and row.number.low is not None else "not fixed by these data"
+        return (
+            "fitted"
+            if row.number and row.number.low is not None
+            else "not identified by these data"
+        )
     judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
     cut = "not judged" if short else "the search ended before it was judged"
     said = [format_p_value(row.p_value) if judged else cut]
@@ -78,7 +82,7 @@ def format_evidence(row: SheetRow, short: bool = False) -> str:
             f"{closed} held out" if short else f"alone it closes {closed} of the held-out gap"
         )
     if row.alternatives:
-        said.append(f"{joined(row.alternatives, 'or')} would do as well")
+        said.append(f"{joined(row.alternatives, 'or')} explains the data equally well")
     return "; ".join(said)
 
 
@@ -86,10 +90,10 @@ def format_detection_limit(row: SheetRow) -> str:
     """Format the smallest value of an absent effect that these data would have revealed."""
     reach = row.detection_limit
     if reach is None or reach.size == float("inf"):
-        return "nothing: not touched"
+        return "none: the data do not depend on it"
     size = format_number(reach.size, 2)
     if reach.vague:
-        return append_unit(f"nothing plausible, ± {size}", row.unit)
+        return append_unit(f"± {size}", row.unit) + ", more than any plausible value"
     if reach.limit:
         return append_unit(f"none {reach.limit} {size}", row.unit)
     if reach.is_nonzero_if_fitted:
@@ -104,5 +108,5 @@ def format_confounding(row: SheetRow) -> str:
     """Format confounded parameters, and causes that the effect might replace."""
     said = list(row.detection_limit.confounded_with) if row.detection_limit else []
     if row.alternatives:
-        said.append(f"may be there instead of {joined(row.alternatives, 'or')}")
+        said.append(f"possible alternative to {joined(row.alternatives, 'or')}")
     return ", ".join(said)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-
-import numpy as np
+from typing import NamedTuple
 
 from bench.diagnosis.report.missing_physics import name_missing_physics
 from bench.diagnosis.report.report_data import DiagnosisReportData
@@ -21,15 +20,13 @@ from bench.diagnosis.validation.gain_and_intervals import Z95
 from bench.diagnosis.validation.run_consistency import (
     SIGNIFICANCE_LEVEL,
     ParameterConsistency,
-    TrendCovariate,
 )
-from bench.pages.html_elements import make_paragraph, make_table, safe
+from bench.pages.interval_drawing import IntervalDrawing, draw_intervals
 
 MAX_TABLE_ROWS = 12
 """Maximum number of rows of the table, the least consistent first."""
 MAX_NAMED_PARAMETERS = 4
 """Maximum number of parameters that a sentence names."""
-_DRAWN = 180.0
 AGREEMENT_COLUMNS = ("model", "number", "unit", "by", "group", "value", "low", "high")
 """Columns of the file apart.csv."""
 
@@ -43,185 +40,187 @@ def format_consistency(story: DiagnosisReportData) -> list[str]:
     Args:
         story: Report data.
     """
-    before = {(s.number, s.by): s for s in story.consistency.before}
+    before = {(spread.number, spread.by): spread for spread in story.consistency.before}
     after = story.consistency.after
-    causes = joined([sanitise(cause.effect, 60) for cause in story.verdict.causes])
+    effects = [cause.effect for cause in story.verdict.causes]
+    causes = joined([sanitise(effect, 60) for effect in effects])
     sentences = []
-    mended = [s for s in after if s.is_consistent and _disagreed(before, s)]
-    if mended and causes:
-        names = joined(list(dict.fromkeys(_named(s) for s in mended))[:MAX_NAMED_PARAMETERS])
-        by = _plural(mended[0].by)
-        sentences.append(f"without {causes} {names} moved between {by} more than their intervals")
-    rival = _clearest([s for s in story.consistency.alternative_effect if not s.is_consistent])
-    for one in rival[:1]:
-        moves = f", and {_goes(one)} with {sanitise(one.by, 40)}" if _moves(one) else ""
+    reconciled = [
+        spread
+        for spread in after
+        if spread.is_consistent
+        and (earlier := before.get((spread.number, spread.by))) is not None
+        and not earlier.is_consistent
+    ]
+    if reconciled and causes:
+        names = list(dict.fromkeys(_name(spread) for spread in reconciled))
         sentences.append(
-            f"with {_named(one)} in place of {causes} its value would differ between "
-            f"{_plural(one.by)}, {append_unit(_span(one), one.unit)} (chance "
-            f"{format_p_value(one.p_value)}){moves}: that is how one sees what is missing"
+            f"without {causes}, {joined(names[:MAX_NAMED_PARAMETERS])} differed between "
+            f"{_plural(reconciled[0].by)} by more than the intervals"
         )
-    apart = _clearest([s for s in after if not s.is_consistent])
-    for one in apart[:MAX_NAMED_PARAMETERS]:
-        sentences.append(_apart(one, [cause.effect for cause in story.verdict.causes]))
-    if len(apart) > MAX_NAMED_PARAMETERS:
-        sentences.append(f"{len(apart) - MAX_NAMED_PARAMETERS} more numbers do not agree either")
-    if after and not apart:
+    rivals = [s for s in story.consistency.alternative_effect if not s.is_consistent]
+    for rival in _select_clearest(rivals)[:1]:
+        trend = ""
+        if _has_trend(rival):
+            trend = f", and it {_direction(rival)} with {sanitise(rival.by, 40)}"
+        sentences.append(
+            f"with {_name(rival)} instead of {causes}, its value would differ between "
+            f"{_plural(rival.by)}, {_format_span(rival)} ({format_p_value(rival.p_value)}){trend}; "
+            f"this difference speaks for {causes}"
+        )
+    inconsistent = _select_clearest([spread for spread in after if not spread.is_consistent])
+    named = inconsistent[:MAX_NAMED_PARAMETERS]
+    sentences += [_format_inconsistency(spread, effects) for spread in named]
+    if len(inconsistent) > len(named):
+        count = len(inconsistent) - len(named)
+        sentences.append(f"{count} more numbers differ between their groups")
+    if after and not inconsistent:
         groups = _plural(after[0].by)
         sentences.append(f"all {groups} agree on every number within its interval")
-    return [format_sentence(text) for text in (*sentences, *_drifts(after))]
+    return [format_sentence(text) for text in (*sentences, *_format_drifts(after))]
 
 
-def _clearest(apart: Sequence[ParameterConsistency]) -> list[ParameterConsistency]:
+def _select_clearest(spreads: Sequence[ParameterConsistency]) -> list[ParameterConsistency]:
     """Return each parameter once, preferably with the grouping in which it has a trend."""
     by_number: dict[str, list[ParameterConsistency]] = {}
-    for one in apart:
-        by_number.setdefault(one.number, []).append(one)
+    for spread in spreads:
+        by_number.setdefault(spread.number, []).append(spread)
     return [min(each, key=_rank) for each in by_number.values()]
 
 
-def _rank(one: ParameterConsistency) -> tuple[bool, int, float]:
+def _rank(spread: ParameterConsistency) -> tuple[bool, int, float]:
     """Return a sort key: by trend first, then constants, logs and runs, then by p-value."""
-    by = {"log": 1, "run": 2}.get(one.by, 0)
-    return not (_moves(one) or one.trend_covariate is not None), by, one.p_value
+    grouping = {"log": 1, "run": 2}.get(spread.by, 0)
+    has_trend = _has_trend(spread) or spread.trend_covariate is not None
+    return not has_trend, grouping, spread.p_value
 
 
-def _moves(one: ParameterConsistency) -> bool:
-    return one.by != "log" and one.trend is not None and one.trend.p_value < SIGNIFICANCE_LEVEL
+def _has_trend(spread: ParameterConsistency) -> bool:
+    trend = spread.trend
+    return spread.by != "log" and trend is not None and trend.p_value < SIGNIFICANCE_LEVEL
 
 
-def _disagreed(
-    before: dict[tuple[str, str], ParameterConsistency], one: ParameterConsistency
-) -> bool:
-    known = before.get((one.number, one.by))
-    return known is not None and not known.is_consistent
-
-
-def _apart(one: ParameterConsistency, known: Sequence[str]) -> str:
+def _format_inconsistency(spread: ParameterConsistency, effects: Sequence[str]) -> str:
     text = (
-        f"{_named(one)} differs between {_plural(one.by)}, {append_unit(_span(one), one.unit)} "
-        f"(chance {format_p_value(one.p_value)}): of a run not yet recorded it is known to "
-        f"±{format_number(Z95 * one.prediction_sigma)}, not to ±{format_number(Z95 * one.error)}"
+        f"{_name(spread)} differs between {_plural(spread.by)}, {_format_span(spread)} "
+        f"({format_p_value(spread.p_value)}): for a new run it is known to "
+        f"±{format_number(Z95 * spread.prediction_sigma)}, not to "
+        f"±{format_number(Z95 * spread.error)}"
     )
-    if one.trend_covariate is None:
-        return f"{text}; an effect is missing that makes it move"
-    way = "grows" if one.trend_covariate.trend.slope > 0 else "falls"
-    text += f"; it {way} with {_along(one.trend_covariate)}"
-    kind, name = one.trend_covariate.kind, sanitise(one.trend_covariate.name, 40)
-    what = name_missing_physics(one.number, kind, name, one.trend_covariate.trend.slope > 0, known)
-    return f"{text}: what is missing is {what}"
-
-
-def _along(mover: TrendCovariate) -> str:
-    """Format the covariate of a trend and those that are indistinguishable from it."""
-    return " or ".join(
-        sanitise(name, 40) for name in (mover.name, *mover.indistinguishable_covariates[:2])
+    covariate = spread.trend_covariate
+    if covariate is None:
+        return f"{text}; an effect that changes it is missing"
+    increases = covariate.trend.slope > 0
+    names = (covariate.name, *covariate.indistinguishable_covariates[:2])
+    text += f"; it {'increases' if increases else 'decreases'} with "
+    text += " or ".join(sanitise(name, 40) for name in names)
+    missing = name_missing_physics(
+        spread.number, covariate.kind, sanitise(covariate.name, 40), increases, effects
     )
+    return f"{text}: {missing} is missing"
 
 
-def _span(one: ParameterConsistency) -> str:
-    values = [part.value for part in one.group_estimates]
-    return f"{format_number(min(values))} to {format_number(max(values))}"
+def _format_span(spread: ParameterConsistency) -> str:
+    values = [part.value for part in spread.group_estimates]
+    return append_unit(f"{format_number(min(values))} to {format_number(max(values))}", spread.unit)
 
 
-def _drifts(after: Sequence[ParameterConsistency]) -> Iterator[str]:
+def _format_drifts(after: Sequence[ParameterConsistency]) -> Iterator[str]:
     """Yield sentences on the parameters that drift over the logs."""
-    logs = [s for s in after if s.by == "log" and s.trend is not None]
+    logs = [spread for spread in after if spread.by == "log" and spread.trend is not None]
     if not logs:
         return
     level = SIGNIFICANCE_LEVEL / len(logs)
     drifting = [
-        s for s in logs if s.trend is not None and s.trend.p_value < level and not s.is_consistent
+        (spread, spread.trend)
+        for spread in logs
+        if spread.trend is not None and spread.trend.p_value < level and not spread.is_consistent
     ]
-    for one in drifting[:MAX_NAMED_PARAMETERS]:
-        assert one.trend is not None
-        size = f"{format_number(abs(one.trend.slope))} ± {format_number(Z95 * one.trend.error)}"
-        yield f"{_named(one)} {_goes(one)} from log to log by {append_unit(size, one.unit)}"
+    for spread, trend in drifting[:MAX_NAMED_PARAMETERS]:
+        size = f"{format_number(abs(trend.slope))} ± {format_number(Z95 * trend.error)}"
+        change = append_unit(size, spread.unit)
+        yield f"{_name(spread)} {_direction(spread)} from log to log by {change}"
     if not drifting:
-        yield f"over the {len(logs[0].group_estimates)} logs, in the order given, nothing drifts"
+        count = len(logs[0].group_estimates)
+        yield f"no number drifts over the {count} logs, in the order given"
 
 
-def _goes(one: ParameterConsistency) -> str:
-    return "grows" if one.trend is not None and one.trend.slope > 0 else "falls"
+def _direction(spread: ParameterConsistency) -> str:
+    return "increases" if spread.trend is not None and spread.trend.slope > 0 else "decreases"
 
 
-def _named(one: ParameterConsistency) -> str:
-    return sanitise(one.number, 60)
+def _name(spread: ParameterConsistency) -> str:
+    return sanitise(spread.number, 60)
 
 
 def _plural(by: str) -> str:
     return f"{by}s" if by in ("run", "log") else f"values of {sanitise(by, 40)}"
 
 
-def render_consistency_section(story: DiagnosisReportData) -> Iterator[str]:
-    """Yield the section of the page; nothing for a single run."""
-    after = sorted(story.consistency.after, key=lambda one: one.p_value)
-    if not after:
-        return
-    yield make_paragraph(" ".join(safe(text, 1000) for text in format_consistency(story)))
-    heads = ("number", "joint fit, 95 %", "for another run, 95 %", "by", "chance", "each apart")
+class AgreementRow(NamedTuple):
+    """Row of the table of the report: one number, and how well its groups agree.
+
+    Attributes:
+        name: Name of the number.
+        is_consistent: Whether the groups agree within their intervals.
+        fitted: Value of the joint fit with its 95 % interval.
+        predicted: Value in a run or log that is not yet recorded, with its 95 % interval.
+        groups: Number and kind of the groups.
+        p_value: P-value of equal values in all groups.
+        drawing: Intervals of the groups, over the interval of the joint fit.
+    """
+
+    name: str
+    is_consistent: bool
+    fitted: str
+    predicted: str
+    groups: str
+    p_value: float
+    drawing: IntervalDrawing | None
+
+
+def build_agreement_rows(story: DiagnosisReportData) -> list[AgreementRow]:
+    """Build the rows of the table, the least consistent number first."""
     rows = []
-    for one in after[:MAX_TABLE_ROWS]:
+    for spread in sorted(story.consistency.after, key=lambda spread: spread.p_value):
+        halves = [(part.value, Z95 * part.error) for part in spread.group_estimates]
         rows.append(
-            [
-                safe(one.number, 60),
-                safe(_within(one, one.error)),
-                safe(_within(one, one.prediction_sigma)),
-                safe(f"{len(one.group_estimates)} {_plural(one.by)}", 60),
-                safe(format_p_value(one.p_value)),
-                _drawn(one),
-            ]
+            AgreementRow(
+                spread.number,
+                spread.is_consistent,
+                _format_interval(spread, spread.error),
+                _format_interval(spread, spread.prediction_sigma),
+                f"{len(halves)} {_plural(spread.by)}",
+                spread.p_value,
+                draw_intervals(
+                    [("after", value, value - half, value + half) for value, half in halves],
+                    (spread.value - Z95 * spread.error, spread.value + Z95 * spread.error),
+                    distance=8,
+                ),
+            )
         )
-    yield make_table(
-        heads, rows, ["" if one.is_consistent else "worst" for one in after[:MAX_TABLE_ROWS]]
-    )
-    if len(after) > MAX_TABLE_ROWS:
-        yield make_paragraph(
-            f"{len(after) - MAX_TABLE_ROWS} more numbers agree as well or better: apart.csv."
-        )
+    return rows
 
 
-def _within(one: ParameterConsistency, error: float) -> str:
+def _format_interval(spread: ParameterConsistency, error: float) -> str:
     half = Z95 * error
-    return append_unit(format_estimate(one.value, one.value - half, one.value + half), one.unit)
-
-
-def _drawn(one: ParameterConsistency) -> str:
-    """Draw the interval of each group one below the other, over a band for the joint fit."""
-    ends = [(p.value - Z95 * p.error, p.value + Z95 * p.error) for p in one.group_estimates]
-    low, high = min(e[0] for e in ends), max(e[1] for e in ends)
-    if not (np.isfinite([low, high]).all() and high > low):
-        return ""
-    scale = _DRAWN / (high - low)
-
-    def at(value: float) -> float:
-        return float(np.clip(10.0 + (value - low) * scale, 0.0, 200.0))
-
-    height = 8 * len(one.group_estimates) + 6
-    left, right = (at(one.value + side * Z95 * one.error) for side in (-1, 1))
-    width = max(right - left, 1.5)
-    shapes = [f'<rect class="joint" x="{left:.1f}" y="0" width="{width:.1f}" height="{height}"/>']
-    for row, (part, (begin, end)) in enumerate(zip(one.group_estimates, ends, strict=True)):
-        y = 8 * row + 7
-        line = f'x1="{at(begin):.1f}" x2="{at(end):.1f}" y1="{y}" y2="{y}"'
-        shapes.append(f'<line class="after" {line} stroke-width="1.5"/>')
-        shapes.append(f'<circle class="after" cx="{at(part.value):.1f}" cy="{y}" r="2.5"/>')
-    label = f"{_named(one)} of {len(one.group_estimates)} {_plural(one.by)}"
-    label = f'viewBox="0 0 200 {height}" role="img" aria-label="{safe(label, 120)}"'
-    return f'<svg class="each" {label}>{"".join(shapes)}</svg>'
+    text = format_estimate(spread.value, spread.value - half, spread.value + half)
+    return append_unit(text, spread.unit)
 
 
 def build_consistency_rows(story: DiagnosisReportData) -> list[tuple[object, ...]]:
     """Build the rows of `AGREEMENT_COLUMNS`: joint fit and groups, with 95 % intervals."""
-    found: list[tuple[object, ...]] = []
     models = [("base", story.consistency.before)]
     if story.verdict.causes:
         models.append(("extended", story.consistency.after))
+    rows: list[tuple[object, ...]] = []
     for model, spreads in models:
-        for one in spreads:
-            about = model, one.number, one.unit, one.by
-            groups = [("all", one.value, one.error)]
-            groups += [(part.group, part.value, part.error) for part in one.group_estimates]
-            groups.append(("another", one.value, one.prediction_sigma))
-            for group, value, error in groups:
-                found.append((*about, group, value, value - Z95 * error, value + Z95 * error))
-    return found
+        for spread in spreads:
+            estimates = [("all", spread.value, spread.error)]
+            estimates += [(part.group, part.value, part.error) for part in spread.group_estimates]
+            estimates.append(("another", spread.value, spread.prediction_sigma))
+            for group, value, error in estimates:
+                half = Z95 * error
+                ends = (value, value - half, value + half)
+                rows.append((model, spread.number, spread.unit, spread.by, group, *ends))
+    return rows

@@ -14,7 +14,7 @@ from bench.diagnosis.report.figure_panels import (
 )
 from bench.diagnosis.report.joint_figure import find_joint, is_robot
 from bench.diagnosis.report.motion_chart import BASE_MODEL_STYLE, EXTENDED_MODEL_STYLE
-from bench.diagnosis.report.report_data import DiagnosisReportData
+from bench.diagnosis.report.report_data import DiagnosisReportData, ResidualProfile
 from bench.diagnosis.report.wording import (
     ALL_PLACES,
     format_effect_name,
@@ -25,8 +25,7 @@ from bench.diagnosis.report.wording import (
     split_effect_name,
 )
 from bench.figures.text_layout import brief
-from bench.pages.chart import Axis, Chart, Panel, Series
-from bench.pages.data_grid import DataGrid, GridColumn
+from bench.pages.chart import Axis, Panel, Series
 from bench.pages.page_table import Table
 from sims import effects
 from sims.core.simulator import InputError
@@ -94,41 +93,6 @@ def _says(story: DiagnosisReportData, name: str) -> str:
         return ""
 
 
-def make_candidate_grid(frame: Table) -> DataGrid:
-    """Make the grid of candidates; for a robot it first shows the best place of each effect."""
-    digits = {"score": 3, "p_value": 2, "heldout_gain": 3}
-    heads = {
-        "effect": "name",
-        "p_value": "p",
-        "heldout_gain": "held-out gain",
-        "says": "what it does",
-        "set": "not to be told apart",
-    }
-    says = {
-        "score": "evidence that the simulation lacks it: twice the gain in log likelihood",
-        "p_value": "how probable as much evidence is by chance",
-        "heldout_gain": "share of the gap on runs that no fit has seen that it closes by itself",
-    }
-    columns = tuple(
-        GridColumn(name, heads.get(name, name), digits.get(name, 0), says.get(name, ""))
-        for name in frame.columns
-        if name not in ("kind", "joint", "shown")
-    )
-    filters = tuple(name for name in ("standing", "kind", "joint", "shown") if name in frame)
-    placed = "shown" in frame
-    return DataGrid(
-        "candidates-table",
-        "Every candidate",
-        CANDIDATES,
-        columns,
-        filters,
-        only={"shown": BEST} if placed else {},
-        sort="score,down",
-        marked=("standing", "found"),
-        lights="joint" if placed else "",
-    )
-
-
 def build_gap_location_table(story: DiagnosisReportData) -> Table:
     """Build a table with one row per part of the data: its RMS residual in units of the noise."""
     rows = []
@@ -148,27 +112,6 @@ def build_gap_location_table(story: DiagnosisReportData) -> Table:
     return Table.from_rows(rows)
 
 
-def make_gap_location_grid(frame: Table) -> DataGrid:
-    """Make the grid of the parts of the data, the largest gap first."""
-    after = "after" in frame
-    heads = {"before": "RMS before" if after else "RMS", "after": "RMS after"}
-    digits = {"samples": 7, "before": 3, "after": 3}
-    columns = tuple(
-        GridColumn(name, heads.get(name, name), digits.get(name, 0))
-        for name in frame.columns
-        if name != "joint"
-    )
-    return DataGrid(
-        "where-table",
-        "Parts of the data",
-        PLACES,
-        columns,
-        ("kind",),
-        sort="before,down",
-        lights="joint" if "joint" in frame else "",
-    )
-
-
 def build_residual_profile_table(story: DiagnosisReportData) -> Table:
     """Build the table of residual profiles, with one row per bin."""
     rows = []
@@ -182,48 +125,48 @@ def build_residual_profile_table(story: DiagnosisReportData) -> Table:
     return Table.from_rows(rows)
 
 
-def make_residual_profile_chart(story: DiagnosisReportData) -> Chart:
-    """Make the chart of residual profiles; the most informative ones are shown first."""
-    units = {c.name: c.unit for c in story.channels}
-    looks = {"before": BASE_MODEL_STYLE, "after": EXTENDED_MODEL_STYLE}
-    first = {id(p) for p in select_informative_profiles(story.profiles)}
+def list_less_informative_profiles(story: DiagnosisReportData) -> tuple[str, ...]:
+    """List the names of the profiles that are not shown at first."""
+    shown = {id(profile) for profile in select_informative_profiles(story.profiles)}
+    return tuple(_name(profile) for profile in story.profiles if id(profile) not in shown)
+
+
+def make_residual_profile_panels(story: DiagnosisReportData) -> list[Panel]:
+    """Make the panels of the residual profiles, the most informative ones first."""
+    units = {channel.name: channel.unit for channel in story.channels}
+    styles = {
+        "after": EXTENDED_MODEL_STYLE._replace(marker="o"),
+        "before": BASE_MODEL_STYLE._replace(marker="s"),
+    }
+    whens = ("after", "before") if has_extended_model(story) else ("before",)
+    shown = {id(profile) for profile in select_informative_profiles(story.profiles)}
     panels = []
-    names: list[str] = []
-    # The most informative profiles come first.
-    for p in sorted(story.profiles, key=lambda one: id(one) not in first):
-        about = {"channel": sanitise(p.channel, 80), "variable": sanitise(p.variable, 80)}
+    for profile in sorted(story.profiles, key=lambda profile: id(profile) not in shown):
+        channel, variable = sanitise(profile.channel, 80), sanitise(profile.variable, 80)
         series = []
-        for when in ("after", "before") if has_extended_model(story) else ("before",):
-            where = {**about, "when": when}
-            look = looks[when]._replace(marker={"before": "s", "after": "o"}[when])
-            series.append(Series(f"simulated {when}", "mean", look, where, "low", "high"))
+        for when in whens:
+            where = {"channel": channel, "variable": variable, "when": when}
+            series.append(Series(f"simulated {when}", "mean", styles[when], where, "low", "high"))
         # The title contains the full names; axes have no space for long ones.
-        name = f"{sanitise(p.channel, 80)} against {sanitise(p.variable, 80)}"
-        variable = brief(sanitise(p.variable), MAX_LABEL_LENGTH)
-        channel = sanitise(p.channel)
-        residual = f"residual of {channel}" if len(channel) <= MAX_LABEL_LENGTH else "residual"
-        names += [name] * (id(p) not in first)
+        label = f"residual of {channel}" if len(channel) <= MAX_LABEL_LENGTH else "residual"
+        up = format_label(label, units.get(profile.channel, "1"), 60)
         panels.append(
             Panel(
-                name,
+                _name(profile),
                 FOLLOWS,
                 "at",
                 tuple(series),
-                Axis(format_label(variable, p.unit), scales=("linear",)),
                 Axis(
-                    format_label(residual, units.get(p.channel, "1"), 60),
+                    format_label(brief(sanitise(variable), MAX_LABEL_LENGTH), profile.unit),
                     scales=("linear",),
-                    holds=(0.0,),
                 ),
-                {"residual of": name},
+                Axis(up, scales=("linear",), holds=(0.0,)),
+                {"residual of": _name(profile)},
                 height=230,
             )
         )
-    return Chart(
-        FOLLOWS,
-        "What the residual follows",
-        "Mean residual in bins of what it may follow; bands: ±2 standard errors.",
-        tuple(panels),
-        toggles=("residual of",),
-        off={"residual of": tuple(names)},
-    )
+    return panels
+
+
+def _name(profile: ResidualProfile) -> str:
+    return f"{sanitise(profile.channel, 80)} against {sanitise(profile.variable, 80)}"

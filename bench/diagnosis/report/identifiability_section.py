@@ -9,8 +9,9 @@ indistinguishable sets are marked. The section must not contradict the headline.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from bench.diagnosis.identifiability import ParameterIdentifiability
 from bench.diagnosis.report.report_data import DiagnosisReportData
 from bench.diagnosis.report.wording import (
     ALL_PLACES,
+    append_unit,
     format_effect,
     format_effect_name,
     format_number,
@@ -27,18 +29,9 @@ from bench.diagnosis.report.wording import (
     split_effect_name,
 )
 from bench.diagnosis.verdict import Cause
-from bench.pages.html_elements import (
-    make_code,
-    make_collapsible,
-    make_paragraph,
-    make_strong,
-    make_table,
-    safe,
-)
 
 MAX_NAMED_CAUSES = 6
 """Maximum number of names in a cell or list; the remaining ones are counted."""
-_HEADS = ("number", "can it be fixed", "95 % interval", "of its range", "mixed up with")
 _STANDINGS = ("found", "set", "identifiable", "weak", "not identifiable")
 """Status of a cause, the most certain first."""
 _SIGNS: Mapping[str, str] = {
@@ -50,11 +43,11 @@ _SIGNS: Mapping[str, str] = {
 }
 """Sign of each status in a cell of the matrix."""
 _LEGEND: Mapping[str, str] = {
-    "found": "found by the verdict",
-    "set": "explains the data as well as what was found",
-    "identifiable": "could be determined",
+    "found": "named by the verdict",
+    "set": "explains the data as well as a named cause",
+    "identifiable": "can be identified",
     "weak": "only roughly",
-    "not identifiable": "not to be seen, whether it acts or not",
+    "not identifiable": "not visible in these data",
 }
 _KINDS = {"joint": "joints", "actuator": "actuators", "body": "bodies", "channel": "channels"}
 
@@ -74,30 +67,89 @@ class _Row:
     standing: str
 
 
-def render_identifiability_section(story: DiagnosisReportData) -> Iterator[str]:
-    """Yield the section on free parameters and causes; nothing if identifiability is unknown."""
-    numbers = story.identifiability
-    if not numbers:
-        return
+class IdentifiabilityRow(NamedTuple):
+    """Row of a table: one number, whether it can be identified, and how well."""
+
+    name: str
+    status: str
+    interval: str
+    range: str
+    confounded: str
+
+
+class MatrixCell(NamedTuple):
+    """Cell of a matrix of effects by places: its sign and the sign's meaning."""
+
+    sign: str
+    label: str
+    is_found: bool
+
+
+class Matrix(NamedTuple):
+    """Matrix of effects by places of one kind; each row is an effect with its cells."""
+
+    kind: str
+    places: list[str]
+    rows: list[MatrixRow]
+
+
+class MatrixRow(NamedTuple):
+    """One effect, and its cell at each place; None where it cannot act."""
+
+    effect: str
+    cells: list[MatrixCell | None]
+
+
+class IdentifiabilitySection(NamedTuple):
+    """Content of the section of the report.
+
+    Attributes:
+        counts: Sentence on how many causes are identifiable.
+        free: Rows of the free parameters.
+        legend: Signs of the matrices and their meaning.
+        matrices: Matrices of effects that are not identifiable at every place.
+        family_headings: Headings of the table of causes without a place.
+        families: Each family of effects with the names in each column, and whether they are bold.
+        identifiable_heading: Heading of `identifiable_matrices`.
+        identifiable_matrices: Matrices of effects that are identifiable at every place.
+        all: Rows of all causes.
+    """
+
+    counts: str
+    free: list[IdentifiabilityRow]
+    legend: str
+    matrices: list[Matrix]
+    family_headings: list[str]
+    families: list[tuple[str, list[tuple[str, bool]]]]
+    identifiable_heading: str
+    identifiable_matrices: list[Matrix]
+    all: list[IdentifiabilityRow]
+
+
+def build_identifiability_section(story: DiagnosisReportData) -> IdentifiabilitySection | None:
+    """Build the section on free parameters and causes; None if identifiability is unknown."""
+    if not story.identifiability:
+        return None
     rows = _rows(story)
-    yield make_paragraph(safe(format_counts(story)))
-    free = [one for one in numbers if one.free]
-    if free:
-        yield make_table(_HEADS, [_cells(one, one.word) for one in free])
-    there = [s for s in _STANDINGS if any(row.standing == s for row in rows)]
-    yield make_paragraph(safe("; ".join(f"{_SIGNS[s]} {_LEGEND[s]}" for s in there)), "soft")
-    placed = [row for row in rows if _place(row)]
-    telling, plain = _told_apart(placed)
-    yield from _matrices(telling)
-    if others := [row for row in rows if not _place(row)]:
-        yield _families(others)
-    if plain:
-        effects = len({split_effect_name(row.effect)[0] for row in plain})
-        head = f"{effects} effects {'more ' * bool(telling)}that could be determined at every place"
-        yield make_collapsible(head, "\n".join(_matrices(plain)))
+    present = [status for status in _STANDINGS if any(row.standing == status for row in rows)]
+    unclear, clear = _told_apart([row for row in rows if _place(row)])
+    count = len({split_effect_name(row.effect)[0] for row in clear})
     ordered = sorted(rows, key=lambda row: _STANDINGS.index(row.standing))
-    every = make_table(_HEADS, [_cells(row.number, _LEGEND[row.standing]) for row in ordered])
-    yield make_collapsible(f"All {len(rows)} causes with their intervals", every)
+    without_place = [row for row in rows if not _place(row)]
+    columns = [s for s in _STANDINGS if any(row.standing == s for row in without_place)]
+    return IdentifiabilitySection(
+        counts=format_counts(story),
+        free=[_table_row(one, one.word) for one in story.identifiability if one.free],
+        legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present),
+        matrices=_matrices(unclear),
+        family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns],
+        families=_families(without_place, columns),
+        identifiable_heading=(
+            f"{count} {'more ' * bool(unclear)}effects that can be identified at every place"
+        ),
+        identifiable_matrices=_matrices(clear),
+        all=[_table_row(row.number, _LEGEND[row.standing]) for row in ordered],
+    )
 
 
 def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
@@ -111,10 +163,12 @@ def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
     return first, [row for row in rows if split_effect_name(row.effect)[0] not in telling]
 
 
-def _matrices(rows: Sequence[_Row]) -> Iterator[str]:
-    """Yield a matrix for each kind of place."""
-    for kind in dict.fromkeys(get_place_kind(row.effect) for row in rows):
-        yield _matrix([row for row in rows if get_place_kind(row.effect) == kind], kind)
+def _matrices(rows: Sequence[_Row]) -> list[Matrix]:
+    """Build a matrix for each kind of place."""
+    kinds = dict.fromkeys(get_place_kind(row.effect) for row in rows)
+    return [
+        _matrix([row for row in rows if get_place_kind(row.effect) == kind], kind) for kind in kinds
+    ]
 
 
 def format_counts(story: DiagnosisReportData) -> str:
@@ -123,7 +177,7 @@ def format_counts(story: DiagnosisReportData) -> str:
     words = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
     counts = {s: words.count(s) for s in _STANDINGS[2:]}
     sentence = (
-        f"Of {len(rows)} causes, each by itself, this recording can determine "
+        f"Of {len(rows)} causes, each considered alone, this recording can identify "
         f"{counts['identifiable']} well, {counts['weak']} roughly and "
         f"{counts['not identifiable']} not at all."
     )
@@ -161,74 +215,69 @@ def _place(row: _Row) -> str:
     return "" if place == ALL_PLACES else place
 
 
-def _best(rows: Sequence[_Row]) -> _Row:
-    return min(rows, key=lambda row: _STANDINGS.index(row.standing))
-
-
-def _matrix(rows: Sequence[_Row], kind: str) -> str:
-    """Render the matrix of effects by places of one kind."""
+def _matrix(rows: Sequence[_Row], kind: str) -> Matrix:
+    """Build the matrix of effects by places of one kind."""
     places = list(dict.fromkeys(_place(row) for row in rows))
-    by_effect: dict[str, dict[str, list[_Row]]] = {}
+    by_effect: dict[str, dict[str, _Row]] = {}
     for row in rows:
         by_place = by_effect.setdefault(split_effect_name(row.effect)[0], {})
-        by_place.setdefault(_place(row), []).append(row)
+        # Of several coefficients at a place, the best one is shown.
+        best = by_place.setdefault(_place(row), row)
+        if _STANDINGS.index(row.standing) < _STANDINGS.index(best.standing):
+            by_place[_place(row)] = row
 
-    def order(item: tuple[str, dict[str, list[_Row]]]) -> list[int]:
-        return sorted(_STANDINGS.index(_best(own).standing) for own in item[1].values())
+    def order(effect: str) -> list[int]:
+        return sorted(_STANDINGS.index(row.standing) for row in by_effect[effect].values())
 
-    body = []
-    for effect, by_place in sorted(by_effect.items(), key=order):
-        cells = [_sign(by_place[p]) if p in by_place else "" for p in places]
-        body.append(
-            [f"{safe(format_effect_name(effect), 60)} {make_code(safe(effect, 60))}", *cells]
-        )
-    heads = [safe(f"{_KINDS.get(kind, 'places')}:"), *(safe(place, 30) for place in places)]
-    return f'<div class="matrix">{make_table(heads, body)}</div>'
-
-
-def _sign(rows: Sequence[_Row]) -> str:
-    """Render a cell of the matrix: its sign, and its meaning as text."""
-    best = _best(rows)
-    said = f"{best.effect}: {_LEGEND[best.standing]}{_interval(best.number, ', ')}"
-    label = safe(said, 200)
-    sign = f'<span title="{label}" role="img" aria-label="{label}">{_SIGNS[best.standing]}</span>'
-    return make_strong(sign) if best.standing in ("found", "set") else sign
-
-
-def _families(rows: Sequence[_Row]) -> str:
-    """Render the table of causes without a place: families of effects by identifiability."""
-    columns = [s for s in _STANDINGS if any(row.standing == s for row in rows)]
-    families: dict[str, dict[str, list[str]]] = {}
-    for row in rows:
-        own = families.setdefault(row.effect.partition(".")[0], {})
-        own.setdefault(row.standing, []).append(row.effect)
-    body = []
-    for family, own in families.items():
-        cells = []
-        for column in columns:
-            names = list(dict.fromkeys(own.get(column, ())))
-            shown = _names(names)
-            cells.append(make_strong(shown) if names and column in ("found", "set") else shown)
-        body.append([safe(family, 40), *cells])
-    heads = ["family", *(f"{_SIGNS[s]} {_LEGEND[s]}" for s in columns)]
-    return make_table(heads, body)
-
-
-def _names(effects: Sequence[str]) -> str:
-    shown = ", ".join(safe(format_effect_name(effect), 60) for effect in effects[:MAX_NAMED_CAUSES])
-    more = len(effects) - MAX_NAMED_CAUSES
-    return f"{shown} and {more} more" if more > 0 else shown
-
-
-def _interval(one: ParameterIdentifiability, before: str = "") -> str:
-    return (
-        f"{before}±{format_number(one.half)} {one.unit}".rstrip() if np.isfinite(one.half) else ""
+    return Matrix(
+        _KINDS.get(kind, "places"),
+        places,
+        [
+            MatrixRow(effect, [_cell(by_effect[effect].get(place)) for place in places])
+            for effect in sorted(by_effect, key=order)
+        ],
     )
 
 
-def _cells(one: ParameterIdentifiability, word: str) -> list[str]:
-    """Format a row of a table of parameters."""
-    span = f"{format_number(one.low)} to {format_number(one.high)}"
-    mixed = joined([f"{name} ({corr:.2f})" for name, corr in one.mixed]) if one.mixed else "–"
-    return [make_code(safe(one.name, 60)), safe(word), safe(_interval(one)) or "–", safe(span),
-            safe(mixed)]  # fmt: skip
+def _cell(row: _Row | None) -> MatrixCell | None:
+    if row is None:
+        return None
+    interval = _interval(row.number)
+    label = f"{row.effect}: {_LEGEND[row.standing]}{', ' * bool(interval)}{interval}"
+    return MatrixCell(_SIGNS[row.standing], label, row.standing in ("found", "set"))
+
+
+def _families(
+    rows: Sequence[_Row], columns: Sequence[str]
+) -> list[tuple[str, list[tuple[str, bool]]]]:
+    """Build the table of causes without a place: families of effects by identifiability."""
+    families: dict[str, dict[str, list[str]]] = {}
+    for row in rows:
+        by_status = families.setdefault(row.effect.partition(".")[0], {})
+        by_status.setdefault(row.standing, []).append(row.effect)
+    return [
+        (
+            family,
+            [(_names(by_status.get(column, ())), column in ("found", "set")) for column in columns],
+        )
+        for family, by_status in families.items()
+    ]
+
+
+def _names(effects: Sequence[str]) -> str:
+    unique = list(dict.fromkeys(effects))
+    shown = ", ".join(format_effect_name(effect) for effect in unique[:MAX_NAMED_CAUSES])
+    more = len(unique) - MAX_NAMED_CAUSES
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def _interval(number: ParameterIdentifiability) -> str:
+    if not np.isfinite(number.half):
+        return ""
+    return append_unit(f"±{format_number(number.half)}", number.unit)
+
+
+def _table_row(number: ParameterIdentifiability, status: str) -> IdentifiabilityRow:
+    mixed = joined([f"{name} ({correlation:.2f})" for name, correlation in number.mixed])
+    span = f"{format_number(number.low)} to {format_number(number.high)}"
+    return IdentifiabilityRow(number.name, status, _interval(number), span, mixed or "–")

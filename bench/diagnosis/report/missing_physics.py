@@ -22,7 +22,7 @@ LAW_PREFIXES: Mapping[str, tuple[str, ...]] = {
     "bounce": ("restitution",),
 }
 """Prefixes of parameter names by law; the first law with a matching prefix applies."""
-_WARMS = "friction that changes with time, as what rubs warms or wears"
+_WARMS = "friction that changes with time, as surfaces warm or wear,"
 _LOAD = "friction that depends on the load (friction.load)"
 _WAY = "friction that differs by direction (friction.direction)"
 _PLACE = "friction that depends on position"
@@ -62,9 +62,9 @@ MISSING_PHYSICS_NAMES: Mapping[tuple[str, CovariateKind], str | tuple[str, str]]
     ("drive", "command"): ("a dead zone (input.deadband)", "a limit (input.saturation)"),
     ("drive", "speed"): ("a drive that gains with speed", "a limit of the rate (input.rate)"),
     ("drive", "load"): "a supply that sags under load",
-    ("drive", "supply"): "a drive that hangs on its supply",
+    ("drive", "supply"): "a drive that depends on its supply",
     ("drive", "time"): "a supply that sags, or a drive that warms",
-    ("inertia", "time"): "a load that changes",
+    ("inertia", "time"): "a load that changes with time",
     ("bounce", "speed"): "restitution that depends on speed (restitution.speed)",
 }
 """Missing effect by law and by covariate of the trend; two texts if an increasing and a decreasing

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import ceil, floor, log10
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from bench.diagnosis.report.summary_text import list_data_splits
 from bench.diagnosis.report.wording import format_label, format_number, format_unit, sanitise
 from bench.figures.style import BLACK, BLUE, VERMILION, MarkStyle, make_mark_style
 from bench.figures.text_layout import brief
-from bench.pages.chart import Axis, AxisSpan, Chart, Panel, PrintedFigure, Series, TooltipLine
+from bench.pages.chart import Axis, AxisSpan, Panel, Series, TooltipLine
 from bench.pages.page_table import Table
 from sims.core.simulator import Array
 
@@ -113,7 +113,7 @@ def _runs(story: DiagnosisReportData) -> list[ShownRun]:
         for row, name in enumerate(side.names):
             there = squares[row][np.isfinite(squares[row])]
             gap = float(np.sqrt(there.mean())) if there.size else 0.0
-            says = f"{sanitise(name, 40)}{use}: {format_number(gap, 2)} noises"
+            says = f"{sanitise(name, 40)}{use}: RMS residual {format_number(gap, 2)} σ"
             found.append(ShownRun(side, row, says, gap))
     shot = (id(first.side), first.row)
     return sorted(found, key=lambda run: ((id(run.side), run.row) != shot, -run.gap))
@@ -183,49 +183,42 @@ def _written(values: Array, digits: int) -> list[str]:
     return [text.rstrip("0").rstrip(".") if "." in text else text for text in texts]
 
 
-def make_motion_chart(
-    story: DiagnosisReportData, shown: MotionTable, static: PrintedFigure | None, printed: str
-) -> Chart:
-    """Make the chart of the table.
+class MotionChart(NamedTuple):
+    """Content of the chart.
 
-    Args:
-        story: Report data.
-        shown: Table of the chart.
-        static: Printed figure.
-        printed: Caption of the printed figure; safe HTML.
+    Attributes:
+        table: Table of the chart.
+        panels: Motion and residual of each channel of each run.
+        columns: Number of panels side by side.
+        sides: Position of motion and residual, in words.
+        toggles: Facets whose panels are switched on and off.
+        off: Values of toggles that are initially off.
     """
+
+    table: MotionTable
+    panels: list[Panel]
+    columns: int
+    sides: tuple[str, str]
+    toggles: tuple[str, ...]
+    off: Mapping[str, tuple[str, ...]]
+
+
+def make_motion_chart(story: DiagnosisReportData) -> MotionChart:
+    """Make the chart with its table."""
+    table, places = build_motion_table(story), _places(story)
+    is_wide = len(places) > 2 or is_robot(story)
     panels: list[Panel] = []
-    places = _places(story)
-    wide = len(places) > 2 or is_robot(story)
-    for run in shown.runs:
+    for run in table.runs:
         for facets, c in places:
-            panels += _pair(story, run, c, {"run": run.says, **facets}, wide)
-    sides = ("Left", "Right") if wide else ("Above", "Below")
-    caption = [
-        f"{sides[0]}: measured (dots) and simulated. {sides[1]}: the residual, measured less "
-        "simulated, in units of the noise σ; in the grey band 95 % of the noise would lie. All "
-        "panels have one time axis: drag across to zoom in, double-click for the whole."
-    ]
-    if shown.stretches:
-        caption.append(
-            f"Of runs of up to {shown.longest} samples not all are shown here: of each of "
-            f"{shown.stretches} stretches those at which what was measured, or a residual, is "
-            "least or largest. Each is a sample of the recording."
-        )
-    if shown.absent:
-        caption.append(f"{shown.absent} more runs, which fit better, are not shown.")
+            panels += _pair(story, run, c, {"run": run.says, **facets}, is_wide)
     toggles = ("joint", "quantity") if is_robot(story) else ("channel",)
-    return Chart(
-        MOTION_TABLE_NAME,
-        "Measured and simulated",
-        f'<span class="alive">{" ".join(caption)}</span><span class="paper">{printed}</span>',
-        tuple(panels),
-        static,
-        columns=2 if wide else 1,
-        along=True,
-        toggles=toggles,
-        off={toggles[0]: _off(story, places, toggles[0])},
-        lights=toggles[0],
+    return MotionChart(
+        table,
+        panels,
+        2 if is_wide else 1,
+        ("Left", "Right") if is_wide else ("Above", "Below"),
+        toggles,
+        {toggles[0]: _off(story, places, toggles[0])},
     )
 
 

@@ -1,9 +1,9 @@
-"""Headline sentences and warnings of the report of a comparison of diagnosers."""
+"""Conclusions and warnings of the report of a comparison of diagnosers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Hashable, Iterator
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -16,8 +16,7 @@ from bench.diagnosis_benchmark.result_tables import (
 )
 from bench.diagnosis_benchmark.wrong_answers import is_correct, select_graded_answers
 from bench.figures.style import TRUSTED_TUNERS_NOTE
-from bench.pages.html_elements import make_code, make_strong, safe
-from bench.pages.text_format import format_p_value, format_percent
+from bench.pages.text_format import format_p_value, format_percent, sanitise
 
 _SIGNIFICANCE_LEVEL = 0.05
 """Maximum Holm-corrected p-value for a significant difference between two diagnosers."""
@@ -25,68 +24,83 @@ _KINDS = {
     "clean": "false alarms in {of} clean recordings",
     "single": "of {of} single effects of at least one noise",
     "double": "of {of} pairs",
-    "foreign": "of {of} foreign causes",
+    "foreign": "of {of} causes outside the library",
 }
 
 
-def write_conclusion(shown: DiagnoserReportData) -> Iterator[str]:
-    """Yield the headline sentences as escaped HTML.
+class OwnFailures(NamedTuple):
+    """Number of questions that simgap fails on, of all questions, and failures by kind."""
 
-    They state the failures of simgap, the diagnoser that identifies most causes among those with
-    few false alarms, and the diagnosers that are significantly better than simgap.
-    """
-    yield from _own_failures(shown)
-    yield from _find_leader(shown)
-    yield from _find_better_than_simgap(shown)
+    wrong: int
+    questions: int
+    kinds: list[str]
 
 
-def _own_failures(shown: DiagnoserReportData) -> Iterator[str]:
+def count_own_failures(shown: DiagnoserReportData) -> OwnFailures | None:
+    """Count the failures of simgap; None if it does not take part."""
     own = select_graded_answers(shown.rows[shown.rows["diagnoser"] == REFERENCE_DIAGNOSER])
     if own.empty:
-        return
+        return None
     wrong = own[~is_correct(own)]
-    parts = []
-    for kind, says in _KINDS.items():
-        of = int((own["kind"] == kind).sum())
-        if of:
-            parts.append(f"{int((wrong['kind'] == kind).sum())} {says.format(of=of)}")
-    said = (
-        f"{make_strong(REFERENCE_DIAGNOSER)} fails on {len(wrong)} of {len(own)} questions: "
-        f"{', '.join(parts)}."
-    )
-    yield f'{said} <a href="#failures">They are listed first</a>.' if len(wrong) else said
+    counts = {kind: int((own["kind"] == kind).sum()) for kind in _KINDS}
+    kinds = [
+        f"{int((wrong['kind'] == kind).sum())} {_KINDS[kind].format(of=count)}"
+        for kind, count in counts.items()
+        if count
+    ]
+    return OwnFailures(len(wrong), len(own), kinds)
 
 
-def _find_leader(shown: DiagnoserReportData) -> Iterator[str]:
-    """Yield the best diagnoser among those with few false alarms, and whether its lead is clear."""
+class Leader(NamedTuple):
+    """Best diagnoser among those with few false alarms.
+
+    Attributes:
+        name: Name of the diagnoser; empty if all have too many false alarms.
+        candidates: Names of the diagnosers with few false alarms.
+        share: Causes that it names.
+        significance: Whether its lead over the others is significant.
+        clean: Number of clean recordings.
+        alarms: Its false alarms in words; empty if they show that its rate is below the limit.
+        alarm_limit: Upper limit of its rate of false alarms.
+    """
+
+    name: str
+    candidates: tuple[str, ...] = ()
+    share: str = ""
+    significance: str = ""
+    clean: int = 0
+    alarms: str = ""
+    alarm_limit: float = 0.0
+
+
+def find_leader(shown: DiagnoserReportData) -> Leader | None:
+    """Find the best diagnoser among those with few false alarms; None without clean recordings."""
     table = shown.tables["table"]
-    alarms, named = (
-        index_by_diagnoser(table, "false alarms"),
-        index_by_diagnoser(table, PRIMARY_METRIC),
-    )
-    if not any(line["of"] for line in alarms.values()):
-        return
+    alarms = index_by_diagnoser(table, "false alarms")
+    named = index_by_diagnoser(table, PRIMARY_METRIC)
+    if not any(row["of"] for row in alarms.values()):
+        return None
     quiet = [name for name in shown.order if alarms[name]["share"] <= TARGET_FALSE_ALARM_RATE]
-    asked = [name for name in quiet if named[name]["of"]]
-    limit = f"{100 * TARGET_FALSE_ALARM_RATE:g} %".replace(" %", "\u00a0%")
-    if not asked:
-        yield f"Nobody stays at {limit} of false alarms or less here."
-        return
-    best = max(asked, key=lambda name: float(named[name]["share"]))
-    said = f"Of those that alarm in {limit} of the clean recordings or less ({_names(asked)}), "
-    yield (
-        f"{said}{make_strong(safe(best, 60))} names most: {_share(named[best])}. "
-        + _is_leader_significant(shown, best, [name for name in asked if name != best])
+    candidates = [name for name in quiet if named[name]["of"]]
+    if not candidates:
+        return Leader("")
+    best = max(candidates, key=lambda name: float(named[name]["share"]))
+    others = [name for name in candidates if name != best]
+    low, high = (format_percent(named[best][end]) for end in ("low", "high"))
+    share = (
+        f"{int(named[best]['count'])} of {int(named[best]['of'])}, "
+        f"{format_percent(named[best]['share'])} (95 % interval {low} to {high})"
     )
-    line = alarms[best]
-    if line["high"] > TARGET_FALSE_ALARM_RATE:
-        yield (
-            f"That {safe(best, 60)} stays below {limit} these {int(line['of'])} clean recordings "
-            f"cannot show: {_alarms(int(line['count']))} up to {format_percent(line['high'])}."
-        )
+    row, text = alarms[best], ""
+    if row["high"] > TARGET_FALSE_ALARM_RATE:
+        text = f"{int(row['count'])} false alarm{'s' * (row['count'] != 1)}"
+    significance = _format_significance(shown, best, others)
+    return Leader(
+        best, tuple(candidates), share, significance, int(row["of"]), text, float(row["high"])
+    )
 
 
-def _is_leader_significant(shown: DiagnoserReportData, best: str, others: list[str]) -> str:
+def _format_significance(shown: DiagnoserReportData, best: str, others: list[str]) -> str:
     """Say whether simgap as the best diagnoser differs significantly from the others.
 
     Returns:
@@ -95,50 +109,41 @@ def _is_leader_significant(shown: DiagnoserReportData, best: str, others: list[s
     """
     if not others or best != REFERENCE_DIAGNOSER:
         return ""
-    lines = index_by_diagnoser(shown.tables["pairs"], "named")
-    near = [name for name in others if float(lines[name]["p_holm"]) >= _SIGNIFICANCE_LEVEL]
+    rows = index_by_diagnoser(shown.tables["pairs"], "named")
+    near = [name for name in others if float(rows[name]["p_holm"]) >= _SIGNIFICANCE_LEVEL]
     if near:
-        return f"It is not told apart from {_names(near)} (McNemar, Holm)."
-    worst = max(float(lines[name]["p_holm"]) for name in others)
-    return f"It is told apart from each of the others ({format_p_value(worst)}; McNemar, Holm)."
+        return f"It does not differ significantly from {', '.join(near)} (McNemar, Holm)."
+    largest = max(float(rows[name]["p_holm"]) for name in others)
+    return f"It differs significantly from all others ({format_p_value(largest)}; McNemar, Holm)."
 
 
-def _find_better_than_simgap(shown: DiagnoserReportData) -> Iterator[str]:
-    """Yield the metrics at which another diagnoser is significantly better than simgap."""
+def list_better_diagnosers(shown: DiagnoserReportData) -> list[dict[Hashable, Any]]:
+    """List the rows of pairs.csv in which another diagnoser is significantly better than simgap."""
     pairs = shown.tables["pairs"]
     if pairs.empty:
-        return
-    sure = pairs[
-        (pairs["p_holm"] < _SIGNIFICANCE_LEVEL) & (pairs["only_other"] > pairs["only_simgap"])
-    ]
-    for line in sure.to_dict("records"):
-        yield (
-            f"{make_strong(safe(line['diagnoser'], 60))} is better than simgap at "
-            f"“{safe(line['metric'])}”: alone right on {int(line['only_other'])} questions, simgap "
-            f"on {int(line['only_simgap'])} ({format_p_value(line['p_holm'])})."
-        )
-    if sure.empty:
-        yield "No other is better than simgap at naming or at keeping quiet, with significance."
+        return []
+    significant = pairs["p_holm"] < _SIGNIFICANCE_LEVEL
+    return pairs[significant & (pairs["only_other"] > pairs["only_simgap"])].to_dict("records")
 
 
 def write_warnings(shown: DiagnoserReportData) -> Iterator[str]:
-    """Yield sentences about limitations of the results, as escaped HTML."""
+    """Yield sentences about limitations of the results."""
     if shown.experiment.trusted:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
     if shown.case_count < shown.planned:
         yield (
-            f"{shown.case_count} of {shown.planned} questions: those that everybody has been "
-            "asked. Questions are asked in an order of chance, so these are a fair sample."
+            f"{shown.case_count} of {shown.planned} questions: those that every diagnoser has "
+            "answered. Questions are asked in random order, so these are a fair sample."
         )
     failed = shown.rows[shown.rows["status"] != "done"]
     if len(failed):
-        by = failed.groupby("diagnoser").size()
-        told = ", ".join(f"{safe(name, 60)} {count}" for name, count in by.items())
-        yield f"Without an answer (crashed, too late or too costly): {told}."
+        counts = failed.groupby("diagnoser").size()
+        each = ", ".join(f"{sanitise(name, 60)} {count}" for name, count in counts.items())
+        yield f"Without an answer (crashed, too late or too costly): {each}."
     for name, reason, count in summarise_unsupported(shown.left_out):
-        yield f"{safe(name, 60)} cannot be asked {count} of the questions: {safe(reason)}."
+        yield f"{sanitise(name, 60)} does not support {count} of the questions: {reason}."
     for name, reason in shown.skipped.items():
-        yield f"{make_code(safe(name, 60))} was not asked: {safe(reason)}"
+        yield f"{sanitise(name, 60)} was not asked: {reason}"
 
 
 def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
@@ -152,16 +157,3 @@ def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
     """
     groups = left_out.groupby(["diagnoser", "reason"], sort=False).size().reset_index(name="of")
     return [(str(n), str(why), int(of)) for n, why, of in groups.itertuples(index=False)]
-
-
-def _names(names: list[str]) -> str:
-    return ", ".join(safe(name, 60) for name in names)
-
-
-def _share(line: dict[str, Any] | pd.Series[Any]) -> str:
-    ends = f"95 % interval {format_percent(line['low'])} to {format_percent(line['high'])}"
-    return f"{int(line['count'])} of {int(line['of'])}, {format_percent(line['share'])} ({ends})"
-
-
-def _alarms(count: int) -> str:
-    return "1 alarm leaves" if count == 1 else f"{count} alarms leave"

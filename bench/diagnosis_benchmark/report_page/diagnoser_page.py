@@ -1,103 +1,66 @@
-"""Assemble report.html, the HTML report of a comparison of diagnosers."""
+"""Report of a comparison of diagnosers: the values of the template `diagnosers.html`."""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Iterator
+from pathlib import Path
 
-from bench.diagnosis_benchmark.report_page import diagnoser_charts, diagnoser_tables
-from bench.diagnosis_benchmark.report_page.diagnoser_conclusion import (
-    write_conclusion,
-    write_warnings,
-)
+from bench.diagnosis_benchmark.diagnoser_figures import TARGET_FALSE_ALARM_RATE
+from bench.diagnosis_benchmark.report_page import diagnoser_charts as charts
+from bench.diagnosis_benchmark.report_page import diagnoser_conclusion as conclusion
 from bench.diagnosis_benchmark.report_page.diagnoser_page_data import DiagnoserReportData
-from bench.diagnosis_benchmark.result_tables import REFERENCE_DIAGNOSER
-from bench.pages.html_elements import make_code, make_list, make_paragraph, safe
+from bench.diagnosis_benchmark.result_tables import PRIMARY_METRIC, REFERENCE_DIAGNOSER
+from bench.diagnosis_benchmark.wrong_answers import build_failure_table
 from bench.pages.html_page import HtmlPage
 
-_OUTCOMES = (
-    "outcomes",
-    "What became of each single effect",
-    "Recordings with one hidden effect of at least one noise; numbers in bars count them.",
-)
-_CONFUSION = (
-    "confusion",
-    "What families are taken for",
-    "Hidden causes by family (rows) and what was said (columns), in per cent of a row. On the "
-    "diagonal stands what is right.",
-)
+_TEMPLATE = Path(__file__).with_name("diagnosers.html")
+_DIGITS = 6
+"""Number of significant digits of stored numbers."""
 
 
 def render_page(shown: DiagnoserReportData) -> str:
-    """Render the HTML report of a comparison of diagnosers.
-
-    The sections are, in this order: failures (of simgap first, if it takes part), strengths, power,
-    confusion, calibration, costs, recording conditions, all answers, and how to repeat the
-    comparison.
-    """
-    name = shown.experiment.title or shown.experiment.name
-    made = (
-        f"Made by {make_code('simgap')} from the answers in {make_code(safe(shown.folder, 300))}."
+    """Render the HTML report of a comparison of diagnosers."""
+    page = HtmlPage()
+    failures = build_failure_table(shown.rows, shown.order)
+    tables = {**shown.tables, "failures": failures, "items": shown.rows}
+    tables |= charts.build_chart_tables(shown)
+    for name, table in tables.items():
+        if len(table):
+            page.add_table(name, table, _DIGITS)
+    table, power, groups = (shown.tables[name] for name in ("table", "power", "groups"))
+    confusion, costs = shown.tables["confusion"], shown.tables["costs"]
+    counts = power[power["metric"] == "named"].drop_duplicates("size")
+    metrics = list(dict.fromkeys(groups["metric"]))
+    confused = list(dict.fromkeys(confusion["diagnoser"]))
+    better = conclusion.list_better_diagnosers(shown)
+    trained = costs[costs["training_simulations"] > 0]
+    return page.render(
+        _TEMPLATE,
+        shown=shown,
+        REFERENCE=REFERENCE_DIAGNOSER,
+        PRIMARY_METRIC=PRIMARY_METRIC,
+        own=conclusion.count_own_failures(shown),
+        leader=conclusion.find_leader(shown),
+        limit=f"{100 * TARGET_FALSE_ALARM_RATE:g} %",
+        better=better,
+        has_pairs=len(shown.tables["pairs"]) > 0,
+        warnings=list(conclusion.write_warnings(shown)),
+        has_own_failures=bool((failures["diagnoser"] == REFERENCE_DIAGNOSER).any()),
+        charts=charts.make_charts(shown),
+        clean_count=int(table.loc[table["metric"] == "false alarms", "of"].max()),
+        single_count=int(table.loc[table["metric"] == PRIMARY_METRIC, "of"].max()),
+        power_counts=", ".join(
+            f"{int(count)} of {size:g} noises" for size, count in counts[["size", "of"]].to_numpy()
+        ),
+        calibration_count=int(shown.tables["calibration"]["of"].max())
+        if len(shown.tables["calibration"])
+        else 0,
+        trained=list(
+            trained[["diagnoser", "training_simulations"]].itertuples(index=False, name=None)
+        ),
+        first_metric="named" if "named" in metrics or not metrics else str(metrics[0]),
+        first_confused=(
+            REFERENCE_DIAGNOSER
+            if REFERENCE_DIAGNOSER in confused or not confused
+            else str(confused[0])
+        ),
     )
-    page = HtmlPage(f"{name}: comparison of diagnosers", made)
-    page.append(*_opening(shown, name))
-    said = f'<div class="conclusion">{make_list(write_conclusion(shown))}</div>'
-    page.append(said, *(make_paragraph(text, "warning") for text in write_warnings(shown)))
-    head = "Where simgap fails" if REFERENCE_DIAGNOSER in shown.order else "Where they fail"
-    page.add_section("failures", head, diagnoser_tables.render_failures_table(shown, page))
-    page.add_section(
-        "who",
-        "Who is good at what",
-        diagnoser_charts.render_leaderboard_chart(shown, page),
-        diagnoser_charts.render_shares_chart(shown, page),
-        diagnoser_tables.render_results_table(shown, page),
-        diagnoser_tables.render_pairs_table(shown, page),
-    )
-    page.add_section("power", "Power", diagnoser_charts.render_power_chart(shown, page))
-    page.add_section(
-        "confused",
-        "Confusion",
-        diagnoser_charts.render_static_figures(shown, page, _OUTCOMES, _CONFUSION),
-        diagnoser_tables.render_confusion_table(shown, page),
-    )
-    page.add_section(
-        "sure",
-        "How sure",
-        diagnoser_charts.render_calibration_chart(shown, page),
-        diagnoser_charts.render_set_size_chart(shown, page),
-    )
-    page.add_section(
-        "costs",
-        "Cost",
-        diagnoser_charts.render_cost_chart(shown, page),
-        diagnoser_tables.render_costs_table(shown, page),
-    )
-    page.add_section(
-        "where", "In which circumstances", diagnoser_tables.render_groups_table(shown, page)
-    )
-    page.add_section(
-        "answers-given", "Every answer", diagnoser_tables.render_answers_table(shown, page)
-    )
-    page.add_section("making", "How it was made", *_making(shown))
-    return page.to_html()
-
-
-def _opening(shown: DiagnoserReportData, name: str) -> Iterator[str]:
-    yield f"<header>\n<h1>{safe(name, 200)}</h1>"
-    counts = (
-        f"{make_code(safe(shown.experiment.name, 100))}: {len(shown.order)} diagnosers, "
-        f"{shown.case_count} questions."
-    )
-    yield make_paragraph(f"{counts} {safe(shown.experiment.says)}", "soft") + "\n</header>"
-
-
-def _making(shown: DiagnoserReportData) -> Iterator[str]:
-    experiment = shown.experiment
-    yield make_paragraph(
-        f"Each answer was allowed {experiment.budget} simulations and {experiment.timeout:g} s. "
-        "The same questions again:"
-    )
-    again = f"simgap compare {shlex.quote(f'{shown.folder}/experiment.toml')}"
-    yield f"<pre>{safe(again, 1000)}</pre>"
-    plot = f"simgap plot {shlex.quote(shown.folder)}"
-    yield make_paragraph(f"The page, tables and figures alone: {make_code(safe(plot, 500))}.")

@@ -90,12 +90,11 @@ class DiagnoserReportData:
             if name in there
         )
 
-    def make_static_figure(self, name: str, shows: str) -> PrintedFigure | None:
+    def make_static_figure(self, name: str, description: str) -> PrintedFigure | None:
         """Return the printed version of a figure, or None if the figure was not drawn.
 
         Args:
             name: name of the figure.
-            shows: text alternative for readers who cannot see the figure.
+            description: text alternative for readers who cannot see the figure.
         """
-        picture = self.pictures.get(name)
-        return None if picture is None else PrintedFigure(picture.svg, picture.pdf, shows, name)
+        return PrintedFigure.from_files(self.pictures, name, description)

@@ -54,7 +54,7 @@ class FigureView {
   }
 
   chosen(name, values) {
-    const first = name === this.spec.beside ? WHOLE : values[0];
+    const first = name === this.spec.side_by_side ? WHOLE : values[0];
     const value = state.get(this.key(name), first);
     return value === WHOLE || values.includes(value) ? value : first;
   }
@@ -116,8 +116,8 @@ class FigureView {
   addControls(panel) {
     const made = this.facets.map(([name, values]) => {
       const options = values.map((value) => [value, value]);
-      if (name === this.spec.beside) options.unshift([WHOLE, "all, side by side"]);
-      const first = name === this.spec.beside ? WHOLE : values[0];
+      if (name === this.spec.side_by_side) options.unshift([WHOLE, "all, side by side"]);
+      const first = name === this.spec.side_by_side ? WHOLE : values[0];
       return this.select(name, options, this.chosen(name, values), (value) => {
         state.chosen.delete(this.key("zoom"));
         state.set(this.key(name), value, first);

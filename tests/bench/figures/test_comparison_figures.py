@@ -60,11 +60,11 @@ def test_what_a_comparison_lacks_is_not_drawn(missing, changes):
         ("error", 2, "absolute error of restitution, median"),
         ("misfit", 2, "RMSE of z [m], median"),
         ("distance", 3, "After 12 simulations"),
-        ("runtime", 2, "share of (run, threshold) pairs reached for good"),
+        ("runtime", 2, "share of (run, threshold) pairs reached"),
         ("cost", 2, "seconds for one target"),
-        ("amortisation", 2, "instead of"),
-        ("spectra", 2, "what the data can know"),
-        ("directions", 6, "of prediction,\nRMSE of z [m]"),
+        ("amortisation", 2, "tuner that searches"),
+        ("spectra", 2, "what the data identify"),
+        ("directions", 6, "RMSE of z [m], unseen scenarios, median"),
     ],
 )
 def test_each_figure_can_be_had_without_a_file(name, axes, says):

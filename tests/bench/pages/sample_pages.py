@@ -1,5 +1,7 @@
 """Small page with each kind of content, and texts that look like markup."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 
@@ -14,8 +16,6 @@ from bench.pages.chart import (
     Series,
     TooltipLine,
 )
-from bench.pages.data_grid import DataGrid, GridColumn
-from bench.pages.html_elements import make_heading, make_paragraph, safe
 from bench.pages.html_page import HtmlPage
 
 NAMES = ("least squares", "<b>cma</b> & co", "random", "</script><script>alert(1)</script>")
@@ -78,7 +78,7 @@ def error_chart():
         )
 
     panels = tuple(panel(kind, title) for kind, title in RANGES.items())
-    return Chart("error", "Error <i>now</i>", "How to read it.", panels, still(), "targets")
+    return Chart("error", "Error <i>now</i>", panels, still(), "targets")
 
 
 def bins_chart():
@@ -88,7 +88,7 @@ def bins_chart():
         for i, n in enumerate(NAMES)
     )
     panel = Panel("Counts", "bins", "bin", series, across, Axis("targets"))
-    return Chart("bins", "Bins", "Bars and points.", (panel,))
+    return Chart("bins", "Bins", (panel,))
 
 
 def motion():
@@ -119,45 +119,20 @@ def motion_chart():
             about = {"facets": where, "spans": span, "tells": tells, "height": 160}
             panels.append(Panel(f"{joint}: {y}", "motion", "t", series, across, up, **about))
     options = {"columns": 2, "along": True, "toggles": ("joint",), "off": {"joint": ("hip",)}}
-    return Chart("motion", "Motion", "Joints.", tuple(panels), lights="joint", **options)
+    return Chart("motion", "Motion", tuple(panels), lights="joint", **options)
 
 
 def page():
-    made = HtmlPage(TITLE, f"Made by {safe('<simgap>')}.")
-    for name, frame in (
-        ("error", errors()),
-        ("bins", bins()),
-        ("notes", notes()),
-        ("motion", motion()),
-    ):
+    made = HtmlPage()
+    tables = {"error": errors(), "bins": bins(), "notes": notes(), "motion": motion()}
+    for name, frame in tables.items():
         made.add_table(name, frame)
-    made.append(f"<h1>{safe(TITLE)}</h1>", make_paragraph("A page to test pages with."))
-    made.add_section("errors", "Errors", made.render_chart(error_chart()))
-    columns = (
-        GridColumn("tuner"),
-        GridColumn("range"),
-        GridColumn("simulations", digits=5),
-        GridColumn("median", "median [rad]", 3),
+    return made.render(
+        Path(__file__).with_name("sample_page.html"),
+        TITLE=TITLE,
+        COMMAND=COMMAND,
+        error_chart=error_chart(),
+        bins_chart=bins_chart(),
+        motion_chart=motion_chart(),
+        still=still(),
     )
-    table = DataGrid(
-        "numbers", "All numbers", "error", columns, ("range",), {"range": "wide"}, "median", "tuner"
-    )
-    made.add_section("rest", "The rest", made.render_chart(bins_chart()), made.render_grid(table))
-    odd = DataGrid("notes", "Notes", "notes", (GridColumn("says"), GridColumn("value", digits=3)))
-    made.add_section("odd", "Odd texts", made.render_grid(odd), make_heading("Nothing below"))
-    told = DataGrid(
-        "joints",
-        "Joints",
-        "motion",
-        (GridColumn("joint"), GridColumn("t", digits=3)),
-        marked=("joint", "elb"),
-        sort="t,down",
-        lights="joint",
-    )
-    made.add_section(
-        "joint", "Joint by joint", made.render_chart(motion_chart()), made.render_grid(told)
-    )
-    made.append(made.render_figure("same", still(), "The same everywhere.", ("bins", "notes")))
-    made.append(f'<pre class="copied">{safe(COMMAND)}</pre>')
-    made.add_section("empty", "Nothing", "", "")
-    return made.to_html()

@@ -12,11 +12,10 @@ import pytest
 
 from bench.diagnosis.identifiability import ParameterIdentifiability
 from bench.diagnosis.report.explanation_figures import RenderedFigure
-from bench.diagnosis.report.explanation_page import render_report
-from bench.diagnosis.report.page_sections import compute_channel_errors
+from bench.diagnosis.report.explanation_page import compute_channel_errors, render_report
 from bench.diagnosis.report_data_builder import DiagnosisReportDataBuilder
 from bench.pages.data_grid import INITIAL_ROWS
-from bench.pages.html_elements import make_iframe
+from bench.pages.html_page import make_iframe
 from tests.bench.diagnosis.report.test_summary_text import VERDICTS
 from tests.bench.diagnosis.sample_report_data import DRAG, EVIL, HELD_OUT, TILT, evil, story
 
@@ -88,7 +87,10 @@ def test_every_verdict_makes_a_sound_page_that_begins_with_its_headline(verdict,
     assert reader.headline == format_headline(told)
     assert reader.tags.count("title") == reader.tags.count("h1") == 1
     assert reader.tags.index("h1") < reader.tags.index("h2") < reader.tags.index("img")
-    assert re.findall(r"<h2[^>]*>([^<]*)", html)[:2] == ["What to do next", "Run by run"]
+    assert re.findall(r"<h2[^>]*>([^<]*)", html)[:2] == [
+        "What to do next",
+        "Measured and simulated",
+    ]
     assert f"{verdict}:" in reader.text
     assert not re.search(r"\bnan\b|None|\binf\b", reader.text)
 
@@ -172,7 +174,7 @@ def test_numbers_are_those_of_the_story(figures):
     assert "0.0310 (0.0280 to 0.0340)" in text
     assert "0.00351 (0.00345 to 0.00357) kg·m²" in cells(html, "inertia")
     assert "+5.4 %, had absorbed part of the gap" in cells(html, "inertia")
-    assert cells(html, "restitution")[1] == "0.7, nominal: not touched by the data"
+    assert cells(html, "restitution")[1] == "0.7, nominal: these data do not depend on it"
     assert "1,412 simulations of system pendulum on engine batch, 2.1 s" in text
 
 
@@ -317,15 +319,18 @@ def test_what_the_recording_can_fix_comes_before_any_verdict(figures):
         ),
     )
     text = render_report(story("named", identifiability=numbers), figures)
-    said = Reader(text).text.partition("How to read this ")[2]
-    assert "Of 3 causes, each by itself, this recording can determine 1 well, 1 roughly and" in said
+    said = Reader(text).text.partition(" Terms ")[2]
+    assert (
+        "Of 3 causes, each considered alone, this recording can identify 1 well, 1 roughly and"
+        in said
+    )
     assert "All 3 causes with their intervals" in said
     assert cells(text, "sensor")[-1] == "sensor drift"
-    assert cells(text, "<code>inertia</code>")[1:3] == ["identifiable", "±1×10⁻⁵ kg*m^2"]
+    assert cells(text, "<code>inertia</code>")[1:3] == ["identifiable", "±1×10⁻⁵ kg·m²"]
     assert "&lt;b&gt;mass" in text
     assert "not identifiable – 0.1 to 1 inertia (1.00)" in said
-    assert "drag.linear found by the verdict ±1×10⁻⁴ 1 0 to 1 drag.quadratic (1.00)" in said
-    assert said.index("What this recording can fix") < said.index("Where the gap is")
+    assert "drag.linear named by the verdict ±1×10⁻⁴ 0 to 1 drag.quadratic (1.00)" in said
+    assert said.index("What the recording identifies") < said.index("Where the gap is")
 
 
 @pytest.mark.parametrize("verdict", ["named", "ambiguous", "unknown"])
@@ -339,14 +344,14 @@ def test_what_can_be_fixed_does_not_contradict_the_headline(figures, verdict):
     told = story(verdict, identifiability=tuple(numbers))
     text = render_report(told, figures)
     said = Reader(text).text.partition("Of 3 causes, ")[2].partition("Where the gap is")[0]
-    lost = "not to be seen, whether it acts or not"
+    lost = "not visible in these data"
     standings = [cells(text, f"<code>{name}</code>")[1] for name in names]
     if verdict == "unknown":
         assert standings == [lost] * 3
         assert "Found:" not in said
         return
-    alike = "explains the data as well as what was found"
-    expected = {"named": ["found by the verdict", lost, lost], "ambiguous": [alike, alike, lost]}
+    alike = "explains the data as well as a named cause"
+    expected = {"named": ["named by the verdict", lost, lost], "ambiguous": [alike, alike, lost]}
     assert standings == expected[verdict]
     assert "Found: linear drag (drag.linear)." in said
 
@@ -373,7 +378,9 @@ def test_causes_at_places_are_a_matrix_of_effects_by_places(figures):
 
 
 def test_where_nobody_knows_there_is_no_word_of_it(figures):
-    assert "What this recording can fix" not in Reader(render_report(story("named"), figures)).text
+    assert (
+        "What the recording identifies" not in Reader(render_report(story("named"), figures)).text
+    )
 
 
 def test_of_a_tracked_film_the_picture_of_its_track_stands_beside_the_curves(figures, tmp_path):

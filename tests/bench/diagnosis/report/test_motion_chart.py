@@ -12,7 +12,6 @@ from bench.diagnosis.report.motion_chart import (
     MAX_ROWS,
     MIN_ROWS_PER_CHANNEL,
     build_motion_table,
-    make_motion_chart,
     select_extreme_samples,
 )
 from bench.diagnosis.report.report_data import ChannelInfo, DataSplit
@@ -58,9 +57,9 @@ def test_long_recordings_are_thinned_said_so_and_stay_below_3_mb():
     told = long_story(channels, runs)
     found = build_motion_table(told)
     assert len(found.frame) <= 1.1 * max(MAX_ROWS, MIN_ROWS_PER_CHANNEL * channels * (runs + 1))
-    caption = make_motion_chart(told, found, None, "").caption
-    assert "Of runs of up to 25000 samples not all are shown" in caption
-    assert f"each of {found.stretches} stretches" in caption
+    page = render_report(told, {})
+    assert "Runs of up to 25000 samples are not drawn in full" in page
+    assert f"each of {found.stretches} parts of a run" in page
     # Every row is an original sample, not an average.
     frame = pd.DataFrame(found.frame.rows())
     rows = frame[(frame["run"] == "2") & (frame["channel"] == "channel_3")]
@@ -70,7 +69,7 @@ def test_long_recordings_are_thinned_said_so_and_stay_below_3_mb():
     assert float(rows["measured"].astype(float).max()) == pytest.approx(
         told.fitting.observed[1, :, 3].max(), abs=1e-4
     )
-    assert len(render_report(told, {}).encode()) < 2_300_000
+    assert len(page.encode()) < 2_300_000
 
 
 def test_of_very_many_runs_the_worst_are_shown_and_the_rest_is_counted():
@@ -87,9 +86,9 @@ def test_of_very_many_runs_the_worst_are_shown_and_the_rest_is_counted():
     names = [run.side.names[run.row] for run in found.runs]
     assert names[:3] == ["held 2", "r79", "r78"]
     assert found.absent == 82 - len(names) > 0
-    caption = make_motion_chart(told, found, None, "").caption
-    assert f"{found.absent} more runs, which fit better, are not shown." in caption
-    assert "stretches" not in caption
+    page = render_report(replace(told, fitting=many), {})
+    assert f"{found.absent} more runs, which fit better, are not drawn." in page
+    assert "not drawn in full" not in page
 
 
 def test_runs_of_one_sample_and_runs_without_any_are_no_trouble():

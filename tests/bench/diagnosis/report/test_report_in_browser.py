@@ -18,7 +18,7 @@ from bench.diagnosis.report.explanation_figures import render_figures
 from bench.diagnosis.report.explanation_page import render_report
 from bench.figures import robot_figure as drawing
 from bench.figures.figure_files import pdf_figures
-from bench.pages.html_elements import make_iframe
+from bench.pages.html_page import make_iframe
 from bench.pages.text_format import format_number
 from tests.bench.diagnosis.report.test_explanation_page import still
 from tests.bench.diagnosis.robot_report_data import CHANGE, WRISTS, robot_story
@@ -147,7 +147,7 @@ def test_the_runs_are_chosen_worst_first_and_the_view_is_kept(browser, simple, w
     pick = simple.page.locator("#motion").get_by_label("run")
     options = pick.locator("option").all_inner_texts()
     assert next(text.split(",")[0].split(":")[0] for text in options) == "held 2"
-    gaps = [float(re.search(r": ([\d.]+) noises", text)[1]) for text in options]
+    gaps = [float(re.search(r"RMS residual ([\d.]+) σ", text)[1]) for text in options]
     assert gaps[1:] == sorted(gaps[1:], reverse=True)
     side = told.held_out
     sigma = np.array([c.sigma for c in told.channels])
@@ -288,7 +288,7 @@ def test_on_paper_and_without_a_script_figures_are_printed_ones(browser, simple,
     for place in ("#motion", "#where-picture", "#candidates-picture"):
         assert simple.page.locator(f"{place} img.still").is_visible()
     assert not simple.page.locator("canvas:visible, button:not(th button):visible").count()
-    assert "In the grey band 95 % of the sensor's noise" in simple.text(
+    assert "95 % of the sensor's noise lies in the grey band" in simple.text(
         "#motion figcaption"
     ).replace("\xa0", " ")
     with Opened(browser, written["robot"].path, java_script_enabled=False) as one:

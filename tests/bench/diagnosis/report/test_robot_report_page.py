@@ -156,11 +156,11 @@ def test_the_lines_of_the_model_file_to_change():
         robot_story(changes=(CHANGE,), unwritable_causes=("a delay has no place in MJCF",)), {}
     )
     reader = Reader(html)
-    assert "What to change in the model file" in reader.text
+    assert "Changes of the model file (already made in extended.xml)" in reader.text
     assert '− <joint name="elbow" axis="0 1 0"/>' in reader.text
     assert '+ <joint name="elbow" axis="0 1 0" frictionloss="0.31"/>' in reader.text
     assert "A delay has no place in MJCF." in reader.text
-    assert "What to change" not in render_report(robot_story(), {})
+    assert "Changes of the model file" not in render_report(robot_story(), {})
 
 
 def test_texts_of_the_model_file_are_escaped():
@@ -173,8 +173,8 @@ def test_texts_of_the_model_file_are_escaped():
 def test_a_set_of_places_is_one_sentence():
     text = Reader(render_report(robot_story("ambiguous", [WRISTS]), FIGURES)).text
     assert (
-        "Not to be told apart: Coulomb friction at each of the joints wrist_1, wrist_2 and wrist_3 "
-        "change these runs so much alike that each explains them equally well." in text
+        "These data cannot distinguish: Coulomb friction at each of the joints wrist_1, wrist_2 "
+        "and wrist_3. Each of them explains these runs equally well." in text
     )
 
 

@@ -1,36 +1,27 @@
-"""Draw what data identify: spectra, parameter directions, errors along them, and prediction."""
+"""Draw what data identify: the spectrum of every target, and the parameters in each direction."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from bench.benchmark.figures.error_figures import draw_error_panel, shade_equal
 from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.problem.fisher_information import STIFF_SIGMA_THRESHOLD
-from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
 from bench.benchmark.statistics.identifiability_table import IDENTIFIABILITY_COLUMNS
 from bench.figures.style import (
     BLUE,
     CAPTION_GREY,
-    MEDIAN_LINE_CAPTION,
-    PANEL_TITLES,
     VERMILION,
     add_caption,
-    finish_figure,
     make_panel_grid,
     style_axis,
-    style_of,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from bench.benchmark.storage.reference_results import ReferenceResult
 
 _MIN_SHOWN_SIGMA = 1e-6
 """Standard deviation in training widths below which values are drawn at the edge."""
@@ -45,12 +36,6 @@ _WHERE = {
 }
 _MARKS = (("o", BLUE), ("^", VERMILION))
 """Markers and colours of the ranges, in their order."""
-METRIC_LABELS = {
-    "stiff_error": "along stiff directions\n[training widths]",
-    "sloppy_error": "along sloppy directions\n[training widths]",
-    "heldout_error": "of prediction,\nRMSE of {channel}",
-}
-"""Axis labels by metric."""
 
 
 def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
@@ -68,7 +53,7 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     figure, axes = make_panel_grid(1, 2, size, width_ratios=[1, 1.25])
     _spectra(axes[0, 0], table, len(names))
     _directions(axes[0, 1], table, names)
-    figure.suptitle(f"{experiment.title or experiment.name}: what the data can know", fontsize=11)
+    figure.suptitle(f"{experiment.title or experiment.name}: what the data identify", fontsize=11)
     real = set(table["range"]) == {"real"}
     where = "the nominal parameters" if real else "each target's truth"
     caption = (
@@ -116,7 +101,7 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     axis.set_ylim(bottom=axis.get_ylim()[0] / 10)
     axis.set_xticks(range(1, directions + 1))
     axis.set_xlabel("direction, the stiffest first")
-    axis.set_ylabel("1 sigma that no estimate can beat\n[training widths]")
+    axis.set_ylabel("smallest possible 1 sigma of an estimate\n[training widths]")
     style_axis(axis)
     axis.legend(fontsize=7.5, frameon=False, loc="lower right")
 
@@ -142,64 +127,3 @@ def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
     axis.set_yticks(range(len(names)), names, fontsize=8)
     axis.set_xlabel("direction")
     axis.set_title("share of each parameter", fontsize=9)
-
-
-def list_directional_metrics(experiment: Experiment, runs: pd.DataFrame) -> list[str]:
-    """List the metrics of `draw_directions_figure` that the runs have.
-
-    A recording has none, since its held-out runs are drawn with its errors.
-
-    Args:
-        experiment: The experiment.
-        runs: Its runs.
-    """
-    if "real" in experiment.ranges:
-        return []
-    return [m for m in METRIC_LABELS if m in runs and runs[m].notna().any()]
-
-
-def draw_directions_figure(
-    experiment: Experiment,
-    statistics: ComparisonStatistics,
-    channel: str,
-    behind: Sequence[ReferenceResult] = (),
-) -> Figure:
-    """Draw errors along stiff and sloppy directions and of prediction, against simulations.
-
-    Each column of panels is a range.
-
-    Args:
-        experiment: The experiment.
-        statistics: Its statistics, with at least one metric of `list_directional_metrics`.
-        channel: Error channel with unit, e.g. ``q [rad]``.
-        behind: Reference results that are drawn in grey.
-    """
-    runs = statistics.all_runs
-    metrics = list_directional_metrics(experiment, runs)
-    ranges = [r for r in experiment.ranges if (runs["range"] == r).any()]
-    size = (1.8 + 4.0 * len(ranges), 1.2 + 2.3 * len(metrics))
-    figure, axes = make_panel_grid(len(metrics), len(ranges), size, sharey="row", sharex=True)
-    drawn = [(metric, kind) for metric in metrics for kind in ranges]
-    style = style_of(experiment, statistics, behind, drawn)
-    for row, metric in zip(axes, metrics, strict=True):
-        for axis, kind in zip(row, ranges, strict=True):
-            part = runs[(runs["range"] == kind) & runs[metric].notna()]
-            style_axis(axis)
-            if part.empty:
-                middle = {"ha": "center", "transform": axis.transAxes}
-                axis.text(0.5, 0.5, "no target has any", fontsize=8, **middle)
-                continue
-            draw_error_panel(axis, statistics, metric, kind, style)
-            axis.set_title(f"{PANEL_TITLES[kind]} ({part['target'].nunique()} targets)", fontsize=9)
-            if axis is row[0]:
-                what = METRIC_LABELS[metric].format(channel=channel)
-                axis.set_ylabel(f"error {what}\nmedian", fontsize=9)
-            # Rows share their horizontal axis, which is labelled below the last row only.
-            if metric != metrics[-1]:
-                axis.set_xlabel("")
-    for row, metric in zip(axes, metrics, strict=True):
-        for axis in row:
-            shade_equal(axis, statistics.floor_of(metric))
-    caption = f"{MEDIAN_LINE_CAPTION} A sloppy direction is one that the target's data do not fix."
-    finish_figure(figure, [a for row in axes for a in row], style, experiment, caption)
-    return figure

@@ -1,0 +1,357 @@
+"""Charts of a comparison, from which both its page and its printed figures are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import pandas as pd
+
+from bench.benchmark.figures.comparison_view import ComparisonView
+from bench.benchmark.statistics.error_table import select_checkpoints
+from bench.benchmark.statistics.expected_running_time import build_ert_table
+from bench.benchmark.statistics.median_curves import format_bin_labels, select_distance_checkpoints
+from bench.benchmark.statistics.training_amortisation import (
+    AT_ONCE,
+    NEVER,
+    TARGETS_PER_TRAINING,
+    build_break_even_table,
+    build_time_per_target_table,
+    find_cheapest_tuners,
+    placed_even,
+)
+from bench.benchmark.storage.result_folder import StoredComparison
+from bench.figures.style import PANEL_TITLES, MarkStyle
+from bench.pages.chart import Axis, AxisSpan, Panel, ReferenceLine, Series, SeriesKind
+from bench.pages.text_format import format_number
+
+SIDE_BY_SIDE = "targets"
+"""Facet of the ranges of targets, whose panels are side by side."""
+DIRECTIONAL_METRICS = ("stiff_error", "sloppy_error", "heldout_error")
+_THINNING_STEP = 3
+"""Step between the stored points of a smooth curve."""
+
+
+@dataclass(frozen=True)
+class ComparisonChart:
+    """Panels of a chart with the tables that they need.
+
+    Attributes:
+        panels: Panels of the chart; those without data are left out.
+        tables: Tables by name.
+        side_by_side: Facet whose panels are side by side.
+        notes: Texts after names in the legend.
+    """
+
+    panels: Sequence[Panel]
+    tables: Mapping[str, pd.DataFrame]
+    side_by_side: str = SIDE_BY_SIDE
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+def make_error_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the main chart: error against simulations."""
+    runs = view.statistics.all_runs
+    # The true parameters of a recording are unknown, so its error on held-out runs is shown.
+    if view.is_recording:
+        metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
+        return _make_median_chart(
+            view, "errors", [(m, "real") for m in metrics], side_by_side="error"
+        )
+    keys = [(view.statistics.parameter_error_metric, kind) for kind in view.ranges]
+    # If the targets come from another simulator, the misfit has its own figure.
+    if not view.experiment.world:
+        keys += [("obs_error", kind) for kind in view.ranges]
+    return _make_median_chart(view, "errors", keys)
+
+
+def make_misfit_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of the misfit, if the targets come from another simulator.
+
+    The smallest possible misfit is unknown; the smallest that any tuner reached is an upper bound.
+    """
+    chart = _make_median_chart(view, "misfit", [("obs_error", kind) for kind in view.ranges])
+    panels = []
+    for panel, kind in zip(chart.panels, view.ranges, strict=False):
+        runs = view.statistics.select_range(kind)
+        least = float(runs.groupby("target")["obs_error"].min().median())
+        text = f"smallest that any tuner reached: {format_number(least, 2)} (median)"
+        panels.append(replace(panel, rules=(ReferenceLine(least, text), *panel.rules)))
+    return replace(chart, panels=panels)
+
+
+def make_directions_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of errors along stiff and sloppy directions, and of prediction."""
+    keys = [(m, kind) for m in list_directional_metrics(view.stored) for kind in view.ranges]
+    return _make_median_chart(view, "directions", keys)
+
+
+def list_directional_metrics(stored: StoredComparison) -> list[str]:
+    """List the errors of `make_directions_chart` that the runs have.
+
+    A recording has none, since its held-out runs are drawn with its errors.
+    """
+    if "real" in stored.experiment.ranges:
+        return []
+    return [m for m in DIRECTIONAL_METRICS if m in stored.runs and stored.runs[m].notna().any()]
+
+
+def _make_median_chart(
+    view: ComparisonView,
+    table: str,
+    keys: Sequence[tuple[str, str]],
+    side_by_side: str = SIDE_BY_SIDE,
+) -> ComparisonChart:
+    """Make panels of median errors against simulations, for pairs of a metric and a range."""
+    statistics, budget = view.statistics, view.experiment.budget
+    ticks = tuple(float(k) for k in select_checkpoints(budget))
+    across = Axis(
+        "simulations used on the target",
+        "symlog",
+        ("symlog", "linear"),
+        ticks,
+        ends=(-0.08, budget * 1.1),
+    )
+    frames, panels = [], []
+    for metric, kind in keys:
+        medians = statistics.compute_median_curves(metric, kind)
+        frames.append(medians.assign(range=kind, metric=metric))
+        where = {"range": kind, "metric": metric}
+        lines = _make_lines(view, medians, "median", "line", "low", "high", **where)
+        label = view.format_metric_label(metric)
+        panel = _make_panel(
+            view, kind, table, "simulations", lines, across, Axis(f"{label}, median", "log")
+        )
+        title = panel.title
+        # A recording has one range only; its panels differ in the runs.
+        if kind == "real":
+            title = f"{PANEL_TITLES[metric]} ({statistics.target_counts[kind]} starting points)"
+        floor = statistics.floor_of(metric)
+        rules: tuple[ReferenceLine, ...] = ()
+        if floor is not None:
+            rules = (ReferenceLine(floor, f"below {floor:.2g}: count as equal"),)
+        facets = {**panel.facets, "error": label}
+        panels.append(replace(panel, facets=facets, rules=rules, title=title))
+    medians = pd.concat(frames, ignore_index=True)
+    return ComparisonChart(
+        _with_data(panels),
+        {table: medians},
+        side_by_side,
+        _make_notes(view, statistics.coinciding(keys)),
+    )
+
+
+def make_distance_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of the error against the target's distance from the training range."""
+    table = view.statistics.medians_by_distance
+    label = f"{view.format_metric_label(view.statistics.parameter_error_metric)}, median"
+    across = Axis(
+        "distance from the training range [widths of it]", names=tuple(format_bin_labels(table))
+    )
+    panels = []
+    for k in select_distance_checkpoints(view.experiment.budget):
+        series = tuple(
+            Series(
+                name,
+                "median",
+                look,
+                {"tuner": name, "simulations": str(k)},
+                "low",
+                "high",
+                "points",
+                view.style.get_category_offset(name),
+            )
+            for name, look in view.get_tuner_styles(table["tuner"])
+        )
+        facets = {"after": f"{k} simulations"}
+        title = f"After {k} simulations"
+        panels.append(Panel(title, "distance", "bin", series, across, Axis(label, "log"), facets))
+    return ComparisonChart(panels, {"distance": table}, "after", _make_notes(view))
+
+
+def make_runtime_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of runtime distributions over all thresholds."""
+    table = view.statistics.runtime_distribution
+    budget = int(table["simulations"].max())
+    ticks = tuple(float(k) for k in select_checkpoints(budget))
+    across = Axis(
+        "simulations used on the target",
+        "symlog",
+        ("symlog", "linear"),
+        ticks,
+        ends=(-0.08, budget * 1.1),
+    )
+    up = Axis("share of (run, threshold) pairs reached", scales=("linear",), ends=(-0.02, 1.02))
+    panels = []
+    for kind in dict.fromkeys(table["range"]):
+        # Steps, not slopes: no threshold is reached between two simulations.
+        lines = _make_lines(view, table[table["range"] == kind], "share", "steps", range=kind)
+        panel = _make_panel(view, kind, "runtime", "simulations", lines, across, up)
+        targets = view.statistics.curves.select(range=str(kind)).keys["target"].nunique()
+        panels.append(replace(panel, title=f"{PANEL_TITLES[str(kind)]} ({targets} targets)"))
+    return ComparisonChart(panels, {"runtime": table}, notes=_make_notes(view))
+
+
+def make_ert_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of the expected running time against the error to be reached."""
+    statistics = view.statistics
+    table = statistics.sorted(
+        build_ert_table(statistics.curves, statistics.levels, view.experiment.budget)
+    )
+    across = Axis(f"error to be reached{view.unit_of_levels}", "log")
+    up = Axis("expected simulations (ERT)", "log")
+    panels = []
+    for kind in view.ranges:
+        lines = _make_lines(view, table, "ert", "line", "low", "high", range=kind)
+        panels.append(_make_panel(view, kind, "ert", "threshold", lines, across, up))
+    return ComparisonChart(_with_data(panels), {}, notes=_make_notes(view))
+
+
+def make_cost_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of seconds per target by the cost of a simulation, with the winners."""
+    across, up = (
+        Axis("seconds that one simulation takes", "log"),
+        Axis("seconds for one target", "log"),
+    )
+    parts, panels = [], []
+    for level in view.levels:
+        costs = view.statistics.tuning_costs[level]
+        table = build_time_per_target_table(costs)
+        rank = table.groupby(["range", "tuner"]).cumcount()
+        parts.append(table[rank % _THINNING_STEP == 0].assign(threshold=level))
+        for kind in view.ranges:
+            winners = list(find_cheapest_tuners(costs[kind], TARGETS_PER_TRAINING))
+            looks = dict(view.get_tuner_styles(tuner for _, _, tuner in winners))
+            spans = tuple(
+                AxisSpan(low, high, tuner, looks[tuner], foot=True) for low, high, tuner in winners
+            )
+            where = {"range": kind, "threshold": str(level)}
+            lines = _make_lines(view, table[table["range"] == kind], "seconds", "line", **where)
+            panel = _make_panel(view, kind, "seconds", "simulation_seconds", lines, across, up)
+            panels.append(_at_level(replace(panel, spans=spans), view, level))
+    return ComparisonChart(
+        _with_data(panels), {"seconds": pd.concat(parts)}, notes=_make_notes(view)
+    )
+
+
+def make_amortisation_chart(view: ComparisonView) -> ComparisonChart:
+    """Make the chart of the number of targets from which on a training pays."""
+    up = Axis("targets from which on the training pays", "log", ends=(0.1, 1e5))
+    rules = (
+        ReferenceLine(AT_ONCE, "at once: the search never reaches the error"),
+        ReferenceLine(NEVER, "never: not within 10 000 targets"),
+    )
+    parts, panels = [], []
+    for level in view.levels:
+        costs = view.statistics.tuning_costs[level]
+        searching, trained = split_by_training(view, level)
+        across = Axis("tuner that searches", names=tuple(searching))
+        for kind in view.ranges:
+            evens = placed_even(
+                build_break_even_table(view.experiment.name, kind, level, costs[kind])
+            )
+            evens = evens[evens["learned"].isin(trained)]
+            parts.append(evens.assign(row=evens["search"].map(searching.index)))
+            series = tuple(
+                Series(
+                    name,
+                    "targets",
+                    view.style.get_mark_style(name),
+                    {"learned": name, "range": kind, "threshold": str(level)},
+                    "low",
+                    "high",
+                    "points",
+                    0.6 * ((place + 0.5) / len(trained) - 0.5),
+                )
+                for place, name in enumerate(trained)
+            )
+            panel = _make_panel(view, kind, "even", "row", series, across, up)
+            panels.append(_at_level(replace(panel, rules=rules), view, level))
+    return ComparisonChart(_with_data(panels), {"even": pd.concat(parts)}, notes=_make_notes(view))
+
+
+def split_by_training(view: ComparisonView, level: float) -> tuple[list[str], list[str]]:
+    """List the searching tuners, and the trained ones that reach an error in some range.
+
+    Args:
+        view: The comparison.
+        level: The error.
+
+    Returns:
+        Two lists, each in the order of the ranking.
+    """
+    by_range = view.statistics.tuning_costs[level].values()
+    costs = {
+        tuner: [by_tuner[tuner] for by_tuner in by_range if tuner in by_tuner]
+        for tuner in view.style.order
+    }
+    trained = [t for t in costs if any(cost.fit_simulations for cost in costs[t])]
+    searching = [t for t in costs if costs[t] and t not in trained]
+    reaching = [
+        t for t in trained if any(cost.effort.compute_ert() < float("inf") for cost in costs[t])
+    ]
+    return searching, reaching
+
+
+CHARTS: Mapping[str, Callable[[ComparisonView], ComparisonChart]] = {
+    "error": make_error_chart,
+    "misfit": make_misfit_chart,
+    "distance": make_distance_chart,
+    "runtime": make_runtime_chart,
+    "cost": make_cost_chart,
+    "amortisation": make_amortisation_chart,
+    "directions": make_directions_chart,
+    "ert": make_ert_chart,
+}
+"""Charts by name; all but ``ert`` are also printed figures."""
+
+
+def _make_notes(
+    view: ComparisonView, coinciding: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Make the notes of the legend: failed runs and coinciding curves."""
+    parts = (view.statistics.notes, coinciding or {})
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: "; ".join(part[name] for part in parts if name in part) for name in names}
+
+
+def _make_panel(
+    view: ComparisonView,
+    kind: str,
+    table: str,
+    x: str,
+    series: tuple[Series, ...],
+    across: Axis,
+    up: Axis,
+) -> Panel:
+    """Make a panel of one range of targets."""
+    counted = "starting points" if kind == "real" else "targets"
+    title = f"{PANEL_TITLES[kind]} ({view.statistics.target_counts[kind]} {counted})"
+    return Panel(title, table, x, series, across, up, {SIDE_BY_SIDE: PANEL_TITLES[kind]})
+
+
+def _at_level(panel: Panel, view: ComparisonView, level: float) -> Panel:
+    """Add the error threshold to a panel's facets."""
+    reached = f"{format_number(level)}{view.unit_of_levels}"
+    return replace(panel, facets={**panel.facets, "error reached": reached})
+
+
+def _make_lines(
+    view: ComparisonView,
+    table: pd.DataFrame,
+    y: str,
+    draw: SeriesKind,
+    low: str = "",
+    high: str = "",
+    **where: str,
+) -> tuple[Series, ...]:
+    """Make a series for each tuner of a table."""
+    styles: list[tuple[str, MarkStyle]] = view.get_tuner_styles(table["tuner"])
+    return tuple(
+        Series(name, y, look, {"tuner": name, **where}, low, high, draw) for name, look in styles
+    )
+
+
+def _with_data(panels: Sequence[Panel]) -> list[Panel]:
+    """Select the panels with data; at least one, since its axes show what is missing."""
+    return [panel for panel in panels if panel.series] or list(panels[:1])

@@ -1,0 +1,91 @@
+"""Jinja2 templates of HTML pages: text is escaped, cleaned and shortened wherever it is written.
+
+Names and titles come from files and plugins. A template writes them like any other text; only
+`markupsafe.Markup` is written as it is.
+"""
+
+from __future__ import annotations
+
+import shlex
+from base64 import b64encode
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from markupsafe import Markup, escape
+
+from bench.pages.text_format import format_number, format_p_value, format_percent, sanitise
+
+if TYPE_CHECKING:
+    from jinja2 import Environment, Template
+
+TEMPLATES = Path(__file__).parent / "templates"
+"""Folder of the templates that all pages share."""
+MAX_TEXT_LENGTH = 2000
+"""Maximum number of characters of a text, unless its template asks for fewer."""
+MAX_DOCUMENT_LENGTH = 6000
+"""Maximum number of characters of a text of several lines, unless its template asks for more."""
+
+
+@cache
+def load_template(path: Path) -> Template:
+    """Load the template of a page."""
+    return _get_environment().from_string(path.read_text(encoding="utf-8"))
+
+
+@cache
+def _get_environment() -> Environment:
+    # Commands that write no page do not load Jinja2.
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        finalize=_clean,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    environment.filters |= {
+        "base64": lambda data: Markup(b64encode(data).decode("ascii")),
+        "document": format_document,
+        "number": format_number,
+        "p_value": format_p_value,
+        "percent": format_percent,
+        "shell": quote_words,
+        "short": sanitise,
+    }
+    return environment
+
+
+def _clean(value: object) -> object:
+    """Prepare a value for output: clean text of control characters, and write nothing for None."""
+    if value is None:
+        return ""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    # A non-breaking space keeps a number and its percent sign on one line.
+    return sanitise(value, MAX_TEXT_LENGTH).replace(" %", "\u00a0%")
+
+
+def quote_words(words: Iterable[object]) -> Markup:
+    """Format a command with its words quoted for a shell, as HTML.
+
+    Line breaks and escape sequences in a path must not reach a terminal unchanged.
+    """
+    return escape(shlex.join(sanitise(word, 500) for word in words))
+
+
+def format_document(text: str, most: int = MAX_DOCUMENT_LENGTH) -> Markup:
+    """Format a text of several lines with its indentation, as HTML.
+
+    Args:
+        text: Text.
+        most: Maximum number of characters.
+    """
+    shown = text if len(text) <= most else f"{text[:most]} …"
+    lines = shown.strip("\n").replace("\t", "    ").split("\n")
+    # `sanitise` removes leading spaces, so they are added again.
+    indented = (" " * (len(line) - len(line.lstrip())) + sanitise(line, 1000) for line in lines)
+    return escape("\n".join(indented))
