@@ -44,8 +44,9 @@ def add_options(
             settings |= {"action": "append", "default": [], "type": parse, "metavar": metavar}
         else:
             default = None if declared.default == () else declared.default
-            if default is not None:
-                settings["help"] += f" (default: {default})"
+            if default not in (None, "") and "(default" not in text:
+                shown = f"{default:g}" if kind == "float" else default
+                settings["help"] += f" (default: {shown})"
             settings |= {"type": parse, "default": default}
             settings |= {"choices": metadata.get("choices")} if metadata.get("choices") else {}
             settings |= {"metavar": metadata.get("metavar") or metavar}

@@ -56,6 +56,32 @@ def read_option_texts(options: type) -> dict[str, str]:
     return texts
 
 
+def takes_options(
+    options: Callable[P, Options],
+) -> Callable[[Callable[[Options], Result]], Callable[P, Result]]:
+    """Decorate a function of options: callers give the fields as arguments.
+
+    The arguments are checked as by `sims.core.argument_checks.check_arguments`.
+
+    Args:
+        options: Frozen dataclass of the options.
+    """
+
+    def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
+        signature = inspect.signature(options)
+
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> Result:
+            given = bind_checked(function.__name__, signature, get_hints(options), args, kwargs)
+            make: Callable[..., Options] = options
+            return function(make(**given.arguments))
+
+        _describe(call, options, signature)
+        return call
+
+    return decorate
+
+
 def with_options(
     options: Callable[P, Options],
 ) -> Callable[[Callable[[Source, Options], Result]], Callable[Concatenate[Source, P], Result]]:
@@ -82,10 +108,15 @@ def with_options(
             make: Callable[..., Options] = options
             return function(given.pop(source.name, source.default), make(**given))
 
-        call.__signature__ = signature  # type: ignore[attr-defined]
-        texts = read_option_texts(options) if isinstance(options, type) else {}
-        lines = [f"    {name}: {texts[name]}" for name in signature.parameters if name in texts]
-        call.__doc__ = "\n".join([inspect.cleandoc(function.__doc__ or ""), "", "Options:", *lines])
+        _describe(call, options, signature)
         return call
 
     return decorate
+
+
+def _describe(call: Any, options: Any, signature: inspect.Signature) -> None:
+    """Give a function the signature of its callers, and the descriptions of its options."""
+    call.__signature__ = signature
+    texts = read_option_texts(options)
+    lines = [f"    {name}: {texts[name]}" for name in signature.parameters if name in texts]
+    call.__doc__ = "\n".join([inspect.cleandoc(call.__doc__ or ""), "", "Options:", *lines])

@@ -7,18 +7,19 @@ that a blind test stays blind.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
 from bench.core.input_signals import evaluate_signal
+from bench.core.options import option
 from bench.core.plugin_registries import make_robot_simulator, simulators
 from bench.core.random_streams import make_rng
 from bench.logs.size_limits import check_simulation_size
 from sims import effects as library
-from sims.core.argument_checks import check_arguments
+from sims.core.argument_checks import Expected, Name, Names, check_arguments
 from sims.core.simulator import Array, InputError, Scenario, Simulator
 from sims.core.system import DefaultRecording
 from sims.core.toml_validation import check_known_names
@@ -45,47 +46,66 @@ EffectCoefficients = float | Sequence[float] | Mapping[str, float]
 """Coefficients of one effect: the first one, several in order, or some by name."""
 
 
+Effects: TypeAlias = Annotated[
+    Mapping[str, EffectCoefficients],
+    Expected("coefficients by the names of effects, as {'drag.linear': 2e-4}"),
+]
+"""Active effects with their coefficients, by name."""
+InputSignal: TypeAlias = Annotated[
+    float | str, Expected("a number or the text of a signal, as 'sine:2:0.5'")
+]
+"""Value of an input over time."""
+InitialState: TypeAlias = Annotated[
+    float | tuple[float, float], Expected("a number or (low, high)")
+]
+"""Initial state of each run, or the range from which it is drawn."""
+
+
 @dataclass(frozen=True)
 class SimulationSpec:
     """Specification of a recording to simulate; all numbers in SI units.
 
     Attributes:
-        system: Registered name; empty if a model is given.
-        model: A robot's model file, MJCF or URDF.
-        actuators: Actuators that the model file lacks, as in a recording's ``[actuators.NAME]``.
+        system: Registered name of a simulator, e.g. ``pendulum``; empty if a model is given.
+        model: Model file of a robot to simulate instead of a system, MJCF or URDF.
+        actuators: Actuators that the model file lacks, by name, as in a recording's
+            ``[actuators.NAME]``.
         parameters: Parameters that differ from their nominal values, by name; or all in order.
-        effects: Active effects with their coefficients.
-        constants: Constants that differ from their defaults.
-        noise: 1 sigma of every channel, or by channel; ``*`` stands for channels not named.
-        inputs: By name, a constant or the text of a signal (`bench.core.input_signals`).
+        effects: Active effects with one coefficient, several in order, or some by name.
+        constants: Constants that differ from the system's defaults.
+        noise: Sensor noise, 1 sigma, of every channel, or by channel; ``*`` stands for channels not
+            named.
+        inputs: By name, a constant or the text of a signal, such as ``sine:2:0.5``
+            (`bench.core.input_signals`).
         initial: Initial states by name, a value or (low, high) for a uniform draw in each run.
-        observe: Channels to record; empty for the system's default channels.
+        observe: Channels to record (default: those of the system).
         runs: Number of runs.
         seconds: Length of a run in seconds.
         rate: Samples per second.
-        engine: Engine to use; None for the batch engine if there is a choice.
+        engine: Engine of the simulation, pybullet, mujoco or batch (default: batch).
         seed: Seed of all random numbers.
-        held_out: Number of final runs that are marked as held out; None for a third of them, at
-            least one if there are several.
-        force: Whether to simulate although it needs more resources than this machine has.
+        held_out: Number of final runs that are marked as held out (default: a third of them, at
+            least one if there are several).
+        force: Simulate even if it needs more resources than this machine has.
     """
 
-    system: str = ""
+    system: Name = option("", in_command=False)
+    _: KW_ONLY
     model: str | Path | None = None
-    actuators: Mapping[str, Any] = field(default_factory=dict)
-    parameters: Mapping[str, float] | Sequence[float] = field(default_factory=dict)
-    effects: Mapping[str, EffectCoefficients] = field(default_factory=dict)
-    constants: Mapping[str, float] = field(default_factory=dict)
+    actuators: Mapping[str, Any] | None = None
+    parameters: Mapping[str, float] | Sequence[float] | None = None
+    effects: Effects | None = None
+    constants: Mapping[str, float] | None = None
     noise: float | Mapping[str, float] = 0.0
-    inputs: Mapping[str, float | str] = field(default_factory=dict)
-    initial: Mapping[str, float | tuple[float, float]] = field(default_factory=dict)
-    observe: Sequence[str] = ()
-    runs: int = 4
-    seconds: float = 4.0
-    rate: float = 100.0
-    engine: str | None = None
+    inputs: Mapping[str, InputSignal] | None = None
+    initial: Mapping[str, InitialState] | None = None
+    observe: Names = ()
+    runs: int = option(4, "N")
+    seconds: float = option(4.0, "T")
+    rate: float = option(100.0, "HZ")
+    engine: Name | None = None
     seed: int = 0
-    held_out: int | None = None
+    held_out: int | None = option(None, "M")
     force: bool = False
 
 
@@ -158,18 +178,21 @@ class _RecordingSimulation:
         self.name = wish.system or kind.name
         self.usual = _get_default_recording(kind)
         self.held_out = _held_out(wish)
-        self.theta = _theta(wish.parameters, kind)
-        self.effects = {name: _coefficients(name, c, kind) for name, c in wish.effects.items()}
+        self.theta = _theta({} if wish.parameters is None else wish.parameters, kind)
+        self.effects = {
+            name: _coefficients(name, c, kind) for name, c in (wish.effects or {}).items()
+        }
         self.engine = wish.engine
         if not self.engine and issubclass(kind, SystemSimulator) and not kind.own_engine:
             self.engine = "batch"
         self.simulator = self._simulator()
         self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
-        check_known_names("initial state", wish.initial, list(kind.states))
-        given = {name: _range(name, value) for name, value in wish.initial.items()}
+        initial, inputs = wish.initial or {}, wish.inputs or {}
+        check_known_names("initial state", initial, list(kind.states))
+        given = {name: _range(name, value) for name, value in initial.items()}
         self.ranges = {**self.usual.initial, **given}
-        check_known_names("input", wish.inputs, [c.name for c in kind.inputs])
-        inputs = {**self.usual.inputs, **wish.inputs}
+        check_known_names("input", inputs, [c.name for c in kind.inputs])
+        inputs = {**self.usual.inputs, **inputs}
         self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
         samples = _samples(wish)
         check_simulation_size(wish.runs, samples, wish.seconds, self.simulator, wish.force)
@@ -182,7 +205,7 @@ class _RecordingSimulation:
         constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
         model = self.wish.model and ModelFileReference(
-            Path(self.wish.model), self.wish.actuators, {}
+            Path(self.wish.model), self.wish.actuators or {}, {}
         )
         title = f"{system}, simulated"
         recording = Recording(path, system, title, constants, stated, runs, model=model or None)
@@ -202,8 +225,9 @@ class _RecordingSimulation:
         return SimulatedRecording(recording, truth, self.simulator)
 
     def _simulator(self) -> Simulator:
-        check_known_names("constant", self.wish.constants, [c.name for c in self.kind.constants])
-        values = {n: _number("constant", n, value) for n, value in self.wish.constants.items()}
+        constants = self.wish.constants or {}
+        check_known_names("constant", constants, [c.name for c in self.kind.constants])
+        values = {n: _number("constant", n, value) for n, value in constants.items()}
         observe = list(self.wish.observe) or list(self.usual.observe) or None
         if issubclass(self.kind, SystemSimulator):
             return self.kind(values, observe, engine=self.engine, fixed=self.effects)
@@ -254,7 +278,7 @@ def _kind(wish: SimulationSpec) -> type[Simulator]:
     return (
         simulators.get(wish.system)
         if wish.model is None
-        else make_robot_simulator(wish.model, wish.actuators)
+        else make_robot_simulator(wish.model, wish.actuators or {})
     )
 
 

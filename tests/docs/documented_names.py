@@ -6,8 +6,11 @@ import simgap
 from bench.api.comparison_options import ComparisonOptions, StudyOptions
 from bench.api.datasheet import DatasheetOptions
 from bench.api.design import DesignOptions
+from bench.api.recordings import ImportRequest
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.logs.data_frames import FrameDescription
+from bench.logs.importing.log_import import ImportOptions
+from bench.logs.synthetic_recording import SimulationSpec
 
 GROUPS = {
     "Commands": (
@@ -46,6 +49,9 @@ OPTIONS = (
     DesignOptions,
     DatasheetOptions,
     FrameDescription,
+    SimulationSpec,
+    ImportRequest,
+    ImportOptions,
     ComparisonOptions,
     StudyOptions,
 )

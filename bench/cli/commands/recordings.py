@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from bench.cli.output import EXIT_OK, EXIT_PROBLEMS_FOUND, CommandResult, JsonDocument, PrintLine
 from bench.cli.shared_options import (
-    add_force_option,
-    add_model_option,
+    add_options,
     add_out_option,
     add_pdf,
     add_plugin_option,
     add_system_options,
+    collect_options,
     parse_name_list,
     parse_path,
     parse_positive_int,
@@ -71,6 +71,8 @@ def _is_value(word: str) -> bool:
 
 def add_simulate_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap simulate`."""
+    from bench.logs.synthetic_recording import SimulationSpec
+
     parser.add_argument(
         "system",
         metavar="SYSTEM",
@@ -79,7 +81,6 @@ def add_simulate_arguments(parser: argparse.ArgumentParser) -> None:
         action=_SystemAction,
         help="see `simgap list systems`",
     )
-    add_model_option(parser, "robot to simulate instead of a system, MJCF or URDF")
     for name, metavar, text in (
         (
             "theta",
@@ -100,27 +101,9 @@ def add_simulate_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f"--{name}", action=_ValuesAction, nargs="+", default=[], metavar=metavar, help=text
         )
-    parser.add_argument(
-        "--observe", metavar="A,B,...", help="channels to record (default: those of the system)"
-    )
-    parser.add_argument(
-        "--runs",
-        type=parse_positive_int,
-        metavar="N",
-        default=4,
-        help="number of runs (default: 4)",
-    )
-    for name, metavar, kind, default, text in (
-        ("seconds", "T", float, 4.0, "length of a run in seconds (default: 4)"),
-        ("rate", "HZ", float, 100.0, "samples per second (default: 100)"),
-        ("engine", "NAME", str, None, "pybullet, mujoco or batch (default: batch)"),
-        ("seed", "K", int, 0, "seed of all random numbers (default: 0)"),
-        ("held-out", "M", int, None, "mark the last M runs as held out (default: a third)"),
-    ):
-        parser.add_argument(f"--{name}", type=kind, metavar=metavar, default=default, help=text)
+    add_options(parser, SimulationSpec, runs={"type": parse_positive_int})
     add_out_option(parser, "file to write, a new one", "FILE.csv", required=True)
     add_plugin_option(parser, "systems")
-    add_force_option(parser)
     parser.set_defaults(command=_simulate)
 
 
@@ -161,30 +144,19 @@ def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.api.recordings import simulate
     from bench.cli.key_value_args import build_simulation_spec_args
     from bench.core.plugin_registries import load_plugins
-    from bench.logs.synthetic_recording import check_output_path
+    from bench.logs.synthetic_recording import SimulationSpec, check_output_path
 
     load_plugins(options.plugin)
     check_output_path(options.out)
-    simulated = simulate(
-        options.system,
-        model=options.model,
-        observe=parse_name_list(options.observe or ""),
-        runs=options.runs,
-        seconds=options.seconds,
-        rate=options.rate,
-        engine=options.engine,
-        seed=options.seed,
-        held_out=options.held_out,
-        force=options.force,
-        **build_simulation_spec_args(
-            options.theta,
-            options.effect,
-            options.constant,
-            options.noise,
-            options.input,
-            options.initial,
-        ),
+    given = build_simulation_spec_args(
+        options.theta,
+        options.effect,
+        options.constant,
+        options.noise,
+        options.input,
+        options.initial,
     )
+    simulated = simulate(**{**collect_options(options, SimulationSpec), **given})
     simulated.write(options.out)
     first = simulated.recording.runs[0]
     truth = options.out.with_suffix(".truth.toml")

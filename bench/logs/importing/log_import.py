@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from bench.core.options import option
 from bench.logs.importing import column_guessing
 from bench.logs.importing.column_guessing import LogColumn
 from bench.logs.importing.joint_order import follow, order_of_commands
@@ -25,6 +26,7 @@ from bench.logs.importing.normalised_positions import (
 from bench.logs.importing.servo_estimation import ServoResponse, estimate_servo_response
 from bench.logs.inspection import load_recording
 from bench.logs.quality import velocity_consistency
+from sims.core.argument_checks import Name, Names
 from sims.core.simulator import Array, InputError
 from sims.core.toml_validation import check_known_names, toml_key, toml_text
 from sims.recording.log_formats.log_files import LogFile, read_log
@@ -54,22 +56,23 @@ MOST_NAMES = 12
 """Maximum number of names in a line."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImportOptions:
     """Information about logs that the user states.
 
     Attributes:
-        held_out: Names of the runs that are held out.
+        held_out: Names of the runs that are held out (default: every third one).
         rate: Rate of the rows in Hz, if the logs have no time stamps.
-        position_unit: Unit of positions and their commands, one of `POSITION_UNITS`; empty to
-            derive it from the joints' ranges.
-        calibration: Calibration file of LeRobot; None to search it in the folder of the dataset.
+        position_unit: Unit of positions and their commands for which none is stated: rad, deg, or
+            normalised (-100 to 100 of LeRobot) (default: derived from the joints' ranges).
+        calibration: Calibration file of LeRobot, by which normalised positions become angles
+            (default: the one in the folder of the dataset).
     """
 
-    held_out: Collection[str] = ()
-    rate: float | None = None
-    position_unit: str = ""
-    calibration: Path | None = None
+    held_out: Names = ()
+    rate: float | None = option(None, "HZ")
+    position_unit: Name = option("", "UNIT")
+    calibration: str | Path | None = None
 
 
 @dataclass
@@ -422,9 +425,8 @@ class _DescriptionBuilder:
         # An episode has one log; other runs may contain larger positions than the first.
         largest = max(self._largest(c) for c, _ in placed)
         options = self.options
-        self.normalised = normalised_positions(
-            path, largest, options.position_unit, options.calibration
-        )
+        calibration = None if options.calibration is None else Path(options.calibration)
+        self.normalised = normalised_positions(path, largest, options.position_unit, calibration)
         if self.normalised is not None:
             self.made_of.guessed.append(f"positions: {self.normalised.description}")
         elif (
