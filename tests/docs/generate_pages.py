@@ -36,6 +36,7 @@ from bench.schemas import load_schema
 from sims.extended_simulator import FittedValue
 from tests.docs import documented_names, tuner_table
 from tests.docs.documentation_pages import DOCS, ROOT
+from tests.docs.page_numbers import inserted_numbers
 
 COMMAND = "python -m tests.docs.generate_pages"
 NOTE = f"<!-- Written by `{COMMAND}` from the code; change it there. -->"
@@ -490,7 +491,7 @@ PAGES = {
 
 
 def main():
-    """Write all schemas of table rows and all pages."""
+    """Write all schemas of table rows and all pages, and insert numbers into the other pages."""
     for name in ROWS:
         path = ROOT / "bench" / "schemas" / f"{name}.schema.json"
         path.write_text(row_schema(name), encoding="utf-8")
@@ -498,6 +499,7 @@ def main():
     for name, make in PAGES.items():
         (DOCS / name).write_text(make(), encoding="utf-8")
         print(DOCS / name)
+    inserted_numbers.main()
 
 
 if __name__ == "__main__":
