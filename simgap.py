@@ -70,7 +70,7 @@ _WHERE = {
     "sims.extended_simulator": ("ExtendedSimulator",),
     "sims.own_simulator": ("BulletWorld", "OwnSimulator"),
     "sims.recording.recording": ("Recording", "Run"),
-    "sims.core.system": (
+    "sims.core.effect": (
         "Coefficient",
         "Contact",
         "Effect",
@@ -79,12 +79,11 @@ _WHERE = {
         "HiddenStateEffect",
         "Input",
         "Level",
-        "StateSnapshot",
         "Sensor",
         "Signal",
         "HiddenState",
-        "System",
     ),
+    "sims.core.system": ("StateSnapshot", "System"),
 }
 """Public names by module; simgap.pyi declares the same for type checkers, and a test compares."""
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}

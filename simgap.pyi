@@ -24,8 +24,7 @@ from methods.tuner import (
     TunerGenerator,
     from_callback,
 )
-from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
-from sims.core.system import (
+from sims.core.effect import (
     Coefficient,
     Contact,
     Effect,
@@ -37,9 +36,9 @@ from sims.core.system import (
     Level,
     Sensor,
     Signal,
-    StateSnapshot,
-    System,
 )
+from sims.core.simulator import Array, Channel, Constant, InputError, Parameter, Scenario, Simulator
+from sims.core.system import StateSnapshot, System
 from sims.extended_simulator import ExtendedSimulator
 from sims.own_simulator import BulletWorld, OwnSimulator
 from sims.recording.recording import Recording, Run

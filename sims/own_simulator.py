@@ -15,20 +15,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sims.core.effect import Contact, Effect, Force, Friction, HiddenStateEffect, Level
+from sims.core.engine import Engine
 from sims.core.simulator import Array, Channel, InputError, Parameter
-from sims.core.system import (
-    SYSTEM_KINDS,
-    Contact,
-    Effect,
-    Engine,
-    Force,
-    Friction,
-    HiddenStateEffect,
-    Level,
-    StateSnapshot,
-    System,
-    SystemKind,
-)
+from sims.core.system import SYSTEM_KINDS, StateSnapshot, System, SystemKind
 from sims.core.value_limits import is_plausible_number, truncate_text
 from sims.engines.adapters.bullet_world import import_pybullet
 from sims.own_simulator_engine import OwnSimulatorEngine

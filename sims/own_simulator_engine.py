@@ -19,16 +19,10 @@ from typing import Protocol
 
 import numpy as np
 
+from sims.core.effect import Force, Friction, Level
+from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, InputError
-from sims.core.system import (
-    Force,
-    Friction,
-    IntegrationBatch,
-    Level,
-    StateSnapshot,
-    System,
-    Trajectories,
-)
+from sims.core.system import StateSnapshot, System
 from sims.engines.external.external_engine import equalise_steps
 
 

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
+from sims.core.effect import Coefficient, Effect, Level
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.core.system import Coefficient, Effect, Level, System
+from sims.core.system import System
 from sims.effects import registry
 
 

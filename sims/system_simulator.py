@@ -9,24 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims import effects as library
-from sims.core.simulation_counter import SIMULATION_COUNTER
-from sims.core.simulator import Array, InputError, Parameter, Scenario, Simulator
-from sims.core.system import (
+from sims.core.effect import (
     ActiveEffects,
     Contact,
     Effect,
-    Engine,
     Force,
     Friction,
     HiddenStateEffect,
     Input,
-    IntegrationBatch,
     Level,
     Sensor,
     Signal,
-    System,
-    Trajectories,
 )
+from sims.core.engine import Engine, IntegrationBatch, Trajectories
+from sims.core.simulation_counter import SIMULATION_COUNTER
+from sims.core.simulator import Array, InputError, Parameter, Scenario, Simulator
+from sims.core.system import System
 from sims.core.toml_validation import format_value
 from sims.core.value_limits import is_plausible_number
 from sims.engines import HIDDEN_STATE_ENGINES, make_engine

@@ -13,8 +13,8 @@ from bench.conformance.simulator_checks import SIMULATOR_CHECKS, SIMULATOR_NEEDS
 from bench.conformance.tuner_checks import TUNER_CHECKS, TUNER_NEEDS
 from bench.core.diagnoser import Diagnoser
 from methods.tuner import Tuner
+from sims.core.effect import Effect
 from sims.core.simulator import InputError, Simulator
-from sims.core.system import Effect
 
 if TYPE_CHECKING:
     import pytest

@@ -21,8 +21,7 @@ from bench.conformance.robot_place_checks import (
 )
 from bench.core.plugin_registries import PartUnavailableError, simulators
 from sims import effects
-from sims.core.simulator import Array, InputError, Scenario
-from sims.core.system import (
+from sims.core.effect import (
     Contact,
     Effect,
     Force,
@@ -32,9 +31,9 @@ from sims.core.system import (
     Level,
     Sensor,
     Signal,
-    StateSnapshot,
-    System,
 )
+from sims.core.simulator import Array, InputError, Scenario
+from sims.core.system import StateSnapshot, System
 from sims.own_simulator import OwnSimulator
 from sims.system_simulator import SystemSimulator
 
@@ -176,7 +175,7 @@ def _contributions(
     if isinstance(acting, Level):
         return [(acting.keep(c, e), e)]
     raise CheckError(
-        f"expected one of the hook classes; found {type(acting).__mro__}; see sims.core.system"
+        f"expected one of the hook classes; found {type(acting).__mro__}; see sims.core.effect"
     )
 
 

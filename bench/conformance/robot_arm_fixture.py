@@ -16,7 +16,7 @@ from sims.core.simulator import Scenario
 from sims.effects import registry
 
 if TYPE_CHECKING:
-    from sims.core.system import Effect
+    from sims.core.effect import Effect
     from sims.robot.robot_simulator import RobotSimulator
 
 ARM_MJCF = """

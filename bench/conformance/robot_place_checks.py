@@ -13,8 +13,7 @@ from bench.conformance.robot_arm_fixture import (
     make_arm_simulator,
     make_scenario,
 )
-from sims.core.simulator import Array, InputError
-from sims.core.system import (
+from sims.core.effect import (
     Effect,
     Force,
     Friction,
@@ -23,6 +22,7 @@ from sims.core.system import (
     ModelValueEffect,
     Sensor,
 )
+from sims.core.simulator import Array, InputError
 
 NO_PLACE = NotApplicable("a robot has no place for it")
 _SHARES = (0.3, 0.9)

@@ -29,9 +29,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sims import effects as effects_library
+from sims.core.effect import Effect
 from sims.core.simulation_counter import SIMULATION_COUNTER
 from sims.core.simulator import Array, InputError, Scenario
-from sims.core.system import Effect
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator
 

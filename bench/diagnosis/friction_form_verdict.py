@@ -16,8 +16,8 @@ from bench.core.random_streams import make_rng
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel, ModelSet
+from sims.core.effect import Effect, Friction, members_of
 from sims.core.simulator import Array
-from sims.core.system import Effect, Friction, members_of
 from sims.system_simulator import SystemSimulator
 
 _HOLDS = ", and holds still what pulls less"

@@ -31,8 +31,8 @@ from bench.diagnosis.fitting.fit_state import TrajectoryFit
 from bench.diagnosis.fitting.trajectory_fit import compute_state_prior
 from bench.diagnosis.search.candidate_directions import DirectionSet, compute_directions
 from bench.diagnosis.validation.gain_and_intervals import Z95
+from sims.core.effect import ALL_PLACES
 from sims.core.simulator import Array
-from sims.core.system import ALL_PLACES
 
 IdentifiabilityLevel = Literal["identifiable", "weak", "not identifiable"]
 

@@ -36,8 +36,8 @@ from bench.diagnosis.validation.gain_and_intervals import (
 )
 from bench.diagnosis.validation.held_out_runs import Validation
 from bench.diagnosis.verdict import Candidate, Cause, HeldOutResult, Verdict, to_finite_or_none
+from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array
-from sims.core.system import Effect, members_of
 from sims.extended_simulator import FittedValue
 from sims.recording.recording import Recording
 from sims.robot.fitted_causes import GRAVITY_COMPENSATED, is_gravity_compensated

@@ -1,10 +1,9 @@
-"""Interfaces of systems, effects and engines.
+"""Interface of systems, and the state at which their forces are evaluated.
 
 A *system* is declared once (`System`): names, units, and its generalised forces as array functions.
-An *engine* integrates it (`Engine`), many batch elements at once. An *effect* (`Effect`) adds one
-contribution through one hook. They are independent of each other's implementation and communicate
-through `StateSnapshot`, the state at which forces are evaluated, and `IntegrationBatch`, the work
-for an engine.
+An *engine* integrates it (`sims.core.engine`), many batch elements at once. An *effect*
+(`sims.core.effect`) adds one contribution. They are independent of each other's implementation and
+communicate through `StateSnapshot`, the state at which forces are evaluated.
 
 Shapes: L batch elements (each a parameter vector in a run), D coordinates, S steps, K coefficients.
 Numbers per batch element are (L, 1), so that they can be multiplied with generalised vectors
@@ -22,22 +21,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from sims.core.simulator import Array, Channel, Constant, Parameter
 
+EffectClass = type[Any]
+"""Class of an effect; see `sims.core.effect.Effect`, which depends on this module."""
+
 SystemKind = Literal["point", "linear", "rotary"]
 """Unit of a system's forces: `point` per unit mass (m/s^2), `linear` in N, `rotary` in N*m."""
 SYSTEM_KINDS: tuple[SystemKind, ...] = ("point", "linear", "rotary")
 """All kinds, in the order of a coefficient's units and ranges."""
-PlaceKind = Literal["joint", "actuator", "body", "channel", "world", "level"]
-"""Kinds of places where an effect acts; `level` exists only in user-defined simulators."""
-ALL_PLACES = "*"
-"""Place of an effect that acts at all places of its kind."""
 STANDARD_GRAVITY = 9.80665
 """Standard gravity in m/s^2 (3rd General Conference on Weights and Measures, 1901)."""
 
@@ -287,7 +284,7 @@ class System(ABC):
         return 1.0
 
     @classmethod
-    def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
+    def placed(cls, effect: EffectClass) -> Sequence[EffectClass]:
         """Return the forms of a registered effect that this system can have; empty if none.
 
         This is the effect itself in a system with one place, and a class for each place and family
@@ -296,7 +293,7 @@ class System(ABC):
         return (effect,) if effect.fits(cls) else ()
 
     @classmethod
-    def effect(cls, name: str) -> type[Effect] | None:  # noqa: ARG003
+    def effect(cls, name: str) -> EffectClass | None:  # noqa: ARG003
         """Return the effect with a name that only this system defines, such as those of its places.
 
         The result is None for registered effects.
@@ -304,7 +301,7 @@ class System(ABC):
         return None
 
     @classmethod
-    def refuses(cls, effect: type[Effect]) -> str:  # noqa: ARG003
+    def refuses(cls, effect: EffectClass) -> str:  # noqa: ARG003
         """Return why the system cannot have an effect although it has all that the effect `needs`.
 
         The result is empty if it can.
@@ -379,508 +376,3 @@ class System(ABC):
         It is less than 1 where the body begins to roll; None for no such limit.
         """
         return None
-
-
-CoefficientReference = Literal[
-    "",
-    "input",
-    "input/s",
-    "input/s^2",
-    "error",
-    "reading",
-    "reading/s",
-    "drive",
-    "level",
-    "travel",
-    "stop",
-    "give",
-    "rotor",
-]
-"""Quantity from which the unit of a coefficient is derived, or the meaning of a coefficient."""
-
-
-@dataclass(frozen=True)
-class Coefficient:
-    """Number of an effect, zero where the effect is off.
-
-    Attributes:
-        name: Name; ``coefficient`` if the effect has only one.
-        units: Units for a point (per unit mass), linear and rotary system; None where the effect
-            does not exist.
-        plausible: Plausible ranges, in the same order.
-        of: Quantity whose unit it has, if `units` are only the default ones: ``input`` the first
-            input, ``error`` likewise for values compared with a servo's error, ``reading`` the
-            channel on which it acts, ``input/s`` and ``reading/s`` per second, ``input/s^2`` per
-            second squared, ``level`` the stored quantity. Other values state a meaning: ``stop`` is
-            the stiffness of a stop at the position given by coefficient ``place``; ``drive`` is a
-            limit of the drive's force and ``travel`` a part of its travel, with units of their own;
-            ``give`` is a compliance; ``rotor`` is an inertia that a model file may state itself.
-        least: Lower bound of a fit that is not a matter of plausibility; None for none.
-        most: Upper bound of a fit that is not a matter of plausibility; None for none.
-        tried: Values at which a search for it begins, if an evenly spaced grid would be too large.
-    """
-
-    name: str
-    units: tuple[str | None, str | None, str | None]
-    plausible: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
-    of: CoefficientReference = ""
-    least: float | None = None
-    most: float | None = None
-    tried: tuple[float, ...] = ()
-
-    def unit(self, kind: SystemKind) -> str | None:
-        """Return the unit on systems of this kind; None if the effect does not exist there."""
-        return self.units[SYSTEM_KINDS.index(kind)]
-
-    def unit_on(self, system: System | type[System], observed: Sequence[str] = ()) -> str | None:
-        """Return the unit on this system; None if the effect does not exist there.
-
-        Args:
-            system: System on which the effect acts.
-            observed: Names of the recorded channels (default: all).
-        """
-        if system.has_model:
-            return self.unit(system.kind)
-        if self.of.startswith(("input", "error")) and system.inputs:
-            return self.of.replace("error", "input").replace("input", system.inputs[0].unit)
-        if self.of.startswith("reading"):
-            units = {channel.name: channel.unit for channel in system.channels}
-            return self.of.replace("reading", units[system.reading(observed or tuple(units))])
-        return self.unit(system.kind)
-
-    def range(self, kind: SystemKind) -> tuple[float, float]:
-        """Return the plausible range on systems of this kind."""
-        return self.plausible[SYSTEM_KINDS.index(kind)]
-
-
-class Effect(ABC):
-    """Physical cause that a simulator may lack. Subclass one of the hook classes below instead.
-
-    A coefficient vector `c` has the shape (K, L, 1): ``c[0]`` is the first coefficient of all batch
-    elements.
-
-    Attributes:
-        name: Name, ``family.form``.
-        noun: Noun with article for reports, such as ``linear drag`` or ``a sensor bias``; if empty,
-            the name and the beginning of `says` are used.
-        says: Description in one sentence, as the end of "the data say that ...".
-        source: Reference for the law.
-        coefficients: Its numbers; if all are zero, the effect is off and must not change anything,
-            bit for bit. Those that a kind of system does not have come last and remain zero there;
-            a kind that lacks the first one lacks the effect.
-        needs: Property that the system must have: ``input``; ``ground`` that it strikes; ``guide``,
-            which a freely flying body lacks; ``joint``, a single one; ``servo``, an input that is a
-            set point; ``gravity``; ``push``, the response to horizontal acceleration; ``space``,
-            three dimensions; ``model``, a file that states its numbers; ``level``, a stored
-            quantity; or empty.
-        contains: Simpler effects to which it reduces if some of its coefficients are zero.
-        hook: Hook of the engine that it uses; set by the hook classes.
-        sharp: Whether it begins and ends at a position within a step, so that finer steps are
-            needed.
-        at: Kind of its places in a robot.
-        place: Place in a robot: the joint, actuator, body or channel where it acts; ``*`` for a
-            family; empty for an effect of the world and in systems with one place.
-        coordinate: Coordinate on which it acts; None for the system's primary one.
-        signal: Input or channel on which it acts; empty for the first, or for all.
-        of: Name of the registered effect of which it is a form at one place.
-    """
-
-    name: ClassVar[str]
-    noun: ClassVar[str] = ""
-    says: ClassVar[str]
-    source: ClassVar[str] = ""
-    coefficients: ClassVar[tuple[Coefficient, ...]]
-    needs: ClassVar[str] = ""
-    contains: ClassVar[tuple[str, ...]] = ()
-    hook: ClassVar[str]
-    sharp: ClassVar[bool] = False
-    at: ClassVar[PlaceKind]
-    place: ClassVar[str] = ""
-    coordinate: ClassVar[int | None] = None
-    signal: ClassVar[str] = ""
-    of: ClassVar[str] = ""
-
-    def parts(self, c: Array) -> ActiveEffects:
-        """Return the effect as the sum of effects at one place each.
-
-        Args:
-            c: Coefficients (K, L, 1).
-
-        Returns:
-            The effects with their coefficients.
-        """
-        return ((self, c),)
-
-    def taking(self, c: Array, simpler: str, given: Array) -> Array:  # noqa: ARG002
-        """Return coefficients that include a simpler effect, which this effect replaces.
-
-        Args:
-            c: (k,) coefficients of this effect.
-            simpler: Name of the simpler effect, one of `contains`.
-            given: Coefficients of the simpler effect.
-
-        Returns:
-            Coefficients (k,); the default implementation returns `c` unchanged.
-        """
-        return c
-
-    @classmethod
-    def fits(cls, system: System | type[System]) -> bool:
-        """Return whether the system can have this effect."""
-        return not cls.misses(system)
-
-    @classmethod
-    def misses(cls, system: System | type[System]) -> str:
-        """Return why the system cannot have this effect; empty if it can."""
-        declared = system if isinstance(system, type) else type(system)
-        heavy = any(c.name == "gravity" for c in system.constants)
-        says_push = declared.push is not System.push
-        in_space = len(system.coordinates) == 3
-        lacks = {
-            "": "",
-            "input": "" if system.inputs else "it has no input",
-            "ground": "" if system.bounces else "it meets no ground",
-            # A bouncing body flies freely: dry friction and springs would act against nothing.
-            "guide": "it flies freely" if system.bounces else "",
-            "joint": "" if _is_joint(system) else "it is not one joint alone",
-            "servo": "" if declared.servo else "it has no servo that follows a set point",
-            "gravity": "" if heavy else "it states no gravity",
-            "push": "" if says_push else "it does not say what horizontal acceleration does",
-            "space": "" if in_space else "it does not move in three dimensions",
-            "model": ""
-            if declared.has_model
-            else "it has no model file whose numbers may be wrong",
-            "level": "" if declared.levels else "it names no level that could spill over",
-        }[cls.needs]
-        undefined = "" if cls.on(system) else f"it is not defined for a {system.kind} system"
-        return lacks or undefined or system.refuses(cls)
-
-    @classmethod
-    def on(cls, system: System | type[System]) -> tuple[Coefficient, ...]:
-        """Return the coefficients that the effect has on this system."""
-        # Coefficients that the kind does not have come last.
-        return tuple(takewhile(lambda c: c.unit(system.kind) is not None, cls.coefficients))
-
-
-def _is_joint(system: System | type[System]) -> bool:
-    """Return whether a system is a single joint, declared by equations."""
-    return len(system.coordinates) == 1 and not system.bounces and not system.has_model
-
-
-def members_of(effect: Effect | type[Effect]) -> Sequence[Any]:
-    """Return the members of a family, which are instances; otherwise the effect alone."""
-    members: Sequence[Any] = getattr(effect, "members", ()) or (effect,)
-    return members
-
-
-class Force(Effect):
-    """Generalised force, added to the others."""
-
-    hook = "force"
-    at: ClassVar[PlaceKind] = "joint"
-
-    @abstractmethod
-    def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the generalised force (L, D).
-
-        Args:
-            c: Coefficients (K, L, 1).
-            moment: State of all batch elements.
-        """
-
-
-class Friction(Effect):
-    """Dry friction, which opposes motion with at most `limit` and prevents motion at lower loads.
-
-    Engines add the limits of all frictions and apply one force against the motion.
-    """
-
-    hook = "force"
-    at: ClassVar[PlaceKind] = "joint"
-
-    @abstractmethod
-    def limit(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return the maximum force (L, 1), >= 0.
-
-        Args:
-            c: Coefficients (K, L, 1).
-            moment: State of all batch elements.
-        """
-
-
-@dataclass(frozen=True)
-class HiddenState:
-    """Hidden state of an effect.
-
-    Attributes:
-        x: (L, 1) position, or another first quantity.
-        v: (L, 1) rate of `x`.
-    """
-
-    x: Array
-    v: Array
-
-
-@dataclass(frozen=True)
-class SeriesElement:
-    """Element in series between a drive and its load, for many batch elements.
-
-    Attributes:
-        stiffness: (L,) stiffness of its spring, N/m or N m/rad; no spring if not above zero.
-        damping: (L,) damping ratio of the load on that spring.
-        gap: (L,) backlash between its flanks, m or rad; with a spring, the flanks are elastic.
-        drive: (L,) inertia of the drive in addition to the stated one, as a share of the joint's.
-    """
-
-    stiffness: Array
-    damping: Array
-    gap: Array
-    drive: Array
-
-
-class HiddenStateEffect(Effect):
-    """Force with a hidden state, which no sensor shows and which is integrated as a coordinate.
-
-    It is off where its first coefficient is not above zero.
-    """
-
-    hook = "hidden"
-    at: ClassVar[PlaceKind] = "joint"
-    needs = "joint"
-    fastest: ClassVar[float] = 0.0
-    """Maximum angular frequency of its oscillations in rad/s, if it is not visible at rest."""
-    between: ClassVar[tuple[Coefficient, ...]] = ()
-    """Its coefficients where both sides are known, as in a robot.
-
-    Only for an element in series between a drive and its load.
-    """
-
-    def element(self, c: Array) -> SeriesElement:
-        """Return the series element with these values (K, L) of the coefficients `between`."""
-        raise NotImplementedError
-
-    def behind(self, c: Array) -> Array:
-        """Return the share (L, 1) of the joint's inertia on the hidden coordinate, below 1."""
-        return np.zeros_like(c[0])
-
-    def begin(self, c: Array, moment: StateSnapshot) -> HiddenState:  # noqa: ARG002
-        """Return the hidden state at the beginning of the run.
-
-        Args:
-            c: Coefficients (K, L, 1).
-            moment: State of all batch elements at the beginning.
-        """
-        return HiddenState(np.zeros_like(c[0]), np.zeros_like(c[0]))
-
-    @abstractmethod
-    def act(self, c: Array, moment: StateSnapshot, state: HiddenState) -> tuple[Array, Array]:
-        """Return the generalised force and the rate of the hidden state.
-
-        Args:
-            c: Coefficients (K, L, 1).
-            moment: State of all batch elements.
-            state: Hidden state.
-
-        Returns:
-            Force (L, D) that the effect adds, and rate (L, 1) of `state.v`.
-        """
-
-
-class ModelValueEffect(Effect):
-    """Number in a robot's model file that may be wrong; the engine writes it into the model."""
-
-    hook = "value"
-    needs = "model"
-
-
-class Level(Effect):
-    """Bound of a stored quantity, such as a tank's level.
-
-    A user-defined simulator applies it after each of its steps.
-    """
-
-    hook = "level"
-    at: ClassVar[PlaceKind] = "level"
-    needs = "level"
-
-    @abstractmethod
-    def keep(self, c: Array, level: Array) -> Array:
-        """Return the bounded level (L, 1).
-
-        Args:
-            c: Coefficients (K, L, 1).
-            level: (L, 1) level before.
-        """
-
-
-class Contact(Effect):
-    """Change of an impact with the ground."""
-
-    hook = "contact"
-    at: ClassVar[PlaceKind] = "world"
-
-    def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:  # noqa: ARG002
-        """Return the restitution (L, 1).
-
-        Args:
-            c: Coefficients (K, L, 1).
-            restitution: (L, 1) restitution without the effect.
-            speed: (L, 1) impact speed, >= 0, m/s.
-        """
-        return restitution
-
-    def friction(self, c: Array) -> Array:
-        """Return the friction coefficient (L, 1).
-
-        The tangential speed lost is this times (1 + e) |vn|, limited by the tangential speed
-        itself.
-        """
-        return np.zeros_like(c[0])
-
-
-@dataclass(frozen=True)
-class Signal:
-    """Signal on the steps of an integration.
-
-    Attributes:
-        values: (L, S) for an input, the constant value over each step; for a reading, the value at
-            its end.
-        steps: (L, S) lengths of the steps, s; zero where a batch element waits.
-        start: (L, 1) value before the first step.
-        times: (L, S) time since the start of the run at the end of each step, s.
-        clock: (L, 1) time stamp of the recording at the start of the run, s.
-    """
-
-    values: Array
-    steps: Array
-    start: Array
-    times: Array
-    clock: Array | float = 0.0
-
-
-class Input(Effect):
-    """Change of the first input on its way to the plant.
-
-    Several effects are applied in the order given by the user.
-    """
-
-    hook = "input"
-    at: ClassVar[PlaceKind] = "actuator"
-    needs = "input"
-    between: ClassVar[bool] = False
-    """Whether its first coefficient is the share of the opposite interpolation between samples.
-
-    That is linear interpolation for an input that is stated to be held, and the reverse.
-    """
-
-    def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
-        """Return the times (L, S) of the commands that are applied at times t (L, S).
-
-        Args:
-            c: Coefficients (K, L, 1).
-            t: (L, S) times since the start of the run, s.
-        """
-        return t
-
-    def feel(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
-        """Return the applied values (L, S) over the steps.
-
-        Args:
-            c: Coefficients (K, L, 1).
-            signal: Signal before the effect.
-        """
-        return signal.values
-
-
-class Sensor(Effect):
-    """Change of an observation by the sensor that records it."""
-
-    hook = "sensor"
-    at: ClassVar[PlaceKind] = "channel"
-    filters: ClassVar[bool] = False
-    """Whether `read` needs every step of the integration instead of the samples only."""
-
-    def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
-        """Return the times (L, T) at which the system is really sampled.
-
-        Args:
-            c: Coefficients (K, L, 1).
-            t: (L, T) recorded times since the start of the run, s.
-        """
-        return t
-
-    def read(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
-        """Return the recorded values (L, S).
-
-        Args:
-            c: Coefficients (K, L, 1).
-            signal: Signal before the effect.
-        """
-        return signal.values
-
-
-ActiveEffects = tuple[tuple[Effect, Array], ...]
-"""Effects with their coefficients (K, L, 1)."""
-
-
-@dataclass(frozen=True)
-class IntegrationBatch:
-    """Batch of simulations to be integrated by an engine.
-
-    Attributes:
-        system: System to integrate.
-        theta: (L, p) parameters of the system.
-        constants: Constants (L, 1) by name.
-        x: (L, D) initial position.
-        v: (L, D) initial velocity.
-        steps: (L, S) lengths of the steps, s; zero where a batch element has finished.
-        inputs: Applied inputs (L, S) by name, constant over each step.
-        effects: Forces, frictions, contacts and effects with other hooks of the engine; inputs and
-            sensors are processed outside the engine.
-        steps_per_sample: Number of steps after which the state is stored, in addition to the
-            initial state.
-    """
-
-    system: System
-    theta: Array
-    constants: Mapping[str, Array]
-    x: Array
-    v: Array
-    steps: Array
-    inputs: Mapping[str, Array]
-    effects: ActiveEffects
-    steps_per_sample: int = 1
-
-
-@dataclass(frozen=True)
-class Trajectories:
-    """Result of an engine: positions, velocities, accelerations (L, S // every + 1, D).
-
-    The acceleration is that of the smooth motion without the shocks of impacts. Failed batch
-    elements are NaN.
-    """
-
-    x: Array
-    v: Array
-    a: Array
-
-
-class Engine(Protocol):
-    """Integrator of batches of simulations."""
-
-    name: str
-    requires: tuple[str, ...]
-    largest_step: float
-    """Maximum step in seconds, to which sampling intervals are divided."""
-
-    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
-        """Integrate every batch element over its steps."""
-        ...
-
-    def find_unsupported_reason(self, system: type[System]) -> str:
-        """Return why this engine cannot integrate the system; empty if it can."""
-        ...
-
-    def close(self) -> None:
-        """Release the engine's worlds."""
-        ...

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from sims.core.effect import Effect
 from sims.core.registry import PartUnavailableError, Registry
-from sims.core.system import Effect, System
+from sims.core.system import System
 
 registry: Registry[Effect] = Registry("effect", "simgap.effects", Effect)
 

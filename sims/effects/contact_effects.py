@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Contact
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Contact
 
 _SMALLEST = 1e-9
 """Minimum impact speed in m/s for the power law, so that a negative power is finite."""

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _FLUIDS = "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
 _FLUID = ("1/m", "N*s^2/m^2", "N*m*s^2/rad^2")

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _MIN_PERIOD = 1e-9
 """Smallest period in m or rad, which replaces zero to avoid division by zero."""

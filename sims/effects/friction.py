@@ -27,8 +27,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, Friction, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _SURVEY = (
     "B. Armstrong-Helouvry et al., Automatica 30(7), 1083 (1994), doi:10.1016/0005-1098(94)90209-7"

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, HiddenState, HiddenStateEffect, StateSnapshot
+from sims.core.system import StateSnapshot
 
 MAX_STATE_RATE = 400.0
 """Maximum rate in 1/s at which friction follows a change of the motion.

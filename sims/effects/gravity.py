@@ -6,8 +6,9 @@
 
 from __future__ import annotations
 
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _PURE = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""

@@ -21,8 +21,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Input, Signal
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Input, Signal
 from sims.effects.first_order_lag import apply_recursion, compute_lag_response, shift_by_one_step
 
 _FORCE_UNITS = ("m/s^2", "N", "N*m")

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _SPINNING = "G. Robinson, I. Robinson, Physica Scripta 88, 018101 (2013), "
 _SPINNING += "doi:10.1088/0031-8949/88/01/018101"

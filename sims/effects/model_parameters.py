@@ -16,7 +16,7 @@ keeps the triangle inequality of its moments.
 
 from __future__ import annotations
 
-from sims.core.system import Coefficient, ModelValueEffect
+from sims.core.effect import Coefficient, ModelValueEffect
 
 _PURE = ("1", "1", "1")
 """Units of a dimensionless coefficient on every kind of system."""

@@ -27,8 +27,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _SHARE = ((0, 0), (0, 0.2), (0, 2))
 """Plausible voltage losses per unit of force, in 1/N and 1/(N m)."""

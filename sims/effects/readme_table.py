@@ -8,7 +8,8 @@ from __future__ import annotations
 import sys
 
 from sims import effects
-from sims.core.system import SYSTEM_KINDS, Coefficient, Effect
+from sims.core.effect import Coefficient, Effect
+from sims.core.system import SYSTEM_KINDS
 
 
 def render_effects_table() -> str:

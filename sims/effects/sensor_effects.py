@@ -23,8 +23,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Sensor, Signal
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Sensor, Signal
 from sims.effects.first_order_lag import apply_recursion, compute_lag_response, shift_by_one_step
 
 _TIME = ("s", "s", "s")

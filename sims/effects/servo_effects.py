@@ -18,8 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Force, Input, Signal
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, Input, Signal, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _USUAL = ("m/s^2", "m", "rad")
 """Units of a set point; point systems have no servo."""

@@ -6,8 +6,9 @@
 
 from __future__ import annotations
 
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _DUFFING = (
     "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"

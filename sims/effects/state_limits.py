@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import Coefficient, Force, Level
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, Level, StateSnapshot
+from sims.core.system import StateSnapshot
 
 _LEVEL = ("m", "m", "m")
 """Units of a level; a level may have another unit."""

@@ -33,15 +33,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from sims.core.simulator import Array
-from sims.core.system import (
+from sims.core.effect import (
     Coefficient,
     HiddenState,
     HiddenStateEffect,
     ModelValueEffect,
     SeriesElement,
-    StateSnapshot,
 )
+from sims.core.simulator import Array
+from sims.core.system import StateSnapshot
 
 CONTACT_FREQUENCY = 150.0
 """Frequency in rad/s of two inertias that oscillate against closed, undamped flanks.

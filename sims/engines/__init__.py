@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
+from sims.core.engine import Engine
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.core.system import Engine, System
+from sims.core.system import System
 
 ENGINE_MODULES = {
     "batch": "sims.engines.batch",

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import InputError
-from sims.core.system import IntegrationBatch, System, Trajectories
+from sims.core.system import System
 from sims.core.value_limits import is_plausible_number, truncate_text
 from sims.engines.compiled.batch_runner import integrate_batch
 from sims.engines.compiled.data_layout import MAX_COORDINATES

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sims.core.system import IntegrationBatch, Trajectories
+from sims.core.engine import IntegrationBatch, Trajectories
 from sims.engines.ground_contact import Indices
 
 

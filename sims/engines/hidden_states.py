@@ -19,19 +19,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sims.core.effect import Effect, Force, Friction, HiddenState, HiddenStateEffect
+from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import Array
-from sims.core.system import (
-    Effect,
-    Engine,
-    Force,
-    Friction,
-    HiddenState,
-    HiddenStateEffect,
-    IntegrationBatch,
-    StateSnapshot,
-    System,
-    Trajectories,
-)
+from sims.core.system import StateSnapshot, System
 from sims.engines.batch_slicing import join_trajectories, slice_batch
 
 

@@ -30,8 +30,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import ActiveEffects, Effect, Input, Sensor, Signal
 from sims.core.simulator import Array, Scenario
-from sims.core.system import ActiveEffects, Effect, Input, Sensor, Signal
 
 _ROUNDING = 1e-6
 """Fraction of a step by which an interval may exceed an integer number of steps."""

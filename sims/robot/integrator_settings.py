@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from sims.core.system import IntegrationBatch, System, Trajectories
+from sims.core.engine import IntegrationBatch, Trajectories
+from sims.core.system import System
 from sims.robot.robot_model import RobotModel
 
 INTEGRATOR_IDS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}

@@ -17,8 +17,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sims import effects as library
+from sims.core.effect import ActiveEffects, Effect, Sensor
+from sims.core.engine import Engine
 from sims.core.simulator import Array, InputError, Scenario, make_unknown_name_error
-from sims.core.system import ActiveEffects, Effect, Engine, Sensor
 from sims.core.toml_validation import format_value
 from sims.engines.time_grid import ScenarioGroups, group_scenarios
 from sims.robot.dynamics.activation_filters import (

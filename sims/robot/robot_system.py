@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sims import effects as library
+from sims.core.effect import ALL_PLACES, Effect
 from sims.core.registry import PartUnavailableError
 from sims.core.simulator import Array, Channel, InputError, Parameter, make_unknown_name_error
-from sims.core.system import ALL_PLACES, Effect, StateSnapshot, System, SystemKind
+from sims.core.system import StateSnapshot, System, SystemKind
 from sims.robot import coupled_drives
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.series_joints import SeriesJoints, compile_error, is_series_effect

@@ -21,8 +21,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from sims.core.effect import Effect
 from sims.core.simulator import Array, Channel, Constant, Parameter
-from sims.core.system import Effect, StateSnapshot, System, SystemKind
+from sims.core.system import StateSnapshot, System, SystemKind
 from sims.core.value_limits import ANGLE_RANGE, GRAVITY_RANGE, LENGTH_RANGE, MASS_RANGE, RATIO_RANGE
 from sims.system_simulator import SystemSimulator
 

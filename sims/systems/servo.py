@@ -8,11 +8,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from sims.core.effect import Effect
 from sims.core.simulator import Array, Channel, Constant, Parameter
 from sims.core.system import (
     DefaultRecording,
     DerivedQuantity,
-    Effect,
     RenderedModelFile,
     StateSnapshot,
     System,

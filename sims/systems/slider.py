@@ -8,8 +8,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from sims.core.effect import Effect
 from sims.core.simulator import Array, Channel, Parameter
-from sims.core.system import DefaultRecording, Effect, StateSnapshot, System, SystemKind
+from sims.core.system import DefaultRecording, StateSnapshot, System, SystemKind
 from sims.system_simulator import SystemSimulator
 
 LOAD_DEPENDENT_EFFECTS = ("friction.load_direction", "friction.load_quadratic")

@@ -21,8 +21,8 @@ from bench.conformance import (
 from bench.conformance.check_suites import SUITES, failed_need
 from bench.conformance.run_checks import run_check
 from methods.tuner import Proposal, Tuner
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Channel, Constant, Parameter, Simulator
-from sims.core.system import Coefficient, Force
 from sims.own_simulator import OwnSimulator
 from tests.conftest import PLUGINS
 

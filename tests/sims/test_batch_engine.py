@@ -5,8 +5,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sims import effects as library
+from sims.core.engine import IntegrationBatch
 from sims.core.simulator import InputError, Parameter, Scenario
-from sims.core.system import IntegrationBatch, System
+from sims.core.system import System
 from sims.effects.friction import CoulombFriction
 from sims.engines.batch import make_engine
 from sims.engines.compiled import compilability

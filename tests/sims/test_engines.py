@@ -14,8 +14,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sims import effects
+from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import InputError, Scenario
-from sims.core.system import Coefficient, Force, Friction
 from sims.engines.external.external_engine import equalise_steps
 from tests.sims.engine_agreement import (
     COEFFICIENTS,

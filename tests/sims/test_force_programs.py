@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sims import effects as library
+from sims.core.effect import Coefficient, Force, Friction
 from sims.core.simulator import InputError, Scenario
-from sims.core.system import Coefficient, Force, Friction
 from sims.engines import make_engine
 from sims.engines.batch import BatchEngine
 from sims.engines.compiled import compilability

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import InputError, Scenario
-from sims.core.system import Coefficient, Force
 from sims.engines.adapters.mujoco_soft_contact import compute_damping_ratio
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sims.core.effect import Coefficient, Input, Sensor
 from sims.core.simulator import InputError, Scenario
-from sims.core.system import Coefficient, Input, Sensor
 from sims.effects import get_effect
 from sims.effects.input_effects import InputBacklash, InputDelay
 from sims.effects.sensor_effects import ClockSkew

@@ -21,16 +21,9 @@ import numpy as np
 
 from bench.diagnosis.datasheet.subject import SheetSubject
 from sims import effects as library
+from sims.core.effect import Effect, Force, Friction, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.core.system import (
-    Effect,
-    Force,
-    Friction,
-    HiddenStateEffect,
-    StateSnapshot,
-    System,
-    SystemKind,
-)
+from sims.core.system import StateSnapshot, System, SystemKind
 from sims.extended_simulator import ExtendedSimulator
 
 LOAD_POINT_COUNT = 201

@@ -20,8 +20,9 @@ import numpy as np
 from bench.diagnosis.datasheet.sheet_content import SheetContent
 from bench.diagnosis.extended_robot_files import collect_causes
 from sims import effects as library
+from sims.core.effect import Friction
 from sims.core.simulator import Array
-from sims.core.system import Friction, RenderedModelFile, StateSnapshot
+from sims.core.system import RenderedModelFile, StateSnapshot
 from sims.core.toml_validation import read_toml
 from sims.extended_simulator import FittedValue
 from sims.recording.recording import Run

@@ -14,7 +14,7 @@ from bench.diagnosis.report.wording import format_effect_name
 from bench.diagnosis.validation.gain_and_intervals import Z95
 from bench.diagnosis.verdict import Cause, Verdict
 from sims import effects as library
-from sims.core.system import ALL_PLACES
+from sims.core.effect import ALL_PLACES
 from sims.extended_simulator import ExtendedSimulator, FittedValue
 
 QuantityState = Literal["found", "fitted", "derived", "not shown"]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from sims import effects as library
+from sims.core.effect import ALL_PLACES, Effect
 from sims.core.simulator import InputError, make_unknown_name_error
-from sims.core.system import ALL_PLACES, Effect
 from sims.extended_simulator import FittedValue
 from sims.recording.recording import Recording
 from sims.system_simulator import SystemSimulator

@@ -11,8 +11,8 @@ import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.time_scale import is_instant
+from sims.core.effect import Coefficient, Effect, Friction
 from sims.core.simulator import Array, Parameter
-from sims.core.system import Coefficient, Effect, Friction
 
 MAX_RANGE_FACTOR = 20.0
 """Ratio of the fit bounds to the plausible range, for coefficients of equation-based systems."""

@@ -17,8 +17,8 @@ from bench.diagnosis.evaluation.simulation_cache import LaneCache
 from bench.diagnosis.evaluation.time_scale import on_time_scale
 from bench.diagnosis.evaluation.worker_pool import ForkedWorkerPool
 from sims import effects as library
+from sims.core.effect import Effect, Input, Sensor, members_of
 from sims.core.simulator import Array, InputError, Parameter, Scenario, make_unknown_name_error
-from sims.core.system import Effect, Input, Sensor, members_of
 from sims.engines import HIDDEN_STATE_ENGINES
 from sims.recording.recording import Recording, Run
 from sims.system_simulator import SystemSimulator

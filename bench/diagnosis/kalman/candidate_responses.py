@@ -37,8 +37,8 @@ from bench.diagnosis.kalman.filter_and_smoother import (
 )
 from bench.diagnosis.kalman.measured_states import measured_states
 from bench.diagnosis.search.candidate_directions import CandidateDirection
+from sims.core.effect import Effect
 from sims.core.simulator import Array
-from sims.core.system import Effect
 from sims.robot.dynamics.measured_linearisation import MeasuredLinear, SingleArray, Trajectory
 from sims.robot.places.typical_forces import compute_floating_forces, compute_joint_scales
 from sims.robot.robot_simulator import RobotSimulator

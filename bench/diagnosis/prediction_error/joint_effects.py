@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.diagnosis.evaluation.noise_model import NoiseModel
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
-from sims.core.system import members_of
+from sims.core.effect import members_of
 from sims.robot.dynamics.series_joints import is_series_effect
 from sims.robot.places.coupled_joints import coupled_joints
 from sims.robot.robot_simulator import RobotSimulator

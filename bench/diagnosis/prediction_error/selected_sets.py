@@ -11,8 +11,8 @@ from bench.diagnosis.prediction_error.effect_selection import Selected
 from bench.diagnosis.prediction_error.joint_effects import acts_at, has_many_shapes
 from bench.diagnosis.prediction_error.search_context import SearchContext
 from bench.diagnosis.prediction_error.simulated_fits import fit, higher_merit, without_idle_effects
+from sims.core.effect import members_of
 from sims.core.simulator import Array
-from sims.core.system import members_of
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 

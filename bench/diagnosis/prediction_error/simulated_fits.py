@@ -19,8 +19,8 @@ from bench.diagnosis.friction_form_verdict import has_dry_friction
 from bench.diagnosis.prediction_error.model_filters import FilteredSet
 from bench.diagnosis.prediction_error.search_context import SearchContext
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from sims.core.effect import members_of
 from sims.core.simulator import Array
-from sims.core.system import members_of
 
 NEARBY = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby."""

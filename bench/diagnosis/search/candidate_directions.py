@@ -37,8 +37,8 @@ from bench.diagnosis.search.initial_values import (
     generate_equal_travel_end_stops,
     list_coefficients,
 )
+from sims.core.effect import ALL_PLACES, members_of
 from sims.core.simulator import Array, Parameter
-from sims.core.system import ALL_PLACES, members_of
 
 INITIAL_PROBE_SHARE = 1e-4
 """Size at which a direction is first computed, as a share of the plausible range."""

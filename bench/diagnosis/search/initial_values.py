@@ -10,8 +10,8 @@ import numpy as np
 from bench.diagnosis.evaluation.run_data import RunData
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.evaluation.time_scale import is_instant
+from sims.core.effect import Effect, members_of
 from sims.core.simulator import Array, Parameter
-from sims.core.system import Effect, members_of
 
 END_STOP_STIFFNESS_FACTORS = (0.3, 1.0, 3.0)
 """Stiffness factors of end stops that a fit starts from, relative to the best-scoring one."""

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 
 TIME, POSITION, SPEED = 0, 1, 2
 """Variables of a hat: time, position or speed of the joint."""

@@ -43,8 +43,9 @@ from bench.diagnosis.search.verdict_rules import (
     get_structure_threshold,
     has_structure,
 )
+from sims.core.effect import Coefficient, Effect, Force
 from sims.core.simulator import Array
-from sims.core.system import Coefficient, Effect, Force, StateSnapshot
+from sims.core.system import StateSnapshot
 from sims.system_simulator import SystemSimulator
 
 HAT_COUNT = 7

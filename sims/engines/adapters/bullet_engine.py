@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import cast
 
+from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import InputError
-from sims.core.system import Engine, IntegrationBatch, System, Trajectories
+from sims.core.system import System
 from sims.engines.adapters import bullet_joints, bullet_world
 from sims.engines.external import ball_rollout, joint_rollout, native_contact
 from sims.engines.external.ball_rollout import BallState

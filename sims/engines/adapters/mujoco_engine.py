@@ -12,8 +12,9 @@ from collections.abc import Iterator
 from functools import partial
 from typing import cast
 
+from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulator import InputError
-from sims.core.system import Engine, IntegrationBatch, System, Trajectories
+from sims.core.system import System
 from sims.core.value_limits import truncate_text
 from sims.engines.adapters.mujoco_bodies import (
     CompiledWorld,

@@ -7,8 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from sims.core.effect import Contact, Effect, Force, Friction
+from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array
-from sims.core.system import Contact, Effect, Force, Friction, IntegrationBatch, Trajectories
 from sims.engines.compiled.compilability import get_force_program
 from sims.engines.compiled.data_layout import DRY, GUIDED, BatchArrays
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram

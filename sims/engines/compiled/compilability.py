@@ -11,8 +11,10 @@ from threading import Lock
 
 import numpy as np
 
+from sims.core.effect import Effect
+from sims.core.engine import IntegrationBatch
 from sims.core.simulator import Array
-from sims.core.system import Effect, IntegrationBatch, System
+from sims.core.system import System
 from sims.engines.compiled.data_layout import (
     DRY,
     IN_E,

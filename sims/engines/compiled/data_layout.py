@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sims.core.system import Effect, Force, Friction, System
+from sims.core.effect import Effect, Force, Friction
+from sims.core.system import System
 from sims.engines.compiled.expression_graph import EXTERNAL
 
 Array = NDArray[Any]

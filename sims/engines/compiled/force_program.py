@@ -14,7 +14,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from sims.core.system import Contact, Effect, Force, Friction, StateSnapshot, System
+from sims.core.effect import Contact, Effect, Force, Friction
+from sims.core.system import StateSnapshot, System
 from sims.engines.compiled.data_layout import (
     BLOCK_WIDTH,
     BlockBuffers,

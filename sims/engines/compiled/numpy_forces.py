@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.simulator import Array
-from sims.core.system import Contact, Effect, Force, Friction, StateSnapshot, System
+from sims.core.system import StateSnapshot, System
 from sims.engines.compiled.data_layout import (
     IN_E,
     IN_MU,

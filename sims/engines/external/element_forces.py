@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from sims.core.system import Force, Friction, System
+from sims.core.effect import Force, Friction
+from sims.core.system import System
 from sims.engines.compiled.data_layout import (
     BOUNCES,
     DRY,

@@ -29,17 +29,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import ActiveEffects, Contact, Force, Friction
+from sims.core.engine import IntegrationBatch, Trajectories
 from sims.core.simulator import Array, InputError
-from sims.core.system import (
-    ActiveEffects,
-    Contact,
-    Force,
-    Friction,
-    IntegrationBatch,
-    StateSnapshot,
-    System,
-    Trajectories,
-)
+from sims.core.system import StateSnapshot, System
 from sims.core.value_limits import is_plausible_number, truncate_text
 from sims.engines.compiled.compilability import get_force_program
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram

@@ -19,8 +19,8 @@ from typing import Protocol
 
 import numpy as np
 
+from sims.core.effect import Contact
 from sims.core.simulator import Array
-from sims.core.system import Contact
 from sims.engines.external.ball_rollout import BallBody, get_gravity, make_trajectory
 from sims.engines.external.element_forces import ElementForces, Vector
 from sims.engines.external.external_engine import ElementWork, Trajectory, split_into_legs

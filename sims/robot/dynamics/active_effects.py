@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sims.core.system import ActiveEffects, Effect
+from sims.core.effect import ActiveEffects, Effect
 from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
 from sims.robot.dynamics.midpoint_state import Mask, Places
 from sims.robot.dynamics.series_joints import is_series_effect

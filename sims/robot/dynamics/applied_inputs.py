@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sims.core.effect import ActiveEffects, Input
 from sims.core.simulator import Array, Scenario
-from sims.core.system import ActiveEffects, Input
 from sims.engines.time_grid import ScenarioGroups, TimeGrid, compute_applied_inputs
 from sims.robot.dynamics.active_effects import slice_active_effects
 from sims.robot.dynamics.midpoint_state import Mask, Places

@@ -8,8 +8,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import ActiveEffects, Sensor
 from sims.core.simulator import Array, Scenario
-from sims.core.system import ActiveEffects, Sensor
 from sims.engines.time_grid import ScenarioGroups
 from sims.robot.dynamics.midpoint_state import Mask, Places
 from sims.robot.floating_joints import FloatingState

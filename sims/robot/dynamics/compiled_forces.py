@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import Effect, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.core.system import Effect, HiddenState, HiddenStateEffect
 from sims.engines.compiled.expression_graph import LANE, MOMENT, ExpressionGraph
 from sims.engines.compiled.force_program import (
     InstructionList,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
-from sims.core.system import ActiveEffects
 from sims.robot.coupled_drives import find_preceding_joint as joint_before
 from sims.robot.dynamics.activation_filters import activation_filters
 from sims.robot.dynamics.active_effects import find_active_elements, slice_active_effects

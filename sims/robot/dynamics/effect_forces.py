@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.core.system import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.robot.dynamics.hidden_state_integration import advance_state
 from sims.robot.dynamics.midpoint_state import JointStates, Mask, predict_midpoint
 from sims.robot.dynamics.mujoco_batch import JointAddresses

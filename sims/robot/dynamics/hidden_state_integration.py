@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sims.core.effect import HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.core.system import HiddenState, HiddenStateEffect, StateSnapshot
+from sims.core.system import StateSnapshot
 from sims.robot.state_snapshots import RobotSnapshot
 
 STATE_STEP = 1e-6

@@ -13,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
+from sims.core.effect import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.core.simulator import Array
-from sims.core.system import ActiveEffects, Effect, Force, Friction, HiddenState, HiddenStateEffect
 from sims.robot.dynamics.active_effects import is_evaluated_per_step, select_model_field_effects
 from sims.robot.dynamics.disabled_drives import ForceRanges, Mask, working_servos
 from sims.robot.dynamics.effect_forces import (

@@ -30,8 +30,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import ActiveEffects, Input, Sensor, members_of
 from sims.core.simulator import Array, Scenario
-from sims.core.system import ActiveEffects, Input, Sensor, members_of
 from sims.robot.dynamics.effect_forces import LOAD_DEPENDENT_EFFECTS
 from sims.robot.dynamics.linearisation_points import (
     LINEARISATION_INTERVAL_SECONDS,

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from sims.core.effect import ActiveEffects
 from sims.core.simulator import Array
-from sims.core.system import ActiveEffects
 from sims.robot.dynamics.disabled_drives import FORCE_FIELDS, ForceRanges, constant_stretches
 from sims.robot.dynamics.midpoint_state import JointStates, Mask, MidpointPredictor, Places
 from sims.robot.dynamics.series_joints import USED_FIELDS as SERIES

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import ActiveEffects, Effect, Input, Sensor
 from sims.core.simulator import Array, Scenario
-from sims.core.system import ActiveEffects, Effect, Input, Sensor
 from sims.robot.dynamics.applied_inputs import SAME_INSTANT_SHARE, compute_inputs_over_steps
 from sims.robot.dynamics.batch_work import BatchInputs, RobotRunBatch
 from sims.robot.dynamics.linearisation_points import (

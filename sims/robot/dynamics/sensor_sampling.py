@@ -16,8 +16,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import ActiveEffects, Sensor, Signal
 from sims.core.simulator import Array
-from sims.core.system import ActiveEffects, Sensor, Signal
 from sims.engines.time_grid import is_active
 from sims.system_simulator import apply_sensor_effects
 

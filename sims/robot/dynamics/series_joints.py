@@ -34,8 +34,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sims.core.effect import ActiveEffects, Effect, HiddenStateEffect, SeriesElement
 from sims.core.simulator import Array
-from sims.core.system import ActiveEffects, Effect, HiddenStateEffect, SeriesElement
 from sims.robot.coupled_drives import COUPLING_EFFECT, COUPLING_PLACEHOLDER, name_unnamed_elements
 from sims.robot.coupled_drives import list_coupling_places as coupled_places
 from sims.robot.coupled_drives import make_coupled_robot as coupled_robot

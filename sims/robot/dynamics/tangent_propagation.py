@@ -28,8 +28,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sims.core.effect import ActiveEffects, Effect
 from sims.core.simulator import Array
-from sims.core.system import ActiveEffects, Effect
 from sims.robot.dynamics.effect_forces import is_in_drive
 from sims.robot.dynamics.linearisation_points import LinearisationPoints
 from sims.robot.dynamics.midpoint_state import Mask, Places

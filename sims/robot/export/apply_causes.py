@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from sims import effects as library
+from sims.core.effect import SeriesElement as Transmission
 from sims.core.freed_memory import release_free_memory
-from sims.core.system import SeriesElement as Transmission
 from sims.extended_simulator import FittedValue
 from sims.robot.coupled_drives import COUPLING_EFFECT as COUPLED
 from sims.robot.coupled_drives import make_coupled_robot

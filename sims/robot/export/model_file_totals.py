@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sims.core.system import Effect
+from sims.core.effect import Effect
 from sims.robot.export.mjcf_attributes import Fields, copy_model_fields
 from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 from sims.robot.robot_model import RobotModel

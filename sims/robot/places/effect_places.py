@@ -15,8 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from sims.core.simulator import Array
-from sims.core.system import (
+from sims.core.effect import (
     ALL_PLACES,
     ActiveEffects,
     Coefficient,
@@ -28,9 +27,9 @@ from sims.core.system import (
     Input,
     ModelValueEffect,
     Sensor,
-    StateSnapshot,
-    SystemKind,
 )
+from sims.core.simulator import Array
+from sims.core.system import StateSnapshot, SystemKind
 from sims.robot.places.place_list import EffectPlace
 from sims.robot.state_snapshots import RobotSnapshot
 

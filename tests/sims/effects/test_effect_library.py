@@ -13,9 +13,7 @@ import pint
 import pytest
 
 from sims import effects
-from sims.core.simulator import InputError
-from sims.core.system import (
-    SYSTEM_KINDS,
+from sims.core.effect import (
     Contact,
     Force,
     Friction,
@@ -25,6 +23,8 @@ from sims.core.system import (
     Sensor,
     Signal,
 )
+from sims.core.simulator import InputError
+from sims.core.system import SYSTEM_KINDS
 from sims.effects.readme_table import render_effects_table
 from sims.system_simulator import make_effect_parameters
 from tests.sims.effects.effect_systems import NAMES, PAIRS, SIMULATORS, SYSTEMS, lanes, moment, run

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sims import effects
-from sims.core.system import Signal
+from sims.core.effect import Signal
 from tests.exams.robots.excitation_signals import profiled
 from tests.sims.effects.effect_systems import lanes
 

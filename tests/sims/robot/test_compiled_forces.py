@@ -7,8 +7,8 @@ import pytest
 
 from bench.core.plugin_registries import make_robot_simulator
 from sims import effects as library
+from sims.core.effect import Coefficient, Force
 from sims.core.simulator import Scenario
-from sims.core.system import Coefficient, Force
 from sims.robot import robot_simulator
 from sims.robot.dynamics import mujoco_batch
 from sims.robot.dynamics.active_effects import is_evaluated_per_step

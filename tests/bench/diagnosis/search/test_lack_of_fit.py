@@ -14,7 +14,7 @@ from bench.diagnosis.search.verdict_rules import (
     STRUCTURE_P_VALUE_THRESHOLD,
     STRUCTURE_P_VALUE_THRESHOLD_ESTIMATED_NOISE,
 )
-from sims.core.system import Coefficient, Force
+from sims.core.effect import Coefficient, Force
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import recorded, searched
