@@ -221,18 +221,21 @@ class DiagnosisReportDataBuilder:
         remains = self.finding.lack_of_fit
         for channel in remains.channels_above_noise:
             times = remains.excess[world.channels.index(channel)]
-            yield f"channel {channel} still misses by {times:.3g} times its noise"
+            yield f"the residual of channel {channel} is {times:.3g} times its noise"
         # Without a result of the test for unmodelled forces there is no dependence to report.
         if remains.has_structure and remains.where:
-            yield f"what is left behaves like a force that depends on {remains.where}"
+            yield f"the residual behaves like a force that depends on {remains.where}"
         untouched = [world.parameters[i].name for i in sorted(self.base.insensitive_parameters)]
         if untouched:
             names = ", ".join(untouched)
-            yield f"the recording does not touch {names}: kept at the nominal value"
+            yield f"the data do not depend on {names}: kept at the nominal value"
         vague = [world.parameters[i].name for i in sorted(self.base.unidentified_parameters)]
         if vague:
             names = ", ".join(vague)
-            yield f"the recording does not fix {names} beside the others: kept at the nominal value"
+            yield (
+                f"the data do not identify {names} together with the other parameters: kept at the "
+                "nominal value"
+            )
         yield from self._bordering()
         yield from self.notes
 
@@ -258,7 +261,7 @@ class DiagnosisReportDataBuilder:
         if finding.early_stop is not None:
             return
         if finding.verdict == "unknown" and finding.causes:
-            yield "the effects that help most do not close enough of the gap to be its explanation"
+            yield "the best effects do not close enough of the gap to explain it"
         if finding.verdict in ("partial", "unknown") and finding.lack_of_fit.has_structure:
             yield self._structure()
         for cause in finding.causes:
@@ -267,7 +270,7 @@ class DiagnosisReportDataBuilder:
                 placed = any("@" in name for name in names)
                 all_of_them = format_effect_set(names, "and") if placed else _named(names)
                 yield (
-                    f"{all_of_them} make the same difference in these runs, "
+                    f"{all_of_them} have the same influence on these runs, "
                     "once parameters and initial states are fitted with each: "
                     "their likelihoods differ by odds of less than 33 to 1"
                 )
@@ -277,10 +280,10 @@ class DiagnosisReportDataBuilder:
         # Lack of fit is either a residual with a pattern, or one that is only too large.
         if chance < STRUCTURE_P_VALUE_THRESHOLD:
             return (
-                f"structure is left over (chance {chance:.2g}) "
+                f"the residual has structure (p-value {chance:.2g}) "
                 "that the sensor's noise does not have"
             )
-        return "what is left over exceeds the stated noise of the sensors"
+        return "the residual exceeds the stated noise of the sensors"
 
 
 def _named(effects: list[str]) -> str:

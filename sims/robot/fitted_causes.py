@@ -74,7 +74,7 @@ class FittedCause:
         return np.array([self.numbers.get(axis, zero).value for axis in axes])
 
     def format(self, recording: str) -> str:
-        """Format as ``friction.coulomb@elbow: 0.3 N*m (95 %: 0.28 to 0.32), fitted to log.csv``."""
+        """Format as ``friction.coulomb@elbow: 0.3 N·m (95 %: 0.28 to 0.32), fitted to log.csv``."""
         several = len(self.numbers) > 1
         numbers = [
             (f"{name} " if several else "") + _told(number) for name, number in self.numbers.items()
@@ -84,7 +84,7 @@ class FittedCause:
 
 
 def _told(number: FittedValue) -> str:
-    """Format as ``-0.05 N*m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N*m``.
+    """Format as ``-0.05 N·m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N·m``.
 
     The last part is the number in the model file before and after.
     """
@@ -98,7 +98,7 @@ def _told(number: FittedValue) -> str:
 
 
 def _unit(unit: str) -> str:
-    return "" if unit == "1" else f" {unit}"
+    return "" if unit == "1" else f" {unit.replace('*', '·')}"
 
 
 def expand_families(

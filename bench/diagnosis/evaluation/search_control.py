@@ -21,11 +21,11 @@ ProgressCallback = Callable[[float, str], None]
 
 QUESTION_TEXTS: Mapping[str, str] = {
     "base_fit": "the best fit of the simulator's own parameters",
-    "search": "the other effects of the library, and several together",
-    "rivals": "whether a rival does better once it is fitted to the end",
-    "held_out": "whether held-out runs bear it out",
-    "structure": "whether a force of any shape would help still",
-    "alternatives": "what would explain the same as well",
+    "search": "the other effects of the library, alone and combined",
+    "rivals": "the full fits of similar causes",
+    "held_out": "the validation on held-out runs",
+    "structure": "the test for unmodelled forces",
+    "alternatives": "the search for alternative causes",
 }
 """Questions of a search in their order, by their name in verdict.json."""
 

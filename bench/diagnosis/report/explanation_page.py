@@ -142,7 +142,7 @@ def render_report(
         values_of_causes=[_format_cause(cause) for cause in verdict.causes],
         consistency=format_consistency(story),
         alternative_sets=[_format_set(story, c) for c in verdict.causes if c.alternatives],
-        residual_description=_RESIDUALS.get(open_verdict, "Nothing that stands out"),
+        residual_description=_RESIDUALS.get(open_verdict, "Nothing significant"),
         residual_runs=residual_runs,
         residual_rms=format_number(compute_normalised_rms(story, residual_split, "after"), 2),
         units=_format_units(story),

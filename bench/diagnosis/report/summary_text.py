@@ -115,7 +115,7 @@ def format_details(story: DiagnosisReportData) -> Iterator[str]:
         not one.is_consistent or one.by == "log"
         for one in (*story.consistency.after, *story.consistency.before)
     ):
-        yield "Which number to trust: " + " ".join(format_consistency(story))
+        yield "Agreement between runs: " + " ".join(format_consistency(story))
     if story.lack_of_fit:
         yield "What remains: " + " ".join(format_sentence(text) for text in story.lack_of_fit)
     # For an ambiguous verdict, the experiment directly follows the headline.
@@ -140,14 +140,16 @@ def format_headline(story: DiagnosisReportData) -> str:
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
     if verdict == "unidentifiable":
-        unknown = "what the simulation lacks cannot be told from them"
-        return f"These data cannot fix {joined(list_unidentified_parameters(story))}: {unknown}."
+        unknown = "it is not known what the simulation lacks"
+        return (
+            f"These data do not identify {joined(list_unidentified_parameters(story))}: {unknown}."
+        )
     if verdict == "unknown" or not causes:
         none = f"none of the {len(rank_candidates(story))} known causes explains it"
         none += " at any place" if has_placed_causes(story) else ""
         return f"Something is missing from the simulation, and {none}."
     if verdict == "ambiguous":
-        return f"The simulation {format_lacking(causes)}: these data cannot tell which."
+        return f"The simulation {format_lacking(causes)}: these data do not show which."
     if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
         return f"The simulation {format_lacking(causes)}, but {_undetermined(open_ones)}."
     if bordering := story.verdict.bordering:
@@ -206,7 +208,7 @@ def undetermined(story: DiagnosisReportData) -> Iterator[str]:
         remedy = "; for a time, record longer runs" * longer
         yield (
             f"{'; '.join(parts)}. A value at a bound is not a result and has no interval: the data "
-            "ask for a value beyond it, or another cause acts in a similar way. Check units and "
+            "suggest a value beyond it, or another cause acts in a similar way. Check units and "
             f"constants of the recording{remedy}."
         )
     if loose:
@@ -225,13 +227,12 @@ def _also(causes: Sequence[Cause]) -> str:
 def _headline_of_cut(verdict: Verdict) -> str:
     """Format the headline of a search that was stopped early, with its preliminary result."""
     if verdict.verdict == "partial":
-        return (
-            f"The simulation {format_lacking(verdict.causes)}; what else, was not asked to the end."
-        )
-    nothing = "The search was ended before it could say what the simulation lacks"
+        lacking = format_lacking(verdict.causes)
+        return f"The simulation {lacking}; the search stopped before testing for further causes."
+    nothing = "The search stopped before it could say what the simulation lacks"
     if not verdict.causes:
         return f"{nothing}."
-    return f"{nothing}; the best that it had come upon: {format_causes(verdict.causes)}."
+    return f"{nothing}; best candidate so far: {format_causes(verdict.causes)}."
 
 
 def format_early_stop(story: DiagnosisReportData) -> str:
@@ -239,14 +240,12 @@ def format_early_stop(story: DiagnosisReportData) -> str:
     found = story.verdict.cut
     if found is None:
         return ""
-    by = {"budget": "its budget of time", "interrupt": "an interrupt"}[found.reason]
+    by = {"budget": "its time budget", "interrupt": "an interrupt"}[found.reason]
     open_ones = joined(
         [QUESTION_TEXTS[name] for name in found.skipped_questions if name in QUESTION_TEXTS]
     )
-    during = (
-        f"; looked at last: {sanitise(found.during_question, 80)}" if found.during_question else ""
-    )
-    return f"The search was ended by {by}{during}. Not asked to the end: {open_ones}."
+    during = f"; last step: {sanitise(found.during_question, 80)}" if found.during_question else ""
+    return f"The search was stopped by {by}{during}. Not completed: {open_ones}."
 
 
 def list_unidentified_parameters(story: DiagnosisReportData) -> list[str]:
@@ -292,7 +291,7 @@ def format_gain_and_caveats(story: DiagnosisReportData) -> Iterator[str]:
         ]
         yield format_sentence("; ".join(sayings))
     if verdict == "ambiguous":
-        yield "To tell them apart: " + (format_next_run(story) or "no experiment is proposed.")
+        yield "To distinguish them: " + (format_next_run(story) or "no experiment is proposed.")
 
 
 def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
@@ -325,7 +324,7 @@ def format_gain(story: DiagnosisReportData) -> str:
     runs = story.validation_runs
     # Without a cause the extended model is the base model, so there is no error after.
     if not story.verdict.causes:
-        return f"On {runs} the tuned simulation errs by {base} (RMSE); {perfect}."
+        return f"On {runs} the error of the tuned simulation is {base} (RMSE); {perfect}."
     errors = f"the error on {runs} (RMSE) is {base} before and {extended} after; {perfect}."
     if not has_gap_closed(held_out):
         return errors[0].upper() + errors[1:]
@@ -355,7 +354,7 @@ def _closer(story: DiagnosisReportData) -> str:
     if len(causes) > 1:
         return "Together they close"
     if is_parameter_error(causes[0].effect) and not causes[0].alternatives:
-        return "To correct it closes"
+        return "Correcting it closes"
     if story.verdict.verdict == "partial":
         return format_sentence(f"{format_effect(causes[0].effect)} closes").rstrip(".")
     if story.verdict.verdict != "ambiguous":
@@ -405,11 +404,11 @@ def format_search_summary(story: DiagnosisReportData) -> str:
     """Format the number of tested causes and the best candidate."""
     candidates = story.verdict.candidates
     if not candidates:
-        return "No candidate causes were at hand."
+        return "There were no candidate causes."
     best = candidates[0]
     where = " at every place" if has_placed_causes(story) else ""
-    count = f"{len(rank_candidates(story))} possible causes were looked for{where}"
-    none = f"{count} and none stands out from chance"
+    count = f"{len(rank_candidates(story))} possible causes were tested{where}"
+    none = f"{count} and none is significant"
     promising = f"{format_effect(best.effect)} ({format_p_value(best.p_value)})"
     return f"{none}; the most promising is {promising}."
 
@@ -506,7 +505,7 @@ def format_coefficients(cause: Cause) -> str:
     others = ""
     if cause.alternatives:
         names = format_effect_set(cause.alternatives)
-        others = f"; {names} instead would do as well"
+        others = f"; {names} would explain the data equally well"
     parts = [text for text in (format_values(cause), format_p_value(cause.p_value)) if text]
     return f"{'; '.join(parts)}{others}."
 
@@ -540,7 +539,7 @@ def format_parameter_shift(story: DiagnosisReportData, p: ParameterChange) -> st
     unit = f" {format_unit(p.unit)}" if format_unit(p.unit) else ""
     if not p.is_sensitive:
         nominal = f"its nominal {format_number(p.before[0])}{unit}"
-        return f"{name} is not touched by these data and stays at {nominal}."
+        return f"{name} does not influence these data and stays at {nominal}."
     if not story.verdict.causes:
         # Without a cause, the last fit is also of the base model, and is the best one.
         return f"{name} = {tuned(p, 1)}."

@@ -220,7 +220,7 @@ def test_a_budget_that_is_over_leaves_an_answer_that_says_so(folder, capsys, tmp
     assert main(command) == 0
     found = verdict_schema.check((out / "verdict.json").read_text())
     assert (found["verdict"], found["cut"]["by"]) == ("unknown", "budget")
-    assert "The search was ended by its budget of time" in " ".join(capsys.readouterr().out.split())
+    assert "The search was stopped by its time budget" in " ".join(capsys.readouterr().out.split())
     assert load_extended(out / "extended.toml", simulators.get).name == "pendulum_extended"
 
 
@@ -252,7 +252,7 @@ def test_ctrl_c_ends_with_what_there_is_and_is_an_interrupt(folder, capsys, tmp_
     found = verdict_schema.check((out / "verdict.json").read_text())
     assert found["cut"]["by"] == "interrupt"
     told = capsys.readouterr()
-    assert "The search was ended by an interrupt" in told.out
+    assert "The search was stopped by an interrupt" in told.out
     assert "simgap: ending with what there is; Ctrl-C again ends at once" in told.err
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

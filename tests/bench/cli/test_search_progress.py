@@ -334,4 +334,4 @@ def test_ctrl_c_on_a_terminal_leaves_whole_lines(command):
     screen = terminal.screen()
     assert screen[0] == "simgap: ending with what there is; Ctrl-C again ends at once"
     assert screen[1] == "pendulum, simulated"
-    assert "The search was ended by an interrupt" in " ".join(screen)
+    assert "The search was stopped by an interrupt" in " ".join(screen)

@@ -59,11 +59,11 @@ def test_what_the_search_came_upon_is_listed_and_not_believed(swing):
     assert found.answer.heldout is None
     assert found.answer.next_experiment is None
     assert "drag.linear" in repr(found)
-    assert "ended by an interrupt" in repr(found)
+    assert "stopped by an interrupt" in repr(found)
 
 
 def test_a_cause_that_stood_is_real_and_never_the_whole_answer(swing, tmp_path):
-    found = until(swing, "whether a force of any shape")
+    found = until(swing, "the test for unmodelled forces")
     assert found.verdict == "partial"
     assert set(found.answer.cut.skipped_questions) <= {"structure", "alternatives"}
     (cause,) = found.causes
@@ -72,8 +72,8 @@ def test_a_cause_that_stood_is_real_and_never_the_whole_answer(swing, tmp_path):
     assert found.answer.heldout.gap_closed > 0.9
     found.write(tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "partial: a cause is found; the search was ended early" in page
-    assert "whether a force of any shape would help still" in page
+    assert "partial: a cause is found; the search was stopped early" in page
+    assert "the test for unmodelled forces" in page
 
 
 def test_an_end_that_never_comes_changes_nothing(swing):

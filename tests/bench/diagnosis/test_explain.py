@@ -152,7 +152,7 @@ def test_what_does_not_fit_the_system_at_all_is_unknown(tmp_path):
     runs = [(TIMES[:60], walk, 0.3 * rng.standard_normal(60)) for walk in walks]
     found = explained(table(tmp_path, runs, noise=NOISE))
     assert found.verdict == "unknown"
-    assert any("channel q still misses by" in line for line in found.story.lack_of_fit)
+    assert any("the residual of channel q is" in line for line in found.story.lack_of_fit)
     assert found.answer.candidates, "what comes nearest is told all the more"
     assert found.answer.heldout.rmse_extended > 10 * 0.003
 

@@ -75,7 +75,7 @@ def test_shown_in_a_notebook_it_is_the_report_in_a_frame(named):
     assert html.count("<") == 2, "the report is an attribute, so none of its elements is the cell's"
     page = unescape(re.search('srcdoc="([^"]*)"', html)[1])
     assert page.startswith("<!DOCTYPE html>")
-    assert "90 % of the gap closed" in page
+    assert "90\xa0% of the gap closed" in page
     pictures = re.findall('src="data:image/png;base64,([^"]+)"', page)
     assert len(pictures) == 3
     assert all(b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
@@ -85,7 +85,10 @@ def test_its_report_is_that_of_the_folder_but_for_the_files_beside_it(named, tmp
     page = unescape(re.search('srcdoc="([^"]*)"', named._repr_html_())[1])
     written = named.write(tmp_path)[-1].read_text(encoding="utf-8")
     # Only the page in the folder contains a command that names a file of the folder.
-    command = r'<p>How far [^<]*</p>\n<pre class="copied" tabindex="0">simgap score [^<]*</pre>\n'
+    command = (
+        r"<p>To measure the error [^<]*</p>\n"
+        r'<pre class="copied" tabindex="0">simgap score [^<]*</pre>\n'
+    )
     assert len(re.findall(command, written)) == 1
     assert re.sub(command, "", written) == page
 

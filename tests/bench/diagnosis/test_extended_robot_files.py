@@ -1,7 +1,7 @@
 """Tests of the model file written next to extended.toml for a robot, and of its score."""
 
 from dataclasses import replace
-from html import escape
+from html import unescape
 from pathlib import Path
 
 import mujoco
@@ -59,11 +59,11 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
     assert "friction" in line
     model = mujoco.MjModel.from_xml_path(str(paths[2]))
     assert model.dof_frictionloss.tolist() == [0.0, 0.03]
-    assert "0.031), from 0 to 0.03 N*m, fitted to a log" in paths[2].read_text()
+    assert "0.031), from 0 to 0.03 N·m, fitted to a log" in paths[2].read_text()
     report = paths[-1].read_text()
-    assert "What to change in the model file" in report
+    assert "Changes of the model file" in report
     assert report.count('<ins class="line">') == 1
-    assert "frictionloss=&quot;0.03&quot;" in report
+    assert 'frictionloss="0.03"' in unescape(report)
 
 
 def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
@@ -72,12 +72,12 @@ def test_the_report_shows_the_lines_to_change(arm, tmp_path, monkeypatch):
     explanation = Explanation(shown.verdict, shown, extended_of(arm, effects=FRICTION))
     html = (explanation.write(tmp_path)[0].parent / "report.html").read_text()
     before = '<joint name="elbow" type="hinge" axis="0 1 0" damping="0.1" armature="0.005"/>'
-    assert f"− {escape(before)}</del>" in html
-    assert escape('armature="0.005" frictionloss="0.03"') in html
+    assert f"− {before}</del>" in unescape(html)
+    assert 'armature="0.005" frictionloss="0.03"' in unescape(html)
     assert "dry friction is stiff in the file" in html
     nothing = Explanation(shown.verdict, replace(shown, verdict=story("adequate").verdict),
                           extended_of(arm))  # fmt: skip
-    assert "What to change" not in nothing._repr_html_()
+    assert "Changes of the model file" not in nothing._repr_html_()
 
 
 @pytest.mark.slow

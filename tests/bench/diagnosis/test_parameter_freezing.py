@@ -57,7 +57,10 @@ def test_a_number_that_is_mixed_up_is_frozen_and_said(log):
     (frozen,) = [text for text in said if text.startswith("frozen")]
     (name,) = re.findall(r"\S+@\S+", frozen)
     assert name in ("mass.scale@body1", "inertia.armature@hinge")
-    assert any(f"does not fix {name} beside the others" in text for text in found.story.lack_of_fit)
+    assert any(
+        f"do not identify {name} together with the other parameters" in text
+        for text in found.story.lack_of_fit
+    )
     numbers = found.answer.parameters
     assert numbers[name].value == 0
     assert numbers[name].low is None

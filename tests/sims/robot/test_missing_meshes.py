@@ -99,4 +99,4 @@ def test_explain_says_what_it_leaves_out_and_goes_on(tmp_path):
     said = []
     found = simgap.explain(tmp_path / "log.csv", jobs=1, budget=3.0, say=said.append)
     assert f"joint.flexibility@elbow is not tested: {WHY}" in said
-    assert found.answer.cut is None or "looked at last" in str(found)
+    assert found.answer.cut is None or "last step" in str(found)

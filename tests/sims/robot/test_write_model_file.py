@@ -43,7 +43,7 @@ def test_an_mjcf_stays_its_authors(tmp_path: Path) -> None:
     comments = [line[2:].strip() for line in changes if line.startswith("+ ") and "<!--" in line]
     assert len(gone) == 8
     assert "<!-- the elbow is the one that wears -->" in done.xml
-    told = "friction.coulomb@elbow: 0.3 N*m (95 %: 0.27 to 0.33), fitted to log.csv"
+    told = "friction.coulomb@elbow: 0.3 N·m (95 %: 0.27 to 0.33), fitted to log.csv"
     place = next(i for i, line in enumerate(after) if told in line)
     assert 'name="elbow"' in after[place + 1]
     assert 'frictionloss="0.35"' in after[place + 1]

@@ -227,7 +227,7 @@ def test_what_is_open_is_not_called_settled(figures):
         "Structure that no known cause"
         in Reader(render_report(story("partial", lack_of_fit=()), figures)).text
     )
-    assert "Nothing that stands out" in Reader(render_report(story("adequate"), figures)).text
+    assert "Nothing significant" in Reader(render_report(story("adequate"), figures)).text
 
 
 def test_gaps_in_what_is_known_do_not_break_the_page():

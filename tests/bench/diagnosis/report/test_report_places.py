@@ -136,12 +136,12 @@ def test_a_headline_says_what_is_lacking_or_wrong_and_where(causes, said):
 def test_a_headline_of_a_set_names_all_of_it():
     assert format_headline(robot_story("ambiguous", [WRISTS])) == (
         "The simulation lacks Coulomb friction at any of the joints wrist_1, wrist_2 or wrist_3: "
-        "these data cannot tell which."
+        "these data do not show which."
     )
     mixed = cause("friction.coulomb@elbow", alternatives=["mass.scale@elbow_link"])
     assert format_headline(robot_story("ambiguous", [mixed])) == (
         "The simulation either lacks Coulomb friction at joint elbow or has a wrong mass of "
-        "body elbow_link: these data cannot tell which."
+        "body elbow_link: these data do not show which."
     )
 
 
@@ -188,7 +188,7 @@ def test_unknown_and_adequate_count_causes_and_not_their_places():
     unknown = format_headline(robot_story("unknown", causes=()))
     assert "none of the 16 known causes explains it at any place" in unknown
     clean = " ".join(format_gain_and_caveats(robot_story("adequate", causes=())))
-    assert "16 possible causes were looked for at every place and none stands out" in clean
+    assert "16 possible causes were tested at every place and none is significant" in clean
 
 
 def test_what_is_wrong_and_what_is_lacking():
@@ -210,7 +210,9 @@ def test_the_account_says_numbers_at_their_places():
     assert "0.300 (0.280 to 0.320) N·m at shoulder_pan, " in text
     text = " ".join(" ".join(format_summary(robot_story("ambiguous", [WRISTS]))).split())
     assert "Each closes 90 % of the gap" in text
-    assert "Coulomb friction at joint wrist_2 or wrist_3 instead would do as well" in text
+    assert (
+        "Coulomb friction at joint wrist_2 or wrist_3 would explain the data equally well" in text
+    )
 
 
 def test_what_an_effect_does_is_said_without_its_place():
@@ -231,7 +233,7 @@ def test_of_many_channels_the_worst_of_each_kind_is_said():
         ),
     )
     assert format_detectable_gap(few).count("in x") == 10
-    assert "To correct it closes" in " ".join(format_gain_and_caveats(robot_story(causes=[HEAVY])))
+    assert "Correcting it closes" in " ".join(format_gain_and_caveats(robot_story(causes=[HEAVY])))
 
 
 def test_marks_are_the_places_that_the_verdict_names():

@@ -42,7 +42,7 @@ def text(told):
         ("named", "The simulation lacks linear drag: motion is resisted in proportion to speed."),
         (
             "ambiguous",
-            "The simulation lacks linear drag or Coulomb friction: these data cannot tell which.",
+            "The simulation lacks linear drag or Coulomb friction: these data do not show which.",
         ),
         (
             "partial",
@@ -54,7 +54,7 @@ def text(told):
         ),
         (
             "unidentifiable",
-            "These data cannot fix inertia: what the simulation lacks cannot be told from them.",
+            "These data do not identify inertia: it is not known what the simulation lacks.",
         ),
     ],
 )
@@ -80,7 +80,7 @@ def test_an_ambiguous_cause_beside_a_certain_one():
     told = story("ambiguous", causes=[EITHER, TILT])
     expected = (
         "The simulation lacks a tilt of gravity, and linear drag or Coulomb friction: "
-        "these data cannot tell which."
+        "these data do not show which."
     )
     assert format_headline(told) == expected
 
@@ -98,7 +98,7 @@ def test_the_gain_of_a_partial_verdict_is_that_of_the_named_cause():
 def test_unidentifiable_says_which_parameters_the_analysis_found_vague():
     assert format_headline(
         story("unidentifiable", unidentified_parameters=("mass", "inertia"))
-    ).startswith("These data cannot fix mass and inertia:")
+    ).startswith("These data do not identify mass and inertia:")
 
 
 def test_the_gain_is_told_with_its_interval_and_units():
@@ -135,7 +135,7 @@ def test_a_weak_cause_under_unknown_is_not_sold_as_the_answer():
 
 def test_adequate_says_what_was_looked_for_and_what_could_hide():
     said = " ".join(format_gain_and_caveats(story("adequate")))
-    assert "6 possible causes were looked for" in said
+    assert "6 possible causes were tested" in said
     assert "p = 0.4" in said
     assert re.search(
         r"A gap of up to 0\.00\d+ rad in q .* and 0\.0\d+ rad/s in qd .* could still hide", said
@@ -166,7 +166,7 @@ def test_a_gap_that_hides_is_smaller_with_more_samples_and_larger_than_a_true_on
 
 
 def test_ambiguous_proposes_the_experiment_and_says_so_if_there_is_none():
-    assert "To tell them apart: Release it from 1.5 rad" in text(story("ambiguous"))
+    assert "To distinguish them: Release it from 1.5 rad" in text(story("ambiguous"))
     assert "no experiment is proposed" in text(story("ambiguous", next_experiment=None))
     assert "Next experiment: Release it" in text(story("unidentifiable", next_experiment=NEXT))
 
@@ -185,7 +185,7 @@ def test_parameters_tell_what_they_had_absorbed():
         "0.00351 (0.00345 to 0.00357) kg·m² after (+5.4 %)" in said
     )
     assert "it had absorbed part of the gap" in said
-    assert "restitution is not touched by these data and stays at its nominal 0.7." in said
+    assert "restitution does not influence these data and stays at its nominal 0.7." in said
 
 
 def test_a_move_within_both_intervals_is_no_absorption():
@@ -302,13 +302,13 @@ CUT = {"by": "budget", "during": "refit of drag.linear and 3 more", "not_asked":
 
 def test_an_early_end_is_told_before_anything_else():
     told = text(story("unknown", cut=CUT, causes=[DRAG]))
-    assert "The search was ended before it could say what the simulation lacks; the best" in told
-    assert "by its budget of time; looked at last: refit of drag.linear and 3 more. Not" in told
+    assert "The search stopped before it could say what the simulation lacks; best" in told
+    assert "by its time budget; last step: refit of drag.linear and 3 more. Not" in told
     assert "none of the 6 known causes" not in told, "they were not all asked"
     told = text(story("unknown", cut={**CUT, "by": "interrupt"}))
-    assert "before it could say what the simulation lacks. The search was ended by an in" in told
+    assert "before it could say what the simulation lacks. The search was stopped by an in" in told
     told = text(story("partial", cut={**CUT, "not_asked": ["structure"]}))
-    assert "lacks linear drag; what else, was not asked to the end." in told
+    assert "lacks linear drag; the search stopped before testing for further causes." in told
     assert "something else that no known cause explains" not in told
 
 

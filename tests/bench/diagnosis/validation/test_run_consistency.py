@@ -86,7 +86,7 @@ def test_a_mass_that_grows_from_day_to_day(tmp_path):
     assert mass.trend_covariate.kind == "time"
     assert (
         name_missing_physics("mass", "time", mass.trend_covariate.name, True, ())
-        == "a load that changes"
+        == "a load that changes with time"
     )
     assert mass.scatter == pytest.approx(np.std(masses, ddof=1), rel=0.3)
     # The prediction error for a new day covers 2.03 kg; the standard error does not.
@@ -117,8 +117,8 @@ def test_what_is_missing_makes_a_number_move(tmp_path, capsys):
     assert main(["explain", *map(str, paths), "--out", str(out)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "lacks Coulomb friction" in said
-    assert "in place of friction.coulomb its value would differ between logs" in said
-    assert "over the 3 logs, in the order given, nothing drifts" in said.lower()
+    assert "instead of friction.coulomb, its value would differ between logs" in said
+    assert "no number drifts over the 3 logs, in the order given" in said.lower()
     with (out / "apart.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     friction = [r for r in rows if r["number"] == "friction.coulomb" and r["by"] == "log"]
@@ -127,8 +127,8 @@ def test_what_is_missing_makes_a_number_move(tmp_path, capsys):
     for row in friction[1:-1]:
         assert float(row["low"]) - 0.01 < 0.3 < float(row["high"]) + 0.01
     page = (out / "report.html").read_text()
-    assert "Which number to trust" in page
-    assert 'class="each"' in page
+    assert "Agreement between runs" in page
+    assert 'class="intervals"' in page
 
 
 def test_logs_that_are_not_of_one_system_are_refused(tmp_path, capsys):
@@ -206,7 +206,7 @@ def test_what_a_number_moves_with_says_what_is_missing(tmp_path):
     assert (drag.trend_covariate.kind, drag.trend_covariate.name) == ("other", "temperature")
     assert drag.trend_covariate.trend.slope == pytest.approx(-0.08 / 5.0, rel=0.1)
     said = " ".join(format_consistency(found.story))
-    assert "it falls with temperature: what is missing is friction that depends on temp" in said
+    assert "it decreases with temperature: friction that depends on temp" in said
 
 
 def test_the_missing_effect_by_what_a_number_moves_with():
