@@ -1,12 +1,14 @@
-"""Gravity effects: errors of size and direction.
+"""Gravity effects: errors of size and direction, and weights that are carried.
 
 * (1) scale: the weight times 1 + c
 * (2) tilt: accelerations x g and y g along the horizontal axes
+* (3) compensation: a force of -c times the weight of a body at its centre of mass (MuJoCo's
+  ``gravcomp``), such as a counterweight, a spring, or a controller that carries it
 """
 
 from __future__ import annotations
 
-from sims.core.effect import Coefficient, Force
+from sims.core.effect import Coefficient, Force, ModelValueEffect
 from sims.core.simulator import Array
 from sims.core.system import StateSnapshot
 
@@ -57,3 +59,14 @@ class GravityTilt(Force):
             moment: state snapshot of L batch elements.
         """
         return moment.gravity * (c[0] * moment.push("x") + c[1] * moment.push("y"))  # (2)
+
+
+class GravityCompensation(ModelValueEffect):
+    """Share c of the weight of a body that is carried, in addition to the file's ``gravcomp``."""
+
+    name = "gravity.compensation"
+    noun = "gravity compensation"
+    says = "a share of the body's weight is carried, such as by a counterweight or the controller"
+    source = "V. Arakelian, Gravity compensation in robotics, Advanced Robotics 30(2), 79 (2016)"
+    at = "body"
+    coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)  # (3)

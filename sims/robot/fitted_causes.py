@@ -18,7 +18,9 @@ ALL_PLACES = "*"
 """Place of an effect family, which acts at all places of its kind."""
 
 _AXES: Mapping[str, tuple[str, ...]] = {
+    "joint.axis": ("x", "y", "z"),
     "mass.offset": ("x", "y", "z"),
+    "payload": ("mass", "x", "y", "z"),
     "gravity.tilt": ("x", "y"),
 }
 """Names of the coefficients of effects with several coefficients, in their order."""

@@ -9,6 +9,11 @@ body:
 * (4) Tilted: gravity plus g c_x along x and g c_y along y, with the magnitude g of the file's
   gravity.
 * (5) Limited: the file's range restricted to [-c, c]; a limit of zero has no effect.
+* (6) Turned: an axis a becomes exp([r]) a with the rotation vector r = c (3 numbers, rad) in the
+  body frame (O. Rodrigues, J. Math. Pures Appl. 5, 380, 1840).
+* (7) Loaded: a point mass m at p on a body with mass m_0, centre of mass p_0 and inertia tensor I_0
+  about it gives mass m_0 + m, centre p_1 = (m_0 p_0 + m p) / (m_0 + m) and tensor
+  I_0 + m_0 J(p_0 - p_1) + m J(p - p_1), with J(d) = |d|^2 1 - d d' (parallel axis theorem).
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from sims.core.simulator import Array
+from sims.robot.places.observable_tilts import observable_tilts
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 
 FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
@@ -37,6 +43,9 @@ RK4_INTEGRATOR_ID = 1
 
 MIN_FACTOR = 1e-6
 """Minimum factor of a mass or a gain, so that none becomes zero or negative."""
+
+GRAVCOMP_PLACEHOLDER = 1e-200
+"""Gravity compensation that changes no force, since it is smaller than any rounding error."""
 
 Fields = Mapping[str, Any]
 """Model fields of L batch elements by name, arrays (L, ...)."""
@@ -76,6 +85,9 @@ def make_batch_spec(robot: RobotModel) -> Any:
     spec = robot.spec.copy()
     for body in spec.bodies:
         body.simple = False
+    # MuJoCo computes no gravity compensation if no body of the compiled model has any.
+    if not any(body.gravcomp for body in spec.bodies):
+        spec.bodies[-1].gravcomp = GRAVCOMP_PLACEHOLDER
     return spec
 
 
@@ -248,6 +260,83 @@ def _couple(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     fields["wrap_prm"][:, get_coupling_address(robot, place)] = c[0]
 
 
+def _move_zero(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    fields["qpos0"][:, robot.joint(place).position] += c[0]
+
+
+def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    number = robot.joint(place).id
+    turned = np.flatnonzero(c.any(axis=0))
+    axis = fields["jnt_axis"][turned, number]
+    vector = np.zeros(axis.shape)
+    # At a place, the effect has only the coefficients that the motion shows.
+    vector[:, list(range(3) if len(c) == 3 else observable_tilts(robot, place))] = c[:, turned].T
+    angle = np.linalg.norm(vector, axis=1, keepdims=True)
+    about = vector / angle
+    along = np.sum(about * axis, axis=1, keepdims=True)
+    rotated = (
+        np.cos(angle) * axis
+        + np.sin(angle) * np.cross(about, axis)
+        + (1.0 - np.cos(angle)) * along * about
+    )  # (6)
+    fields["jnt_axis"][turned, number] = rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
+
+
+def _scale_length(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    fields["body_pos"][:, robot.body(place).id] *= compute_factor(c[0])[:, None]
+
+
+def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    column = fields["body_gravcomp"]
+    number = robot.body(place).id
+    column[:, number] = np.where(c[0], add_to_stated(column[:, number], c[0]), column[:, number])
+
+
+def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    number = robot.body(place).id
+    loaded = np.flatnonzero(c[0])
+    point = robot.compiled.body_ipos[number] + c[1:, loaded].T
+    mass, centre = fields["body_mass"][loaded, number], fields["body_ipos"][loaded, number]
+    total = mass + c[0, loaded]
+    middle = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
+    axes = _rotation_matrices(fields["body_iquat"][loaded, number])
+    moments = fields["body_inertia"][loaded, number]
+    tensor = np.einsum("lij,lj,lkj->lik", axes, moments, axes)
+    tensor += mass[:, None, None] * compute_point_inertias(centre - middle)
+    tensor += c[0, loaded, None, None] * compute_point_inertias(point - middle)  # (7)
+    moments, axes = np.linalg.eigh(tensor)
+    # A rotation has no reflection.
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    fields["body_mass"][loaded, number] = total
+    fields["body_ipos"][loaded, number] = middle
+    fields["body_inertia"][loaded, number] = moments
+    fields["body_iquat"][loaded, number] = _quaternions(axes)
+
+
+def compute_point_inertias(arms: Array) -> Array:
+    """Return J(d) (L, 3, 3) of (7) for vectors (L, 3)."""
+    squares = np.sum(arms**2, axis=1)[:, None, None]
+    result: Array = squares * np.eye(3) - arms[:, :, None] * arms[:, None, :]
+    return result
+
+
+def _rotation_matrices(quaternions: Array) -> Array:
+    """Return rotation matrices (L, 3, 3) of unit quaternions (L, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    w, *xyz = np.moveaxis(quaternions, 1, 0)
+    result: Array = Rotation.from_quat(np.stack([*xyz, w], axis=1)).as_matrix()
+    return result
+
+
+def _quaternions(matrices: Array) -> Array:
+    """Return unit quaternions (L, 4), MuJoCo's w first, of rotation matrices (L, 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    result: Array = np.roll(Rotation.from_matrix(matrices).as_quat(), 1, axis=1)
+    return result
+
+
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
     number = robot.actuator(place).id
     limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
@@ -284,6 +373,17 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
     ),
     "actuator.stiffness": ModelFieldEffect(_SERVO, _scale_stiffness),
     "actuator.damping": ModelFieldEffect(_SERVO, _scale_damping),
+    "joint.zero": ModelFieldEffect(("qpos0",), _move_zero),
+    "joint.axis": ModelFieldEffect(("jnt_axis",), _turn_axis, changes_derived_constants=True),
+    "link.length": ModelFieldEffect(("body_pos",), _scale_length, changes_derived_constants=True),
+    "gravity.compensation": ModelFieldEffect(
+        ("body_gravcomp",), _compensate_gravity, changes_derived_constants=True
+    ),
+    "payload": ModelFieldEffect(
+        ("body_mass", "body_ipos", "body_inertia", "body_iquat"),
+        _add_payload,
+        changes_derived_constants=True,
+    ),
     "gravity.scale": ModelFieldEffect(("opt.gravity",), _scale_gravity),
     "gravity.tilt": ModelFieldEffect(("opt.gravity",), _tilt_gravity),
     "joint.coupling": ModelFieldEffect((COUPLING_FIELD,), _couple),
@@ -295,3 +395,12 @@ MODEL_FIELD_EFFECTS: Mapping[str, ModelFieldEffect] = {
 
 Each acts at a place of its kind, and those of the world at any place, such as ``""``.
 """
+
+
+def get_write_order(effect: str) -> int:
+    """Return the sort key of an effect in the order in which model fields are written.
+
+    A payload comes last, since errors of a body's own mass and inertia do not apply to it. In a
+    URDF, a joint's zero is a turn about the axis, so it comes after errors of the axis.
+    """
+    return int(effect in ("joint.zero", "payload"))

@@ -155,11 +155,12 @@ def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[
     """
     parameters = list_coefficients(world, name)
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
-    shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
+    # One that is tried at several values, such as the position of a payload, is one as well.
+    coefficients = world.available_effects[name].coefficients
+    shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0 or coefficients[i].tried]
     count = len(parameters)
     scaling = [i for i in range(count) if i not in shaping]
     travel = world.get_effect_travel(name)
-    coefficients = world.available_effects[name].coefficients
     grids = [
         parameters[i].bounds[:1]
         if coefficients[i].of == "rotor" and _is_contained_in_model(world, at, name)

@@ -31,6 +31,7 @@ from sims.robot.floating_joints import FloatingJoints, FloatingState
 from sims.robot.model_field_effects import (
     COUPLING_FIELD,
     MODEL_FIELD_EFFECTS,
+    get_write_order,
     make_batch_spec,
     write_friction_form,
 )
@@ -214,7 +215,7 @@ class MujocoBatch:
         was_derived = any(self._derives(name) for name in self._changed)
         self._changed.clear()
         derives = was_derived or bool(self.robot.series)
-        for effect, c in acting:
+        for effect, c in sorted(acting, key=lambda one: get_write_order(one[0].of)):
             if not c.any() or is_series_effect(effect):
                 continue
             native = MODEL_FIELD_EFFECTS[effect.of or effect.name]

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sims import effects as library
 from sims.core.effect import SeriesElement as Transmission
 from sims.core.freed_memory import release_free_memory
+from sims.core.simulator import Array
 from sims.extended_simulator import FittedValue
 from sims.robot.coupled_drives import COUPLING_EFFECT as COUPLED
 from sims.robot.coupled_drives import make_coupled_robot
@@ -30,6 +32,7 @@ from sims.robot.dynamics.series_joints import (
 from sims.robot.dynamics.series_joints import write_elements as state_element
 from sims.robot.export.command_attributes import COMMAND_WRITERS, get_application_order
 from sims.robot.export.mjcf_attributes import (
+    ANGLE_ATTRIBUTES,
     ATTRIBUTES_BY_KIND,
     ENUM_ATTRIBUTES,
     FLAG_ATTRIBUTES,
@@ -57,6 +60,9 @@ KEPT_VALUE_NOTE = "as it was: it would move along with another change"
 KEYFRAMES_OMITTED_NOTE = "keyframes are left out: they lack the coordinates of joints in series"
 
 COULOMB = "friction.coulomb"
+
+GEOMETRY_EFFECTS = frozenset({"joint.axis", "link.length"})
+"""Effects that change attributes in the frame of the element around theirs."""
 
 _NOTES = {
     "joint.flexibility": "joint.flexibility: the joint has a second one in series, whose position "
@@ -200,6 +206,8 @@ def _write(
         for body in robot.bodies:
             wanted["body_gravcomp"][0, body.id] = 1.0
         return "+gravity is compensated: the bodies have gravcomp = 1, and gravity is as it was"
+    if cause.effect in GEOMETRY_EFFECTS and _is_in_frame(robot, cause):
+        return "its element is within a <frame>, or made by another element"
     if cause.effect in MODEL_FIELD_EFFECTS:
         MODEL_FIELD_EFFECTS[cause.effect].write(
             wanted, robot, cause.place, cause.coefficients[:, None]
@@ -214,6 +222,12 @@ def _write(
     if cause.effect.startswith(("sensor.", "clock.")):
         return "what a sensor shows is no part of the model"
     return "MuJoCo has no such element"
+
+
+def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
+    """Return whether a frame element changes the attributes that a geometry effect changes."""
+    elements = robot.spec.joints if cause.effect.startswith("joint.") else robot.spec.bodies
+    return any(one.name == cause.place and one.frame is not None for one in elements)
 
 
 def _compiled(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
@@ -285,6 +299,8 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
             value = limited.mjLIMITED_TRUE if values[0] else limited.mjLIMITED_FALSE
         elif name in INTEGER_ATTRIBUTES:
             value = int(values[0])
+        elif kind == "frame" and name == "pos":
+            value = _in_frames(element, values)
         else:
             value = _numbers(element, name, known[name], values)
         setattr(element, known[name], value)
@@ -294,11 +310,27 @@ def set_attributes(element: Any, statement: AttributeStatement) -> None:
         element.springdamper = (0.0, 0.0)
 
 
+def _in_frames(body: Any, position: Sequence[float]) -> Array:
+    """Convert a position in the parent body to the innermost of the frames around a body.
+
+    MuJoCo replaces the bodies that it fuses by such frames.
+    """
+    rotation, origin = Rotation.identity(), np.zeros(3)
+    frame = body.frame
+    while frame is not None:
+        w, *xyz = frame.quat
+        outer = Rotation.from_quat([*xyz, w])
+        rotation, origin = outer * rotation, frame.pos + outer.apply(origin)
+        frame = frame.frame
+    result: Array = rotation.inv().apply(np.asarray(position) - origin)
+    return result
+
+
 def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
     """Convert values to the form of a spec attribute: a number, or an array of its length."""
     import mujoco
 
-    if name == "springref" and element.type == mujoco.mjtJoint.mjJNT_HINGE:
+    if name in ANGLE_ATTRIBUTES and element.type == mujoco.mjtJoint.mjJNT_HINGE:
         return float(np.rad2deg(values[0])) if element.compiler.degree else values[0]
     now = np.asarray(getattr(element, attribute))
     if now.ndim == 0:

@@ -20,6 +20,7 @@ import numpy as np
 
 from sims.robot.export.mjcf_attributes import Fields
 from sims.robot.fitted_causes import FittedCause
+from sims.robot.model_field_effects import get_write_order
 from sims.robot.robot_model import RobotModel
 
 UnstatableReason = str | None
@@ -246,6 +247,10 @@ def get_application_order(cause: FittedCause) -> Any:
     """
     # The stiffness of dry friction depends on the time step.
     if cause.effect.startswith("numerics."):
-        return -2
+        return -2.0
     names = list(COMMAND_WRITERS)
-    return names.index(cause.effect) if cause.effect in names else -1
+    return (
+        names.index(cause.effect)
+        if cause.effect in names
+        else -1.0 + 0.5 * get_write_order(cause.effect)
+    )

@@ -23,7 +23,7 @@ _USUAL: Mapping[str, Values] = {
     "solimpfriction": (0.9, 0.95, 0.001, 0.5, 2.0),
 }
 """MuJoCo's default values of attributes; all other attributes default to zero."""
-_OF_THE_POSE = frozenset({"springref"})
+_OF_THE_POSE = frozenset({"axis", "ref", "springref"})
 """Attributes that stay with a joint since they depend on its pose."""
 _NONE, _FIXED, _AFFINE = 0.0, 0.0, 1.0
 """MuJoCo's enumeration values of a position servo: no dynamics, fixed gain, affine bias."""

@@ -11,10 +11,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-Kind = Literal["joint", "body", "weight", "actuator", "option", "compiler"]
+Kind = Literal["joint", "body", "frame", "actuator", "option", "compiler"]
 """Kinds of model elements.
 
-Kind ``weight`` is the gravity compensation of a body, separate from its inertial.
+Kind ``frame`` is a body without its inertial: the position of its frame, and its gravity
+compensation.
 """
 
 Fields = dict[str, Any]
@@ -106,6 +107,8 @@ ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
         MjcfAttribute("stiffness", "stiffness", _polynomial("jnt_stiffness", "jnt_stiffnesspoly")),
         MjcfAttribute("springref", "springref", _of("qpos_spring", "position")),
         MjcfAttribute("armature", "armature", _of("dof_armature", "velocity")),
+        MjcfAttribute("axis", "axis", _of("jnt_axis")),
+        MjcfAttribute("ref", "ref", _of("qpos0", "position")),
     ),
     "body": (
         MjcfAttribute("pos", "ipos", _of("body_ipos")),
@@ -113,7 +116,10 @@ ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
         MjcfAttribute("mass", "mass", _of("body_mass")),
         MjcfAttribute("diaginertia", "inertia", _of("body_inertia")),
     ),
-    "weight": (MjcfAttribute("gravcomp", "gravcomp", _of("body_gravcomp")),),
+    "frame": (
+        MjcfAttribute("pos", "pos", _of("body_pos")),
+        MjcfAttribute("gravcomp", "gravcomp", _of("body_gravcomp")),
+    ),
     "actuator": (
         MjcfAttribute("dyntype", "dyntype", _of("actuator_dyntype")),
         MjcfAttribute("dynprm", "dynprm", _of("actuator_dynprm")),
@@ -141,6 +147,7 @@ ATTRIBUTES_BY_KIND: Mapping[Kind, tuple[MjcfAttribute, ...]] = {
 _NAMES = (
     *("dof_damping", "dof_dampingpoly", "dof_frictionloss", "dof_solref", "dof_solimp"),
     *("jnt_stiffness", "jnt_stiffnesspoly", "qpos_spring", "dof_armature"),
+    *("jnt_axis", "qpos0", "body_pos"),
     *("body_ipos", "body_iquat", "body_mass", "body_inertia", "body_gravcomp"),
     *("actuator_dyntype", "actuator_dynprm", "actuator_gaintype", "actuator_gainprm"),
     *("actuator_biastype", "actuator_biasprm", "actuator_ctrllimited", "actuator_ctrlrange"),
@@ -148,6 +155,8 @@ _NAMES = (
 )
 
 FLAG_ATTRIBUTES = frozenset({"ctrllimited", "forcelimited"})
+ANGLE_ATTRIBUTES = frozenset({"ref", "springref"})
+"""Attributes of a hinge in the unit of the file's angles."""
 INTEGER_ATTRIBUTES = frozenset({"nsample", "interp"})
 ENUM_ATTRIBUTES: Mapping[str, str] = {
     "dyntype": "mjtDyn",
@@ -186,7 +195,7 @@ def list_elements(model: Any) -> list[ModelElement]:
     one = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     found = [ModelElement("joint", i) for i in range(model.njnt) if int(model.jnt_type[i]) in one]
     found += [ModelElement("body", i) for i in range(1, model.nbody)]
-    found += [ModelElement("weight", i) for i in range(1, model.nbody)]
+    found += [ModelElement("frame", i) for i in range(1, model.nbody)]
     single = [i for i in range(len(model.actuator_ctrlnum)) if int(model.actuator_ctrlnum[i]) == 1]
     found += [ModelElement("actuator", i) for i in single]
     return [*found, ModelElement("option", 0)]

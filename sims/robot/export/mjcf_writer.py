@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sims.robot.export.mjcf_attributes import (
+    ANGLE_ATTRIBUTES,
     ENUM_ATTRIBUTES,
     FLAG_ATTRIBUTES,
     INTEGER_ATTRIBUTES,
@@ -60,7 +61,7 @@ class MjcfWriter:
         element = statement.element
         if element.kind == "option":
             self._option(statement, comments)
-        elif element.kind == "weight":
+        elif element.kind == "frame":
             body = self.tags[ModelElement("body", element.id)]
             _say(body, comments)
             body.new |= format_attributes(statement.values)
@@ -127,10 +128,8 @@ class MjcfWriter:
     def _joint(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
         values = format_attributes(statement.values)
         hinge = tag.get_attribute("type") in (None, "hinge")
-        if "springref" in statement.values and hinge and self.degrees:
-            values["springref"] = format_numbers(
-                (float(np.rad2deg(statement.values["springref"][0])),)
-            )
+        for name in ANGLE_ATTRIBUTES & set(statement.values) if hinge and self.degrees else ():
+            values[name] = format_number(float(np.rad2deg(statement.values[name][0])))
         if {"damping", "stiffness"} & set(values) and tag.get_attribute("springdamper"):
             values["springdamper"] = "0 0"
         return values

@@ -9,7 +9,7 @@ import numpy as np
 
 from sims.core.effect import Effect
 from sims.robot.export.mjcf_attributes import Fields, copy_model_fields
-from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS, get_write_order
 from sims.robot.robot_model import RobotModel
 
 
@@ -88,6 +88,13 @@ _TOTALS: Mapping[str, Reading] = {
     "inertia.scale": Reading(
         lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
     ),
+    "joint.zero": Reading(
+        lambda f, r, place: [f["qpos0"][0, r.joint(place).position]],
+    ),
+    "link.length": Reading(
+        lambda f, r, place: [float(np.linalg.norm(f["body_pos"][0, r.body(place).id]))], "m"
+    ),
+    "gravity.compensation": Reading(lambda f, r, place: [f["body_gravcomp"][0, r.body(place).id]]),
     "gravity.scale": Reading(_strength, "m/s^2"),
     "gravity.tilt": Reading(lambda f, *_: f["opt.gravity"][0, :2], "m/s^2"),
 }
@@ -111,7 +118,7 @@ def totals(robot: RobotModel, fitted: Fitted) -> list[list[Total | None]]:
         For each effect, one entry per coefficient; None if the file has no such number.
     """
     stated, after = copy_model_fields(robot.compiled), copy_model_fields(robot.compiled)
-    for effect, values in fitted:
+    for effect, values in sorted(fitted, key=lambda one: get_write_order(_name(one[0]))):
         if _name(effect) in _TOTALS:
             c = np.array(values, dtype=float)[:, None]
             MODEL_FIELD_EFFECTS[_name(effect)].write(after, robot, effect.place, c)

@@ -35,6 +35,16 @@ _OF_URDF = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
 """Model fields that a URDF specifies, in addition to the inertia tensors."""
 
 
+_NOT_OF_URDF = (
+    *("dof_solref", "dof_solimp", "body_inertia", "body_iquat"),
+    *("dof_invweight0", "body_invweight0"),
+)
+"""Model fields that a URDF does not specify, or that have been compared before.
+
+Inverse weights belong to the reference pose, which is another one if a joint's zero has moved.
+"""
+
+
 def check_written_files(
     robot: RobotModel, causes: CauseCoefficients, done: WrittenModelFiles
 ) -> None:
@@ -98,7 +108,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
         # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
         # elsewhere.
         _without_contacts(model)
-        for name in ("dof_solref", "dof_solimp", "body_inertia", "body_iquat"):
+        for name in _NOT_OF_URDF:
             getattr(model, name)[:] = getattr(found, name)
     _compare_motion(found, wanted, "extended.urdf")
 
@@ -129,20 +139,36 @@ def _compare(found: Any, wanted: Any, name: str) -> None:
 
 
 def _compare_motion(found: Any, wanted: Any, name: str) -> None:
-    one, other = simulate_test_motion(found), simulate_test_motion(wanted)
+    # A URDF states a joint's zero as a turned frame, so that its reference pose is another one.
+    pose = displace_reference_pose(wanted)
+    one, other = simulate_test_motion(found, pose), simulate_test_motion(wanted, pose)
     if not np.allclose(one, other, rtol=MOTION_TOLERANCE, atol=MOTION_TOLERANCE, equal_nan=True):
         error = float(np.nanmax(np.abs(one - other)))
         raise RuntimeError(f"{name} does not move as it was meant: qpos differs by {error:.2g}")
 
 
-def simulate_test_motion(model: Any) -> Array:
-    """Simulate a test motion (S, nq) from a displaced pose with nonzero controls."""
+def displace_reference_pose(model: Any) -> Array:
+    """Return a pose (nq,) near the reference pose, with different displacements of all joints."""
+    import mujoco
+
+    # Different values detect swapped coordinates.
+    pose: Array = model.qpos0.copy()
+    mujoco.mj_integratePos(model, pose, 0.1 + 0.05 * np.sin(np.arange(model.nv)), 1.0)
+    return pose
+
+
+def simulate_test_motion(model: Any, pose: Array | None = None) -> Array:
+    """Simulate a test motion (S, nq) with nonzero controls.
+
+    Args:
+        model: the mujoco.MjModel.
+        pose: initial pose (nq,); that of `displace_reference_pose` by default.
+    """
     import mujoco
     from mujoco import rollout
 
     data = mujoco.MjData(model)
-    # All coordinates get different values, so that swapped coordinates are detected.
-    mujoco.mj_integratePos(model, data.qpos, 0.1 + 0.05 * np.sin(np.arange(model.nv)), 1.0)
+    data.qpos[:] = displace_reference_pose(model) if pose is None else pose
     low, high = model.actuator_ctrlrange.T
     middle, half = (low + high) / 2.0, (high - low) / 2.0
     limited = model.actuator_ctrllimited.astype(bool)

@@ -7,6 +7,11 @@ MuJoCo fused from several links on fixed joints is changed in each of them:
   mass of the body follow.
 * (2) Each centre of mass is moved by R' c, with the link's axes R in the body frame; the body's
   centre of mass moves by c.
+* (3) A joint's zero moves by c if its origin is turned by -c about the axis, or moved by -c along
+  it.
+* (4) The origin of a body's joint moves by R' c p, with the position p of the body in the frame of
+  the body that carries it, and the axes R of the joint's parent link in that frame.
+* (5) A payload is added to the first link of its body by the parallel axis theorem.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sims.core.simulator import Array
 from sims.robot.export.xml_editing import (
@@ -24,7 +30,11 @@ from sims.robot.export.xml_editing import (
     format_numbers,
 )
 from sims.robot.fitted_causes import FittedCause
-from sims.robot.model_field_effects import add_to_stated, compute_factor
+from sims.robot.model_field_effects import (
+    add_to_stated,
+    compute_factor,
+    compute_point_inertias,
+)
 from sims.robot.robot_model import RobotModel
 
 _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -56,6 +66,10 @@ class UrdfWriter:
             "mass.scale": self._mass,
             "inertia.scale": self._tensor,
             "mass.offset": self._offset,
+            "joint.zero": self._zero,
+            "joint.axis": self._axis,
+            "link.length": self._length,
+            "payload": self._payload,
         }
         if cause.effect not in known:
             return "URDF has no word for it"
@@ -75,7 +89,7 @@ class UrdfWriter:
     def _dynamics(self, cause: FittedCause, attribute: str) -> str | None:
         joint = self.joints.get(cause.place)
         if joint is None:
-            return "the file has no joint of this name"
+            return _NO_JOINT
         stated = _child(joint, "dynamics")
         before = float((stated.get_attribute(attribute) if stated else None) or 0.0)
         value = format_number(float(add_to_stated(before, cause.coefficients[0])))
@@ -83,20 +97,8 @@ class UrdfWriter:
         if stated:
             stated.new[attribute] = value
         else:
-            self._insert(joint, "dynamics", attribute, value)
+            _insert(joint, "dynamics", attribute, value)
         return None
-
-    def _insert(self, joint: XmlElement, name: str, attribute: str, value: str) -> None:
-        """Insert a child element into a joint, or add an attribute to a child inserted before."""
-        begin = f"<{name} "
-        for i, (comments, element) in enumerate(joint.within):
-            if element.startswith(begin):
-                joint.within[i] = (
-                    comments,
-                    f'{begin}{attribute}="{value}" {element[len(begin) :]}',
-                )
-                return
-        joint.within.append(([], f'{begin}{attribute}="{value}"/>'))
 
     def _say(self, tag: XmlElement, cause: FittedCause) -> None:
         tag.before.append(cause.format(self.recording))
@@ -156,6 +158,71 @@ class UrdfWriter:
             origin.new["xyz"] = format_numbers(tuple(float(v) for v in before + moved))
         return None
 
+    def _zero(self, cause: FittedCause) -> str | None:
+        joint = self.joints.get(cause.place)
+        if joint is None:
+            return _NO_JOINT
+        (c,) = cause.coefficients
+        self._say(joint, cause)
+        axis = _axis_of(joint)
+        axes = _turn(_origin(joint, "rpy"))
+        if joint.get_attribute("type") == "prismatic":
+            moved = _origin(joint, "xyz") - axes @ axis * c
+            _set(joint, "origin", "xyz", tuple(moved.tolist()))
+        else:
+            turned = Rotation.from_matrix(axes) * Rotation.from_rotvec(-c * axis)
+            _set(joint, "origin", "rpy", tuple(turned.as_euler("xyz").tolist()))  # (3)
+        return None
+
+    def _axis(self, cause: FittedCause) -> str | None:
+        joint = self.joints.get(cause.place)
+        if joint is None:
+            return _NO_JOINT
+        self._say(joint, cause)
+        axis = Rotation.from_rotvec(cause.coefficients).apply(_axis_of(joint))
+        _set(joint, "axis", "xyz", tuple(axis.tolist()))
+        return None
+
+    def _length(self, cause: FittedCause) -> str | None:
+        body, model = self.robot.body(cause.place), self.robot.compiled
+        joints = [tag for tag in self.joints.values() if _names(tag, "child") == body.name]
+        if not joints:
+            return "the file has no joint that carries the link"
+        carrier = model.body(int(model.body_parentid[body.id])).name
+        axes = self._axes(_names(joints[0], "parent"), carrier)
+        moved = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
+        self._say(joints[0], cause)
+        _set(joints[0], "origin", "xyz", tuple((_origin(joints[0], "xyz") + moved).tolist()))
+        return None
+
+    def _payload(self, cause: FittedCause) -> str | None:
+        body = self.robot.body(cause.place)
+        link = self.links.get(body.name)
+        inertial = _child(link, "inertial") if link else None
+        if inertial is None:
+            return "the link states no inertial"
+        mass_tag, tensor_tag = _child(inertial, "mass"), _child(inertial, "inertia")
+        if mass_tag is None or tensor_tag is None:
+            return "the link's inertial lacks a mass or an inertia"
+        mass, (more, *offset) = float(mass_tag.get_attribute("value") or 0.0), cause.coefficients
+        point = self.robot.compiled.body_ipos[body.id] + offset
+        centre, axes = _origin(inertial, "xyz"), _turn(_origin(inertial, "rpy"))
+        values = [float(tensor_tag.get_attribute(key) or 0.0) for key in _TENSOR]
+        tensor = np.zeros((3, 3))
+        tensor[np.triu_indices(3)] = values
+        tensor += np.triu(tensor, 1).T
+        middle = (mass * centre + more * point) / (mass + more)
+        tensor = axes @ tensor @ axes.T
+        arms = np.stack([centre - middle, point - middle])
+        tensor += np.einsum("n,nij->ij", [mass, more], compute_point_inertias(arms))  # (5)
+        tensor = axes.T @ tensor @ axes
+        self._say(inertial, cause)
+        mass_tag.new["value"] = format_number(mass + more)
+        for key, value in zip(_TENSOR, tensor[np.triu_indices(3)].tolist(), strict=True):
+            tensor_tag.new[key] = format_number(value)
+        _set(inertial, "origin", "xyz", tuple(middle.tolist()))
+        return None
+
     def _axes(self, link: str, body: str) -> Array:
         """Return the axes (3, 3) of a link in the frame of the body into which it is fused."""
         axes = np.eye(3)
@@ -165,6 +232,42 @@ class UrdfWriter:
             axes = _turn(_vector(origin.get_attribute("rpy") if origin else None)) @ axes
             link = _names(joint, "parent")
         return axes
+
+
+_NO_JOINT = "the file has no joint of this name"
+
+
+def _origin(tag: XmlElement, attribute: str) -> Array:
+    """Return the position ``xyz`` or the angles ``rpy`` of an element's origin."""
+    origin = _child(tag, "origin")
+    return _vector(origin.get_attribute(attribute) if origin else None)
+
+
+def _axis_of(joint: XmlElement) -> Array:
+    """Return the unit vector of a joint's axis; URDF's default is x."""
+    axis = _child(joint, "axis")
+    vector = _vector((axis.get_attribute("xyz") if axis else None) or "1 0 0")
+    result: Array = vector / np.linalg.norm(vector)
+    return result
+
+
+def _set(tag: XmlElement, name: str, attribute: str, values: tuple[float, ...]) -> None:
+    """Set a vector of a child element, which is added if there is none."""
+    child = _child(tag, name)
+    if child is None:
+        _insert(tag, name, attribute, format_numbers(values))
+    else:
+        child.new[attribute] = format_numbers(values)
+
+
+def _insert(tag: XmlElement, name: str, attribute: str, value: str) -> None:
+    """Insert a child element, or add an attribute to a child inserted before."""
+    begin = f"<{name} "
+    for i, (comments, element) in enumerate(tag.within):
+        if element.startswith(begin):
+            tag.within[i] = (comments, f'{begin}{attribute}="{value}" {element[len(begin) :]}')
+            return
+    tag.within.append(([], f'{begin}{attribute}="{value}"/>'))
 
 
 def _child(tag: XmlElement, name: str) -> XmlElement | None:

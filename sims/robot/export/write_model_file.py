@@ -34,7 +34,7 @@ from sims.robot.export.xml_editing import (
     format_numbers,
 )
 from sims.robot.fitted_causes import expand_families
-from sims.robot.model_field_effects import get_coupling_address
+from sims.robot.model_field_effects import get_coupling_address, get_write_order
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.robot_model import COUPLING_TENDON_SUFFIX, RobotModel
 
@@ -175,7 +175,8 @@ def _urdf(
         said.append(f"no URDF is written: {unfit}")
         return None
     lines = []
-    for cause in expand_families(robot, causes):
+    found = expand_families(robot, causes)
+    for cause in sorted(found, key=lambda one: get_write_order(one.effect)):
         answer = writer.write(cause)
         if answer:
             lines.append(f"{cause.format(recording)}: not in the URDF: {answer}")

@@ -42,6 +42,7 @@ EFFECTS_WITHOUT_FAMILY = frozenset(
         "force.periodic",
         "force.ripple",
         "input.power",
+        "joint.axis",
         "joint.backlash",
         "joint.coupling",
         "joint.flexibility",
@@ -52,6 +53,7 @@ EFFECTS_WITHOUT_FAMILY = frozenset(
         "friction.position",
         "friction.stribeck",
         "friction.warming",
+        "payload",
         "sensor.eccentricity",
         "sensor.slip",
         "state.limit",
@@ -69,6 +71,11 @@ HIDDEN_STATE_SHAPE_COUNT = 6
 
 It is small since each value requires an integration over time.
 """
+MAX_PAYLOAD_SHARE = 0.5
+"""Largest plausible payload, as a share of the mass of all moving bodies."""
+PAYLOAD_SHARES = (-0.5, 0.5)
+"""Positions of a payload that are tried along each axis, as shares of the half width of the link.
+"""
 MIN_LOAD_FREQUENCY = 15.0
 """Minimum natural frequency of the load on a flexible joint, in rad/s."""
 _KINDS: Mapping[str, SystemKind] = {"hinge": "rotary", "slide": "linear"}
@@ -82,7 +89,9 @@ def make_world_effect(effect: type[Effect]) -> type[Effect]:
 
 def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
     """Make the class of an effect at one place."""
-    coefficients = [_of_spot(effect, c, spot) for c in effect.coefficients]
+    tilts = spot.tilts if effect.name == "joint.axis" else None
+    shown = [c for c in effect.coefficients if tilts is None or c.name in tilts]
+    coefficients = [_of_spot(effect, c, spot) for c in shown]
     changed: dict[str, Any] = {"coordinate": spot.coordinate, "signal": spot.signal}
     changed["says"] = f"{effect.says} (at {spot.words})"
     if issubclass(effect, Force):
@@ -292,17 +301,27 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coeffic
     if c.of == "give":
         high = 1.0 / (spot.inertia * MIN_LOAD_FREQUENCY**2)
     most = c.most
-    stated = spot.stated.get(effect.name) if effect.at == "joint" else None
+    with_total = effect.at == "joint" or effect.name == "gravity.compensation"
+    stated = spot.stated.get(effect.name) if with_total else None
     if stated is not None:
         # The total must not be negative, so the difference can at most remove the value of the
         # file.
         high = max(high, 2.0 * abs(stated))
         low = least = min(0.0 - stated, 0.0)
-    if effect.name == "mass.offset":
-        least, most = spot.offsets[c.name]
+    if effect.name == "payload" and c.name == "mass":
+        high = MAX_PAYLOAD_SHARE * spot.mass
+    tried = c.tried
+    if c.name in spot.limits.get(effect.name, {}):
+        least, most = spot.limits[effect.name][c.name]
         if least < most:
             low, high = max(low, least), min(high, most)
-    return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most)
+        if effect.name == "payload":
+            low, high = (least, most) if least < most else (low, high)
+            middle, half = 0.5 * (least + most), 0.5 * (most - least)
+            tried = tuple(dict.fromkeys(middle + share * half for share in PAYLOAD_SHARES))
+    return replace(
+        c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most, tried=tried
+    )
 
 
 def make_effect_classes(
@@ -364,6 +383,10 @@ def _acts_at(
     if effect.needs == "servo" and not spot.servo:
         return False
     if effect.name == "joint.coupling" and not spot.coupled:
+        return False
+    if effect.name == "link.length" and not spot.stated["link.length"]:
+        return False
+    if effect.name == "joint.axis" and not spot.tilts:
         return False
     # A power effect is undefined for a set point.
     if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):

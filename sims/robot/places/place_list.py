@@ -13,6 +13,7 @@ import numpy as np
 
 from sims.robot.coupled_drives import list_coupling_places as coupled_places
 from sims.robot.places.centre_of_mass_limits import observable_axes, reach
+from sims.robot.places.observable_tilts import observable_tilts
 from sims.robot.robot_model import RobotModel
 
 MUJOCO_EFFECT_WORDS = {
@@ -47,9 +48,12 @@ class EffectPlace(NamedTuple):
         servo: whether it is an actuator that follows a position set point.
         last: whether it is the last joint of its body.
         coupled: whether it is a joint whose drive may be coupled to the preceding joint.
-        offsets: for a body, lowest and highest offset in metres that leaves its centre of mass
-            within the link, by axis of its frame (``x``, ``y``, ``z``); both are zero along an axis
-            where an offset cannot be observed.
+        limits: for a body, lowest and highest coefficients by effect and coefficient. Offsets in
+            metres leave a centre of mass, and a payload, within the link; both ends are zero along
+            an axis where an offset cannot be observed.
+        mass: for a body, the mass in kg of all moving bodies.
+        tilts: for a joint, the axes of its body's frame about which a tilt of its axis shows in the
+            motion.
     """
 
     name: str
@@ -64,7 +68,9 @@ class EffectPlace(NamedTuple):
     servo: bool = False
     last: bool = False
     coupled: bool = False
-    offsets: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    limits: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType({})
+    mass: float = 0.0
+    tilts: tuple[str, ...] = ()
 
 
 def list_places(
@@ -99,6 +105,7 @@ def list_places(
                 f"joint {joint.name}",
                 last=lasts[int(bodies[joint.id])] == joint.id,
                 coupled=joint.name in may_be_coupled,
+                tilts=tuple("xyz"[axis] for axis in observable_tilts(robot, joint.name)),
             )
         )
     for actuator in robot.actuators:
@@ -116,15 +123,25 @@ def list_places(
                 servo=actuator.kind == "position",
             )
         )
+    mass = sum(body.mass for body in robot.bodies)
     for body in robot.bodies:
-        nothing: Mapping[str, float] = {}
         words = f"body {body.name}"
         box = reach(robot, body.name)
         axes = observable_axes(robot, body.name)
         ends = np.where(np.isin(range(3), axes)[:, None], box, 0.0).tolist()
         offsets = {axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)}
         spot = EffectPlace(
-            body.name, "hinge", None, "", "kg", 1.0, 1.0, nothing, words, offsets=offsets
+            body.name,
+            "hinge",
+            None,
+            "",
+            "kg",
+            1.0,
+            1.0,
+            _stated_of_body(robot, body.id),
+            words,
+            limits={"mass.offset": offsets, "payload": offsets},
+            mass=mass,
         )
         found["body"].append(spot)
     for name, unit in channels:
@@ -150,6 +167,19 @@ def _gains(robot: RobotModel, actuator: int) -> dict[str, float]:
     """Return the servo gains of an actuator in the model file; zero if it is not a servo."""
     bias = robot.compiled.actuator_biasprm[actuator]
     return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
+
+
+def _stated_of_body(robot: RobotModel, body: int) -> dict[str, float]:
+    """Return the gravity compensation of a body, and its distance from a parent that moves.
+
+    The distance is zero if no moving body carries it: then it moves the whole robot.
+    """
+    model = robot.compiled
+    carried = int(model.body_weldid[model.body_parentid[body]]) != 0
+    return {
+        "gravity.compensation": float(model.body_gravcomp[body]),
+        "link.length": float(np.linalg.norm(model.body_pos[body])) if carried else 0.0,
+    }
 
 
 def _stated(robot: RobotModel, dof: int, joint: int) -> dict[str, float]:

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from sims.effects import get_effect
 from sims.extended_simulator import FittedValue
 from sims.robot import model_field_effects
 from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
@@ -34,7 +35,7 @@ def test_a_cause_is_what_it_is_in_a_lane(
 ) -> None:
     """The compiled model of a cause has the same fields as a batch element with the effect."""
     arm = robot(tmp_path)
-    names = ("coefficient",) if len(c) == 1 else "xyz"
+    names = [coefficient.name for coefficient in get_effect(effect).coefficients]
     numbers = {name: number(value) for name, value in zip(names, c, strict=False)}
     applied = apply_causes(arm, {f"{effect}@{place}" if place else effect: numbers})
     lane = copy_model_fields(arm.compiled)

@@ -62,6 +62,29 @@ STATED = {
 }
 """By effect, place and coefficients: text in the file, and its equivalent replacement."""
 
+HUB = '<joint name="spin" axis="0 0 1"/>'
+LOAD = '<body pos="{}"><inertial pos="0 0 0" mass="0.4" diaginertia="1e-14 1e-14 1e-14"/></body>'
+STATED |= {
+    ("joint.zero", "elbow", (0.15,)): (
+        'springref="10"',
+        f'springref="10" ref="{np.rad2deg(0.15)}"',
+    ),
+    ("joint.axis", "spin", (0.3, 0.0, 0.0)): (
+        HUB,
+        HUB.replace("0 0 1", f"0 {-np.sin(0.3)} {np.cos(0.3)}"),
+    ),
+    ("joint.axis", "elbow", (np.pi, 0.0, 0.0)): ('"elbow" axis="0 1 0"', '"elbow" axis="0 -1 0"'),
+    ("link.length", "fore", (0.25,)): ('"fore" pos="0.4 0 0"', '"fore" pos="0.5 0 0"'),
+    ("gravity.compensation", "fore", (0.6,)): ('"fore"', '"fore" gravcomp="0.6"'),
+    # A body welded to the link, at its centre of mass plus the offset.
+    ("payload", "fore", (0.4, 0.1, -0.02, 0.05)): (
+        '<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/>',
+        '<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/>'
+        + LOAD.format("0.25 -0.02 0.06"),
+    ),
+    ("payload", "wheel", (0.4, 0.03, 0.0, 0.0)): (WHEEL, WHEEL + LOAD.format("0.03 0 0")),
+}
+
 CONTROL = (0.7, 1.8, 6.0)
 
 

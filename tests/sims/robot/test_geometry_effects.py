@@ -1,0 +1,171 @@
+"""Tests of geometry errors and payloads: their physics, and the model files that state them."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from sims.core.simulator import Scenario
+from sims.robot.export.round_trip_check import check_written_files
+from sims.robot.export.write_model_file import CauseCoefficients, write_model_files
+from sims.robot.parsing.read_model_file import read_robot
+from sims.robot.robot_simulator import make_robot_simulator
+from tests.sims.robot.sample_arms import robot
+from tests.sims.robot.sample_urdfs import joint, link
+from tests.sims.robot.sample_urdfs import robot as urdf
+from tests.sims.robot.test_model_changes import number, one
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.001" integrator="RK4"/>
+  <worldbody>
+    <body name="rod" gravcomp="{gravcomp}">
+      <joint name="hinge" axis="0 1 0"/>
+      <inertial pos="0 0.2 -0.5" mass="0.8" diaginertia="0.02 0.02 0.001"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+MASS, LENGTH, INERTIA = 0.8, 0.5, 0.02 + 0.8 * 0.5**2
+
+
+def pendulum(folder: Path, gravcomp: float = 0.0):
+    path = folder / "pendulum.xml"
+    path.write_text(PENDULUM.format(gravcomp=gravcomp))
+    return make_robot_simulator(read_robot(path))
+
+
+def accelerations(kind, effect: str, *c: float) -> np.ndarray:
+    """Return the accelerations at rest at some angles, from the positions after 20 ms."""
+    times = np.array([0.0, 0.02])
+    simulator = kind(observe=["q.hinge"], effects=[effect])
+    found = []
+    for angle in (-1.0, 0.2, 0.9):
+        seen = simulator.simulate(np.array([c]), Scenario(times, {"q.hinge": angle}, {}))
+        found.append(2.0 * (seen[0, 1, 0] - angle) / times[1] ** 2)
+    return np.array(found)
+
+
+ANGLES = np.array([-1.0, 0.2, 0.9])
+WEIGHT = MASS * 9.81 * LENGTH
+
+
+@pytest.mark.parametrize(
+    ("effect", "c", "expected"),
+    [
+        # The reading is larger by c than the angle from the vertical.
+        ("joint.zero@hinge", (0.3,), -WEIGHT * np.sin(ANGLES - 0.3) / INERTIA),
+        # The component of gravity across an axis that is tilted by c.
+        ("joint.axis@hinge", (0.4, 0.0), None),
+        ("gravity.compensation@rod", (0.7,), -0.3 * WEIGHT * np.sin(ANGLES) / INERTIA),
+        (
+            "payload@rod",
+            (0.5, 0.0, 0.0, -0.3),
+            -(WEIGHT + 0.5 * 9.81 * 0.8) * np.sin(ANGLES) / (INERTIA + 0.5 * 0.8**2),
+        ),
+    ],
+)
+def test_a_pendulum_moves_as_in_the_textbook(effect, c, expected, tmp_path: Path) -> None:
+    """The angular acceleration at rest is the torque of gravity divided by the inertia."""
+    if expected is None:
+        # The distance of the centre of mass from the axis (0, cos, sin), and its inertia there.
+        distance = LENGTH * np.cos(0.4) + 0.2 * np.sin(0.4)
+        inertia = 0.02 * np.cos(0.4) ** 2 + 0.001 * np.sin(0.4) ** 2 + MASS * distance**2
+        expected = -MASS * 9.81 * np.cos(0.4) * distance * np.sin(ANGLES) / inertia
+    found = accelerations(pendulum(tmp_path), effect, *c)
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+def test_a_file_with_too_much_compensation_is_corrected(tmp_path: Path) -> None:
+    """A coefficient of -1 removes the compensation of the file."""
+    kind = pendulum(tmp_path, gravcomp=1.0)
+    (c,) = kind.system.effect("gravity.compensation@rod").coefficients
+    assert (c.least, c.plausible[0][0]) == (-1.0, -1.0)
+    found = accelerations(kind, "gravity.compensation@rod", -1.0)
+    np.testing.assert_allclose(found, -WEIGHT * np.sin(ANGLES) / INERTIA, rtol=2e-3)
+
+
+def test_only_geometry_that_shows_in_the_motion_is_a_candidate(tmp_path: Path) -> None:
+    """Tilts out of a plane and the position of the whole robot do not show."""
+    system = make_robot_simulator(robot(tmp_path)).system
+    names = {name for kind in ("joint.axis", "link.length") for name in _names(system, kind)}
+    # The wheel turns about an axis of its own, so all links move in one plane except for it.
+    assert names == {"joint.axis@shoulder", "joint.axis@elbow", "joint.axis@spin"} | {
+        f"link.length@{place}" for place in ("fore", "wheel", "*")
+    }
+    axis = system.effect("joint.axis@elbow")
+    assert [c.name for c in axis.coefficients] == ["x", "z"]
+
+
+def _names(system, kind: str) -> list[str]:
+    from sims import effects
+
+    return [effect.name for effect in system.placed(effects.get_effect(kind))]
+
+
+CAUSES: CauseCoefficients = {
+    "joint.zero@elbow": one(0.1),
+    "joint.axis@spin": {"x": number(0.1, "rad"), "z": number(-0.05, "rad")},
+    "link.length@wheel": one(0.2),
+    "payload@fore": {"mass": number(0.3, "kg"), "x": number(0.1, "m"), "z": number(0.02, "m")},
+    "mass.scale@fore": one(0.5),
+    "gravity.compensation@upper": one(0.8),
+}
+
+
+def test_an_mjcf_states_geometry(tmp_path: Path) -> None:
+    """Angles are in the unit of the file, and a payload is not scaled with its body."""
+    arm = robot(tmp_path)
+    done = write_model_files(arm, CAUSES)
+    check_written_files(arm, CAUSES, done)
+    assert not done.notes
+    assert done.xml is not None
+    assert 'ref="5.72957' in done.xml
+    assert '<body name="wheel" pos="0.36 0 0"' in done.xml
+    assert 'gravcomp="0.8"' in done.xml
+    model = mujoco.MjModel.from_xml_string(done.xml)
+    assert model.body("fore").mass == pytest.approx(0.8 * 1.5 + 0.3)
+
+
+def test_an_element_in_a_frame_is_said(tmp_path: Path) -> None:
+    """The frame would change the written attribute."""
+    from tests.sims.robot.sample_arms import ARM
+
+    body = ARM[ARM.index('<body name="wheel"') : ARM.index("</body>") + len("</body>")]
+    arm = robot(tmp_path, ARM.replace(body, f'<frame euler="0 0 30">{body}</frame>'))
+    done = write_model_files(arm, {"link.length@wheel": one(0.2)})
+    assert any("link.length@wheel" in note and "<frame>" in note for note in done.notes)
+
+
+def test_a_urdf_states_geometry(tmp_path: Path) -> None:
+    """A URDF has no reference position, so the frame of the joint turns instead."""
+    origin = '<origin xyz="0.3 0.1 0" rpy="0.1 0.2 0.3"/><limit lower="-1" upper="1"/>'
+    fixed = '<joint name="w" type="fixed"><parent link="b"/><child link="c"/>'
+    fixed += '<origin xyz="0 0.2 0.1" rpy="0 0.4 0"/></joint>'
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        urdf(
+            *(link(name) for name in ("base", "a", "b", "c", "d", "e")),
+            joint("i", "base", "a", inside=origin),
+            joint("j", "a", "b", inside=origin),
+            fixed,
+            joint("k", "c", "d", inside=origin),
+            joint("l", "d", "e", kind="prismatic", inside=origin),
+        )
+    )
+    arm = read_robot(path)
+    causes: CauseCoefficients = {
+        "joint.zero@j": one(0.2),
+        "joint.zero@l": one(0.05),
+        "joint.axis@j": {"y": number(0.1, "rad"), "z": number(0.3, "rad")},
+        "link.length@d": one(0.2),
+        "payload@b": {"mass": number(0.4, "kg"), "y": number(0.3, "m")},
+        "gravity.compensation@d": one(0.5),
+    }
+    done = write_model_files(arm, causes)
+    check_written_files(arm, causes, done)
+    assert done.urdf is not None
+    assert [note for note in done.notes if "not in the URDF" in note] == [
+        "gravity.compensation@d: 0.5 (95 %: 0.45 to 0.55): not in the URDF: URDF has no word for it"
+    ]
