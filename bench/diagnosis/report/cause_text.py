@@ -182,6 +182,24 @@ def _moved(where: str, values: Sequence[FittedValue]) -> str:
     return f"the centre of mass {where} is {far} from where the model file has it"
 
 
+def _zero(where: str, values: Sequence[FittedValue]) -> str:
+    size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
+    return f"the zero {where}, of command and reading alike, is {size} from that of the model file"
+
+
+def _tilted(where: str, values: Sequence[FittedValue]) -> str:
+    angle = np.rad2deg(np.linalg.norm([n.value for n in values]))
+    return f"the axis {where} is tilted by {format_number(float(angle), 2)}° from the model file"
+
+
+def _length(where: str, values: Sequence[FittedValue]) -> str:
+    c = values[0].value
+    percent = format_percent(abs(c))
+    return (
+        f"the distance {where} from its parent is {percent} {_MORE[c > 0]} than the model file says"
+    )
+
+
 _SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
     "mass.scale": _share("mass"),
     "inertia.scale": _share("inertia"),
@@ -189,6 +207,9 @@ _SIZED: Mapping[str, Callable[[str, Sequence[FittedValue]], str]] = {
     "actuator.damping": _share("damping"),
     "inertia.armature": _difference("armature"),
     "mass.offset": _moved,
+    "joint.zero": _zero,
+    "joint.axis": _tilted,
+    "link.length": _length,
 }
 """Functions that format how wrong a value of the model file is, by effect."""
 _STEPPED = {

@@ -120,12 +120,12 @@ def apply_causes(
         RuntimeError: the model does not accept a change; this is a program error.
     """
     found = expand_families(robot, causes)
-    said = []
+    notes = []
     couplings = {c.place: float(c.coefficients[0]) for c in found if c.effect == COUPLED}
     robot = make_coupled_robot(robot, couplings) if couplings else robot
     series = _in_series(found)
     if series:
-        said += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
+        notes += [KEYFRAMES_OMITTED_NOTE] if robot.compiled.nkey else []
         added = tuple((c.place, c.effect) for c in found if _is_in_series(c))
         robot = prepare_flanks_for_file(add_series_joints(robot, added), series)
     wanted = copy_model_fields(robot.compiled)
@@ -137,12 +137,12 @@ def apply_causes(
         done = {one.place for one in held if _is_in_series(one)}
         answer = _write(wanted, robot, cause, series if cause.place not in done else {})
         if answer and not answer.startswith("+"):
-            said.append(f"{cause.format(recording)}: not in the file: {answer}")
+            notes.append(f"{cause.format(recording)}: not in the file: {answer}")
             continue
         held.append(cause)
         note = f"{cause.effect}: {answer[1:]}" if answer else _note(robot, cause)
-        if note and note not in said:
-            said.append(note)
+        if note and note not in notes:
+            notes.append(note)
         changed = [
             one.element for one in find_differing_statements(robot.compiled, before, wanted, 0.0)
         ]
@@ -165,7 +165,7 @@ def apply_causes(
     text = format_spec(spec, robot.path.resolve().parent)
     del spec
     release_free_memory()
-    return ModifiedModel(robot, text, model, wanted, comments, tuple(held), tuple(said))
+    return ModifiedModel(robot, text, model, wanted, comments, tuple(held), tuple(notes))
 
 
 def _note(robot: RobotModel, cause: FittedCause) -> str | None:

@@ -63,7 +63,7 @@ class MjcfWriter:
             self._option(statement, comments)
         elif element.kind == "frame":
             body = self.tags[ModelElement("body", element.id)]
-            _say(body, comments)
+            _add_comments(body, comments)
             body.new |= format_attributes(statement.values)
         elif element.kind == "body":
             if statement.values:
@@ -71,7 +71,7 @@ class MjcfWriter:
             self._inertial(self.tags[element], statement, comments)
         else:
             tag = self.tags[element]
-            _say(tag, comments)
+            _add_comments(tag, comments)
             values = self._joint(tag, statement)
             if element.kind == "actuator":
                 values = self._actuator(tag, statement)
@@ -80,13 +80,13 @@ class MjcfWriter:
     def _option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
         options, values = self.document.find_elements("option"), format_attributes(statement.values)
         if options:
-            _say(options[-1], comments)
+            _add_comments(options[-1], comments)
             options[-1].new |= values
             return
         if not values:
             return
-        said = " ".join(f'{name}="{value}"' for name, value in values.items())
-        self.document.root.within.append((list(comments), f"<option {said}/>"))
+        attributes = " ".join(f'{name}="{value}"' for name, value in values.items())
+        self.document.root.within.append((list(comments), f"<option {attributes}/>"))
 
     def _keep_masses(self) -> None:
         """Change compiler settings so that MuJoCo uses inertials as specified."""
@@ -102,7 +102,7 @@ class MjcfWriter:
         values = format_attributes(statement.values)
         for child in self.document.children(body):
             if child.name == "inertial":
-                _say(child, comments)
+                _add_comments(child, comments)
                 if not values:
                     return
                 before = self._before(statement.element)
@@ -117,10 +117,10 @@ class MjcfWriter:
                 child.new |= {name: values[name] for name in values if name in changed}
                 return
         if not values:
-            _say(body, comments)
+            _add_comments(body, comments)
             return
-        said = " ".join(f'{name}="{value}"' for name, value in values.items())
-        body.within.append((list(comments), f"<inertial {said}/>"))
+        attributes = " ".join(f'{name}="{value}"' for name, value in values.items())
+        body.within.append((list(comments), f"<inertial {attributes}/>"))
 
     def _before(self, element: ModelElement) -> Mapping[str, Values]:
         return list_all_attributes(self.model, element, copy_model_fields(self.model))
@@ -198,7 +198,7 @@ def _shortcut(
     return None
 
 
-def _say(tag: XmlElement, comments: Sequence[str]) -> None:
+def _add_comments(tag: XmlElement, comments: Sequence[str]) -> None:
     tag.before += [text for text in comments if text not in tag.before]
 
 

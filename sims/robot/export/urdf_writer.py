@@ -75,14 +75,14 @@ class UrdfWriter:
             return "URDF has no word for it"
         return known[cause.effect](cause)
 
-    def to_text(self, said: list[str]) -> str:
+    def to_text(self, lines: list[str]) -> str:
         """Return the file with all changes.
 
         Args:
-            said: lines for the comment at the top of the file.
+            lines: lines for the comment at the top of the file.
         """
         fitted = f", with what was found in {self.recording}" if self.recording else ""
-        comment = format_heading([f"{self.robot.path.name}{fitted}", *said])
+        comment = format_heading([f"{self.robot.path.name}{fitted}", *lines])
         self.markup.root.within.insert(0, ([comment], ""))
         return self.markup.to_text().decode()
 
@@ -93,14 +93,14 @@ class UrdfWriter:
         stated = _child(joint, "dynamics")
         before = float((stated.get_attribute(attribute) if stated else None) or 0.0)
         value = format_number(float(add_to_stated(before, cause.coefficients[0])))
-        self._say(stated or joint, cause)
+        self._add_comment(stated or joint, cause)
         if stated:
             stated.new[attribute] = value
         else:
             _insert(joint, "dynamics", attribute, value)
         return None
 
-    def _say(self, tag: XmlElement, cause: FittedCause) -> None:
+    def _add_comment(self, tag: XmlElement, cause: FittedCause) -> None:
         tag.before.append(cause.format(self.recording))
 
     def _inertials(self, cause: FittedCause) -> list[tuple[str, XmlElement]] | None:
@@ -126,7 +126,7 @@ class UrdfWriter:
             return "a link of the body states no inertial"
         factor = float(compute_factor(cause.coefficients[0]))
         for _, inertial in inertials:
-            self._say(inertial, cause)
+            self._add_comment(inertial, cause)
             _scale(inertial, "mass", ("value",), factor)  # (1)
             _scale(inertial, "inertia", _TENSOR, factor)
         return None
@@ -136,7 +136,7 @@ class UrdfWriter:
         if inertials is None or len(inertials) > 1:
             return "the body is not one link with an inertial"
         ((_, inertial),) = inertials
-        self._say(inertial, cause)
+        self._add_comment(inertial, cause)
         _scale(inertial, "inertia", _TENSOR, float(compute_factor(cause.coefficients[0])))
         return None
 
@@ -146,7 +146,7 @@ class UrdfWriter:
             return "a link of the body states no inertial"
         body = self.robot.body(cause.place).name
         for name, inertial in inertials:
-            self._say(inertial, cause)
+            self._add_comment(inertial, cause)
             moved = self._axes(name, body).T @ cause.coefficients  # (2)
             origin = _child(inertial, "origin")
             if origin is None:
@@ -163,7 +163,7 @@ class UrdfWriter:
         if joint is None:
             return _NO_JOINT
         (c,) = cause.coefficients
-        self._say(joint, cause)
+        self._add_comment(joint, cause)
         axis = _axis_of(joint)
         axes = _turn(_origin(joint, "rpy"))
         if joint.get_attribute("type") == "prismatic":
@@ -178,7 +178,7 @@ class UrdfWriter:
         joint = self.joints.get(cause.place)
         if joint is None:
             return _NO_JOINT
-        self._say(joint, cause)
+        self._add_comment(joint, cause)
         axis = Rotation.from_rotvec(cause.coefficients).apply(_axis_of(joint))
         _set(joint, "axis", "xyz", tuple(axis.tolist()))
         return None
@@ -191,7 +191,7 @@ class UrdfWriter:
         carrier = model.body(int(model.body_parentid[body.id])).name
         axes = self._axes(_names(joints[0], "parent"), carrier)
         moved = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
-        self._say(joints[0], cause)
+        self._add_comment(joints[0], cause)
         _set(joints[0], "origin", "xyz", tuple((_origin(joints[0], "xyz") + moved).tolist()))
         return None
 
@@ -216,7 +216,7 @@ class UrdfWriter:
         arms = np.stack([centre - middle, point - middle])
         tensor += np.einsum("n,nij->ij", [mass, more], compute_point_inertias(arms))  # (5)
         tensor = axes.T @ tensor @ axes
-        self._say(inertial, cause)
+        self._add_comment(inertial, cause)
         mass_tag.new["value"] = format_number(mass + more)
         for key, value in zip(_TENSOR, tensor[np.triu_indices(3)].tolist(), strict=True):
             tensor_tag.new[key] = format_number(value)

@@ -81,7 +81,7 @@ def write_model_files(
         InputError: the robot has no place of that name.
     """
     applied = apply_causes(robot, causes, recording)
-    said = list(applied.notes)
+    notes = list(applied.notes)
     try:
         if robot.format != "mjcf":
             raise NotEditableError("it is a URDF")
@@ -92,10 +92,10 @@ def write_model_files(
         ).to_text()
     except NotEditableError as unfit:
         if robot.format == "mjcf":
-            said.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
+            notes.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
         text = MjcfEditor(applied.robot, applied, recording, applied.text.encode()).to_text()
-    urdf = _urdf(robot, causes, recording, said) if robot.format == "urdf" else None
-    return WrittenModelFiles(text, urdf, tuple(said), applied)
+    urdf = _urdf(robot, causes, recording, notes) if robot.format == "urdf" else None
+    return WrittenModelFiles(text, urdf, tuple(notes), applied)
 
 
 def render_with_series_joints(applied: ModifiedModel) -> bytes:
@@ -161,18 +161,18 @@ def _joint(second: Any) -> str:
         attributes["solreflimit"] = format_numbers(tuple(second.solref_limit))
         attributes["solimplimit"] = format_numbers(tuple(second.solimp_limit))
     attributes |= dict.fromkeys(("damping", "frictionloss", "armature", "stiffness"), "0")
-    said = " ".join(f'{name}="{value}"' for name, value in attributes.items())
-    return f"<joint {said}/>"
+    text = " ".join(f'{name}="{value}"' for name, value in attributes.items())
+    return f"<joint {text}/>"
 
 
 def _urdf(
-    robot: RobotModel, causes: CauseCoefficients, recording: str, said: list[str]
+    robot: RobotModel, causes: CauseCoefficients, recording: str, notes: list[str]
 ) -> str | None:
     """Render the URDF with the causes that it can express, and add notes about all others."""
     try:
         writer = UrdfWriter(robot, recording)
     except NotEditableError as unfit:
-        said.append(f"no URDF is written: {unfit}")
+        notes.append(f"no URDF is written: {unfit}")
         return None
     lines = []
     found = expand_families(robot, causes)
@@ -183,7 +183,7 @@ def _urdf(
         elif cause.effect == COULOMB and robot.friction_form == "stiff":
             lines.append(_SOFT_IN_URDF)
     lines = list(dict.fromkeys(lines))
-    said += lines
+    notes += lines
     return writer.to_text(lines)
 
 

@@ -313,12 +313,13 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coeffic
     tried = c.tried
     if c.name in spot.limits.get(effect.name, {}):
         least, most = spot.limits[effect.name][c.name]
-        if least < most:
-            low, high = max(low, least), min(high, most)
         if effect.name == "payload":
-            low, high = (least, most) if least < most else (low, high)
-            middle, half = 0.5 * (least + most), 0.5 * (most - least)
+            begin, end = spot.limits["mass.offset"][c.name]
+            low, high = (begin, end) if begin < end else (low, high)
+            middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
             tried = tuple(dict.fromkeys(middle + share * half for share in PAYLOAD_SHARES))
+        elif least < most:
+            low, high = max(low, least), min(high, most)
     return replace(
         c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most, tried=tried
     )

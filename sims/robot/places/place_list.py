@@ -21,15 +21,26 @@ MUJOCO_EFFECT_WORDS = {
     "damping": "drag.linear",
     "frictionloss": "friction.coulomb",
     "gear": "input.gain",
+    "gravcomp": "gravity.compensation",
     "gravity": "gravity.scale",
     "inertia": "inertia.scale",
     "ipos": "mass.offset",
     "kp": "actuator.stiffness",
     "kv": "actuator.damping",
     "mass": "mass.scale",
+    "pos": "link.length",
+    "ref": "joint.zero",
     "stiffness": "spring.linear",
 }
 """MuJoCo's words for numbers of a model file, and the effects that change them."""
+
+
+MAX_PAYLOAD_DISTANCE = 2.0
+"""Maximum distance of a payload from the middle of its link along each axis, as a multiple of half
+the longest side of the link's box.
+
+A payload may stick out of the link that carries it.
+"""
 
 
 class EffectPlace(NamedTuple):
@@ -49,8 +60,8 @@ class EffectPlace(NamedTuple):
         last: whether it is the last joint of its body.
         coupled: whether it is a joint whose drive may be coupled to the preceding joint.
         limits: for a body, lowest and highest coefficients by effect and coefficient. Offsets in
-            metres leave a centre of mass, and a payload, within the link; both ends are zero along
-            an axis where an offset cannot be observed.
+            metres leave a centre of mass within the link, and a payload near it; both ends are zero
+            along an axis where an offset cannot be observed.
         mass: for a body, the mass in kg of all moving bodies.
         tilts: for a joint, the axes of its body's frame about which a tilt of its axis shows in the
             motion.
@@ -130,6 +141,11 @@ def list_places(
         axes = observable_axes(robot, body.name)
         ends = np.where(np.isin(range(3), axes)[:, None], box, 0.0).tolist()
         offsets = {axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)}
+        middle, half = box.mean(axis=1), MAX_PAYLOAD_DISTANCE * 0.5 * np.ptp(box, axis=1).max()
+        loads = {
+            axis: (middle[k] - half, middle[k] + half) if k in axes else (0.0, 0.0)
+            for k, axis in enumerate("xyz")
+        }
         spot = EffectPlace(
             body.name,
             "hinge",
@@ -140,7 +156,7 @@ def list_places(
             1.0,
             _stated_of_body(robot, body.id),
             words,
-            limits={"mass.offset": offsets, "payload": offsets},
+            limits={"mass.offset": offsets, "payload": loads},
             mass=mass,
         )
         found["body"].append(spot)
