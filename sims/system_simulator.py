@@ -141,7 +141,9 @@ class SystemSimulator(Simulator):
         Returns:
             Observations (n, T, C), SI units.
         """
-        return self.simulate_batch(theta, [scenario] * len(theta))
+        scenarios = [scenario] * len(theta)
+        theta = self._count_elements(theta, scenarios)
+        return self._simulated(theta, scenarios, {}) if len(theta) else self._nothing()
 
     def simulate_batch(
         self,
@@ -166,14 +168,26 @@ class SystemSimulator(Simulator):
             InputError: A shape is wrong, or a scenario names a constant, input or state that the
                 system does not have.
         """
+        theta = self._count_elements(theta, scenarios)
+        return self._simulated(theta, scenarios, initial or {}) if len(theta) else self._nothing()
+
+    def _count_elements(self, theta: Array, scenarios: Sequence[Scenario]) -> Array:
+        """Count the simulations of parameter vectors, and return the vectors after a check.
+
+        Raises:
+            InputError: Their shape is wrong.
+        """
         theta = np.asarray(theta, dtype=np.float64)
-        if theta.ndim != 2 or theta.shape != (len(scenarios), len(self.parameters)):
-            expected = (len(scenarios), len(self.parameters))
+        expected = (len(scenarios), len(self.parameters))
+        if theta.shape != expected:
             raise InputError(f"theta must have shape {expected}, found {theta.shape}")
-        if not len(theta):
-            return np.empty((0, 0, len(self.channels)))
-        SIMULATION_COUNTER.count(len(theta))
-        return self._simulated(theta, scenarios, initial or {})
+        if len(theta):
+            SIMULATION_COUNTER.count(len(theta))
+        return theta
+
+    def _nothing(self) -> Array:
+        """Return the observations of no batch element."""
+        return np.empty((0, 0, len(self.channels)))
 
     def _simulated(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
@@ -202,7 +216,12 @@ class SystemSimulator(Simulator):
                 self._declared, own, constants, x, v, plan.steps, inputs, forces, every
             )
             clock = np.array([s.times[0] for s in runs.unique_scenarios])[runs.scenario_index, None]
-            motion = integrate_with_hidden_states(self.engine, lanes)
+            has_hidden_states = any(isinstance(effect, HiddenStateEffect) for effect, _ in forces)
+            motion = (
+                integrate_with_hidden_states(self.engine, lanes)
+                if has_hidden_states
+                else self.engine.integrate(lanes)
+            )
             observations = self._read(motion, lanes, plan, sensors, clock)
         # Readings of a shorter run while it waits at its end are not samples.
         sizes = np.array([s.times.size for s in runs.unique_scenarios])

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from bench.benchmark.runner.worker_pools import Pool
+    from bench.benchmark.storage.study_progress import StudyOutcome
 
 _SHOT_TABLE_COLUMNS = {
     "status": SHOT_STATUS_COLUMNS,
@@ -102,7 +103,9 @@ def compare(
     if chosen.experiments:
         raise InputError(f"experiment {chosen.name} names several: use simgap.sweep")
     pool = _cluster(options.cluster)
-    return _run_studies(begin_studies(chosen, options), options, pool)[0]
+    (begun,) = begin_studies(chosen, options)
+    with pdf_figures(options.pdf):
+        return _report(begun, begun.run(options.jobs, options.progress, pool))
 
 
 @with_options(StudyOptions)
@@ -122,9 +125,9 @@ def sweep(experiment: ExperimentSource, options: StudyOptions) -> list[Compariso
     """
     shared = ComparisonOptions(**vars(options))
     studies = begin_studies(build_experiment(experiment, shared), shared)
-    results = _run_studies(studies, options)
-    if len(studies) > 1:
-        with pdf_figures(options.pdf):
+    with pdf_figures(options.pdf):
+        results = [_report(one, one.run(options.jobs, options.progress)) for one in studies]
+        if len(studies) > 1:
             study.report_jointly(studies[0].folder.parent, _discard_line)
     return results
 
@@ -226,17 +229,8 @@ def _cluster(address: str | None) -> Pool | None:
     return ClusterPool(address)
 
 
-def _run_studies(
-    studies: Sequence[study.Study], options: StudyOptions, pool: Pool | None = None
-) -> list[ComparisonResult]:
-    """Run and report studies."""
-    with pdf_figures(options.pdf):
-        return [_run_study(begun, options, pool) for begun in studies]
-
-
-def _run_study(begun: study.Study, options: StudyOptions, pool: Pool | None) -> ComparisonResult:
-    """Run and report a study."""
-    outcome = begun.run(options.jobs, options.progress, pool)
+def _report(begun: study.Study, outcome: StudyOutcome) -> ComparisonResult:
+    """Write the tables and figures of a study that has been run."""
     if outcome.skipped:
         raise InputError(f"{begun.configuration.experiment.name}: skipped: {outcome.skipped}")
     begun.report(_discard_line)

@@ -18,7 +18,6 @@ from bench.logs.importing.log_import import (
 )
 from bench.logs.inspection import load_recording
 from bench.logs.synthetic_recording import (
-    SimulatedRecording,
     SimulationSpec,
     simulate_recording,
 )
@@ -49,18 +48,7 @@ class ImportRequest(ImportOptions):
     out: str | Path
 
 
-@takes_options(SimulationSpec)
-def simulate(options: SimulationSpec) -> SimulatedRecording:
-    """Simulate a recording with known truth; nothing is written before `write` is called.
-
-    Args:
-        options: Arguments, the attributes of `bench.logs.synthetic_recording.SimulationSpec`; all
-            but `system` by name.
-
-    Raises:
-        InputError: An argument is invalid; the message is one line.
-    """
-    return simulate_recording(options)
+simulate = takes_options(SimulationSpec, "simulate")(simulate_recording)
 
 
 @check_arguments

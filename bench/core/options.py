@@ -57,7 +57,7 @@ def read_option_texts(options: type) -> dict[str, str]:
 
 
 def takes_options(
-    options: Callable[P, Options],
+    options: Callable[P, Options], name: str = ""
 ) -> Callable[[Callable[[Options], Result]], Callable[P, Result]]:
     """Decorate a function of options: callers give the fields as arguments.
 
@@ -65,17 +65,19 @@ def takes_options(
 
     Args:
         options: Frozen dataclass of the options.
+        name: Name of the function in messages; empty for its own.
     """
 
     def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
-        signature = inspect.signature(options)
+        signature, called = inspect.signature(options), name or function.__name__
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> Result:
-            given = bind_checked(function.__name__, signature, get_hints(options), args, kwargs)
+            given = bind_checked(called, signature, get_hints(options), args, kwargs)
             make: Callable[..., Options] = options
             return function(make(**given.arguments))
 
+        call.__name__ = called
         _describe(call, options, signature)
         return call
 

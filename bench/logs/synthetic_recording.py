@@ -160,13 +160,17 @@ def _truth_of(out: Path) -> Path:
     return out.with_suffix(".truth.toml")
 
 
-def simulate_recording(wish: SimulationSpec) -> SimulatedRecording:
-    """Simulate a recording.
+def simulate_recording(options: SimulationSpec) -> SimulatedRecording:
+    """Simulate a recording with known truth; nothing is written before `write` is called.
+
+    Args:
+        options: Specification; `simgap.simulate` takes its attributes as arguments, all but
+            `system` by name.
 
     Raises:
-        InputError: The specification contains something impossible.
+        InputError: The specification contains something impossible; the message is one line.
     """
-    return _RecordingSimulation(wish).make()
+    return _RecordingSimulation(options).make()
 
 
 class _RecordingSimulation:
@@ -200,7 +204,9 @@ class _RecordingSimulation:
 
     def make(self) -> SimulatedRecording:
         scenarios = {str(number): self._scenario(number) for number in range(1, self.wish.runs + 1)}
-        runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
+        runs: list[Run] = []
+        for name, scenario in scenarios.items():
+            runs.append(self._run(int(name), scenario))
         stated = {name: sigma for name, sigma in self.noise.items() if sigma}
         constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
@@ -208,7 +214,9 @@ class _RecordingSimulation:
             Path(self.wish.model), self.wish.actuators or {}, {}
         )
         title = f"{system}, simulated"
-        recording = Recording(path, system, title, constants, stated, runs, model=model or None)
+        recording = Recording(
+            path, system, title, constants, stated, tuple(runs), model=model or None
+        )
         truth = {
             "system": system,
             **({"model": str(Path(self.wish.model).resolve())} if self.wish.model else {}),

@@ -80,8 +80,9 @@ def draw_chart(
     Returns:
         The figure without title, legend and caption, and its axes in the order of the panels.
     """
-    columns = columns or len(panels)
-    rows = -(-len(panels) // columns)
+    # Without a panel, such as costs of tuners that never reach the error, the figure is empty.
+    columns = columns or max(len(panels), 1)
+    rows = max(-(-len(panels) // columns), 1)
     width, height = size or PANEL_SIZE
     shared = all(panel.up == panels[0].up for panel in panels)
     figure, grid = make_panel_grid(

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from bench.benchmark.isolation.linux_syscalls import not_dumpable
 from bench.benchmark.isolation.memory_limit import import_resource_module
@@ -310,36 +310,48 @@ def run_experiment(
     # This process has the true parameters, and a tuner's process may run as the same user.
     hidden = nullcontext() if experiment.trusted else not_dumpable()
     with hidden, pool or make_pool(jobs) as workers:
-        workers.load_plugins(describe_plugins(plugins, results.problem.experiment))
+        workers.load_plugins(describe_plugins(plugins, experiment))
         try:
-            _run(results, workers, progress)
+            _identify(results, progress)
+            failures = _train(workers, results, progress)
+            ready = _store_untrained_runs(results, failures, progress)
+            # Each outcome is stored before the next one, so that a kill loses running calls only.
+            calls = _LazyCalls(results, ready.places)
+            for i, outcome in workers.iterate_results(calls, experiment.timeout):
+                _store_result(results, ready.places[i], outcome)
+                ready.step()
         except KeyboardInterrupt:
             results.interrupted = True
         except PoolLostError as error:
             results.stopped = str(error)
 
 
-def _run(results: ExperimentRun, pool: Pool, progress: ProgressFactory) -> None:
+class _ReadyRuns(NamedTuple):
+    """Places in the plan of runs that can be executed, and the callback after each of them."""
+
+    places: list[int]
+    step: Callable[[], None]
+
+
+def _store_untrained_runs(
+    results: ExperimentRun,
+    failures: Mapping[tuple[str, int], Exception],
+    progress: ProgressFactory,
+) -> _ReadyRuns:
+    """Store runs whose training failed as failures, and return the other missing runs."""
     missing = [
         place for place in range(len(results.plan)) if place not in results.run_sink.statuses
     ]
-    _identify(results, progress)
-    failures = _train(pool, results, progress)
-    step = progress("running", len(missing))
-    ready: list[int] = []
-    # Runs of a tuner whose training failed remain in the table, as failures.
+    ready = _ReadyRuns([], progress("running", len(missing)))
     for place in missing:
         order = results.plan[place].request
-        if (failure := failures.get((order.entry.label, order.seed))) is not None:
-            _store_result(results, place, failure)
-            step()
+        failure = failures.get((order.entry.label, order.seed))
+        if failure is None:
+            ready.places.append(place)
         else:
-            ready.append(place)
-    # Each outcome is stored before the next one, so that a kill loses running calls only.
-    calls = _LazyCalls(results, ready)
-    for i, outcome in pool.iterate_results(calls, results.problem.experiment.timeout):
-        _store_result(results, ready[i], outcome)
-        step()
+            _store_result(results, place, failure)
+            ready.step()
+    return ready
 
 
 def _identify(results: ExperimentRun, progress: ProgressFactory) -> None:

@@ -35,7 +35,7 @@ from bench.benchmark.runner.tuner_training import (
 )
 from bench.benchmark.storage.run_status import FAILED_STATUSES
 from bench.core.random_streams import make_rng, make_seed_words
-from methods.tuner import Task
+from methods.tuner import Task, Tuner
 from sims.core.simulator import Array
 
 
@@ -124,19 +124,64 @@ def close_problem() -> None:
     _problems.clear()
 
 
-def execute_run(experiment: Experiment, order: RunRequest) -> RunOutcome:
+def execute_run(
+    experiment: Experiment, order: RunRequest, requests: list[Array] | None = None
+) -> RunOutcome:
     """Execute one run; failures of the tuner or the simulator are a status of its trace.
 
     Args:
         experiment: configuration of the experiment.
         order: request of the run.
+        requests: points that an isolated tuner requested before its process was killed; None for a
+            run that is repeated here if that happens.
 
     Raises:
         HiddenSimulationError: more points were simulated than the tuner requested from the harness.
         RunEndedError: the tuner's process was killed externally several times.
     """
-    before: list[Array] = []
-    return retry_if_killed(lambda: _perform(experiment, order, before))
+    if order.tuned is not None and requests is None:
+        earlier: list[Array] = []
+        return retry_if_killed(lambda: execute_run(experiment, order, earlier))
+    problem = get_problem(experiment)
+    target = order.target
+    evaluator = ProposalEvaluator(problem, target.fitting)
+    task = Task(
+        dim=problem.cube.dim,
+        start=target.start,
+        observed=target.fitting.observed,
+        scale=problem.scale,
+        training=problem.cube.training,
+        budget=order.budget,
+        lengths=tuple(s.times.size for s in target.fitting.scenarios),
+        scene=problem.describe_scenarios(target.fitting.scenarios),
+    )
+    # Simulations of the scoring and of earlier runs are not counted.
+    simulated = problem.simulated
+    started = perf_counter()
+    written, import_seconds = NOTHING_WRITTEN, 0.0
+    if order.tuned is None:
+        rng = make_rng(*_names(experiment, order))
+        with limited_memory(experiment.memory):
+            trace = drive_tuner(_build(order), task, evaluator, rng, experiment.timeout)
+    else:
+        repeated = _ReplayCheckedEvaluator(evaluator, [] if requests is None else requests)
+        trace, written, import_seconds = _run_isolated(experiment, order, task, repeated)
+    seconds = perf_counter() - started
+    beside = problem.simulated - simulated - len(trace.losses)
+    # A simulator that raises an error has counted simulations without a result.
+    if beside > 0 and trace.status != "crashed":
+        raise HiddenSimulationError(f"{beside} simulations beside the budget")
+    if trace.status == "crashed":
+        # The stderr of a worker is discarded; without workers the author of the tuner sees it.
+        sys.stderr.write(trace.reason)
+    # Held-out runs are simulated after the run, so that the tuner cannot see them.
+    heldout = None
+    if target.held_out.scenarios:
+        heldout = ProposalEvaluator(problem, target.held_out).compute_rmse(
+            trace.proposals[:0], trace.recommendations
+        )
+    rmse = evaluator.compute_rmse(trace.proposals, trace.recommendations)
+    return RunOutcome(trace, rmse, heldout, seconds, written, import_seconds)
 
 
 class _ReplayCheckedEvaluator:
@@ -158,61 +203,16 @@ class _ReplayCheckedEvaluator:
         return self._evaluate(points)
 
 
-def _perform(experiment: Experiment, order: RunRequest, before: list[Array]) -> RunOutcome:
-    problem = get_problem(experiment)
-    target = order.target
-    evaluator = ProposalEvaluator(problem, target.fitting)
-    task = Task(
-        dim=problem.cube.dim,
-        start=target.start,
-        observed=target.fitting.observed,
-        scale=problem.scale,
-        training=problem.cube.training,
-        budget=order.budget,
-        lengths=tuple(s.times.size for s in target.fitting.scenarios),
-        scene=problem.describe_scenarios(target.fitting.scenarios),
-    )
-    # Simulations of the scoring and of earlier runs are not counted.
-    simulated = problem.simulated
-    started = perf_counter()
-    written, import_seconds = NOTHING_WRITTEN, 0.0
-    if order.tuned is None:
-        trace = _run_in_process(experiment, order, task, evaluator)
-    else:
-        repeated = _ReplayCheckedEvaluator(evaluator, before)
-        trace, written, import_seconds = _run_isolated(experiment, order, task, repeated)
-    seconds = perf_counter() - started
-    beside = problem.simulated - simulated - len(trace.losses)
-    # A simulator that raises an error has counted simulations without a result.
-    if beside > 0 and trace.status != "crashed":
-        raise HiddenSimulationError(f"{beside} simulations beside the budget")
-    if trace.status == "crashed":
-        # The stderr of a worker is discarded; without workers the author of the tuner sees it.
-        sys.stderr.write(trace.reason)
-    # Held-out runs are simulated after the run, so that the tuner cannot see them.
-    heldout = None
-    if target.held_out.scenarios:
-        heldout = ProposalEvaluator(problem, target.held_out).compute_rmse(
-            trace.proposals[:0], trace.recommendations
-        )
-    rmse = evaluator.compute_rmse(trace.proposals, trace.recommendations)
-    return RunOutcome(trace, rmse, heldout, seconds, written, import_seconds)
-
-
 def _names(experiment: Experiment, order: RunRequest) -> tuple[str | int, ...]:
     """Return the names that determine the random stream of the run."""
     return experiment.name, order.entry.tuner, order.target.name, order.seed
 
 
-def _run_in_process(
-    experiment: Experiment, order: RunRequest, task: Task, evaluate: Evaluate
-) -> RunTrace:
-    """Execute a run whose tuner works in this process."""
-    entry, weights = order.entry, order.weights
-    tuner = build_tuner(entry) if weights is None else load_trained_tuner(entry, weights)
-    rng = make_rng(*_names(experiment, order))
-    with limited_memory(experiment.memory):
-        return drive_tuner(tuner, task, evaluate, rng, experiment.timeout)
+def _build(order: RunRequest) -> Tuner:
+    """Build a tuner that works in this process, with its weights if it has been trained."""
+    if order.weights is None:
+        return build_tuner(order.entry)
+    return load_trained_tuner(order.entry, order.weights)
 
 
 def _run_isolated(

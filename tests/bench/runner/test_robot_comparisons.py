@@ -74,7 +74,7 @@ def test_a_finished_comparison_is_taken_up_and_one_of_another_file_is_not(compar
 def test_options_that_contradict_each_other_are_one_line(tmp_path, capsys):
     model = str(written(tmp_path))
     for arguments, message in (
-        (["ball-drop", "--model", model], "says what it tunes: leave out model"),
+        (["ball-drop", "--model", model], "states what it tunes: leave out model"),
         (["--model", model], "found none"),
         (["--model", str(tmp_path / "no.xml"), "--free", "x"], "no.xml: no such file"),
         (["--resume", "x", "--free", "damping@*"], "leave out free"),
