@@ -1,16 +1,18 @@
 """Map the columns of a recording to raw logs that were not written for simgap.
 
-The mapping is stated by `file`, `column`, `[time]` and `runs.NAME.folder` in a description.
+The mapping is stated by `file`, `column`, `matrix`, `[time]` and `runs.NAME.folder` in a
+description.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.core.toml_validation import (
@@ -20,6 +22,7 @@ from sims.core.toml_validation import (
     check_text,
     make_error,
     read_toml,
+    toml_key,
 )
 from sims.core.value_limits import MAX_NAME_LENGTH, MAX_TIMESTAMP_SECONDS, MIN_RUN_SECONDS
 from sims.recording.csv_table import CsvRun
@@ -35,10 +38,32 @@ SAME_INSTANT_SECONDS = 1e-9
 
 
 class SignalSource(NamedTuple):
-    """Location of a signal: a file relative to its run's folder, and a column of that file."""
+    """Location of a signal: a file relative to its run's folder, and columns of that file.
+
+    The signal is the weighted sum of the columns, which for one column has the weight 1. Weights
+    convert coupled drives to the joint side: a row of their coupling matrix.
+
+    Attributes:
+        file: File, relative to the folder of the run; empty for the usual one.
+        columns: Names of the columns.
+        weights: Weight of each column.
+    """
 
     file: str
-    column: str
+    columns: tuple[str, ...]
+    weights: tuple[float, ...] = (1.0,)
+
+    def combine(self, read_column: Callable[[str], Array]) -> Array:
+        """Return the signal (T,) in the unit of its columns.
+
+        Args:
+            read_column: Function that returns a column (T,) by name.
+        """
+        first = read_column(self.columns[0])
+        if self.weights == (1.0,):
+            return first
+        rest = zip(self.columns[1:], self.weights[1:], strict=True)
+        return sum((w * read_column(name) for name, w in rest), self.weights[0] * first)
 
 
 @dataclass(frozen=True)
@@ -57,6 +82,8 @@ class RecordingSources:
         files: By run, the file of signals without a stated file, relative to the run's folder.
         is_renaming: Whether only column names are stated, so that the table may be one written for
             simgap with other names.
+        extra: Location of each column that is neither channel nor input. Without a file, it is in
+            the first file of the other signals that has such a column.
     """
 
     signals: Mapping[str, SignalSource]
@@ -68,10 +95,14 @@ class RecordingSources:
     rate: float = 0.0
     files: Mapping[str, str] = field(default_factory=dict)
     is_renaming: bool = False
+    extra: Mapping[str, SignalSource] = field(default_factory=dict)
 
 
 def read_sources(
-    path: Path, meta: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]]
+    path: Path,
+    meta: Mapping[str, Any],
+    columns: Mapping[str, Mapping[str, Any]],
+    extra: Mapping[str, Mapping[str, Any]],
 ) -> RecordingSources:
     """Read the locations of all columns from a description.
 
@@ -79,6 +110,7 @@ def read_sources(
         path: Path of the description, for messages.
         meta: Content of the description.
         columns: Table of each channel and input in the description.
+        extra: Table of each column that is neither.
 
     Raises:
         InputError: The description is malformed.
@@ -92,34 +124,66 @@ def read_sources(
     except InputError as error:
         raise InputError(f"{path}: time.unit: {error}") from None
     rate = _rate(path, time)
-    signals = {}
-    for name, own in columns.items():
-        file = check_text(path, f"{name}.file", own.get("file", ""))
-        column = check_text(path, f"{name}.column", own.get("column", name))
-        signals[name] = SignalSource(file, column)
-    folders, own_files = {}, {}
+    signals = {name: _read_source(path, name, table) for name, table in columns.items()}
+    folders, run_files = {}, {}
     for name, marks in check_table(path, "runs", meta.get("runs", {})).items():
         if not isinstance(marks, dict):
             continue
         if "file" in marks:
-            own_files[name] = check_text(path, f"runs.{name}.file", marks["file"])
+            run_files[name] = check_text(path, f"runs.{name}.file", marks["file"])
             folders[name] = ""
         if "folder" in marks:
             folders[name] = check_text(path, f"runs.{name}.folder", marks["folder"])
-    said = any({"file", "column"} & own.keys() for own in columns.values())
-    elsewhere = any("file" in own for own in columns.values()) or bool(folders)
-    elsewhere = elsewhere or bool({"column", "unit", "rate"} & time.keys())
+    tables = (*columns.values(), *extra.values())
+    has_columns = any({"file", "column"} & table.keys() for table in tables)
+    has_files = any("file" in table for table in tables)
+    has_files = has_files or bool(folders) or bool({"column", "unit", "rate"} & time.keys())
     return RecordingSources(
         signals,
         stamps,
         second,
         check_finite(path, "time.offset", time.get("offset", 0.0)),
         folders,
-        said or elsewhere,
+        has_columns or has_files,
         rate,
-        own_files,
-        said and not elsewhere,
+        run_files,
+        has_columns and not has_files,
+        {name: _read_source(path, f"extra.{name}", table, name) for name, table in extra.items()},
     )
+
+
+def _read_source(
+    path: Path, where: str, table: Mapping[str, Any], default: str = ""
+) -> SignalSource:
+    """Read the location of one signal: `file`, `column` and `matrix` of its table.
+
+    Args:
+        path: Path of the description, for messages.
+        where: Name of the table, for messages.
+        table: Content of the table.
+        default: Name of the column where none is stated; `where` if empty.
+    """
+    file = check_text(path, f"{where}.file", table.get("file", ""))
+    column = table.get("column", default or where)
+    if not isinstance(column, list):
+        if "matrix" in table:
+            raise make_error(
+                path,
+                f"{where}.matrix",
+                'it with several columns (column = ["A", "B"] and matrix = [0.5, -0.5])',
+                table["matrix"],
+            )
+        return SignalSource(file, (check_text(path, f"{where}.column", column),))
+    names = tuple(check_text(path, f"{where}.column", name) for name in column)
+    matrix = table.get("matrix")
+    if not names or not isinstance(matrix, list) or len(matrix) != len(names):
+        raise make_error(
+            path, f"{where}.matrix", f"a row of {len(names)} numbers, one for each column", matrix
+        )
+    weights = tuple(check_finite(path, f"{where}.matrix", weight) for weight in matrix)
+    if not any(weights):
+        raise make_error(path, f"{where}.matrix", "a number that is not zero", matrix)
+    return SignalSource(file, names, weights)
 
 
 def _rate(path: Path, time: Mapping[str, Any]) -> float:
@@ -147,7 +211,7 @@ def list_mapped_files(description: Path) -> list[Path]:
         meta = read_toml(description)
     except InputError:
         return []
-    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs", "runs")]
+    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs", "extra", "runs")]
     folders = _named(meta.get("runs"), "folder") or [""]
     # A signal without a file is in the table that has the description's name, in each folder.
     usual = description.with_suffix(".csv").name
@@ -176,7 +240,8 @@ def read_logs(
 
     The rows of a run are all times at which a sensor or an input has a stamp, from the first to the
     last sample of a sensor. The cells of a sensor are empty between its own stamps; an input has
-    its held or interpolated value at all times. So measurements are not resampled.
+    its held or interpolated value at all times, and an extra column its held value. So measurements
+    are not resampled.
 
     Args:
         path: Table in which signals without a file are found.
@@ -190,172 +255,216 @@ def read_logs(
     """
     runs = []
     for name, folder in (sources.folders or {"": ""}).items():
-        here = path.parent / folder
         if len(name) > MAX_NAME_LENGTH:
             raise InputError(f"{path}: the name of run {name[:40]}… is too long")
-        usual = sources.files.get(name, path.name)
-        parts = _Parts(here, usual, sources, (*channels, *inputs))
-        for own, rows in parts.runs(name):
-            runs.append(parts.joined(own, rows, channels, inputs, linear))
+        logs = _FolderLogs(
+            path.parent / folder, sources.files.get(name, path.name), sources, channels, inputs
+        )
+        runs += [logs.join(run, rows, linear) for run, rows in logs.list_runs(name)]
     return runs
 
 
-class _Parts:
-    """Logs of one folder."""
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+class _LogRows(NamedTuple):
+    """Rows of a log that belong to a run.
+
+    Attributes:
+        stamps: (N,) stamps, in s from the first stamp of the run.
+        rows: (N,) numbers of the rows in the log.
+    """
+
+    stamps: Array
+    rows: NDArray[np.intp]
+
+
+class _FolderLogs:
+    """Logs of one folder.
+
+    Args:
+        folder: Folder of the logs.
+        default_file: File of signals without a stated file.
+        sources: Location of each signal.
+        channels: Names of the measured signals.
+        inputs: Names of the inputs.
+    """
 
     def __init__(
-        self, folder: Path, usual: str, sources: RecordingSources, signals: Sequence[str]
+        self,
+        folder: Path,
+        default_file: str,
+        sources: RecordingSources,
+        channels: Sequence[str],
+        inputs: Sequence[str],
     ) -> None:
-        self.sources = sources
-        files = {name: sources.signals[name].file or usual for name in signals}
+        self._time, self._rate, self._second = sources.time, sources.rate, sources.second
+        self._channels, self._inputs = channels, inputs
+        self._sources = {name: sources.signals[name] for name in (*channels, *inputs)}
+        self._extra = dict(sources.extra)
+        files = {name: source.file or default_file for name, source in self._sources.items()}
+        for name, source in self._extra.items():
+            (column,) = source.columns
+            files[name] = source.file or _find_file(folder, column, list(files.values()))
+        self._sources |= self._extra
         wanted: dict[str, set[str]] = {}
         for name, file in files.items():
-            own = wanted.setdefault(file, set() if sources.rate else {sources.time})
-            own.add(sources.signals[name].column)
-        self.logs: dict[str, LogFile] = {
+            columns = wanted.setdefault(file, set() if self._rate else {self._time})
+            columns.update(self._sources[name].columns)
+        self._logs: dict[str, LogFile] = {
             name: read_log(folder / Path(file), frozenset(wanted[file]))
             for name, file in files.items()
         }
 
-    def runs(self, name: str) -> list[tuple[str, Array | None]]:
+    def list_runs(self, name: str) -> list[tuple[str, Mask | None]]:
         """Return the names of the runs in these files, each with a mask of its rows.
 
         The mask is None where all rows belong to one run.
         """
-        first = next(iter(self.logs.values()))
-        alone = all(log.path == first.path for log in self.logs.values())
-        if name or not alone or "run" not in first.columns:
+        first = next(iter(self._logs.values()))
+        is_one_file = all(log.path == first.path for log in self._logs.values())
+        if name or not is_one_file or "run" not in first.columns:
             return [(name or "1", None)]
         numbers = first.get_column("run")
         order = list(dict.fromkeys(numbers.tolist()))
         return [(f"{number:g}", numbers == number) for number in order]
 
-    def joined(
-        self,
-        name: str,
-        rows: Array | None,
-        channels: Sequence[str],
-        inputs: Sequence[str],
-        linear: frozenset[str],
-    ) -> CsvRun:
+    def join(self, run: str, run_rows: Mask | None, linear: frozenset[str]) -> CsvRun:
         """Join the logs of one run into a table.
 
         Args:
-            name: Name of the run.
-            rows: Mask of the run's rows; None for all rows.
-            channels: Names of the measured signals.
-            inputs: Names of the inputs.
+            run: Name of the run.
+            run_rows: Mask of the run's rows; None for all rows.
             linear: Inputs that are interpolated linearly between samples.
 
         Raises:
             InputError: A log has missing or decreasing stamps, or a signal has no samples.
         """
-        stamps: dict[Path, Array] = {}
-        # Rows of each file that are used; of rows with the same stamp, only the first.
-        kept: dict[Path, Any] = {}
+        rows_of, notes = self._select_rows(run_rows)
+        times = self._sample_times(run, rows_of)
+        columns = {}
+        for channel in self._channels:
+            log = self._logs[channel]
+            values = self._read(channel, rows_of[log.path])
+            if not np.isfinite(values).any():
+                raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
+            stamps = rows_of[log.path].stamps
+            cells = np.full(times.size, np.nan)
+            places = np.searchsorted(times, stamps - SAME_INSTANT_SECONDS)
+            inside = (places < times.size) & (stamps >= times[0] - SAME_INSTANT_SECONDS)
+            cells[places[inside]] = values[inside]
+            columns[channel] = make_read_only(cells)
+        for name in self._inputs:
+            columns[name] = make_read_only(self._hold(name, rows_of, times, name in linear))
+        for name in self._extra:
+            columns[name] = make_read_only(self._hold(name, rows_of, times, False))
+        return CsvRun(run, times, columns, tuple(notes))
+
+    def _select_rows(self, run_rows: Mask | None) -> tuple[dict[Path, _LogRows], list[str]]:
+        """Return the rows of each log that are used, and notes on those that are left out.
+
+        Of rows with the same stamp, only the first is used.
+        """
+        rows_of: dict[Path, _LogRows] = {}
         notes = []
-        for log in self.logs.values():
-            if log.path in stamps:
+        for log in self._logs.values():
+            if log.path in rows_of:
                 continue
-            own, first = self._stamps(log, rows)
-            stamps[log.path] = own[first]
-            chosen = np.arange(own.size) if rows is None else np.flatnonzero(rows)
-            kept[log.path] = chosen[first]
-            if not first.all():
-                repeated = f"{int((~first).sum())} of {own.size} stamps repeat the one before"
+            stamps, is_first = self._stamps(log, run_rows)
+            numbers = np.arange(stamps.size) if run_rows is None else np.flatnonzero(run_rows)
+            rows_of[log.path] = _LogRows(stamps[is_first], numbers[is_first])
+            if not is_first.all():
+                repeated = f"{int((~is_first).sum())} of {stamps.size} stamps repeat the one before"
                 notes.append(f"{log.path}: {repeated}; their {log.rows}s are left out")
         # Clocks of robots count from 1970: the remaining resolution is too coarse for rates, so
         # subtract the first stamp.
-        zero = min(own[0] for own in stamps.values())
-        stamps = {path: self.sources.second * (own - zero) for path, own in stamps.items()}
-        measured = np.unique(np.concatenate([stamps[self.logs[c].path] for c in channels]))
-        given = [stamps[self.logs[u].path] for u in inputs]
-        times = np.unique(np.concatenate([measured, *given]))
+        zero = min(rows.stamps[0] for rows in rows_of.values())
+        return {
+            path: rows._replace(stamps=self._second * (rows.stamps - zero))
+            for path, rows in rows_of.items()
+        }, notes
+
+    def _sample_times(self, run: str, rows_of: Mapping[Path, _LogRows]) -> Array:
+        """Return the times (T,) of a run's rows, in s."""
+
+        def stamps_of(names: Sequence[str]) -> list[Array]:
+            return [rows_of[self._logs[name].path].stamps for name in names]
+
+        measured = np.unique(np.concatenate(stamps_of(self._channels)))
+        times = np.unique(np.concatenate([measured, *stamps_of(self._inputs)]))
         times = times[(times >= measured[0]) & (times <= measured[-1])]
         times = times[np.diff(times, prepend=-np.inf) > SAME_INSTANT_SECONDS]
-        path = self.logs[channels[0]].path
         if times.size < 2 or times[-1] - times[0] < MIN_RUN_SECONDS:
-            raise InputError(f"{path}: run {name!r}: expected at least two instants, found one")
-        columns = {}
-        for channel in channels:
-            log = self.logs[channel]
-            values = self._values(log, channel, kept)
-            if not np.isfinite(values).any():
-                raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
-            cells = np.full(times.size, np.nan)
-            places = np.searchsorted(times, stamps[log.path] - SAME_INSTANT_SECONDS)
-            inside = (places < times.size) & (stamps[log.path] >= times[0] - SAME_INSTANT_SECONDS)
-            cells[places[inside]] = values[inside]
-            columns[channel] = make_read_only(cells)
-        for name_, own in zip(inputs, given, strict=True):
-            columns[name_] = make_read_only(self._given(name_, own, times, kept, name_ in linear))
-        return CsvRun(name, make_read_only(times), columns, tuple(notes))
+            path = self._logs[self._channels[0]].path
+            raise InputError(f"{path}: run {run!r}: expected at least two instants, found one")
+        return make_read_only(times)
 
-    def _values(self, log: LogFile, signal: str, kept: Mapping[Path, Any]) -> Array:
-        name = self.sources.signals[signal].column
-        values, rows = log.get_column(name), kept[log.path]
-        if rows.size and rows[-1] >= values.size:
-            raise InputError(
-                f"{log.path}, column {name}: expected a number for each stamp, found "
-                f"{values.size} numbers and at least {rows[-1] + 1} stamps"
-            )
-        taken: Array = values[rows]
-        return taken
+    def _read(self, signal: str, rows: _LogRows) -> Array:
+        """Return the values (N,) of a signal in the rows of a run, in the unit of the log."""
+        log = self._logs[signal]
 
-    def _given(
-        self,
-        signal: str,
-        stamps: Array,
-        times: Array,
-        kept: Mapping[Path, Any],
-        straight: bool,
+        def read_column(name: str) -> Array:
+            values = log.get_column(name)
+            if rows.rows.size and rows.rows[-1] >= values.size:
+                raise InputError(
+                    f"{log.path}, column {name}: expected a number for each stamp, found "
+                    f"{values.size} numbers and at least {rows.rows[-1] + 1} stamps"
+                )
+            return np.asarray(values[rows.rows])
+
+        return self._sources[signal].combine(read_column)
+
+    def _hold(
+        self, signal: str, rows_of: Mapping[Path, _LogRows], times: Array, is_linear: bool
     ) -> Array:
-        """Return the values of an input at all times of a run.
+        """Return the values of an input or an extra column at all times of a run.
 
         Args:
-            signal: Name of the input.
-            stamps: Stamps of the input's log, s.
+            signal: Name of the signal.
+            rows_of: Rows of each log that are used.
             times: (T,) times of the run, s.
-            kept: Rows of each log that are used.
-            straight: Whether to interpolate linearly instead of holding the last value.
+            is_linear: Whether to interpolate linearly instead of holding the last value.
 
         Returns:
             (T,) values in the unit of the log.
+
+        Raises:
+            InputError: A value of an input is missing.
         """
-        log = self.logs[signal]
-        values = self._values(log, signal, kept)
+        log = self._logs[signal]
+        rows = rows_of[log.path]
+        values = self._read(signal, rows)
         missing = np.flatnonzero(~np.isfinite(values))
-        if missing.size:
-            row = int(kept[log.path][missing[0]]) + log.first
+        if missing.size and signal in self._inputs:
+            row = int(rows.rows[missing[0]]) + log.first
+            columns = ", ".join(self._sources[signal].columns)
             raise InputError(
-                f"{log.path}, {log.rows} {row}, column {self.sources.signals[signal].column}: "
-                f"expected a number, found none; what was put in is known at every stamp"
+                f"{log.path}, {log.rows} {row}, column {columns}: expected a number, found none; "
+                "an input has a value at every stamp: take out the row, or name another column"
             )
-        if straight:
-            return np.interp(times, stamps, values)
-        places = np.searchsorted(stamps, times + SAME_INSTANT_SECONDS, side="right") - 1
+        if is_linear:
+            return np.interp(times, rows.stamps, values)
+        places = np.searchsorted(rows.stamps, times + SAME_INSTANT_SECONDS, side="right") - 1
         held: Array = values[np.maximum(places, 0)]
         return held
 
-    def _stamps(
-        self, log: LogFile, rows: Array | None
-    ) -> tuple[Array, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
-        """Return the stamps (T,) of a log in its own unit, and a mask of the unrepeated ones.
+    def _stamps(self, log: LogFile, run_rows: Mask | None) -> tuple[Array, Mask]:
+        """Return the stamps (N,) of a log in its own unit, and a mask of the unrepeated ones.
 
         Raises:
             InputError: A stamp is missing or decreases, or many stamps repeat the previous one.
         """
-        if self.sources.rate:
+        if self._rate:
             longest = max(len(values) for values in log.columns.values())
-            count = longest if rows is None else int(rows.sum())
-            return np.arange(count) / self.sources.rate, np.ones(count, dtype=bool)
-        stamps = log.get_column(self.sources.time)
-        stamps = stamps if rows is None else stamps[rows]
-        where = f"{log.path}, column {self.sources.time}"
+            count = longest if run_rows is None else int(run_rows.sum())
+            return np.arange(count) / self._rate, np.ones(count, dtype=bool)
+        stamps = log.get_column(self._time)
+        stamps = stamps if run_rows is None else stamps[run_rows]
+        where = f"{log.path}, column {self._time}"
         if not np.isfinite(stamps).all():
             row = int(np.flatnonzero(~np.isfinite(stamps))[0]) + log.first
             raise InputError(f"{where}, {log.rows} {row}: expected a stamp, found none")
-        if np.abs(stamps).max() * self.sources.second > MAX_TIMESTAMP_SECONDS:
+        if np.abs(stamps).max() * self._second > MAX_TIMESTAMP_SECONDS:
             raise InputError(
                 f"{where}: expected stamps in the unit that [time] states, found {stamps[0]:.12g}; "
                 "is it milliseconds or less?"
@@ -370,4 +479,22 @@ class _Parts:
                 f"{where}, {log.rows} {row}: expected more than {stamps[bad[0]]:.12g}, found "
                 f"{stamps[bad[0] + 1]:.12g}; take out rows that came twice or late"
             )
-        return np.asarray(stamps), np.asarray(np.diff(stamps, prepend=-np.inf) > 0)
+        is_first: Mask = np.diff(stamps, prepend=-np.inf) > 0
+        return np.asarray(stamps), is_first
+
+
+def _find_file(folder: Path, column: str, files: Sequence[str]) -> str:
+    """Return the first of some files that has a column.
+
+    Raises:
+        InputError: No file has it.
+    """
+    for file in dict.fromkeys(files):
+        log = read_log(folder / Path(file), frozenset({column}))
+        if column.strip().lower() in {name.strip().lower() for name in log.list_columns()}:
+            return file
+    searched = ", ".join(dict.fromkeys(files))
+    raise InputError(
+        f"{folder}: column '{column}': expected it in one of {searched}, found none there; state "
+        f'[extra.{toml_key(column)}] file = "NAME", column = "NAME"'
+    )

@@ -110,7 +110,6 @@ def check_switches(
     switches: Sequence[DriveSwitch],
     actuators: Sequence[str],
     taken: Sequence[str],
-    are_logs: bool,
 ) -> None:
     """Check the switch columns of a description.
 
@@ -119,10 +118,9 @@ def check_switches(
         switches: Switch columns from `read_switches`.
         actuators: Names of the actuators of the model.
         taken: Names of columns with another meaning.
-        are_logs: Whether the columns are in raw logs instead of a table next to the description.
 
     Raises:
-        InputError: There is no such actuator, or the column cannot be read.
+        InputError: There is no such actuator, or the column is a channel or an input.
     """
     for switch in switches:
         where = f"{path}: actuators.{switch.actuator}"
@@ -135,11 +133,6 @@ def check_switches(
             raise InputError(
                 f"{where}: expected a column that says when the drive is on, found {switch.column},"
                 " which is a channel or input; name a column of its own"
-            )
-        if are_logs:
-            raise InputError(
-                f"{where}: column {switch.column}: expected it in the table beside the description,"
-                " found logs; write the table with simgap import first"
             )
 
 

@@ -251,12 +251,20 @@ def _read_renamed(
     Returns:
         The runs, with columns by the names of the signals.
     """
-    columns = {name: sources.signals[name].column for name in (*channels, *inputs)}
+
+    def columns_of(names: Sequence[str]) -> list[str]:
+        return list(dict.fromkeys(c for name in names for c in sources.signals[name].columns))
+
+    measured = columns_of(channels)
+    given = [column for column in columns_of(inputs) if column not in measured]
+    extra_columns = {name: sources.extra[name].columns[0] for name in extra}
     parts = []
-    recorded = [columns[name] for name in channels], [columns[name] for name in inputs]
-    for part in read_table(path, recorded[0], recorded[1], extra):
-        values = {name: part.columns[column] for name, column in columns.items()}
-        values |= {name: part.columns[name] for name in extra}
+    for part in read_table(path, measured, given, list(extra_columns.values())):
+        values = {
+            name: sources.signals[name].combine(part.columns.__getitem__)
+            for name in (*channels, *inputs)
+        }
+        values |= {name: part.columns[column] for name, column in extra_columns.items()}
         parts.append(part._replace(columns=values))
     return parts
 
@@ -337,7 +345,7 @@ def _run(table: Path, part: CsvRun, about: RecordingDescription) -> Run:
     inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
     for name, command in about.wrapped.items():
         channels[name] = make_read_only(unwrapped(channels[name], inputs.get(command)))
-    # Extra columns keep their unit, because no system reads them; runs read from logs have none.
+    # Extra columns keep their unit, because no system reads them.
     extra = {name: part.columns[name] for name in about.extra if name in part.columns}
     first = {
         n: s.gain * extra[n][0] + s.offset

@@ -287,13 +287,15 @@ def check_description(
     # A robot has no system name: its model file is stated instead.
     robotic = declared.has_model
     extra = _extra(path, meta, declared)
+    switches = _switches(path, meta, declared)
+    extra = {**{switch.column: {"unit": "1"} for switch in switches}, **extra}
     sources = read_sources(
         path,
         meta,
         {name: column.table for name, column in (*channels.items(), *inputs.items())},
+        extra,
     )
-    switches = _switches(path, meta, declared, sources)
-    extra = {**{switch.column: "1" for switch in switches}, **extra}
+    extra_units = {name: str(table["unit"]) for name, table in extra.items()}
     return RecordingDescription(
         system=declared.name if robotic else _system(path, meta),
         title=title,
@@ -302,8 +304,8 @@ def check_description(
         noise=_noises(path, channels, declared),
         constants=constants,
         runs=runs,
-        extra=extra,
-        initial_pose_scales=_begins(path, extra, declared),
+        extra=extra_units,
+        initial_pose_scales=_begins(path, extra_units, declared),
         linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
         sources=sources,
         switches=switches,
@@ -342,13 +344,13 @@ def _wrapped(
 
 
 def _switches(
-    path: Path, meta: Mapping[str, Any], declared: DeclaredSignals, sources: RecordingSources
+    path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
 ) -> tuple[DriveSwitch, ...]:
     """Read and check the columns that say when drives are on."""
     switches = read_switches(path, meta)
     names = [signal.name for signal in (*declared.channels, *declared.inputs)]
     actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
-    check_switches(path, switches, actuators, ["run", "t", *names], sources.stated)
+    check_switches(path, switches, actuators, ["run", "t", *names])
     return switches
 
 
@@ -450,6 +452,7 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
         "scale",
         "offset",
         "column",
+        "matrix",
         "file",
         *(("noise", "unwrap") if kind == "channel" else ("hold",)),
     )
@@ -506,11 +509,13 @@ def _noise(path: Path, name: str, value: Any) -> float:
     return noise
 
 
-def _extra(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> dict[str, str]:
-    """Return the units of the columns that belong to no channel or input."""
+def _extra(
+    path: Path, meta: Mapping[str, Any], declared: DeclaredSignals
+) -> dict[str, Mapping[str, Any]]:
+    """Return the tables of the columns that belong to no channel or input."""
     # A forgotten channel must not be accepted as an unused column.
     taken = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
-    units = {}
+    tables: dict[str, Mapping[str, Any]] = {}
     given = dotted(
         check_table(path, "extra", meta.get("extra", {})), get_floating_state_units(declared)
     )
@@ -521,9 +526,9 @@ def _extra(path: Path, meta: Mapping[str, Any], declared: DeclaredSignals) -> di
         unit = entry.get("unit") if isinstance(entry, dict) else None
         if not isinstance(unit, str):
             raise make_error(path, f"extra {name}", 'a table with unit = "TEXT"', entry)
-        _known(path, f"extra.{name}", entry, ("unit",))
-        units[name] = unit
-    return units
+        _known(path, f"extra.{name}", entry, ("unit", "file", "column"))
+        tables[name] = entry
+    return tables
 
 
 def _begins(

@@ -6,6 +6,7 @@ Columns of a ``DataFrame`` are checked by the same rules as those of `NAME.csv`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,6 +15,7 @@ import numpy as np
 from sims.core.simulator import Array, InputError, make_unknown_name_error, similar
 from sims.core.toml_validation import check_table, format_value
 from sims.core.value_limits import is_plausible_number
+from sims.recording.column_mapping import SignalSource
 from sims.recording.csv_table import CsvRun, Table
 from sims.recording.drive_switches import read_switches
 from sims.recording.recording_description import (
@@ -109,9 +111,10 @@ def described(
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
     switches = [switch.column for switch in read_switches(path, result)]
-    stamps = _column("t", time)
+    (stamps,) = _columns("t", time)[:1]
     taken = {stamps, *extra}
-    taken.update(_column(name, own) for name, own in (*channels.items(), *inputs.items()))
+    for name, own in (*channels.items(), *inputs.items(), *extra.items()):
+        taken.update(_columns(name, own))
     for name in (name for name in columns if name not in taken):
         if name in _names(declared.channels):
             channels[name] = {}
@@ -130,8 +133,9 @@ def described(
     missing = {}
     for name, own in (*channels.items(), *inputs.items(), *extra.items()):
         # Entries that are not tables are refused when the description is checked.
-        if isinstance(own, dict) and not _state_unit(own, _column(name, own), units, noted):
-            missing[_column(name, own)] = usual.get(name, "1")
+        column = _columns(name, own)[0]
+        if isinstance(own, dict) and not _state_unit(own, column, units, noted):
+            missing[column] = usual.get(name, "1")
     if missing:
         raise InputError(
             f"{path}: expected the unit of each column, found none of "
@@ -140,10 +144,11 @@ def described(
     return {**result, **{key: entries for key, entries in tables.items() if entries}}
 
 
-def _column(name: str, own: Any) -> str:
-    """Return the column of a signal; entries of a wrong type are refused elsewhere."""
+def _columns(name: str, own: Any) -> list[str]:
+    """Return the columns of a signal; entries of a wrong type are refused elsewhere."""
     column = own.get("column") if isinstance(own, dict) else None
-    return column if isinstance(column, str) else name
+    columns = column if isinstance(column, list) else [column]
+    return [column for column in columns if isinstance(column, str)] or [name]
 
 
 def _state_unit(
@@ -196,7 +201,9 @@ def read_frame(path: Path, frame: Frame, about: RecordingDescription) -> list[Cs
         InputError: The frame is malformed; the message is one line.
     """
     sources = about.sources
-    if sources.folders or any(source.file for source in sources.signals.values()):
+    if sources.folders or any(
+        source.file for source in (*sources.signals.values(), *sources.extra.values())
+    ):
         raise InputError(f"{path}: expected no file and no folder in the description of a frame")
     return _FrameTable(path, list(about.channels), list(about.inputs), list(about.extra)).of(
         frame, about
@@ -218,15 +225,20 @@ class _FrameTable(Table):
             about: Checked description of the frame.
         """
         sources = about.sources
-        signals = {name: source.column for name, source in sources.signals.items()}
-        places = {"t": sources.time, **signals, **{name: name for name in about.extra}}
-        for name in places.values():
-            if name not in frame.columns:
-                raise InputError(
-                    f"{self.path}: expected column '{name}', found columns "
-                    f"{', '.join(map(str, frame.columns))}"
-                )
-        columns = {name: self._values(name, frame, column) for name, column in places.items()}
+        places = {
+            "t": SignalSource("", (sources.time,)),
+            **sources.signals,
+            **sources.extra,
+        }
+        columns = {}
+        for name, source in places.items():
+            for column in source.columns:
+                if column not in frame.columns:
+                    raise InputError(
+                        f"{self.path}: expected column '{column}', found columns "
+                        f"{', '.join(map(str, frame.columns))}"
+                    )
+            columns[name] = source.combine(partial(self._values, name, frame))
         if sources.second != 1.0:
             columns["t"] = sources.second * columns["t"]
         return self.runs(self._run_names(frame, len(columns["t"])), columns)

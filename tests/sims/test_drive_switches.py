@@ -111,7 +111,54 @@ def test_a_drive_that_is_never_on_is_refused(tmp_path):
         load_recording(path, divide=False)
 
 
-def test_logs_have_no_such_column(tmp_path):
-    more = '[actuators.m]\nenable = "on"\n[time]\ncolumn = "t"\n'
-    with pytest.raises(InputError, match=r"column on: expected it in the table beside"):
-        load_recording(written(tmp_path, more), divide=False)
+MAPPED = """[time]
+column = "stamp"
+unit = "ms"
+[channels."q.hinge"]
+file = "states.csv"
+column = "pos"
+unit = "rad"
+[inputs."u.m"]
+file = "commands.csv"
+column = "target"
+unit = "rad"
+"""
+
+
+def mapped(folder, more):
+    """Write raw logs of one run: states with a power flag, and slower commands."""
+    rows = [f"{10 * k},0.{k},{'True' if k < 4 else 'False'}" for k in range(8)]
+    (folder / "states.csv").write_text("stamp,pos,Power\n" + "\n".join(rows) + "\n")
+    (folder / "commands.csv").write_text("stamp,target\n0,0.1\n35,0.2\n")
+    (folder / "safety.csv").write_text("stamp,stop\n0,0\n52,1\n")
+    (folder / "robot.xml").write_text(ROBOT)
+    (folder / "log.toml").write_text(f'model = "robot.xml"\n{MAPPED}{more}')
+    return folder / "log.toml"
+
+
+@pytest.mark.parametrize(
+    ("more", "off"),
+    [
+        # Times in ms: 0, 10, 20, 30, 35 (a command), 40, 50, 60, 70.
+        ('[actuators.m]\nenable = "Power"\n', "000001111"),
+        (
+            '[actuators.m]\ndisable = "estop"\n'
+            '[extra.estop]\nunit = "1"\nfile = "safety.csv"\ncolumn = "stop"\n',
+            "000000011",
+        ),
+    ],
+)
+def test_raw_logs_have_switches(tmp_path, more, off):
+    recording, _ = load_recording(mapped(tmp_path, more), divide=False)
+    (run,) = recording.runs
+    assert "".join(str(int(value)) for value in run.off["m"]) == off
+    assert run.times[4] == pytest.approx(0.035)
+
+
+def test_a_switch_that_no_log_has_is_refused(tmp_path):
+    message = (
+        r"column 'on': expected it in one of states.csv, commands.csv, found none there; "
+        r'state \[extra.on\] file = "NAME"'
+    )
+    with pytest.raises(InputError, match=message):
+        load_recording(mapped(tmp_path, '[actuators.m]\nenable = "on"\n'), divide=False)

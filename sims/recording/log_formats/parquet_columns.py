@@ -43,7 +43,8 @@ def is_numeric_type(kind: Any) -> bool:
     if _is_list(kind):
         kind = kind.value_type
     types = pyarrow.types
-    return any(is_one(kind) for is_one in (types.is_integer, types.is_floating, types.is_timestamp))
+    numeric = types.is_integer, types.is_floating, types.is_timestamp, types.is_boolean
+    return any(is_one(kind) for is_one in numeric)
 
 
 def _is_list(kind: Any) -> bool:
@@ -61,6 +62,9 @@ def _numbers(column: Any) -> Array | None:
     if pyarrow.types.is_timestamp(kind):
         column = column.cast(pyarrow.int64())
         return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
+    if pyarrow.types.is_boolean(kind):
+        column = column.cast(pyarrow.int8())
+        kind = column.type
     if pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind):
         return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
     if not _is_list(kind):

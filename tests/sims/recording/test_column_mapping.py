@@ -108,6 +108,30 @@ def test_the_scale_and_the_offset_of_a_signal_are_applied_before_its_unit(tmp_pa
     assert recording.noise["x"] == pytest.approx(0.4e-3)
 
 
+def test_a_row_of_a_coupling_matrix_makes_a_signal_of_several_columns(tmp_path):
+    """Two motors of a differential wrist: pitch = (a - b) / 2, behind a gear of 1:4."""
+    toml = TOML.replace(
+        'column = "pos[1]"\nunit = "mm"',
+        'column = ["pos[0]", "pos[1]"]\nmatrix = [0.5, -0.5]\nscale = 0.25\nunit = "mm"',
+    )
+    toml = toml.replace('column = "Force"', 'column = ["Force", "force"]\nmatrix = [2.0, 1]')
+    (run,) = read_recording(written(tmp_path, toml), Slider, whole=True).runs
+    x = run.channels["x"]
+    expected = 0.25e-3 * (9 - np.array([0, 1.5, 4, 7, 9])) / 2
+    np.testing.assert_allclose(x[np.isfinite(x)], expected, atol=1e-15)
+    assert run.inputs["u"].tolist() == [1.5, 1.5, 4.5, 4.5, 4.5, -6, -6]
+
+
+def test_a_coupling_matrix_in_a_table_with_runs(tmp_path):
+    toml = 'system = "slider"\n[channels.x]\nunit = "m"\n[inputs.u]\nunit = "N"\n'
+    toml += 'column = ["left", "right"]\nmatrix = [1.0, -1.0]\n'
+    (tmp_path / "log.toml").write_text(toml)
+    rows = [f"{r},{k / 10},0.{k},{k},1" for r in "ab" for k in range(4)]
+    (tmp_path / "log.csv").write_text("run,t,x,left,right\n" + "\n".join(rows) + "\n")
+    recording = read_recording(tmp_path / "log.csv", Slider, whole=True)
+    assert [run.inputs["u"].tolist() for run in recording.runs] == [[-1, 0, 1, 2]] * 2
+
+
 def test_rows_at_a_rate_stand_for_stamps(tmp_path):
     toml = TOML.replace('column = "stamp"\nunit = "ms"', "rate = 50")
     (run,) = read_recording(written(tmp_path, toml), Slider, whole=True).runs
@@ -128,6 +152,14 @@ def test_a_stamp_that_repeats_leaves_its_row_out_and_is_said(tmp_path):
 
 
 FAULTS = {
+    "a matrix of one column": ({"toml": TOML.replace('unit = "mm"', 'unit = "mm"\nmatrix = [1.0]')},
+                               r"x.matrix: expected it with several columns"),
+    "a short matrix": ({"toml": TOML.replace('"pos[1]"', '["pos[0]", "pos[1]"]\nmatrix = [1]')},
+                       r"x.matrix: expected a row of 2 numbers, one for each column, found \[1\]"),
+    "a matrix of zeros": ({"toml": TOML.replace('"Force"', '["Force"]\nmatrix = [0]')},
+                          r"u.matrix: expected a number that is not zero"),
+    "columns without a matrix": ({"toml": TOML.replace('"Force"', '["Force", "note"]')},
+                                 r"u.matrix: expected a row of 2 numbers"),
     "a rate and stamps": ({"toml": TOML.replace("[time]", "[time]\nrate = 100")}, r"time: expected "
                           r"a rate, or column and unit of stamps, found both"),
     "no rate": ({"toml": TOML.replace('column = "stamp"\nunit = "ms"', "rate = 0")}, r"time.rate: "
