@@ -10,12 +10,8 @@ from typing import Annotated, Any, TypeAlias
 from bench.api.explain import RecordingSource, list_sources
 from bench.core.options import takes_options
 from bench.logs.data_frames import FrameDescription, Units
-from bench.logs.importing.log_import import (
-    ImportOptions,
-    ImportResult,
-    describe_logs,
-    write_checked_description,
-)
+from bench.logs.importing.import_result import ImportOptions, ImportResult
+from bench.logs.importing.log_import import describe_logs, write_checked_description
 from bench.logs.inspection import load_recording
 from bench.logs.synthetic_recording import (
     SimulationSpec,
@@ -92,7 +88,7 @@ def import_logs(options: ImportRequest) -> ImportResult:
 
     Args:
         options: Arguments, the attributes of `ImportRequest` and, by name, those of
-            `bench.logs.importing.log_import.ImportOptions`.
+            `bench.logs.importing.import_result.ImportOptions`.
 
     Returns:
         The guesses, the columns that were left out, and what to check.

@@ -9,7 +9,7 @@ from bench.api.design import DesignOptions
 from bench.api.recordings import ImportRequest
 from bench.diagnosis.explain_options import ExplainOptions
 from bench.logs.data_frames import FrameDescription
-from bench.logs.importing.log_import import ImportOptions
+from bench.logs.importing.import_result import ImportOptions
 from bench.logs.synthetic_recording import SimulationSpec
 
 GROUPS = {

@@ -10,7 +10,7 @@ from bench.cli.shared_options import add_options, add_out_option, collect_option
 
 def add_import_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap import`."""
-    from bench.logs.importing.log_import import ImportOptions
+    from bench.logs.importing.import_result import ImportOptions
 
     parser.add_argument(
         "logs",

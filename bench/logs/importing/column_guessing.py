@@ -2,12 +2,7 @@
 
 The names show most: whether a column is a command or a sensor signal; a position, a rate or a
 force; and its joint. The numbers verify it: a position lies within its joint's range, in radians or
-in degrees, and a rate is the derivative of its position,
-
-    v = b dq/dt,    b = <v dq/dt> / <(dq/dt)^2>                                                (1)
-
-with b = 1 if both have the same unit, and 57.3 if the rate is in degrees and the position in
-radians.
+in degrees.
 """
 
 from __future__ import annotations
@@ -21,7 +16,6 @@ import numpy as np
 from sims.core.simulator import Array
 from sims.recording.column_mapping import MAX_REPEATED
 from sims.recording.log_formats.unit_names import read_unit, split_unit
-from sims.recording.unit_conversion import compute_unit_scale
 from sims.robot.robot_model import Joint
 
 Role = Literal["command", "position", "velocity", "force", "other"]
@@ -38,7 +32,7 @@ _WORD_LISTS: Mapping[Role, str] = {
     "winkel lage istwert",
     "other": "temperature temperatures temp temps voltage voltages volt acceleration accelerations "
     "accel acc qdd ddq error errors err status mode modes enable enabled flag covariance pwm seq "
-    "stiffness damping",
+    "stiffness damping estop emergency stop brake brakes power armed fault",
 }
 ROLE_KEYWORDS: Mapping[Role, frozenset[str]] = {
     role: frozenset(words.split()) for role, words in _WORD_LISTS.items()
@@ -71,10 +65,6 @@ MAX_RANGE_EXCESS = 0.5
 """Maximum distance of a position beyond its joint's range, as a fraction of the range."""
 MAX_UNLIMITED_POSITION_RAD = 4.0 * np.pi
 """Largest position in radians of a joint without a range; a larger one is taken for degrees."""
-MIN_DERIVATIVE_CORRELATION = 0.7
-"""Minimum correlation of a rate with the derivative of its position."""
-SLOPE_RANGE = (0.7, 1.4)
-"""Interval of slopes b of equation (1), divided by a unit's factor, that confirm the unit."""
 DEGREES_PER_RADIAN = 180.0 / np.pi
 
 
@@ -293,41 +283,9 @@ def _within(ends: Array, limits: tuple[float, float]) -> bool:
     return bool(limits[0] - slack <= ends[0] and ends[1] <= limits[1] + slack)
 
 
-def guess_velocity_unit(rate: Array, slope: Array, joint: Joint, stated: str = "") -> str | None:
-    """Return the unit of a rate by equation (1); None if it is not the derivative of the position.
-
-    Args:
-        rate: (T,) numbers of the rate.
-        slope: (T,) derivative of the position, rad/s or m/s.
-        joint: Joint that moves.
-        stated: Unit in the log, which is tested first.
-    """
-    seen = np.isfinite(slope) & np.isfinite(rate)
-    r, d = rate[seen], slope[seen]
-    # Differences of an encoder's steps are noisy, so both are averaged over a few samples.
-    r, d = _smooth(r), _smooth(d)
-    if not (r @ r and d @ d) or abs(float(r @ d)) < MIN_DERIVATIVE_CORRELATION * float(
-        np.sqrt((r @ r) * (d @ d))
-    ):
-        return None
-    b = float(r @ d) / float(d @ d)
-    si = f"{joint.unit}/s"
-    usual = ("rad/s", "deg/s", "rpm", "turn/s") if joint.kind == "hinge" else ("m/s", "mm/s")
-    units: Sequence[str] = (stated, *usual) if stated else usual
-    for unit in units:
-        if SLOPE_RANGE[0] < b * compute_unit_scale(unit, si).gain < SLOPE_RANGE[1]:
-            return unit
-    return None
-
-
 def is_constant(values: Array) -> bool:
     """Return whether a column never changes."""
     return bool(np.nanmax(values) == np.nanmin(values))
-
-
-def _smooth(values: Array) -> Array:
-    kernel = np.ones(5) / 5.0
-    return np.convolve(values, kernel, mode="same") if values.size > 5 else values
 
 
 def _increases(values: Array, repeated: float) -> bool:

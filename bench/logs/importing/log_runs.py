@@ -48,19 +48,25 @@ def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
     files = [path for path in logs if not path.is_dir() and not is_bag(path)]
     runs: dict[str, RunFiles] = {}
     for folder in (path for path in logs if path not in files):
-        if is_dataset(folder):
-            runs |= {path.parent.name: RunFiles(path.parent, [path]) for path in list_logs(folder)}
-            continue
-        inside = [folder] if is_bag(folder) else [folder, *sorted(folder.iterdir())]
-        for one in inside:
-            if is_bag(one):
-                own = list(list_logs(one))
-            elif one.is_dir():
-                own = [path for path in list_logs(one) if path.suffix.lower() in TABLES]
+        is_whole = is_bag(folder) or is_dataset(folder)
+        parts = [folder] if is_whole else [folder, *sorted(folder.iterdir())]
+        datasets = [part for part in parts if is_dataset(part)]
+        for part in parts:
+            if part in datasets:
+                prefix = f"{part.name}_" if len(datasets) > 1 else ""
+                runs |= {
+                    f"{prefix}{path.parent.name}": RunFiles(path.parent, [path])
+                    for path in list_logs(part)
+                }
+                continue
+            if is_bag(part):
+                paths = list(list_logs(part))
+            elif part.is_dir():
+                paths = [path for path in list_logs(part) if path.suffix.lower() in TABLES]
             else:
                 continue
-            if own:
-                runs[one.stem if one.is_file() else one.name] = RunFiles(one, own)
+            if paths:
+                runs[part.stem if part.is_file() else part.name] = RunFiles(part, paths)
     if files and runs:
         raise InputError("expected files of one run, or folders of one run each, found both")
     if files:

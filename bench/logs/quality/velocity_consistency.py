@@ -15,7 +15,7 @@ since s lags dq by T dv to first order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +36,18 @@ SIGNIFICANCE_SIGMAS = 4.0
 """Detection threshold in standard deviations."""
 MIN_SEGMENT_SAMPLES = 5
 """Minimum number of samples in an interval of integration."""
+MIN_SEGMENTS = 10
+"""Minimum number of intervals of integration."""
+MIN_RMS_CHANGE_SIGMAS = 3.0
+"""Minimum change (RMS) of a position over an interval, in standard deviations of its noise; the
+noise of a joint that stands still makes changes of 1.4.
+"""
 MIN_POSITION_CHANGE_SIGMAS = 10.0
 """Wanted change of a position over an interval of integration, in standard deviations of noise."""
+MAX_INTERVAL_RATIO = 3.0
+"""Largest time between two samples, in usual sampling intervals, over which a velocity is
+integrated; over a longer gap it is not known.
+"""
 _UNITS = {180.0 / np.pi: "degrees", 1e3: "thousandths"}
 """Ratios of velocity to position derivative that a wrong unit causes, and the unit."""
 
@@ -59,58 +69,7 @@ def check_velocities(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
     for position, rate in zip(system.coordinates, system.rates, strict=False):
         runs = [run for run in recording.runs if {position, rate} <= run.channels.keys()]
         if runs:
-            yield from _pair(runs, position, rate)
-
-
-class _Stretches(NamedTuple):
-    """Values dq, s, dv of equations (1) and (2) per interval, and the sampling interval in s."""
-
-    gone: Array
-    added: Array
-    faster: Array
-    interval: float
-
-
-def _pair(runs: list[Run], position: str, rate: str) -> Iterator[QualityFinding]:
-    found = _stretches(runs, position, rate)
-    if found is None:
-        return
-    gone, added, *_ = found
-    power, along = float(added @ added), float(gone @ added)
-    like = along / np.sqrt(power * float(gone @ gone))
-    if abs(like) < MIN_CORRELATION:
-        yield QualityFinding(
-            "contradiction",
-            f"{rate} has little to do with the derivative of {position} (correlation {like:.2f})",
-            "is it of another joint? correct the columns, or leave it out",
-        )
-        return
-    # Noise of the velocity makes (1) too small, noise of the position makes its inverse too small:
-    # the true slope lies between.
-    slope, other = along / power, float(gone @ gone) / along
-    rest = gone - slope * added
-    doubt = float(np.sqrt(rest @ rest / max(gone.size - 1, 1) / power))
-    size = f"{position} goes {slope:.3g} times as far as {rate} adds up to"
-    off = max(SLOPE_ERROR_THRESHOLD, SIGNIFICANCE_SIGMAS * doubt)
-    if slope < 0:
-        yield QualityFinding("contradiction", size, f"a sign is wrong: turn that of {rate}")
-    elif slope > 1.0 + off or other < 1.0 - off:
-        yield QualityFinding("contradiction", size, _remedy(abs(np.log(slope)), rate))
-    elif (behind := _late(found, slope)) is not None:
-        yield QualityFinding(
-            "contradiction",
-            f"{rate} is {1e3 * abs(behind.seconds):.2g} ms (±{2e3 * behind.error:.1g}, "
-            f"{behind.samples:.2g} samples) {behind.direction_word} the derivative of {position}",
-            "it is filtered, or stamped at another time: trust the position, or leave it out",
-        )
-
-
-def _remedy(ratio: float, rate: str) -> str:
-    """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm."""
-    for factor, word in _UNITS.items():
-        if abs(ratio - np.log(factor)) < 0.1:
-            return f"one of the two is in {word}: correct its unit"
-    return f"correct the unit or the gain of {rate}, or leave it out"
+            yield from _check_pair(runs, position, rate)
 
 
 class VelocityDelay(NamedTuple):
@@ -132,74 +91,169 @@ class VelocityDelay(NamedTuple):
         return "behind" if self.seconds > 0 else "ahead of"
 
 
-def estimate_velocity_delay(runs: list[Run], position: str, rate: str) -> VelocityDelay | None:
-    """Estimate the lag of a velocity whose sign and unit are right.
+class VelocityComparison(NamedTuple):
+    """Values of equations (1) and (2) for N intervals of a motion.
 
-    Args:
-        runs: Runs with both channels.
-        position: Name of the position channel.
-        rate: Name of the velocity channel.
-
-    Returns:
-        The lag, or None if it is not significant or cannot be estimated.
+    Attributes:
+        position_changes: (N,) dq.
+        velocity_integrals: (N,) s.
+        velocity_changes: (N,) dv.
+        interval: Sampling interval, s.
     """
-    found = _stretches(runs, position, rate)
-    if found is None:
-        return None
-    return _late(found, float(found.gone @ found.added) / float(found.added @ found.added))
+
+    position_changes: Array
+    velocity_integrals: Array
+    velocity_changes: Array
+    interval: float
+
+    @staticmethod
+    def measure(runs: Sequence[Run], position: str, rate: str) -> VelocityComparison | None:
+        """Compare a velocity with its position, where both have samples.
+
+        The intervals are so long that the position changes well beyond its noise.
+
+        Args:
+            runs: Runs with both channels.
+            position: Name of the position channel.
+            rate: Name of the velocity channel.
+
+        Returns:
+            The comparison, or None if the motion is too short or too small.
+        """
+        series = [_Series.read(run, position, rate) for run in runs]
+        noise = estimate_noise((one.times, one.position) for one in series)
+        sigma = max(float(np.nan_to_num(noise.sigma)), noise.step)
+        steps = np.concatenate([np.diff(one.times) for one in series]) if series else np.empty(0)
+        if not steps.size or not max(np.abs(one.velocity).max(initial=0.0) for one in series) > 0:
+            return None
+        interval = float(np.median(steps))
+        moves = np.concatenate([np.diff(one.position) for one in series])
+        usual_move = float(np.sqrt(np.mean(moves**2)))
+        if not usual_move > 0:
+            return None
+        # Long enough to exceed the noise, but no longer: over a whole oscillation both integrals
+        # vanish.
+        wanted = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / usual_move)
+        length = int(np.clip(wanted, MIN_SEGMENT_SAMPLES, 50))
+        parts = [one.integrate(length, MAX_INTERVAL_RATIO * interval) for one in series]
+        dq, s, dv = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+        known = np.isfinite(s)
+        dq, s, dv = dq[known], s[known], dv[known]
+        if known.sum() < MIN_SEGMENTS or not (s @ s > 0 and dq @ dq > 0):
+            return None
+        if np.sqrt(np.mean(dq**2)) < MIN_RMS_CHANGE_SIGMAS * sigma:
+            return None
+        return VelocityComparison(dq, s, dv, interval)
+
+    @staticmethod
+    def pool(comparisons: Sequence[VelocityComparison]) -> VelocityComparison:
+        """Join comparisons of several joints, each velocity in the unit of its position."""
+        scaled = [
+            VelocityComparison(
+                one.position_changes,
+                one.slope * one.velocity_integrals,
+                one.slope * one.velocity_changes,
+                one.interval,
+            )
+            for one in comparisons
+        ]
+        interval = float(np.median([one.interval for one in scaled]))
+        dq, s, dv = (np.concatenate(rows) for rows in list(zip(*scaled, strict=True))[:3])
+        return VelocityComparison(dq, s, dv, interval)
+
+    @property
+    def slope(self) -> float:
+        """Slope g of equation (1)."""
+        s = self.velocity_integrals
+        return float(self.position_changes @ s) / float(s @ s)
+
+    @property
+    def correlation(self) -> float:
+        """Correlation of dq and s."""
+        dq, s = self.position_changes, self.velocity_integrals
+        return float(dq @ s) / float(np.sqrt((s @ s) * (dq @ dq)))
+
+    def delay(self) -> VelocityDelay | None:
+        """Return the lag by equation (2), in units of the slope; None if it is not significant."""
+        slope, dv = self.slope, self.velocity_changes
+        behind = slope * self.velocity_integrals - self.position_changes
+        power = slope * float(dv @ dv)
+        if power == 0:
+            return None
+        seconds = -float(behind @ dv) / power
+        residual = behind + slope * seconds * dv
+        error = float(np.sqrt(residual @ residual / max(residual.size - 1, 1) / abs(slope * power)))
+        if abs(seconds) < max(
+            DELAY_THRESHOLD_INTERVALS * self.interval, SIGNIFICANCE_SIGMAS * error
+        ):
+            return None
+        return VelocityDelay(seconds, error, abs(seconds) / self.interval)
 
 
-def _late(found: _Stretches, slope: float) -> VelocityDelay | None:
-    """Estimate the lag by equation (2); None if it is not significant."""
-    gone, added, faster, interval = found
-    behind = slope * added - gone
-    power = float(faster @ faster)
-    if not power > 0:
-        return None
-    seconds = -float(behind @ faster) / power
-    rest = behind + seconds * faster
-    error = float(np.sqrt(rest @ rest / max(rest.size - 1, 1) / power))
-    if abs(seconds) < max(DELAY_THRESHOLD_INTERVALS * interval, SIGNIFICANCE_SIGMAS * error):
-        return None
-    return VelocityDelay(seconds, error, abs(seconds) / interval)
+class _Series(NamedTuple):
+    """Times, positions and velocities (T,) of a run, where both are known."""
+
+    times: Array
+    position: Array
+    velocity: Array
+
+    @staticmethod
+    def read(run: Run, position: str, rate: str) -> _Series:
+        q, v = run.channels[position], run.channels[rate]
+        # If two publishers alternate, each row has the joints of one of them.
+        known = np.isfinite(q) & np.isfinite(v)
+        return _Series(run.times[known], q[known], v[known])
+
+    def integrate(self, length: int, max_gap: float) -> tuple[Array, Array, Array]:
+        """Return dq, s and dv of intervals of `length` samples; s is NaN across a gap in time."""
+        steps = np.diff(self.times)
+        areas = 0.5 * (self.velocity[1:] + self.velocity[:-1]) * steps
+        areas[steps > max_gap] = np.nan
+        ends = np.arange(0, self.times.size, length)
+        if ends.size < 2:
+            return np.empty(0), np.empty(0), np.empty(0)
+        integrals = np.add.reduceat(areas, ends[:-1])
+        integrals[-1] = areas[ends[-2] : ends[-1]].sum()
+        return np.diff(self.position[ends]), integrals, np.diff(self.velocity[ends])
 
 
-def _stretches(runs: list[Run], position: str, rate: str) -> _Stretches | None:
-    """Compute the integrals over intervals in which the position changes well beyond its noise.
+def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[QualityFinding]:
+    comparison = VelocityComparison.measure(runs, position, rate)
+    if comparison is None:
+        return
+    dq, s = comparison.position_changes, comparison.velocity_integrals
+    correlation, slope = comparison.correlation, comparison.slope
+    if abs(correlation) < MIN_CORRELATION:
+        yield QualityFinding(
+            "contradiction",
+            f"{rate} has little to do with the derivative of {position} "
+            f"(correlation {correlation:.2f})",
+            "is it of another joint? correct the columns, or leave it out",
+        )
+        return
+    # Noise of the velocity makes (1) too small, noise of the position makes its inverse too small:
+    # the true slope lies between.
+    inverse_slope = float(dq @ dq) / float(dq @ s)
+    residual = dq - slope * s
+    error = float(np.sqrt(residual @ residual / max(dq.size - 1, 1) / (s @ s)))
+    size = f"{position} goes {slope:.3g} times as far as {rate} adds up to"
+    threshold = max(SLOPE_ERROR_THRESHOLD, SIGNIFICANCE_SIGMAS * error)
+    if slope < 0:
+        yield QualityFinding("contradiction", size, f"a sign is wrong: turn that of {rate}")
+    elif slope > 1.0 + threshold or inverse_slope < 1.0 - threshold:
+        yield QualityFinding("contradiction", size, _remedy(abs(np.log(slope)), rate))
+    elif (delay := comparison.delay()) is not None:
+        yield QualityFinding(
+            "contradiction",
+            f"{rate} is {1e3 * abs(delay.seconds):.2g} ms (±{2e3 * delay.error:.1g}, "
+            f"{delay.samples:.2g} samples) {delay.direction_word} the derivative of {position}",
+            "it is filtered, or stamped at another time: trust the position, or leave it out",
+        )
 
-    Returns None if there are too few intervals.
-    """
-    noise = estimate_noise((run.times, run.channels[position]) for run in runs)
-    sigma = max(float(np.nan_to_num(noise.sigma)), noise.step)
-    speeds = np.concatenate([np.abs(run.channels[rate]) for run in runs])
-    intervals = np.concatenate([np.diff(run.times) for run in runs])
-    if not intervals.size or not np.nanmax(speeds, initial=0.0) > 0:
-        return None
-    interval = float(np.median(intervals))
-    moves = np.concatenate([np.abs(np.diff(run.channels[position])) for run in runs])
-    usual = float(np.sqrt(np.nanmean(moves**2))) if np.isfinite(moves).any() else 0.0
-    if not usual > 0:
-        return None
-    # Long enough to exceed the noise, but no longer: over a whole oscillation both integrals
-    # vanish.
-    length = int(
-        np.clip(np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / usual), MIN_SEGMENT_SAMPLES, 50)
-    )
-    parts = [_of(run, position, rate, length) for run in runs]
-    gone, added, faster = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-    seen = np.isfinite(gone) & np.isfinite(added) & np.isfinite(faster)
-    if seen.sum() < 20 or not (added[seen] @ added[seen] > 0 and gone[seen] @ gone[seen] > 0):
-        return None
-    return _Stretches(gone[seen], added[seen], faster[seen], interval)
 
-
-def _of(run: Run, position: str, rate: str, length: int) -> tuple[Array, Array, Array]:
-    q, v, t = run.channels[position], run.channels[rate], run.times
-    areas = 0.5 * (v[1:] + v[:-1]) * np.diff(t)
-    ends = np.arange(0, q.size, length)
-    if ends.size < 2:
-        return np.empty(0), np.empty(0), np.empty(0)
-    # A missing sample invalidates only the interval that contains it.
-    added = np.add.reduceat(areas, ends[:-1])
-    added[-1] = areas[ends[-2] : ends[-1]].sum()
-    return np.diff(q[ends]), added, np.diff(v[ends])
+def _remedy(log_ratio: float, rate: str) -> str:
+    """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm."""
+    for factor, unit in _UNITS.items():
+        if abs(log_ratio - np.log(factor)) < 0.1:
+            return f"one of the two is in {unit}: correct its unit"
+    return f"correct the unit or the gain of {rate}, or leave it out"

@@ -177,3 +177,87 @@ def test_malformed_logs_are_one_line_and_leave_nothing(tmp_path_factory, head, r
     assert "\n" not in said
     if not said:
         load_recording(out)
+
+
+# -- joints that stand still, and publishers that alternate
+
+WAVES = np.column_stack([np.sin(3 * TIMES - 0.1), 0.7 * np.cos(2 * TIMES - 0.1)])
+SLOPES = np.column_stack([3 * np.cos(3 * TIMES - 0.1), -1.4 * np.sin(2 * TIMES - 0.1)])
+
+
+def written(folder, name, columns):
+    """Write a table of columns by name; NaN is an empty cell."""
+    cells = np.column_stack(list(columns.values()))
+    rows = [",".join("" if np.isnan(x) else f"{x:.9g}" for x in row) for row in cells]
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_text(",".join(columns) + "\n" + "\n".join(rows) + "\n")
+    return folder / name
+
+
+def still(folder, moving):
+    """Write a log in which one joint of the arm moves and the other is held, with noise."""
+    rng = np.random.default_rng(3)
+    columns = {"t": TIMES}
+    for k, joint in enumerate(("shoulder", "elbow")):
+        noise = 1e-3 * rng.standard_normal(TIMES.size)
+        moves = joint == moving
+        columns[f"{joint}_pos"] = WAVES[:, k] if moves else 0.3 + 0.02 * noise
+        columns[f"{joint}_vel"] = SLOPES[:, k] if moves else noise
+        columns[f"{joint}_cmd"] = (
+            np.sin(3 * TIMES) if moves and k == 0 else 0.7 * np.cos(2 * TIMES) if moves else 0.3
+        ) * np.ones(TIMES.size)
+    return written(folder, "log.csv", columns)
+
+
+def test_two_logs_of_one_logger_have_the_same_velocities(arm, tmp_path):
+    texts = []
+    for moving in ("shoulder", "elbow"):
+        log = still(tmp_path / moving, moving)
+        made = simgap.import_logs([log], arm, tmp_path / f"{moving}.toml")
+        texts.append([line for line in made.text.splitlines() if "qd." in line])
+        still_joint = "elbow" if moving == "shoulder" else "shoulder"
+        line = f"in rad/s, as the other velocities are; {still_joint} hardly moves"
+        assert any(line in guess for guess in made.guessed)
+    assert [sorted(line.partition("]")[0] for line in text) for text in texts] == [
+        ['[channels."qd.elbow"', '[channels."qd.shoulder"']
+    ] * 2
+
+
+def test_gains_of_a_joint_that_the_log_does_not_move_are_said_and_not_fitted(tmp_path):
+    bare = tmp_path / "bare.xml"
+    bare.write_text(ARM[: ARM.index("<actuator>")] + "</mujoco>")
+    made = simgap.import_logs([still(tmp_path / "a", "shoulder")], bare, tmp_path / "log.toml")
+    (check,) = made.checks
+    assert check.startswith("gains of the servo of elbow: the log does not move this joint")
+    assert "state those of the drive in [actuators.m_elbow]" in check
+    _, kind = load_recording(tmp_path / "log.toml")
+    assert kind.free == ("actuator.stiffness@m_shoulder", "actuator.damping@m_shoulder")
+
+
+def test_velocities_of_two_publishers_that_alternate_are_read(arm, tmp_path):
+    """One topic, two publishers: each row has the joints of one of them."""
+    first = np.arange(TIMES.size) % 2 == 0
+    columns = {"t": TIMES}
+    for k, (joint, mine) in enumerate((("shoulder", first), ("elbow", ~first))):
+        columns[f"position.{joint}"] = np.where(mine, WAVES[:, k], np.nan)
+        columns[f"velocity.{joint}"] = np.where(mine, SLOPES[:, k], np.nan)
+    made = simgap.import_logs(
+        [written(tmp_path, "states.csv", columns)], arm, tmp_path / "log.toml"
+    )
+    assert "in rad/s, as the derivative of position.elbow" in "\n".join(made.guessed)
+    recording, _ = load_recording(tmp_path / "log.toml", divide=False)
+    seen = recording.runs[0].channels["qd.elbow"]
+    np.testing.assert_allclose(seen[~first], SLOPES[~first, 1], atol=1e-6)
+    assert np.isnan(seen[first]).all()
+
+
+def test_a_column_of_zeros_and_ones_that_changes_is_kept_as_a_switch(arm, tmp_path):
+    columns = {"t": TIMES, "shoulder_pos": WAVES[:, 0], "elbow_pos": WAVES[:, 1]}
+    columns |= {"torque_enable": (TIMES < 2.0) * 1.0, "mode": np.ones(TIMES.size)}
+    made = simgap.import_logs([written(tmp_path, "log.csv", columns)], arm, tmp_path / "log.toml")
+    assert any("column torque_enable, zeros and ones; if it says" in g for g in made.guessed)
+    assert "column mode: what it is cannot be told; left out" in "\n".join(made.untold)
+    recording, _ = load_recording(tmp_path / "log.toml", divide=False)
+    np.testing.assert_array_equal(
+        recording.runs[0].extra["torque_enable"], columns["torque_enable"]
+    )

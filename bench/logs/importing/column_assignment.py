@@ -1,0 +1,342 @@
+"""Assign log columns to positions, commands and measured torques of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bench.logs.importing import column_guessing
+from bench.logs.importing.column_guessing import LogColumn, Role
+from bench.logs.importing.import_result import MAX_NAMES, ImportOptions, ImportResult
+from bench.logs.importing.normalised_positions import (
+    LARGEST,
+    REMEDY,
+    NormalisedPositions,
+    is_lerobot,
+    normalised_positions,
+)
+from bench.logs.importing.run_logs import RunLogs
+from bench.logs.importing.signal_assignment import (
+    Placement,
+    Signal,
+    SignalAssignment,
+    converts,
+)
+from sims.core.simulator import InputError
+from sims.robot.robot_model import Actuator, Joint
+
+MIN_FOLLOWING_CORRELATION = 0.9
+"""Minimum correlation of a motor's command with a position that makes it a desired position."""
+MAX_FOLLOWING_DISTANCE = 0.5
+"""Maximum distance (RMS) of such a command from the position, as a share of its deviation."""
+COMMAND_QUANTITIES = {"motor": "force", "position": "position", "velocity": "velocity"}
+"""Quantity that an actuator takes, by its kind."""
+
+
+class ColumnAssigner:
+    """Assignment of columns to the signals of a robot, with messages.
+
+    Args:
+        logs: Logs that are imported.
+        signals: Assignment to which signals are added.
+        options: Information that the user states.
+        result: Result to which messages are added.
+    """
+
+    def __init__(
+        self,
+        logs: RunLogs,
+        signals: SignalAssignment,
+        options: ImportOptions,
+        result: ImportResult,
+    ) -> None:
+        self._logs, self._signals, self._result = logs, signals, result
+        self._options = options
+        self.normalised: NormalisedPositions | None = None
+
+    def _with_role(self, *roles: Role | None) -> list[LogColumn]:
+        """Return the columns that have one of some roles."""
+        return [c for c in self._logs.columns if column_guessing.guess_role(c) in roles]
+
+    # -- positions
+
+    def assign_positions(self) -> None:
+        """Assign the positions of the joints.
+
+        Raises:
+            InputError: No column is a joint's position.
+        """
+        columns = self._with_role("position", None)
+        self._find_normalised([column for column in columns if not column.unit])
+        for column, joint, placement in self._signals.place_columns(columns):
+            self._add(
+                self._signals.channels,
+                f"q.{joint.name}",
+                column,
+                self._position_signal(column, joint, placement),
+            )
+        if not self._signals.channels:
+            names = ", ".join(f"{c.file}: {c.name}" for c in self._logs.columns[:MAX_NAMES])
+            raise InputError(
+                f"{self._logs.first_path}: no column is a joint's position by name, number or "
+                f"range; there are {names}; write the description by hand"
+            )
+
+    def _find_normalised(self, columns: Sequence[LogColumn]) -> None:
+        """Decide whether positions are normalised, and report if it cannot be decided."""
+        placed = [(column, joint) for column, joint, _ in self._signals.place_columns(columns)]
+        if not placed:
+            return
+        path, options = self._logs.first_path, self._options
+        # An episode has one log; other runs may contain larger positions than the first.
+        largest = max(
+            float(np.nanmax(np.abs(values), initial=0.0))
+            for column, _ in placed
+            for values in (column.values, *self._logs.read_runs(column)[1:])
+        )
+        calibration = None if options.calibration is None else Path(options.calibration)
+        self.normalised = normalised_positions(path, largest, options.position_unit, calibration)
+        if self.normalised is not None:
+            self._result.guessed.append(f"positions: {self.normalised.description}")
+        elif (
+            not options.position_unit
+            and largest <= LARGEST
+            and is_lerobot(path, (column.name for column, _ in placed))
+            and any(
+                column_guessing.guess_position_unit(column.values, joint) in ("deg", None)
+                for column, joint in placed
+            )
+        ):
+            self._result.checks.append(
+                "positions lie within -100 to 100: they are taken for degrees and may be LeRobot's "
+                f"normalised positions; {REMEDY}"
+            )
+
+    def _position_signal(
+        self, column: LogColumn, joint: Joint, placement: Placement
+    ) -> Signal | None:
+        """Assign the unit of a position or position command, as stated or by the joint's range."""
+        if column.unit:
+            if not converts(column.unit, joint.unit):
+                expected = "an angle" if joint.kind == "hinge" else "a length"
+                self._result.leave_out(
+                    column,
+                    f"is in {column.unit}, expected {expected}; state unit, scale and offset in "
+                    "the description by hand",
+                )
+                return None
+            origin = "the row of units" if column.units_row else "its name"
+            return Signal(column, column.unit, placement, f"; in {column.unit} by {origin}")
+        if self.normalised is not None:
+            scale = self.normalised.scale_of(column.name, column.values, joint)
+            if scale is None:
+                reason = f"is normalised, and nothing says the range of {joint.name}"
+                self._result.leave_out(column, reason)
+                return None
+            unit, (gain, offset) = scale
+            return Signal(column, unit, placement, "; normalised", gain, offset)
+        if self._options.position_unit and joint.kind == "hinge":
+            unit = self._options.position_unit
+            return Signal(column, unit, placement, f"; in {unit} as the user states")
+        guessed_unit = column_guessing.guess_position_unit(column.values, joint)
+        if guessed_unit is None:
+            low, high = joint.range or (-np.inf, np.inf)
+            ends = f"{np.nanmin(column.values):.4g} to {np.nanmax(column.values):.4g}"
+            self._result.leave_out(
+                column, f"goes from {ends}, {joint.name} from {low:.4g} to {high:.4g}"
+            )
+            return None
+        return Signal(column, guessed_unit, placement, f"; in {guessed_unit} by its range")
+
+    def _add(
+        self, table: dict[str, Signal], name: str, column: LogColumn, signal: Signal | None
+    ) -> bool:
+        """Add a signal unless one with this name exists; return whether it was added."""
+        if name in table:
+            self._result.leave_out(column, f"{name} is {table[name].column.name} already")
+            return False
+        if signal is not None:
+            table[name] = signal
+        return signal is not None
+
+    # -- commands
+
+    def assign_commands(self) -> None:
+        """Assign commands to actuators, and to servos that are missing in the model file."""
+        for column, joint, placement in self._signals.place_columns(self._with_role("command")):
+            actuator = self._signals.actuator_of(joint.name)
+            if actuator is not None:
+                self._assign_command(column, joint, placement, actuator)
+            elif self._signals.robot.actuators:
+                self._result.leave_out(column, f"no actuator drives {joint.name}")
+            else:
+                self._assign_undriven(column, joint, placement)
+
+    def _assign_undriven(self, column: LogColumn, joint: Joint, placement: Placement) -> None:
+        """Assign a command of a joint that the model does not drive: a servo or a force."""
+        quantity = column_guessing.commanded_role(column)
+        if quantity == "force":
+            self._assign_force(column, joint, f"force.{joint.name}", placement)
+        elif quantity in (None, "position"):
+            name = f"m_{joint.name}"
+            signal = self._position_signal(column, joint, placement)
+            if self._add(self._signals.inputs, f"u.{name}", column, signal):
+                self._signals.added_servos[name] = joint
+        else:
+            self._result.leave_out(
+                column, f"asks for a {quantity} of {joint.name}, which no actuator takes"
+            )
+
+    def _assign_command(
+        self, column: LogColumn, joint: Joint, placement: Placement, actuator: Actuator
+    ) -> None:
+        """Assign the command of an actuator if it takes this quantity."""
+        quantity = column_guessing.commanded_role(column)
+        expected = COMMAND_QUANTITIES.get(actuator.kind)
+        if actuator.kind == "motor" and quantity is None and self._resembles(column, joint):
+            quantity = "position"
+        name = f"u.{actuator.name}"
+        if expected is not None and quantity is not None and quantity != expected:
+            words = {"force": "torque" if joint.kind == "hinge" else "force"}
+            desired, taken = (words.get(word, word) for word in (quantity, expected))
+            self._result.leave_out(
+                column,
+                f"is a desired {desired} of {joint.name}, and {actuator.name} takes a {taken}",
+            )
+        elif actuator.kind == "motor":
+            self._assign_force(column, joint, name, placement)
+        elif actuator.kind == "position":
+            signal = self._position_signal(column, joint, placement)
+            self._add(self._signals.inputs, name, column, signal)
+        else:
+            si = f"{joint.unit}/s"
+            unit = column.unit if converts(column.unit, si) else si
+            signal = Signal(column, unit, placement, f"; in {unit}")
+            self._add(self._signals.inputs, name, column, signal)
+
+    def _resembles(self, column: LogColumn, joint: Joint) -> bool:
+        """Return whether a command resembles its joint's position, as a desired position does."""
+        position = self._signals.position_of(joint.name)
+        if position is None:
+            return False
+        u, q = self._logs.hold_command(column, position.column)
+        finite = np.isfinite(u) & np.isfinite(q)
+        u, q = u[finite], q[finite]
+        if u.size < 3 or np.ptp(u) == 0 or np.ptp(q) == 0:
+            return False
+        # A torque may also correlate with a position, but does not share its mean and size.
+        distance = float(np.sqrt(np.mean((u - q) ** 2)))
+        return bool(
+            np.corrcoef(u, q)[0, 1] > MIN_FOLLOWING_CORRELATION
+            and distance < MAX_FOLLOWING_DISTANCE * float(np.std(q))
+        )
+
+    def _assign_force(
+        self, column: LogColumn, joint: Joint, name: str, placement: Placement, origin: str = ""
+    ) -> None:
+        """Assign the torque of a motor, or a force along a joint."""
+        unit = column.unit or joint.force_unit
+        if not converts(unit, joint.force_unit):
+            self._result.leave_out(column, f"is in {unit}, expected {joint.force_unit}")
+            return
+        stated = "as its file states" if column.unit else "which no file states"
+        signal = Signal(column, unit, placement, f"{origin}; in {unit}, {stated}")
+        self._add(self._signals.inputs, name, column, signal)
+
+    def assign_efforts(self) -> None:
+        """Assign measured torques to motors without a command and to undriven joints."""
+        signals = self._signals
+        columns = [column for column in self._with_role("force") if _is_torque(column)]
+        torques: dict[str, list[tuple[LogColumn, Joint, Placement]]] = {}
+        for column, joint, placement in signals.place_columns(columns):
+            actuator = signals.actuator_of(joint.name)
+            if actuator is not None and actuator.kind == "motor":
+                name = f"u.{actuator.name}"
+            elif not signals.robot.actuators and f"m_{joint.name}" not in signals.added_servos:
+                name = f"force.{joint.name}"
+            else:
+                continue
+            if name not in signals.inputs:
+                torques.setdefault(name, []).append((column, joint, placement))
+        for name, candidates in torques.items():
+            measured = [one for one in candidates if column_guessing.is_measured(one[0])]
+            # A log may also contain a controller's desired torque and a friction estimate.
+            if len(candidates) > 1 and len(measured) != 1:
+                continue
+            ((column, joint, placement),) = measured if len(candidates) > 1 else candidates
+            origin = ", measured, as nothing commands it"
+            self._assign_force(column, joint, name, placement, origin)
+
+    # -- other columns
+
+    def find_switches(self) -> None:
+        """Keep the columns of zeros and ones that change: one may say when a drive is on."""
+        for column in self._with_role("other", "command"):
+            if self._is_used(column) or self._is_reported(column):
+                continue
+            values = np.concatenate([column.values, *self._logs.read_runs(column)[1:]])
+            if set(np.unique(values[np.isfinite(values)]).tolist()) == {0.0, 1.0}:
+                self._signals.switches.append(column)
+                self._result.guessed.append(
+                    f"extra: {column.file}, column {column.name}, zeros and ones; if it says when "
+                    f'a drive is on, add [actuators.NAME] enable = "{column.name}"'
+                )
+
+    def report_missing_inputs(self) -> None:
+        """Report which actuators or joints have no input."""
+        signals = self._signals
+        idle = [a for a in signals.robot.actuators if f"u.{a.name}" not in signals.inputs]
+        if not idle and (signals.inputs or signals.robot.actuators):
+            return
+        text = "the model has no input, so that nothing drives it"
+        table = f"force.{signals.joints[0].name}"
+        if idle:
+            names = ", ".join(actuator.name for actuator in idle[:MAX_NAMES])
+            text = f"actuators without an input: {names}; their commands are taken for 0"
+            table = f"u.{idle[0].name}"
+        candidates = [c.name for c in self._with_role("command", "force") if not self._is_used(c)]
+        likely = f"columns that may be it: {', '.join(candidates[:6])}; " if candidates else ""
+        self._result.checks.append(
+            f'{text}; {likely}add [inputs."{table}"] with file, column and unit'
+        )
+
+    def report_unused(self) -> None:
+        """Report the columns that were neither used nor mentioned before."""
+        for column in self._logs.columns:
+            if self._is_used(column) or self._is_reported(column):
+                continue
+            reason = "what it is cannot be told"
+            if column_guessing.guess_role(column) == "force":
+                reason = "its unit cannot be told"
+                if column.unit:
+                    reason = f"is in {column.unit}; no input of the model takes it"
+            self._result.leave_out(column, reason)
+        missing = [
+            joint.name
+            for joint in self._signals.joints
+            if self._signals.position_of(joint.name) is None
+        ]
+        if missing:
+            self._result.untold.append(f"joints without a position: {', '.join(missing)}")
+
+    def _is_used(self, column: LogColumn) -> bool:
+        """Return whether a column is a signal or a switch."""
+        signals = (*self._signals.channels.values(), *self._signals.inputs.values())
+        used = [signal.column for signal in signals] + self._signals.switches
+        return (column.file, column.name) in {(one.file, one.name) for one in used}
+
+    def _is_reported(self, column: LogColumn) -> bool:
+        """Return whether a message says that a column is left out."""
+        start = f"{column.file}, column {column.name}: "
+        return any(line.startswith(start) for line in self._result.untold)
+
+
+def _is_torque(column: LogColumn) -> bool:
+    """Return whether a measured column is a torque or force rather than a current or a load."""
+    if column.unit:
+        return column.quantity in ("torque", "force")
+    vague = {"current", "currents", "load", "loads", "strom"}
+    words = set(column_guessing.split_name(column.bare))
+    return bool(words & (column_guessing.ROLE_KEYWORDS["force"] - vague))

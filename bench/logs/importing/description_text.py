@@ -1,0 +1,205 @@
+"""Write the description of imported logs in TOML."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.logs.importing.import_result import ImportOptions, ImportResult
+from bench.logs.importing.run_logs import RunLogs
+from bench.logs.importing.servo_estimation import ServoResponse, estimate_servo_response
+from bench.logs.importing.signal_assignment import Signal, SignalAssignment
+from sims.core.simulator import Array
+from sims.core.toml_validation import toml_key, toml_text
+from sims.robot.places.typical_forces import compute_joint_scales
+from sims.robot.robot_model import Joint
+
+DEFAULT_RESPONSE = ServoResponse(20.0, 0.7)
+"""Natural frequency in rad/s and damping ratio of a servo whose gains are unknown."""
+MIN_MOTION = {"rad": 0.02, "m": 0.002}
+"""Smallest motion of a joint, by its unit, that shows something about the gains of its servo."""
+FREE_GAINS = "actuator.stiffness", "actuator.damping"
+"""Free numbers of a servo that is missing in the model file."""
+
+
+class _AddedServo(NamedTuple):
+    """Position servo that is missing in the model file.
+
+    Attributes:
+        name: Name that it gets.
+        joint: Joint that it drives.
+        kp: Stiffness, N·m/rad.
+        kv: Damping, N·m·s/rad.
+        is_free: Whether its gains are fitted, because the log moves the joint.
+    """
+
+    name: str
+    joint: Joint
+    kp: float
+    kv: float
+    is_free: bool
+
+
+class DescriptionWriter:
+    """Writer of the description of imported logs.
+
+    Args:
+        logs: Logs that are imported.
+        signals: Signals and their columns.
+        options: Information that the user states.
+        model: Model file of the robot.
+        folder: Folder in which the description will be written.
+        result: Result to which messages are added.
+    """
+
+    def __init__(
+        self,
+        logs: RunLogs,
+        signals: SignalAssignment,
+        options: ImportOptions,
+        model: Path,
+        folder: Path,
+        result: ImportResult,
+    ) -> None:
+        self._logs, self._signals, self._options = logs, signals, options
+        self._model, self._folder, self._result = model, folder, result
+
+    def write(self) -> str:
+        """Return the description."""
+        servos = [self._added_servo(*item) for item in self._signals.added_servos.items()]
+        body = [*self._time_lines(), *self._run_lines()]
+        for servo in servos:
+            body += [
+                f"[actuators.{toml_key(servo.name)}]",
+                f"joint = {toml_text(servo.joint.name)}",
+                'kind = "position"  # guess: its commands are positions',
+                f"kp = {servo.kp:.4g}  # guess",
+                f"kv = {servo.kv:.4g}  # guess",
+                "",
+            ]
+        for kind, table in (
+            ("channels", self._signals.channels),
+            ("inputs", self._signals.inputs),
+        ):
+            for name, signal in table.items():
+                body += self._signal_lines(kind, name, signal)
+        for column in self._signals.switches:
+            body += [f"[extra.{toml_key(column.name)}]  # guess: zeros and ones"]
+            body += [*self._file_lines(column.file), f"column = {toml_text(column.name)}"]
+            body += ['unit = "1"', ""]
+        head = [*(f"# check: {line}" for line in self._result.checks)]
+        head += [f"model = {toml_text(self._relative(self._model))}"]
+        free = [servo.name for servo in servos if servo.is_free]
+        if free:
+            places = ["*"] if len(free) == len(servos) else free
+            names = [f"{number}@{place}" for place in places for number in FREE_GAINS]
+            listed = ", ".join(map(toml_text, names))
+            head.append(f"free = [{listed}]  # not known: they are estimated")
+        return "\n".join([*head, "", *body]).rstrip("\n") + "\n"
+
+    def _time_lines(self) -> Iterator[str]:
+        yield "[time]"
+        if self._logs.rate is not None:
+            yield f"rate = {float(self._logs.rate)!r}"
+        else:
+            yield f"column = {toml_text(self._logs.time_column)}"
+            yield f"unit = {toml_text(self._logs.time_unit)}  # guess"
+        yield ""
+
+    def _run_lines(self) -> Iterator[str]:
+        for run, files in self._logs.runs.items():
+            if run:
+                path = files.paths[0] if files.alone else files.folder
+                key = "file" if files.alone else "folder"
+                yield f"[runs.{toml_key(run)}]"
+                yield f"{key} = {toml_text(self._relative(path))}"
+                if run in self._options.held_out:
+                    yield "held_out = true"
+                yield ""
+
+    def _file_lines(self, file: str) -> list[str]:
+        """Return the line with the file of a signal; none if each run is one file."""
+        runs = self._logs.runs
+        if next(iter(runs.values())).alone:
+            return []
+        if "" in runs:
+            file = self._relative(runs[""].folder / file)
+        return [f"file = {toml_text(file)}"]
+
+    def _signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
+        """Return the lines of a channel or an input."""
+        column = signal.column
+        lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.description}"]
+        lines += self._file_lines(column.file)
+        lines += [f"column = {toml_text(column.name)}", f"unit = {toml_text(signal.unit)}"]
+        # A stated scale shows that the user knows that positions are not normalised.
+        is_stated = self._options.position_unit == "deg" and name.startswith("q.")
+        if signal.scale != 1.0 or is_stated:
+            lines.append(f"scale = {signal.scale!r}")
+        if signal.offset:
+            lines.append(f"offset = {signal.offset!r}")
+        self._result.guessed.append(
+            f"{name}: {column.file}, column {column.name}, {signal.description}"
+        )
+        return [*lines, ""]
+
+    def _added_servo(self, name: str, joint: Joint) -> _AddedServo:
+        """Estimate the gains of a servo that is missing in the model file."""
+        signals = self._signals
+        inertia = float(compute_joint_scales(signals.robot).inertia[signals.joints.index(joint)])
+        samples = self._servo_samples(name, joint)
+        response = estimate_servo_response(samples)
+        frequency, damping = response or DEFAULT_RESPONSE
+        kp, kv = inertia * frequency**2, 2.0 * damping * frequency * inertia
+        is_moved = response is not None or any(
+            np.ptp(u) > 0 and np.ptp(q[np.isfinite(q)]) > MIN_MOTION[joint.unit]
+            for _, u, q in samples
+            if np.isfinite(q).any()
+        )
+        gains = f"of one of {frequency:.3g} rad/s and {damping:.2g} of critical damping"
+        if is_moved:
+            origin = "as it follows its command" if response else "as of any hobby servo"
+            self._result.guessed.append(
+                f"gains of the servo of {joint.name}: {gains}, {origin}; free"
+            )
+        else:
+            self._result.checks.append(
+                f"gains of the servo of {joint.name}: the log does not move this joint and cannot "
+                f"show them; kp = {kp:.4g} and kv = {kv:.4g} ({gains}) only hold it and are not "
+                f"fitted; state those of the drive in [actuators.{toml_key(name)}], or import a "
+                "log that moves the joint"
+            )
+        return _AddedServo(name, joint, kp, kv, is_moved)
+
+    def _servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
+        """Return times, commands and positions (T,) of a servo in each run, SI units."""
+        command, position = self._signals.inputs[f"u.{name}"], self._signals.position_of(joint.name)
+        samples: list[tuple[Array, Array, Array]] = []
+        if position is None:
+            return samples
+        for run in self._logs.runs:
+            given = self._logs.read(run, command.column)
+            measured = self._logs.read(run, position.column)
+            if given is None or measured is None:
+                continue
+            # A command holds until the next one.
+            places = np.searchsorted(given[0], measured[0], side="right") - 1
+            held = given[1][np.clip(places, 0, given[1].size - 1)]
+            samples.append(
+                (
+                    measured[0],
+                    command.convert(joint.unit, held),
+                    position.convert(joint.unit, measured[1]),
+                )
+            )
+        return samples
+
+    def _relative(self, path: Path) -> str:
+        try:
+            return Path(os.path.relpath(path, self._folder)).as_posix()
+        except ValueError:  # on another drive
+            return path.resolve().as_posix()

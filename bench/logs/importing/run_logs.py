@@ -1,0 +1,272 @@
+"""Read the logs of the runs that are imported, and find the time stamps of their files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bench.logs.importing import column_guessing
+from bench.logs.importing.column_guessing import LogColumn
+from bench.logs.importing.import_result import MAX_NAMES, ImportResult
+from bench.logs.importing.log_runs import RunFiles
+from sims.core.simulator import Array, InputError
+from sims.recording.log_formats.log_files import LogFile, read_log
+
+MAX_RUNS = 8
+"""Maximum number of runs that are read to decide what a column is."""
+
+
+class RunLogs:
+    """Logs of the runs that are imported. The first run decides which columns there are.
+
+    Args:
+        runs: Files of each run.
+        rate: Rate of the rows in Hz, if the logs have no time stamps.
+        joint_names: Names of the robot's joints, for messages.
+        result: Result to which messages are added.
+
+    Attributes:
+        runs: Files of each run.
+        rate: Rate of the rows in Hz; None if the logs have time stamps.
+        time_column: Name of the column of time stamps; empty if there is none.
+        time_unit: Its unit.
+        columns: Columns of the first run with one number for each time stamp, except the stamps.
+        seconds: (T,) time stamps of each file of the first run, from its first stamp.
+
+    Raises:
+        InputError: A file that the user named cannot be read, or no file can.
+    """
+
+    def __init__(
+        self,
+        runs: Mapping[str, RunFiles],
+        rate: float | None,
+        joint_names: Sequence[str],
+        result: ImportResult,
+    ) -> None:
+        self.runs, self.rate = runs, rate
+        self.time_column, self.time_unit = "", "s"
+        self.seconds: dict[str, Array] = {}
+        self._joint_names, self._result = joint_names, result
+        self._starts: dict[str, float] = {}
+        self._cache: dict[Path, LogFile] = {}
+        logs = self._read_first_run()
+        if rate is not None:
+            for file, log in logs.items():
+                count = max(log.get_column(name).size for name in log.list_columns())
+                self.seconds[file], self._starts[file] = np.arange(count) / rate, 0.0
+        else:
+            self._choose_clock(logs)
+        self.columns = self._complete_columns(logs)
+
+    @property
+    def first_path(self) -> Path:
+        """Path of the first log of the first run."""
+        return next(iter(self.runs.values())).paths[0]
+
+    def read(self, run: str, column: LogColumn) -> tuple[Array, Array] | None:
+        """Return time stamps (T,) in s and values (T,) of a column in a run; None if missing."""
+        files = self.runs[run]
+        paths = files.paths
+        if not files.alone:
+            paths = [path for path in paths if files.name(path) == column.file]
+        if not paths:
+            return None
+        log = self._read_log(paths[0])
+        if column.name not in log.list_columns():
+            return None
+        values = log.get_column(column.name)
+        if self.rate is not None:
+            return np.arange(values.size) / self.rate, values
+        if self.time_column not in log.list_columns():
+            return None
+        stamps = log.get_column(self.time_column)
+        if stamps.size != values.size:
+            return None
+        return column_guessing.TIME_UNITS[self.time_unit] * stamps, values
+
+    def read_runs(self, column: LogColumn) -> list[Array]:
+        """Return the values (T,) of a column in each of the first `MAX_RUNS` runs that have it."""
+        samples = [self.read(run, column) for run in list(self.runs)[:MAX_RUNS]]
+        return [values for _, values in (pair for pair in samples if pair is not None)]
+
+    def hold_command(self, command: LogColumn, position: LogColumn) -> tuple[Array, Array]:
+        """Return (T,) a command at the times of a position (zero-order hold), and that position.
+
+        Both are those of the first run.
+        """
+        if command.file == position.file:
+            return command.values, position.values
+        stamps = self.seconds[command.file]
+        offset = self._starts[command.file] - self._starts[position.file]
+        places = np.searchsorted(stamps + offset, self.seconds[position.file], side="right") - 1
+        return command.values[np.clip(places, 0, stamps.size - 1)], position.values
+
+    # -- files
+
+    def _read_log(self, path: Path) -> LogFile:
+        """Read a log; each file is read only once."""
+        if path not in self._cache:
+            self._cache[path] = read_log(path)
+        return self._cache[path]
+
+    def _read_first_run(self) -> dict[str, LogFile]:
+        """Read the logs of the first run, by name; leave out unreadable logs of a folder.
+
+        Raises:
+            InputError: A file that the user named cannot be read, or no file can.
+        """
+        files = next(iter(self.runs.values()))
+        logs: dict[str, LogFile] = {}
+        errors: list[InputError] = []
+        for path in files.paths:
+            try:
+                log = self._read_log(path)
+                if not log.named:
+                    raise self._no_header(log)
+            except InputError as error:
+                errors.append(error)
+                self._refuse(files.name(path), error, path)
+                continue
+            logs[files.name(path)] = log
+        if not logs:
+            raise errors[0]
+        return logs
+
+    def _no_header(self, log: LogFile) -> InputError:
+        """Make the error for a table whose first row contains numbers."""
+        names = ["t", *(f"{name}_pos" for name in self._joint_names)]
+        shown = ",".join(names[:MAX_NAMES])
+        return InputError(
+            f"{log.path}, row {log.first}: expected a header that names the "
+            f"{len(log.list_columns())} columns, found numbers; put one above, such as {shown},..."
+        )
+
+    def _refuse(self, file: str, error: InputError, path: Path) -> None:
+        """Leave out a file of a folder with a message.
+
+        Raises:
+            InputError: The user named the file.
+        """
+        if next(iter(self.runs.values())).chosen:
+            raise error
+        text = str(error).removeprefix(str(path)).lstrip(",: ")
+        self._result.untold.append(f"{file}: {text}; left out")
+
+    # -- time stamps
+
+    def _choose_clock(self, logs: Mapping[str, LogFile]) -> None:
+        """Find the time stamps of all files, which have a common name and unit.
+
+        Raises:
+            InputError: A file that the user named has other stamps or none, or no file has stamps.
+        """
+        clocks = self._list_clocks(logs)
+        names = [{column.name for column, _ in candidates} for candidates in clocks.values()]
+        # Prefer a name that all files share: the stamp in a message's header over its time of
+        # arrival.
+        common = set.intersection(*names)
+        chosen = {
+            file: next((pair for pair in candidates if pair[0].name in common), candidates[0])
+            for file, candidates in clocks.items()
+        }
+        counts: dict[tuple[str, str], int] = {}
+        for file, (column, unit) in chosen.items():
+            roles = map(column_guessing.guess_role, _all_columns(file, logs[file]))
+            key = column.name, unit
+            counts[key] = counts.get(key, 0) + sum(role is not None for role in roles)
+        self.time_column, self.time_unit = max(counts, key=lambda key: counts[key])
+        zero = min(float(column.values[0]) for column, _ in chosen.values())
+        for file, (column, unit) in chosen.items():
+            if (column.name, unit) != (self.time_column, self.time_unit):
+                path = logs[file].path
+                error = InputError(
+                    f"{path}: its stamps are called {column.name} ({unit}), those of the files "
+                    f"before {self.time_column} ({self.time_unit}); give them one name"
+                )
+                self._refuse(file, error, path)
+                continue
+            # Robot clocks often count from 1970, and floats of that size resolve fractions of a
+            # second coarsely, so the first stamp is subtracted before scaling.
+            second = column_guessing.TIME_UNITS[unit]
+            self.seconds[file] = second * (column.values - column.values[0])
+            self._starts[file] = second * float(column.values[0] - zero)
+            repeated = int((np.diff(column.values) == 0).sum())
+            if repeated:
+                self._result.untold.append(
+                    f"{file}: {repeated} of {column.values.size} stamps repeat the one before; "
+                    "their rows are left out"
+                )
+        steps = np.diff(next(iter(self.seconds.values())))
+        rate = 1.0 / float(np.median(steps[steps > 0]))
+        self._result.guessed.append(
+            f"time: column {self.time_column} in {self.time_unit}, {rate:.4g} Hz"
+        )
+
+    def _list_clocks(self, logs: Mapping[str, LogFile]) -> dict[str, list[tuple[LogColumn, str]]]:
+        """Return for each file the columns that may be its time stamps, with their units.
+
+        Raises:
+            InputError: A file that the user named has no such column, or no file has one.
+        """
+        clocks: dict[str, list[tuple[LogColumn, str]]] = {}
+        errors: list[InputError] = []
+        for file, log in logs.items():
+            columns = column_guessing.clocks(_all_columns(file, log))
+            units = [(column, _unit_of_time(column)) for column in columns]
+            candidates = [(column, unit) for column, unit in units if unit is not None]
+            if candidates:
+                clocks[file] = candidates
+                continue
+            if columns:
+                steps = np.diff(columns[0].values)
+                interval = float(np.median(steps[steps > 0]))
+                error = InputError(
+                    f"{log.path}, column {columns[0].name}: stamps {interval:g} apart are no log's "
+                    "in s, ms, us or ns"
+                )
+            else:
+                error = InputError(
+                    f"{log.path}: no column increases from row to row; expected one of stamps; "
+                    "state the rate of the rows with --rate HZ if there is none"
+                )
+            errors.append(error)
+            self._refuse(file, error, log.path)
+        if not clocks:
+            raise errors[0]
+        return clocks
+
+    def _complete_columns(self, logs: Mapping[str, LogFile]) -> list[LogColumn]:
+        """Return the columns that have one number for each time stamp of their file."""
+        columns = []
+        for file, seconds in self.seconds.items():
+            for column in _all_columns(file, logs[file]):
+                if column.name == self.time_column:
+                    continue
+                if column.values.size != seconds.size:
+                    reason = f"has {column.values.size} numbers, not {seconds.size}"
+                    self._result.leave_out(column, reason)
+                elif np.isnan(column.values).all():
+                    self._result.leave_out(column, "has no number")
+                else:
+                    columns.append(column)
+        return columns
+
+
+def _all_columns(file: str, log: LogFile) -> list[LogColumn]:
+    """Return all numeric columns of a log."""
+    columns = []
+    for name in log.list_columns():
+        values = log.get_column(name)
+        finite = np.where(np.isfinite(values), values, np.nan)
+        columns.append(LogColumn(file, name, finite, log.units.get(name, "")))
+    return columns
+
+
+def _unit_of_time(column: LogColumn) -> str | None:
+    """Return the unit of time stamps: as in the file, else the one with a plausible rate."""
+    if column.quantity == "time" and column.unit in column_guessing.TIME_UNITS:
+        return column.unit
+    return column_guessing.guess_time_unit(column.values)
