@@ -19,6 +19,7 @@ import numpy as np
 from sims.core.atomic_files import require_file
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats import hdf5_files, lerobot_dataset, ros_bags
+from sims.recording.log_formats.message_table import TIME_COLUMN
 from sims.recording.log_formats.named_entries import arrays_by_name
 from sims.recording.log_formats.parquet_columns import make_unreadable_error, read_numeric_columns
 from sims.recording.log_formats.text_table import read_text_table
@@ -178,7 +179,7 @@ def _read_topic(stamp: FileVersion, wanted: frozenset[str] = frozenset()) -> Log
     bag = ros_bags.split_bag_path(stamp.path)
     assert bag is not None  # the caller checked the path
     columns = ros_bags.read_topic(*bag, wanted)
-    if (len(columns) < 2 and not wanted) or not columns[ros_bags.TIME_COLUMN].size:
+    if (len(columns) < 2 and not wanted) or not columns[TIME_COLUMN].size:
         raise InputError(f"{stamp.path}: expected messages with numbers, found none")
     return LogFile(stamp.path, columns, (), "message")
 

@@ -2,33 +2,24 @@
 
 The log ``drive.mcap/joint_states`` is the topic ``/joint_states``. Bags of ROS 1 (``.bag``) and ROS
 2 (a folder with its ``metadata.yaml``, ``.db3``, ``.mcap``) are read message by message with
-rosbags, and only the numbers of a message are stored. Entries are named as in ROS, ``velocity[2]``,
-or by the names in the message where it has some, ``position.elbow``. The column ``time`` holds the
-stamps in seconds: those of the message headers, or the times of writing where there is no header.
+rosbags, MCAP files of JSON or Protobuf messages with mcap, and only the numbers of a message are
+stored (`message_table`). The column ``time`` holds the stamps in seconds: those of the message
+headers, or the times of writing where there is no header.
 """
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sims.core.simulator import Array, InputError, make_read_only
+from sims.core.simulator import Array, InputError
+from sims.recording.log_formats import mcap_messages
+from sims.recording.log_formats.message_table import MessageTable
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """File name endings of bags that are single files."""
-TIME_COLUMN = "time"
-"""Name of the column of time stamps."""
-MAX_LIST_LENGTH = 64
-"""Maximum length of a list whose entries become columns; longer lists are skipped."""
-MAX_MESSAGE_DEPTH = 6
-"""Maximum depth of nested messages that are read."""
-_NANO = 1e-9
 
 
 def is_bag(path: Path) -> bool:
@@ -54,6 +45,8 @@ def list_topics(bag: Path) -> list[str]:
     Raises:
         InputError: The bag cannot be read, or rosbags is not installed.
     """
+    if mcap_messages.is_readable(bag):
+        return mcap_messages.list_topics(bag)
     with _opened(bag) as reader:
         return sorted({connection.topic.lstrip("/") for connection in reader.connections})
 
@@ -72,16 +65,28 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
     Raises:
         InputError: The bag has no such topic, or its messages cannot be read.
     """
-    table = _Table(wanted)
-    with _opened(bag) as reader:
-        mine = [one for one in reader.connections if one.topic == topic]
-        if not mine:
-            there = ", ".join(sorted({one.topic.lstrip("/") for one in reader.connections}))
-            raise InputError(f"{bag}: unknown topic '{topic[1:]}'; there are: {there or 'none'}")
-        for connection, stamp, raw in reader.messages(connections=mine):
-            message = reader.deserialize(raw, connection.msgtype)
+    table = MessageTable(wanted)
+    if mcap_messages.is_readable(bag):
+        topics = mcap_messages.list_topics(bag)
+        # Topics of other loggers need not begin with a slash.
+        if topic.lstrip("/") not in topics:
+            raise _unknown_topic(bag, topic, topics)
+        for message, stamp in mcap_messages.read_messages(bag, topic.lstrip("/")):
             table.add(message, stamp)
+        return table.columns()
+    with _opened(bag) as reader:
+        connections = [one for one in reader.connections if one.topic == topic]
+        if not connections:
+            topics = sorted({one.topic.lstrip("/") for one in reader.connections})
+            raise _unknown_topic(bag, topic, topics)
+        for connection, stamp, raw in reader.messages(connections=connections):
+            table.add(reader.deserialize(raw, connection.msgtype), stamp)
     return table.columns()
+
+
+def _unknown_topic(bag: Path, topic: str, topics: list[str]) -> InputError:
+    names = ", ".join(topics) or "none"
+    return InputError(f"{bag}: unknown topic '{topic.lstrip('/')}'; there are: {names}")
 
 
 @contextmanager
@@ -103,82 +108,5 @@ def _opened(bag: Path) -> Iterator[Any]:
         raise
     except Exception as error:  # the readers of the three formats raise many kinds of errors
         what = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{bag}: not a bag that can be read: {what[:300]}") from None
-
-
-class _Table:
-    """Numbers of the messages of one topic, by name."""
-
-    def __init__(self, wanted: Collection[str] = ()) -> None:
-        # A column named run may number the runs of the log.
-        self.wanted = {name.strip().lower() for name in (*wanted, "run")} if wanted else set()
-        self.stamps = array("d")
-        self.written = array("d")
-        self.numbers: dict[str, array[float]] = {}
-
-    def add(self, message: Any, written: int) -> None:
-        """Append the numbers of one message; numbers missing from it become NaN.
-
-        Args:
-            message: Deserialised message.
-            written: Time of writing in nanoseconds.
-        """
-        row = len(self.stamps)
-        stamp = getattr(getattr(message, "header", None), "stamp", None)
-        seconds = 0.0 if stamp is None else stamp.sec + _NANO * stamp.nanosec
-        self.stamps.append(seconds)
-        self.written.append(_NANO * written)
-        for name, value in _numbers("", message, 0):
-            if self.wanted and name.lower() not in self.wanted:
-                continue
-            column = self.numbers.setdefault(name, array("d"))
-            column.extend([np.nan] * (row - len(column)))
-            column.append(value)
-
-    def columns(self) -> dict[str, Array]:
-        """Return all columns (T,) by name, ordered by time stamp."""
-        rows = len(self.stamps)
-        stamps = np.array(self.stamps)
-        # Header stamps of zero were not filled in: use the times of writing instead.
-        times = stamps if rows and (stamps > 0).all() else np.array(self.written)
-        order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
-        result = {TIME_COLUMN: make_read_only(times if order is None else times[order])}
-        for name in list(self.numbers):
-            # Release each column after conversion; otherwise a long bag would be in memory twice.
-            column = self.numbers.pop(name)
-            column.extend([np.nan] * (rows - len(column)))
-            values = np.frombuffer(column)
-            result[name] = make_read_only(values if order is None else values[order])
-        return result
-
-
-def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
-    """Iterate over the numbers of a message with their names.
-
-    Entries of a list get the names in the message where it has some, as in joint states.
-    """
-    if isinstance(value, bool | int | float | np.number | np.bool_):
-        yield path, float(value)
-    elif is_dataclass(value) and depth < MAX_MESSAGE_DEPTH:
-        names = getattr(value, "name", None) or getattr(value, "joint_names", None) or ()
-        for field in fields(value):
-            if field.name in ("header", "__msgtype__"):
-                continue
-            inner = f"{path}.{field.name}" if path else field.name
-            own = getattr(value, field.name)
-            if _named(own, names):
-                for name, number in zip(names, own, strict=True):
-                    yield f"{inner}.{name}", float(number)
-            else:
-                yield from _numbers(inner, own, depth + 1)
-    elif isinstance(value, list | tuple | np.ndarray) and 0 < len(value) <= MAX_LIST_LENGTH:
-        for place, entry in enumerate(value):
-            yield from _numbers(f"{path}[{place}]", entry, depth + 1)
-
-
-def _named(values: Any, names: Any) -> bool:
-    """Return whether a list has a name for each of its numbers."""
-    if not isinstance(names, Sequence) or isinstance(names, str) or not names:
-        return False
-    listed = isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "fiu"
-    return bool(listed and len(values) == len(names) and all(isinstance(n, str) for n in names))
+        hint = mcap_messages.INSTALL_HINT if bag.suffix.lower() == ".mcap" else ""
+        raise InputError(f"{bag}: not a bag that can be read: {what[:300]}{hint}") from None

@@ -178,7 +178,7 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
         ),
         (
             TOML.replace("noise", "nosie"),
-            r"unknown entry in \[channels.x\] of .*'nosie'; there are: column, file, matrix, noise, offset",
+            r"unknown entry in \[channels.x\] of .*'nosie'; there are: column, file, matrix, noise",
         ),
         (
             TOML.replace("0.01", "0"),

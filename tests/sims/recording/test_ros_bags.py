@@ -12,6 +12,7 @@ from bench.logs.inspection import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats import ros_bags
 from sims.recording.log_formats.log_files import list_logs, read_log
+from sims.recording.log_formats.message_table import MessageTable
 
 rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: extra bags")
 from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
@@ -160,10 +161,10 @@ def test_what_is_not_wanted_is_not_kept(tmp_path):
 
 def test_a_topic_stands_in_memory_once(tmp_path):
     """Columns of messages in order are returned without a copy."""
-    table, rows = ros_bags._Table(), 50_000
+    table, rows = MessageTable(), 50_000
     for name in "abcdefgh":
-        table.numbers[name] = array("d", bytes(8 * rows))
-    table.stamps, table.written = array("d", range(1, rows + 1)), array("d", range(rows))
+        table._numbers[name] = array("d", bytes(8 * rows))
+    table._stamps, table._written = array("d", range(1, rows + 1)), array("d", range(rows))
     tracemalloc.start()
     try:
         columns = table.columns()

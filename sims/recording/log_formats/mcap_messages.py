@@ -1,0 +1,106 @@
+"""Read MCAP files whose messages are JSON or Protobuf (Foxglove, own loggers), without ROS.
+
+The packages mcap and mcap-protobuf-support are imported when such a file is read. (Format:
+mcap.dev/spec, message encodings ``json`` and ``protobuf``.)
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from sims.core.simulator import InputError
+
+ENCODINGS = ("json", "protobuf")
+"""Encodings of messages that are read here."""
+INSTALL_HINT = (
+    ""
+    if find_spec("mcap")
+    else "; if its messages are JSON or Protobuf: pip install 'simgap[mcap]'"
+)
+"""Advice for a file that rosbags cannot read, where mcap is not installed."""
+
+
+def is_readable(path: Path) -> bool:
+    """Return whether a path is an MCAP file with messages in JSON or Protobuf."""
+    if path.suffix.lower() != ".mcap" or not path.is_file() or find_spec("mcap") is None:
+        return False
+    try:
+        return bool(_topics(path))
+    except InputError:  # Reported by the reader of ROS bags.
+        return False
+
+
+def list_topics(path: Path) -> list[str]:
+    """List the topics with messages in JSON or Protobuf, without a leading slash.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    return sorted({topic.lstrip("/") for topic in _topics(path)})
+
+
+def read_messages(path: Path, topic: str) -> Iterator[tuple[Any, int]]:
+    """Iterate over the messages of a topic, each with its time of writing in nanoseconds.
+
+    Args:
+        path: MCAP file.
+        topic: Name of the topic without a leading slash.
+
+    Raises:
+        InputError: A message cannot be decoded.
+    """
+    names = [name for name in _topics(path) if name.lstrip("/") == topic]
+    decoders: dict[int, Callable[[bytes], Any]] = {}
+    with _opened(path) as reader:
+        for schema, channel, message in reader.iter_messages(topics=names):
+            if channel.id not in decoders:
+                decoders[channel.id] = _decoder(path, channel.message_encoding, schema)
+            yield decoders[channel.id](message.data), message.log_time
+
+
+def _decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
+    """Return the function that decodes the messages of a channel."""
+    if encoding == "json":
+        return json.loads
+    try:
+        from mcap_protobuf.decoder import DecoderFactory
+    except ImportError:
+        raise InputError(
+            f"{path}: needs mcap-protobuf-support to read Protobuf messages, not installed "
+            "(pip install 'simgap[mcap]')"
+        ) from None
+    decode: Callable[[bytes], Any] | None = DecoderFactory().decoder_for(encoding, schema)
+    if decode is None:
+        raise InputError(f"{path}: expected the Protobuf schema of each message, found none")
+    return decode
+
+
+def _topics(path: Path) -> set[str]:
+    """Return the topics with messages in JSON or Protobuf."""
+    with _opened(path) as reader:
+        summary = reader.get_summary()
+        if summary is not None and summary.channels:
+            channels = list(summary.channels.values())
+        else:
+            channels = [channel for _, channel, _ in reader.iter_messages()]
+    return {channel.topic for channel in channels if channel.message_encoding in ENCODINGS}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open an MCAP file, and convert the errors of its reader to one line."""
+    from mcap.reader import make_reader
+
+    try:
+        with path.open("rb") as file:
+            yield make_reader(file)
+    except (InputError, MemoryError, KeyboardInterrupt):
+        raise
+    except Exception as error:  # a damaged file or message raises many kinds of errors
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not an MCAP file that can be read: {reason[:300]}") from None
