@@ -307,9 +307,9 @@ class ColumnAssigner:
         for column in self._logs.columns:
             if self._is_used(column) or self._is_reported(column):
                 continue
-            reason = "what it is cannot be told"
+            reason = "its meaning is unknown"
             if column_guessing.guess_role(column) == "force":
-                reason = "its unit cannot be told"
+                reason = "its unit is unknown"
                 if column.unit:
                     reason = f"is in {column.unit}; no input of the model takes it"
             self._result.leave_out(column, reason)

@@ -26,7 +26,7 @@ class Placement(Enum):
 
     @property
     def is_order(self) -> bool:
-        """Whether the number of the column decides, in the model's order of joints."""
+        """True if the number of the column decides, in the model's order of joints."""
         return self in (Placement.MODEL_ORDER, Placement.CONFIRMED_ORDER)
 
 

@@ -30,8 +30,8 @@ from sims.recording.log_formats.table_layout import (
     is_numeric,
 )
 
-TRUTH_VALUES = {"true": 1.0, "false": 0.0}
-"""Numbers that truth values in a table, such as those of a drive that is enabled, are read as."""
+BOOLEAN_VALUES = {"true": 1.0, "false": 0.0}
+"""Numbers that booleans in a table, such as those of a drive that is enabled, are read as."""
 
 
 @dataclass(frozen=True)
@@ -277,8 +277,8 @@ class _CellKind:
         if self.filled.empty:
             return np.full(len(self.series), np.nan)
         first = self.filled.iloc[0]
-        if first.lower() in TRUTH_VALUES:
-            switches = self.series.str.lower().map({**TRUTH_VALUES, "": np.nan})
+        if first.lower() in BOOLEAN_VALUES:
+            switches = self.series.str.lower().map({**BOOLEAN_VALUES, "": np.nan})
             if bool(((self.series == "") | switches.notna()).all()):
                 return np.asarray(switches, dtype=np.float64)
         if NUMBERS.fullmatch(first) and is_numeric(first):

@@ -56,7 +56,7 @@ def test_a_log_of_other_words_and_units_is_read_as_what_it_is(arm, tmp_path, cap
     said = capsys.readouterr().out
     assert "q.elbow: motor_state.csv, column Elbow Position, by its name; in deg" in said
     assert "time: column TIMESTAMP in us, 50 Hz" in said
-    assert "column temperature: what it is cannot be told; left out" in said
+    assert "column temperature: its meaning is unknown; left out" in said
     recording, _ = load_recording(out)
     run = recording.runs[0]
     seen = np.concatenate([r.channels["q.elbow"] for r in recording.runs])
@@ -194,7 +194,7 @@ def written(folder, name, columns):
     return folder / name
 
 
-def still(folder, moving):
+def log_with_held_joint(folder, moving):
     """Write a log in which one joint of the arm moves and the other is held, with noise."""
     rng = np.random.default_rng(3)
     columns = {"t": TIMES}
@@ -212,11 +212,11 @@ def still(folder, moving):
 def test_two_logs_of_one_logger_have_the_same_velocities(arm, tmp_path):
     texts = []
     for moving in ("shoulder", "elbow"):
-        log = still(tmp_path / moving, moving)
+        log = log_with_held_joint(tmp_path / moving, moving)
         made = simgap.import_logs([log], arm, tmp_path / f"{moving}.toml")
         texts.append([line for line in made.text.splitlines() if "qd." in line])
-        still_joint = "elbow" if moving == "shoulder" else "shoulder"
-        line = f"in rad/s, as the other velocities are; {still_joint} hardly moves"
+        held_joint = "elbow" if moving == "shoulder" else "shoulder"
+        line = f"in rad/s, as the other velocities are; {held_joint} hardly moves"
         assert any(line in guess for guess in made.guessed)
     assert [sorted(line.partition("]")[0] for line in text) for text in texts] == [
         ['[channels."qd.elbow"', '[channels."qd.shoulder"']
@@ -226,7 +226,9 @@ def test_two_logs_of_one_logger_have_the_same_velocities(arm, tmp_path):
 def test_gains_of_a_joint_that_the_log_does_not_move_are_said_and_not_fitted(tmp_path):
     bare = tmp_path / "bare.xml"
     bare.write_text(ARM[: ARM.index("<actuator>")] + "</mujoco>")
-    made = simgap.import_logs([still(tmp_path / "a", "shoulder")], bare, tmp_path / "log.toml")
+    made = simgap.import_logs(
+        [log_with_held_joint(tmp_path / "a", "shoulder")], bare, tmp_path / "log.toml"
+    )
     (check,) = made.checks
     assert check.startswith("gains of the servo of elbow: the log does not move this joint")
     assert "state those of the drive in [actuators.m_elbow]" in check
@@ -256,7 +258,7 @@ def test_a_column_of_zeros_and_ones_that_changes_is_kept_as_a_switch(arm, tmp_pa
     columns |= {"torque_enable": (TIMES < 2.0) * 1.0, "mode": np.ones(TIMES.size)}
     made = simgap.import_logs([written(tmp_path, "log.csv", columns)], arm, tmp_path / "log.toml")
     assert any("column torque_enable, zeros and ones; if it says" in g for g in made.guessed)
-    assert "column mode: what it is cannot be told; left out" in "\n".join(made.untold)
+    assert "column mode: its meaning is unknown; left out" in "\n".join(made.untold)
     recording, _ = load_recording(tmp_path / "log.toml", divide=False)
     np.testing.assert_array_equal(
         recording.runs[0].extra["torque_enable"], columns["torque_enable"]

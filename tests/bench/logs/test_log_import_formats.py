@@ -327,7 +327,7 @@ def test_a_temperature_is_no_angle_and_a_current_position_no_current(arm, tmp_pa
     made = simgap.import_logs([table(tmp_path / "l.csv", columns)], arm, tmp_path / "l.toml")
     assert 'column = "yaw_current_position"' in made.text
     assert 'column = "lift"' in made.text
-    assert "column yaw_temp: what it is cannot be told" in "\n".join(made.untold)
+    assert "column yaw_temp: its meaning is unknown" in "\n".join(made.untold)
 
 
 def test_words_that_every_joint_of_a_model_has_are_not_needed(tmp_path):
