@@ -25,6 +25,7 @@ from functools import cached_property
 import numpy as np
 
 from bench.diagnosis.conventions.convention_hypotheses import (
+    LATE_SAMPLES,
     MAX_NAMED,
     MIN_OFFSET,
     ConventionHypothesis,
@@ -53,13 +54,23 @@ from sims.robot.robot_simulator import RobotSimulator
 
 LOG_LIKELIHOOD_MARGIN = 20.0
 """Minimum gain in log-likelihood of a hypothesis over the log as it is described."""
-CAUSES_MARGIN = 10.0
-"""Minimum gain in log-likelihood of a hypothesis over the best set of causes."""
+CAUSES_MARGIN = 5.0
+"""Minimum gain in log-likelihood of a hypothesis over the best set of causes, whose coefficients
+are penalised; it corresponds to odds of 150 to 1.
+"""
 EQUAL_LOG_LIKELIHOOD = 3.0
 """Maximum difference of log-likelihoods of two hypotheses that explain a log equally well."""
 MIN_MISSING_FORCE, LARGE_MISSING_FORCE = 0.1, 0.3
 """Limits of the largest missing force of a joint, as a share of its typical force. Below the first
-no convention is tested, and below the second only those of this joint.
+no convention is tested, and below the second only those of joints with a similar share.
+"""
+ABSURD_MISSING_FORCE = 10.0
+"""Missing force of a joint, as a share of its typical force, at which no test of significance is
+needed.
+"""
+SIMILAR_SHARE = 0.5
+"""Minimum missing force of a joint whose conventions are tested, as a share of the largest one, if
+all of them are small.
 """
 SUSPECT_SHARE = 0.1
 """Minimum missing force of a joint whose conventions are tested, as a share of its typical force,
@@ -141,13 +152,19 @@ class ConventionComparison:
                 break
             differences.append(best)
             corrected = best.hypothesis.applied(corrected)
-        gain = sum(one.gain for one in differences)
-        if not differences or gain < self._gain_of_causes(corrected) + CAUSES_MARGIN:
+        if not differences:
+            return []
+        hypotheses = [one.hypothesis for one in differences]
+        parts = self._parts(corrected)
+        explained = _log_likelihood(self._follow(parts)) + _log_scales(hypotheses, parts)
+        if explained < self._log_likelihood_of_causes(corrected) + CAUSES_MARGIN:
             return []
         if not self._removes_missing_force(described, corrected):
             return []
-        before, after = (_log_likelihood(self._follow(one)) for one in (described, corrected))
-        after += sum(_log_scales(one.hypothesis, described) for one in differences)
+        before, after = (
+            _log_likelihood(self._follow(one)) for one in _equally_long(described, corrected)
+        )
+        after += _log_scales(hypotheses, corrected)
         return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
 
     def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
@@ -169,11 +186,12 @@ class ConventionComparison:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
         shares = (followed.force / followed.typical)[: len(coordinates)]
-        if not followed.missing_forces.any() or shares.max() <= MIN_MISSING_FORCE:
+        is_missing = followed.missing_forces.any() or shares.max() > ABSURD_MISSING_FORCE
+        if not is_missing or shares.max() <= MIN_MISSING_FORCE:
             return []
         limit = min(SUSPECT_SHARE * max(1.0, float(shares.max())), MAX_SUSPECT_LIMIT)
         if shares.max() < LARGE_MISSING_FORCE:
-            limit = float(np.nextafter(shares.max(), 0.0))
+            limit = SIMILAR_SHARE * float(shares.max())
         share_of = dict(zip(coordinates, shares.tolist(), strict=True))
         return [j for j in self._generator.joints if share_of[f"q.{j.name}"] > limit]
 
@@ -181,9 +199,11 @@ class ConventionComparison:
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> ConventionDifference | None:
         """Return the hypothesis with the largest likelihood; None if none is clearly better."""
-        limit = self._evaluate(ConventionHypothesis(""), recording) + LOG_LIKELIHOOD_MARGIN
-        # Most hypotheses already fail on one run.
-        first_limit = self._evaluate(ConventionHypothesis(""), recording, runs=1)
+        described = ConventionHypothesis("")
+        limit = self._evaluate(described, recording) + LOG_LIKELIHOOD_MARGIN
+        # Most hypotheses already fail on the run that the log as described explains worst.
+        by_run = [self._evaluate(described, recording, run) for run in range(len(self._slices))]
+        worst_run = int(np.argmin(by_run))
         scored: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated: list[object] = []
         for hypothesis in self._generator.generate(recording, suspects):
@@ -191,7 +211,7 @@ class ConventionComparison:
             if key in evaluated:
                 continue
             evaluated.append(key)
-            if not self._evaluate(hypothesis, recording, runs=1) > first_limit:
+            if not self._evaluate(hypothesis, recording, worst_run) > by_run[worst_run]:
                 continue
             score = self._evaluate(hypothesis, recording)
             # For several offsets of one signal, the best one is refined.
@@ -242,7 +262,7 @@ class ConventionComparison:
         step = FIRST_OFFSET_STEP
         while step > OFFSET_ACCURACY:
             for signed in (step, -step):
-                moved = hypothesis.shifted(signed)
+                moved = hypothesis.with_offset_step(signed)
                 moved_score = self._evaluate(moved, recording)
                 if moved_score > score + MIN_REFINEMENT_GAIN:
                     score, hypothesis = moved_score, moved
@@ -253,19 +273,19 @@ class ConventionComparison:
         return (score if offset > MIN_OFFSET else -np.inf), hypothesis
 
     def _evaluate(
-        self, hypothesis: ConventionHypothesis, recording: Recording, runs: int = PART_RUNS
+        self, hypothesis: ConventionHypothesis, recording: Recording, run: int | None = None
     ) -> float:
         """Return the log-likelihood (1) on the short parts of a recording.
 
         Args:
             hypothesis: Difference between the conventions.
             recording: Recording as it is described, or with some conventions corrected.
-            runs: Maximum number of runs.
+            run: Number of the only run; None for all runs with parts.
         """
         self.evaluations += 1
-        parts = self._parts(hypothesis.applied(recording), runs)
+        parts = self._parts(hypothesis.applied(recording), run)
         followed = self._follow(parts, max_linearisations=1)
-        return _log_likelihood(followed) + _log_scales(hypothesis, parts)
+        return _log_likelihood(followed) + _log_scales([hypothesis], parts)
 
     def _follow(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
@@ -282,13 +302,13 @@ class ConventionComparison:
         world.close()
         return followed
 
-    def _gain_of_causes(self, corrected: Recording) -> float:
-        """Return the penalised log-likelihood that the best set of causes gains on short parts.
+    def _log_likelihood_of_causes(self, corrected: Recording) -> float:
+        """Return the penalised log-likelihood of the log as described with the best set of causes.
 
         Each effect has a penalty of half the logarithm of the number of samples for each
         coefficient (BIC), and of the logarithm of the number of effects. With large missing forces,
-        regression is inaccurate, so the gain is computed by filters with the effects in the model.
-        If the corrected log is not explained either, the larger of both gains is used.
+        regression is inaccurate, so the likelihood is computed by filters with the effects in the
+        model. If the corrected log is not explained either, the larger of both is used.
 
         Args:
             corrected: Recording with its conventions corrected.
@@ -303,15 +323,14 @@ class ConventionComparison:
         )
         if not followed.is_sound:
             world.close()
-            return 0.0
+            return -np.inf
         left_out = MANY_SHAPES | GAIN_EFFECTS
         names = [name for name in world.library if name.partition("@")[0] not in left_out]
         base = _unfitted(world)
         probes = [probe for name in names for probe in first_probes(world, base, name)]
         selected = identify(followed, followed.columns(probes))
-        before = followed.with_parameters(world.get_nominal_theta()).log_likelihood
         samples = int(followed.runs.recorded.sum())
-        gain, penalty = 0.0, 0.0
+        best, penalty = followed.log_likelihood, 0.0
         for count, group in enumerate(selected.groups, start=1):
             penalty += 0.5 * len(group.column_indices) * math.log(samples) + math.log(len(names))
             groups = selected.groups[:count]
@@ -319,17 +338,24 @@ class ConventionComparison:
             for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
                 theta[world.slots[one.effect]] = group_coefficients(world, probes, one, numbers)
             fitted = _with_best_coefficients(followed.with_parameters(theta), groups)
-            gain = max(gain, fitted.log_likelihood - before - penalty)
-        gain = max(gain, _log_likelihood_of_soft_friction(followed) - before)
+            best = max(best, fitted.log_likelihood - penalty)
+        best = max(best, _log_likelihood_of_soft_friction(followed))
         world.close()
         if self._largest_missing_force(corrected) < LARGE_MISSING_FORCE:
-            return gain
-        return max(gain, selected.log_likelihood - followed.log_likelihood - penalty)
+            return best
+        return max(best, selected.log_likelihood - penalty)
 
-    def _parts(self, recording: Recording, runs: int = PART_RUNS) -> Recording:
-        """Return the parts of some training runs with the largest movement."""
-        pairs = zip(recording.training(), self._slices[:runs], strict=False)
-        return replace(recording, runs=tuple(run.part(part) for run, part in pairs))
+    def _parts(self, recording: Recording, run: int | None = None) -> Recording:
+        """Return the parts of some training runs with the largest movement.
+
+        Args:
+            recording: Recording as it is described, or with some conventions corrected.
+            run: Number of the only run; None for all runs with parts.
+        """
+        parts = [
+            run.part(part) for run, part in zip(recording.training(), self._slices, strict=False)
+        ]
+        return replace(recording, runs=tuple(parts if run is None else parts[run : run + 1]))
 
     @cached_property
     def _slices(self) -> list[slice]:
@@ -344,16 +370,28 @@ class ConventionComparison:
         return [_liveliest_part(run) for run in runs]
 
 
+def _equally_long(one: Recording, other: Recording) -> tuple[Recording, Recording]:
+    """Cut the runs of two versions of a recording to the samples that both have."""
+    pairs = list(zip(one.runs, other.runs, strict=True))
+    counts = [min(a.times.size, b.times.size) for a, b in pairs]
+
+    def cut(recording: Recording) -> Recording:
+        runs = zip(recording.runs, counts, strict=True)
+        return replace(recording, runs=tuple(run.part(slice(0, count)) for run, count in runs))
+
+    return cut(one), cut(other)
+
+
 def _log_likelihood(followed: FollowedRuns) -> float:
     """Return the log-likelihood of the innovations; minus infinity if the filter diverges."""
     likelihood = followed.log_likelihood
     return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
 
 
-def _log_scales(hypothesis: ConventionHypothesis, recording: Recording) -> float:
+def _log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording) -> float:
     """Return the last term of (1) for the training runs of a recording."""
     result = 0.0
-    for name, change in hypothesis.changes.items():
+    for name, change in (item for one in hypotheses for item in one.changes.items()):
         samples = [run.channels[name] for run in recording.training() if name in run.channels]
         count = sum(int(np.isfinite(values).sum()) for values in samples)
         result += count * math.log(abs(change.scale))
@@ -407,9 +445,10 @@ def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
 
 def _liveliest_part(run: Run) -> slice:
     """Return the part of a run in which its channels move most."""
-    count = run.times.size
+    # The commands after the end of a run are not known, and a hypothesis may move them.
+    count = run.times.size - max(LATE_SAMPLES)
     if count <= PART_SAMPLES:
-        return slice(0, count)
+        return slice(0, max(count, min(run.times.size, 2)))
 
     def movement(begin: int) -> float:
         total = 0.0

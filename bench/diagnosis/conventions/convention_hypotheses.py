@@ -117,22 +117,43 @@ class ConventionHypothesis:
             name: np.stack([run.before[name][0], values])
             for name, values in changed(earlier, earlier).items()
         }
-        return replace(
+        result = replace(
             run,
             channels=changed(run.channels, signals),
             inputs=changed(run.inputs, signals),
             before=before,
             initial={} if self.changes else run.initial,
-            offset=run.offset - self.late,
         )
+        return _advanced(result, self.late) if self.late else result
 
-    def shifted(self, step: float) -> ConventionHypothesis:
+    def with_offset_step(self, step: float) -> ConventionHypothesis:
         """Return the hypothesis with a step in rad added to its offsets."""
         changes = {
             name: replace(change, offset=change.offset + step)
             for name, change in self.changes.items()
         }
         return replace(self, changes=changes)
+
+
+def _advanced(run: Run, late: float) -> Run:
+    """Return a run with its inputs earlier by a delay in s; without its end, whose inputs are lost.
+
+    Samples are moved instead of the offset of the time stamps, because a part of a run contains no
+    inputs after its end.
+    """
+    stamps = run.times + late
+    count = int(np.searchsorted(stamps, run.times[-1] + 0.5 * late, side="right"))
+    count = min(max(count, 2), run.times.size)
+    inputs = {}
+    for name, values in run.inputs.items():
+        if name in run.linear:
+            moved = np.interp(stamps, run.times, values)
+        else:
+            # The tolerance is for stamps that differ by rounding.
+            places = np.searchsorted(run.times, stamps + 1e-6 * late, side="right") - 1
+            moved = values[places]
+        inputs[name] = moved
+    return replace(run, inputs=inputs).part(slice(0, count))
 
 
 @dataclass(frozen=True)
