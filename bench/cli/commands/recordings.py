@@ -22,6 +22,7 @@ from bench.cli.shared_options import (
 
 if TYPE_CHECKING:
     from bench.diagnosis.conventions.convention_comparison import ConventionDifference
+    from bench.logs.quality.quality_finding import QualityFinding
     from sims.core.simulator import Simulator
     from sims.recording.recording import Recording
 
@@ -203,7 +204,9 @@ def _inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     ]
     odd = [*(o.text for o in found), *robot_summary.format_log_warnings(recording, kind)]
     findings = list(check_log_quality(recording, kind))
-    differences, fixes = _differing_conventions(options, recording, kind)
+    active_recording, inactive = _without_inactive_drives(recording, kind)
+    findings += inactive
+    differences, fixes = _differing_conventions(options, active_recording, kind)
     for line in (
         *about,
         *format_summary(recording, kind),
@@ -241,6 +244,24 @@ def _inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     }
     lost = any(n["free"] and n["word"] == "not identifiable" for n in numbers or ())
     return CommandResult(document, EXIT_PROBLEMS_FOUND if lost else EXIT_OK)
+
+
+def _without_inactive_drives(
+    recording: Recording, kind: type[Simulator]
+) -> tuple[Recording, list[QualityFinding]]:
+    """Return a robot's recording without samples in which drives do nothing, and where that is."""
+    from bench.logs.quality.quality_finding import QualityFinding
+
+    if not kind.has_model:
+        return recording, []
+    from bench.diagnosis.prediction_error.inactive_drives import without_inactive_drives
+
+    used = without_inactive_drives(recording, kind)
+    findings = []
+    for note in used.notes[len(recording.notes) :]:
+        text, _, remedy = note.rpartition("; ")
+        findings.append(QualityFinding("drive", text, remedy))
+    return used, findings
 
 
 def _differing_conventions(

@@ -31,7 +31,9 @@ from bench.diagnosis.conventions.convention_hypotheses import (
     ConventionHypothesis,
     HypothesisGenerator,
     JointSignals,
+    SignalChange,
 )
+from bench.diagnosis.conventions.copied_commands import find_copied_commands
 from bench.diagnosis.conventions.unit_check import Subject
 from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
 from bench.diagnosis.evaluation.noise_floor import compute_noise_floor
@@ -142,7 +144,26 @@ class ConventionComparison:
         self._generator = HypothesisGenerator(subject)
 
     def differences(self) -> list[ConventionDifference]:
-        """Return the conventions that differ, in the order of the search; empty if none."""
+        """Return the conventions that differ, in the order of the search; empty if none.
+
+        If commands are copies of measurements, only these are returned: without commands, no other
+        convention can be compared.
+        """
+        copies = [
+            ConventionDifference(
+                ConventionHypothesis(
+                    f"command {command} equals {channel} digit for digit: it is a copy of the "
+                    "measurement",
+                    {command: SignalChange(column)},
+                ),
+                np.inf,
+            )
+            for command, channel, column in find_copied_commands(
+                self.subject.recording, self.subject.kind
+            )
+        ]
+        if copies:
+            return copies
         described = corrected = self.subject.recording
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):

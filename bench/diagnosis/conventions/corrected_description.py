@@ -10,6 +10,7 @@ from typing import Any
 
 from bench.diagnosis.conventions.convention_comparison import ConventionDifference
 from bench.diagnosis.conventions.convention_hypotheses import ConventionHypothesis, SignalChange
+from bench.diagnosis.conventions.copied_commands import UNKNOWN_COLUMN
 from sims.core.simulator import InputError
 from sims.core.toml_validation import toml_key, toml_text
 from sims.recording.recording_description import DeclaredSignals, dotted, read_meta
@@ -45,7 +46,7 @@ def corrected(
             before = copy.deepcopy(result[kind])
             for name, change in hypothesis.changes.items():
                 if name in before:
-                    own = _moved(before[change.source], name, change)
+                    own = _moved(before, name, change)
                     result[kind][name] = _changed(own, units[kind][name], change, hypothesis)
         if hypothesis.late:
             time = dict(result.get("time", {}))
@@ -54,10 +55,15 @@ def corrected(
     return result
 
 
-def _moved(table: Mapping[str, Any], name: str, change: SignalChange) -> dict[str, Any]:
-    """Return the table of a signal whose values are in the column of another signal."""
-    own = dict(table)
+def _moved(
+    tables: Mapping[str, Mapping[str, Any]], name: str, change: SignalChange
+) -> dict[str, Any]:
+    """Return the table of a signal whose values are in another column."""
+    is_signal = change.source in tables
+    own = dict(tables[change.source if is_signal else name])
     if change.source != name:
+        if not is_signal:  # A column of the log that is not used so far.
+            return {**own, "column": change.source}
         own.setdefault("column", change.source)
         if own["column"] == name:
             del own["column"]
@@ -143,12 +149,24 @@ def write_corrected(
         The files that were written.
 
     Raises:
-        InputError: A file exists already, or the path does not end in ``.toml``.
+        InputError: A file exists already, the path does not end in ``.toml``, or a column is
+            unknown.
     """
     import tomli_w
 
     if path.suffix != ".toml":
         raise InputError(f"{path}: expected NAME.toml for the corrected description")
+    unknown = [
+        name
+        for one in differences
+        for name, change in one.hypothesis.changes.items()
+        if change.source == UNKNOWN_COLUMN
+    ]
+    if unknown:
+        raise InputError(
+            f"{recording}: no column of the log can be the command {', '.join(unknown)}; record "
+            f'it, or write its column into [inputs."{unknown[0]}"] by hand'
+        )
     description, meta = read_meta(recording)
     content = corrected(meta, declared, differences)
     if "model" in content:

@@ -7,7 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bench.logs.quality import clock_drift, sampling_clock, signal_values, velocity_consistency
+from bench.logs.quality import (
+    clock_drift,
+    pose_check,
+    sampling_clock,
+    signal_values,
+    velocity_consistency,
+)
 from bench.logs.quality.quality_finding import QualityFinding
 from sims.core.simulator import Simulator
 from sims.recording.recording import Recording
@@ -30,3 +36,4 @@ def check_log_quality(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     yield from signal_values.check_saturation(recording, kind)
     yield from signal_values.check_standstill(recording, kind)
     yield from velocity_consistency.check_velocities(recording, kind)
+    yield from pose_check.find_overlaps(recording, kind)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.logs.quality.anomaly import Anomaly
+from bench.logs.quality.quality_finding import QualityFinding
 from sims.core.simulator import Array, Simulator
 from sims.recording.recording import Recording, Run
 from sims.robot.mujoco_messages import capture_mujoco_warnings
@@ -37,6 +38,10 @@ DEGREE_SLOPE_RANGE = (40.0, 80.0)
 """Range of slopes b of (1) which show that one of the two signals is in degrees (57.3)."""
 CHECKED_INSTANTS = 100
 """Maximum number of times of a run at which forces or contacts are evaluated."""
+MIN_OVERLAP_METRES = 1e-3
+"""Smallest depth, in m, at which two bodies overlap; feet on the ground sink in by less."""
+MIN_OVERLAP_SHARE = 0.9
+"""Smallest share of the recorded poses in which bodies overlap that do so by their shape."""
 _SMALLER = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
 """Smaller unit in which positions are often recorded, by SI unit: its value and name."""
 
@@ -138,23 +143,71 @@ def find_contacts(
         positions: (N,) position of each joint, rad or m, by channel; other joints keep their
             initial position.
     """
+    pairs: set[tuple[int, int]] = set()
+    for data in _place(kind, positions):
+        pairs |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
+    return frozenset(pairs)
+
+
+def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find bodies of a robot that overlap in most of the recorded poses.
+
+    Their contact forces act all the time, and no measured robot can be so.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
+    if not kind.has_model:
+        return
+    robot: Any = kind.robot  # type: ignore[attr-defined]
+    model = robot.compiled
+    depths: dict[tuple[str, str], list[float]] = {}
+    count = 0
+    for run in recording.training():
+        for data in _place(kind, run.channels):
+            count += 1
+            deepest: dict[tuple[str, str], float] = {}
+            for contact in data.contact[: data.ncon]:
+                bodies = [model.body(int(model.geom_bodyid[g])).name for g in contact.geom]
+                pair = min(bodies), max(bodies)
+                deepest[pair] = max(deepest.get(pair, 0.0), -float(contact.dist))
+            for pair, depth in deepest.items():
+                if depth > MIN_OVERLAP_METRES:
+                    depths.setdefault(pair, []).append(depth)
+    for (one, other), values in depths.items():
+        if len(values) > MIN_OVERLAP_SHARE * count:
+            line = f'<contact><exclude body1="{one}" body2="{other}"/></contact>'
+            remedy = f"add {line}"
+            if robot.format == "urdf":
+                remedy = "make their collision shapes smaller"
+            yield QualityFinding(
+                "overlap",
+                f"bodies {one} and {other} overlap by up to {1e3 * max(values):.3g} mm in "
+                f"{len(values) / count:.0%} of the recorded poses, so that a contact pushes them "
+                "apart all the time",
+                f"{remedy} in {robot.path.name}",
+            )
+
+
+def _place(kind: type[Simulator], positions: Mapping[str, Array]) -> Iterator[Any]:
+    """Yield MuJoCo's data with a robot at up to `CHECKED_INSTANTS` recorded poses."""
     import mujoco
 
     robot = kind.robot  # type: ignore[attr-defined]
     model = robot.compiled
     data = mujoco.MjData(model)
     count = max((values.size for values in positions.values()), default=0)
-    found = set()
+    rows = np.unique(np.linspace(0, max(count - 1, 0), CHECKED_INSTANTS).astype(np.intp))
     with capture_mujoco_warnings():
-        for row in np.unique(np.linspace(0, max(count - 1, 0), CHECKED_INSTANTS).astype(np.intp)):
+        for row in rows:
             mujoco.mj_resetData(model, data)
             for joint in robot.joints:
                 values = positions.get(f"q.{joint.name}")
                 if joint.has_one_coordinate and values is not None and np.isfinite(values[row]):
                     data.qpos[joint.position] = values[row]
             mujoco.mj_forward(model, data)
-            found |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
-    return frozenset(found)
+            yield data
 
 
 def _at(run: Run, name: str, row: int) -> float:

@@ -10,7 +10,7 @@ class QualityFinding(NamedTuple):
     """One finding of a quality check.
 
     Attributes:
-        about: clock, drift, quantisation, saturation, stillness or contradiction.
+        about: clock, drift, quantisation, saturation, stillness, contradiction, overlap or drive.
         text: Description of the finding, with its number.
         remedy: Recommended action.
     """

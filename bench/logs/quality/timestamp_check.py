@@ -72,6 +72,10 @@ def check_recording_plausible(
         *pose_check.check_poses(recording, kind),
         *find_anomalies(recording, kind),
         *find_missing_base_poses(recording, kind),
+        *(
+            Anomaly(overlap.text_line, False)
+            for overlap in pose_check.find_overlaps(recording, kind)
+        ),
     ]
     for oddity in found:
         if oddity.certain and not force:

@@ -1,0 +1,108 @@
+"""Find commands that are copies of the measurement.
+
+Some loggers write the measured position into the column of the command. A servo with such a command
+exerts no force, so the log contains no input, and any cause would only imitate it. Equality in
+every digit over a whole motion cannot be an accident: encoders have noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.core.simulator import Array, InputError, Simulator
+from sims.recording.column_mapping import list_mapped_files
+from sims.recording.log_formats.log_files import LogFile, read_log
+from sims.recording.recording import Recording
+from sims.recording.recording_description import read_meta
+
+UNKNOWN_COLUMN = "NAME OF ITS COLUMN"
+"""Stands for the column of a command where no column of the log can be it."""
+MIN_SAMPLES = 20
+"""Minimum number of samples, and of different values, that are compared."""
+MIN_CORRELATION = 0.9
+"""Minimum correlation of a position with the column that may be its command."""
+MEASURED_QUANTITIES = {"position": "q", "velocity": "qd"}
+"""Channel that a servo controls, by the kind of its actuator."""
+
+
+def find_copied_commands(
+    recording: Recording, kind: type[Simulator]
+) -> Iterator[tuple[str, str, str]]:
+    """Find commands of servos that equal the measurement of their joint in all samples.
+
+    Args:
+        recording: Recording of a robot.
+        kind: Simulator class of the robot.
+
+    Returns:
+        Name of the input, name of the channel that it equals, and the column that may be the
+        command instead, `UNKNOWN_COLUMN` if there is none.
+    """
+    robot: Any = kind.robot  # type: ignore[attr-defined]
+    for actuator in robot.actuators:
+        quantity = MEASURED_QUANTITIES.get(actuator.kind)
+        command, channel = f"u.{actuator.name}", f"{quantity}.{actuator.joint}"
+        runs = [run for run in recording.runs if command in run.inputs and channel in run.channels]
+        if not runs:
+            continue
+        u = np.concatenate([run.inputs[command] for run in runs])
+        y = np.concatenate([run.channels[channel] for run in runs])
+        measured = np.isfinite(y)
+        u, y = u[measured], y[measured]
+        if len(np.unique(y)) >= MIN_SAMPLES and np.array_equal(u, y):
+            yield command, channel, _likely_column(recording, channel)
+
+
+def _likely_column(recording: Recording, channel: str) -> str:
+    """Return the unused column of the log that a position follows best."""
+    try:
+        description, meta = read_meta(recording.path)
+    except InputError:  # A recording in memory has no description.
+        return UNKNOWN_COLUMN
+    tables = [table for kind in ("channels", "inputs") for table in meta.get(kind, {}).values()]
+    used = [column for table in tables if isinstance(table, dict) for column in _columns(table)]
+    own = meta.get("channels", {}).get(channel, {})
+    name = (_columns(own) or [channel])[0]
+    best, best_correlation = UNKNOWN_COLUMN, MIN_CORRELATION
+    for log in _logs(description):
+        if name not in log.list_columns():
+            continue
+        y = log.get_column(name)
+        for column in log.list_columns():
+            if column in (*used, name):
+                continue
+            correlation = _correlation(log.get_column(column), y)
+            if correlation > best_correlation:
+                best, best_correlation = column, correlation
+        break
+    return best
+
+
+def _columns(table: dict[str, Any]) -> list[str]:
+    """Return the columns that the table of a signal names."""
+    column = table.get("column", [])
+    return [column] if isinstance(column, str) else list(column)
+
+
+def _logs(description: Path) -> Iterator[LogFile]:
+    """Yield the logs of a description that can be read."""
+    for path in list_mapped_files(description):
+        try:
+            yield read_log(path)
+        except InputError:  # Such as the model file.
+            continue
+
+
+def _correlation(u: Array, y: Array) -> float:
+    """Return the correlation of two columns; 0 if they are equal, or one does not change."""
+    if u.shape != y.shape or np.array_equal(u, y, equal_nan=True):
+        return 0.0
+    known = np.isfinite(u) & np.isfinite(y)
+    u, y = u[known], y[known]
+    if u.size < MIN_SAMPLES or np.ptp(u) == 0 or np.ptp(y) == 0:
+        return 0.0
+    return float(np.corrcoef(u, y)[0, 1])

@@ -1,0 +1,91 @@
+"""Tests of commands that are copies of the measurement: found, named, and corrected if possible."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.diagnosis.conventions.copied_commands import find_copied_commands
+from bench.logs.inspection import load_recording
+
+ARM = """<mujoco model="arm"><option timestep="0.002"/><worldbody>
+<body><joint name="hip" axis="0 1 0" damping="0.1" armature="0.02"/>
+<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/>
+<body pos="0.3 0 0"><joint name="knee" axis="0 1 0" damping="0.1" armature="0.02"/>
+<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/></body></body></worldbody>
+<actuator><position name="m_hip" joint="hip" kp="80" kv="6"/>
+<position name="m_knee" joint="knee" kp="60" kv="5"/></actuator></mujoco>"""
+TOML = """model = "arm.xml"
+[time]
+column = "t"
+unit = "s"
+[runs.a]
+file = "a.csv"
+[runs.b]
+file = "b.csv"
+[channels."q.hip"]
+column = "hip_pos"
+unit = "rad"
+[channels."q.knee"]
+column = "knee_pos"
+unit = "rad"
+[inputs."u.m_hip"]
+column = "hip_cmd"
+unit = "rad"
+[inputs."u.m_knee"]
+column = "knee_act"
+unit = "rad"
+"""
+
+
+def written(folder, with_commands=True, noise=0.0):
+    """Write raw logs whose column `knee_act` is the measured position of the knee."""
+    (folder / "arm.xml").write_text(ARM)
+    (folder / "log.toml").write_text(TOML)
+    rng = np.random.default_rng(4)
+    for name in "ab":
+        model = mujoco.MjModel.from_xml_string(ARM)
+        data = mujoco.MjData(model)
+        rows = ["t,hip_pos,knee_pos,hip_cmd,knee_act" + ",knee_cmd" * with_commands]
+        phase = rng.uniform(0, 6, 2)
+        for k in range(300):
+            u = 0.5 * np.sin(np.array([3.0, 4.0]) * 0.01 * k + phase)
+            q = data.qpos + 1e-4 * rng.standard_normal(2)
+            act = q[1] + noise * rng.standard_normal()
+            cells = [0.01 * k, *q, u[0], act, *[u[1]] * with_commands]
+            rows.append(",".join(f"{x:.9g}" for x in cells))
+            data.ctrl[:] = u
+            for _ in range(5):
+                mujoco.mj_step(model, data)
+        (folder / f"{name}.csv").write_text("\n".join(rows) + "\n")
+    return folder / "log.toml"
+
+
+def test_a_copy_is_found_and_the_unused_command_is_offered(tmp_path, capsys):
+    log = written(tmp_path)
+    assert main(["explain", str(log), "--out", str(tmp_path / "out"), "--jobs", "1"]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "command u.m_knee equals q.knee digit for digit: it is a copy of the" in message
+    assert '[inputs."u.m_knee"] column = "knee_cmd"' in message
+    assert not (tmp_path / "out").exists()
+    fixed = tmp_path / "fixed.toml"
+    arguments = ["inspect", str(log), "--fix", str(fixed), "--out", str(tmp_path / "look")]
+    assert main(arguments) == 0
+    recording, kind = load_recording(fixed)
+    assert list(find_copied_commands(recording, kind)) == []
+    assert np.ptp(recording.runs[0].inputs["u.m_knee"]) > 0.9
+
+
+def test_without_another_column_the_command_must_be_named(tmp_path, capsys):
+    log = written(tmp_path, with_commands=False)
+    arguments = ["inspect", str(log), "--out", str(tmp_path / "look")]
+    assert main([*arguments, "--fix", str(tmp_path / "fixed.toml")]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "no column of the log can be the command u.m_knee; record it, or write its" in message
+    assert not (tmp_path / "fixed.toml").exists()
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-3])
+def test_a_command_that_is_close_to_the_measurement_is_no_copy(tmp_path, noise):
+    recording, kind = load_recording(written(tmp_path, noise=noise))
+    assert list(find_copied_commands(recording, kind)) == []

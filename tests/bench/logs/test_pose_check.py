@@ -1,0 +1,79 @@
+"""Tests of bodies that overlap in the recorded poses, and of drives that do nothing."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.logs.inspection import load_recording
+from bench.logs.quality.pose_check import find_overlaps
+
+LEG = """<mujoco model="leg"><worldbody>
+<body name="base"><geom name="block" type="box" size="0.1 0.1 0.05"/>
+<body name="hip" pos="0 0 {height}"><joint name="hip" axis="0 1 0"/>
+<geom name="round" type="sphere" size="0.05"/><geom type="sphere" size="0.03" pos="0 0 0.2"/>
+</body></body>
+</worldbody><actuator><motor name="m" joint="hip"/></actuator>{more}</mujoco>"""
+EXCLUDED = '<contact><exclude body1="base" body2="hip"/></contact>'
+
+
+def log(folder, height, more=""):
+    """Write a log of a leg whose hip is at some height above the middle of its fixed base."""
+    (folder / "leg.xml").write_text(LEG.format(height=height, more=more))
+    toml = 'model = "leg.xml"\n[channels."q.hip"]\nunit = "rad"\n[inputs."u.m"]\nunit = "N*m"\n'
+    (folder / "log.toml").write_text(toml)
+    rows = [f"a,{k / 50},{0.3 * np.sin(k / 9):.6f},{np.cos(k / 9):.6f}" for k in range(120)]
+    (folder / "log.csv").write_text("run,t,q.hip,u.m\n" + "\n".join(rows) + "\n")
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize(
+    ("height", "more", "depth"),
+    [(0.084, "", "16 mm"), (0.084, EXCLUDED, None), (0.11, "", None)],
+)
+def test_bodies_that_overlap_in_all_poses_are_named(height, more, depth, tmp_path):
+    """A base that is welded to the world: MuJoCo does not leave out contacts with its children."""
+    path = log(tmp_path, height, more)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "leg.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert bool(data.ncon) == (depth is not None)
+    findings = list(find_overlaps(*load_recording(path)))
+    if depth is None:
+        assert findings == []
+        return
+    (finding,) = findings
+    assert finding.text.startswith(f"bodies base and hip overlap by up to {depth} in 100% of the")
+    assert finding.remedy == f"add {EXCLUDED} in leg.xml"
+
+
+def test_inspect_prints_overlaps_and_drives_that_do_nothing(tmp_path, capsys):
+    """A servo is switched off at 2 s; the column of its power changes there."""
+    text = """<mujoco model="arm"><option timestep="0.002"/><worldbody><body name="link">
+    <joint name="hinge" axis="0 1 0" damping="0.05"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02"/></body></worldbody>
+    <actuator><position name="servo" joint="hinge" kp="20" kv="0.5"/></actuator></mujoco>"""
+    (tmp_path / "arm.xml").write_text(text)
+    (tmp_path / "log.toml").write_text(
+        'model = "arm.xml"\n[time]\ncolumn = "t"\n[channels."q.hinge"]\nfile = "raw.csv"\n'
+        'column = "pos"\nunit = "rad"\n[inputs."u.servo"]\nfile = "raw.csv"\ncolumn = "cmd"\n'
+        'unit = "rad"\n[extra.power]\nunit = "1"\n'
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    data, rows = mujoco.MjData(model), []
+    rng = np.random.default_rng(1)
+    for k in range(400):
+        u = 0.8 * np.sin(3 * k / 100) + 0.3
+        q = data.qpos[0] + 1e-4 * rng.standard_normal()
+        rows.append(f"{k / 100},{q:.6f},{u:.6f},{int(k < 200)}")
+        if k == 200:
+            model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0
+        data.ctrl[:] = u
+        for _ in range(5):
+            mujoco.mj_step(model, data)
+    (tmp_path / "raw.csv").write_text("t,pos,cmd,power\n" + "\n".join(rows) + "\n")
+    assert main(["inspect", str(tmp_path / "log.toml"), "--out", str(tmp_path / "look")]) == 0
+    output = capsys.readouterr().out
+    assert "finding: drive: actuator servo exerts nothing where power is 0" in output
+    assert 'state it in log.toml: [actuators.servo] enable = "power"' in output
+    assert "convention:" not in output
