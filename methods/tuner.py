@@ -106,6 +106,12 @@ class Task:
         difference = (observations - self.observed) / self.scale
         return np.where(np.isnan(self.observed), 0.0, difference).reshape(len(observations), -1)
 
+    def compute_finite_residuals(self, evaluation: Evaluation) -> Array:
+        """Return the residuals of an evaluation; those of a failed simulation are large numbers."""
+        return np.nan_to_num(
+            self.residuals(evaluation.observations), nan=1e10, posinf=1e10, neginf=1e10
+        )
+
 
 class TrainingSimulator(Protocol):
     """Training simulator of a learned tuner: counted, and limited to the training range.
@@ -258,42 +264,52 @@ class _OptimiserStopped(BaseException):
     """Raised inside a callback optimiser's thread when the harness ends its run."""
 
 
-def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) -> TunerGenerator:
+def get_first_loss(evaluation: Evaluation) -> float:
+    """Return the loss of the first point of an evaluation."""
+    return float(evaluation.losses[0])
+
+
+def from_callback(
+    minimise: Callable[[Callable[[Array], Any]], str | None],
+    get_value: Callable[[Evaluation], Any] = get_first_loss,
+) -> TunerGenerator:
     """Turn an optimiser that only takes an objective function into a tuner's generator.
 
     The optimiser runs in its own thread, and never at the same time as the harness: each call of
-    the objective passes one point to the harness and waits for its loss.
+    the objective passes its points to the harness and waits for the result.
 
     Args:
-        minimise: called with the objective (dim,) -> loss; returns the reason why it stopped, or
-            None. It must not catch exceptions of the objective.
+        minimise: called with the objective; returns the reason why it stopped, or None. It must not
+            catch exceptions of the objective. The objective takes one point (dim,) or several
+            (n, dim).
+        get_value: value of the objective for an evaluation; by default the loss of one point.
 
     Returns:
         The generator; its return value is the reason.
     """
     to_harness: list[Array] = []
-    to_optimiser: list[float] = []
+    to_optimiser: list[Any] = []
     outcome: list[str | None] = []
     failure: list[BaseException] = []
     # Each side waits for the other's semaphore, so that only one of the two runs at any time.
-    asked = threading.Semaphore(0)
-    answered = threading.Semaphore(0)
-    closing = False
+    point_ready = threading.Semaphore(0)
+    value_ready = threading.Semaphore(0)
+    is_closing = False
 
-    def objective(point: Array) -> float:
-        if closing:
+    def objective(point: Array) -> Any:
+        if is_closing:
             raise _OptimiserStopped
         to_harness.append(np.array(point, dtype=np.float64))
-        asked.release()
-        answered.acquire()
-        if closing:
+        point_ready.release()
+        value_ready.acquire()
+        if is_closing:
             raise _OptimiserStopped
         return to_optimiser.pop()
 
     def work() -> None:
         try:
-            answered.acquire()
-            if not closing:
+            value_ready.acquire()
+            if not is_closing:
                 outcome.append(minimise(objective))
         except _OptimiserStopped:
             pass
@@ -302,26 +318,26 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
             failure.append(error)
         finally:
             # Without a new point, the harness sees that the optimiser has ended.
-            asked.release()
+            point_ready.release()
 
     # A daemon thread, because an optimiser that never returns must not keep the process alive.
     worker = threading.Thread(target=work, daemon=True, name="callback-optimiser")
     worker.start()
     try:
-        answered.release()
+        value_ready.release()
         while True:
-            asked.acquire()
+            point_ready.acquire()
             if failure:
                 raise failure[0]
             if not to_harness:
                 return outcome[0] if outcome else None
-            evaluation = yield to_harness.pop()[None, :]
-            to_optimiser.append(float(evaluation.losses[0]))
-            answered.release()
+            evaluation = yield np.atleast_2d(to_harness.pop())
+            to_optimiser.append(get_value(evaluation))
+            value_ready.release()
     finally:
         # The optimiser waits for a loss, and gets an exception instead.
-        closing = True
-        answered.release()
+        is_closing = True
+        value_ready.release()
         worker.join(timeout=_THREAD_TIMEOUT_SECONDS)
         if worker.is_alive():
             raise RuntimeError(

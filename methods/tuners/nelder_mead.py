@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from methods.learning.nlopt_search import minimise_with_nlopt
 from methods.tuner import Array, Task, Tuner, TunerGenerator, from_callback
 
 
@@ -42,23 +43,6 @@ class NelderMead(Tuner):
         return from_callback(lambda loss: self._minimise(task, loss))
 
     def _minimise(self, task: Task, loss: Callable[[Array], float]) -> str:
-        import nlopt
-
-        def objective(point: Array, gradient: Array) -> float:  # noqa: ARG001 - nlopt's signature
-            value = loss(point)
-            # The simplex could not sort its corners with NaN.
-            return value if np.isfinite(value) else np.inf
-
-        optimiser = nlopt.opt(nlopt.LN_NELDERMEAD, task.dim)
-        optimiser.set_lower_bounds(np.zeros(task.dim))
-        optimiser.set_upper_bounds(np.ones(task.dim))
-        optimiser.set_min_objective(objective)
-        optimiser.set_xtol_abs(self.step_tolerance)
-        if self.initial_step is not None:
-            optimiser.set_initial_step(self.initial_step)
-        try:
-            optimiser.optimize(task.start)
-        except nlopt.RoundoffLimited:
-            # With a tolerance of 0 this is the usual end, and not an error.
-            return "the simplex reached the limit of rounding"
-        return "the simplex has collapsed to a point"
+        return minimise_with_nlopt(
+            "LN_NELDERMEAD", loss, task, self.step_tolerance, self.initial_step
+        )

@@ -18,6 +18,7 @@ from typing import Any, TypedDict
 from bench.benchmark.problem import experiment_sweep
 from bench.benchmark.problem.recorded_runs import resolve_recording_path
 from bench.benchmark.problem.salt import check_commitment
+from bench.benchmark.problem.suite_version import check_problem_hash, compute_problem_hash
 from bench.benchmark.problem.tuner_entries import TunerEntry, parse_entries
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
@@ -53,6 +54,18 @@ _MOST_MEMORY = 10**9
 """Maximum memory limit in MiB; no machine has more memory."""
 ISOLATION_MODES = ("run", "tuner")
 """Lifetimes of a tuner's process: one run, or all runs of the tuner."""
+
+_RARE_KEYS = (
+    "sweep",
+    "experiments",
+    "nuisance",
+    "diagnosis",
+    "identifiable",
+    "resolution",
+    "suite",
+    "problem_hashes",
+)
+"""Keys that the stored configuration omits if they are empty."""
 
 FixedOrRange = float | Range
 """A number, or the range from which each scenario draws one uniformly."""
@@ -125,6 +138,7 @@ class Experiment:
         name: file name without its ending.
         title: heading of figures.
         says: a sentence on what it is.
+        identifiable: a sentence on what its data determine.
         tags: words by which a list is searched, e.g. ``quick``; they change nothing.
         simulator: registered name; of a robot what tables call it, its file's name where empty.
         model: a robot's model file (MJCF or URDF) in place of a registered simulator: relative to
@@ -149,6 +163,7 @@ class Experiment:
         timeout: seconds a run may take.
         memory: MiB that a run may take beside what its worker holds; 0 is no limit.
         noise: standard deviation of the sensor noise added to simulated targets, by channel.
+        resolution: step to which the noisy samples of simulated targets are rounded, by channel.
         settings: the simulator's own settings, e.g. its time step.
         world: settings of the simulator that makes the targets, where it is another: another
             engine, effects with fixed coefficients. Empty: the same simulator. Its parameters are
@@ -188,6 +203,10 @@ class Experiment:
             each combination of them. A key within a table is joined by dots, as ``noise.x``.
         experiments: others, by name or file, which it stands for: each with the targets, seeds,
             budgets, limits and tuners of this one.
+        suite: name and version of the benchmark suite that the experiment belongs to; empty for
+            none.
+        problem_hashes: hash by name of each of the `experiments` of a suite
+            (`problem.suite_version`); a changed problem is refused.
         tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
             the same, a ``label``; or a table for each by its label.
     """
@@ -195,6 +214,7 @@ class Experiment:
     name: str
     title: str = ""
     says: str = ""
+    identifiable: str = ""
     tags: tuple[str, ...] = ()
     simulator: str = ""
     model: str = ""
@@ -212,6 +232,7 @@ class Experiment:
     timeout: float = 3600.0
     memory: int = 0
     noise: Mapping[str, float] = field(default_factory=dict)
+    resolution: Mapping[str, float] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     world: Mapping[str, Any] = field(default_factory=dict)
     constants: Mapping[str, FixedOrRange] = field(default_factory=dict)
@@ -232,6 +253,8 @@ class Experiment:
     salt_sha256: str = ""
     sweep: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
     experiments: tuple[str, ...] = ()
+    suite: str = ""
+    problem_hashes: Mapping[str, str] = field(default_factory=dict)
     tuners: tuple[TunerEntry, ...] = ()
 
     def __post_init__(self) -> None:
@@ -281,6 +304,8 @@ class Experiment:
         """Raise an error for texts that do not fit into figures, tables or paths."""
         check_text(who, "title", self.title)
         check_text(who, "says", self.says, most=MAX_DESCRIPTION_LENGTH)
+        check_text(who, "identifiable", self.identifiable, most=MAX_DESCRIPTION_LENGTH)
+        check_text(who, "suite", self.suite, most=MAX_NAME_LENGTH)
         check_text(who, "same_targets_as", self.same_targets_as)
         check_text(who, "model", self.model, most=MAX_DESCRIPTION_LENGTH)
         for word in self.free:
@@ -306,6 +331,9 @@ class Experiment:
         for name, sigma in self.noise.items():
             if check_finite(who, f"noise.{name}", sigma) < 0:
                 raise make_error(who, f"noise.{name}", "at least 0", sigma)
+        for name, step in self.resolution.items():
+            if not check_finite(who, f"resolution.{name}", step) > 0:
+                raise make_error(who, f"resolution.{name}", "more than 0", step)
         held = self.held_out.initial if self.held_out else {}
         calibrated = self.calibration.initial if self.calibration else {}
         for where, given in (
@@ -322,8 +350,7 @@ class Experiment:
         """Return the whole configuration as TOML tables, the inverse of `parse_experiment`."""
         document = {key: value for key, value in asdict(self).items() if value is not None}
         del document["name"]
-        # An experiment that is run never has the first two keys, and rarely the last two.
-        for rare in ("sweep", "experiments", "nuisance", "diagnosis"):
+        for rare in _RARE_KEYS:
             if not document[rare]:
                 del document[rare]
         document["tuners"] = {entry.label: entry.to_table() for entry in self.tuners}
@@ -399,14 +426,22 @@ def load_experiment(name_or_path: str) -> Experiment:
     Raises:
         InputError: there is no such experiment, or its file has an error.
     """
-    if name_or_path in list_experiment_names():
-        path = Path(str(resources.files("bench.experiments").joinpath(f"{name_or_path}.toml")))
-    elif name_or_path.endswith(".toml"):
-        path = Path(name_or_path)
-    else:
-        error = make_unknown_name_error("experiment", name_or_path, list_experiment_names())
-        raise InputError(f"{error} (or give the path of a .toml file)")
+    path = find_experiment_file(name_or_path)
     return parse_experiment(path.stem, read_toml(path), path)
+
+
+def find_experiment_file(name_or_path: str) -> Path:
+    """Find the file of an experiment of the project, or of a user.
+
+    Raises:
+        InputError: there is no such experiment.
+    """
+    if name_or_path in list_experiment_names():
+        return Path(str(resources.files("bench.experiments").joinpath(f"{name_or_path}.toml")))
+    if name_or_path.endswith(".toml"):
+        return Path(name_or_path)
+    error = make_unknown_name_error("experiment", name_or_path, list_experiment_names())
+    raise InputError(f"{error} (or give the path of a .toml file)")
 
 
 def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
@@ -474,21 +509,28 @@ SHARED_KEYS = (
     "isolation",
     "trusted",
     "salt",
+    "suite",
     "tuners",
 )
 """Keys of a file with several experiments that hold for each of them."""
+_UNHASHED_KEYS = (*SHARED_KEYS, "title", "says", "identifiable", "tags")
+"""Keys that do not belong to the definition of a suite's problem: shared ones, and words."""
 
 
 def _as_in(together: Experiment, name: str) -> list[Experiment]:
     """Return an experiment that another one names, with the numbers and tuners of the latter."""
-    one = load_experiment(name)
-    if one.experiments:
+    experiment = load_experiment(name)
+    if experiment.experiments:
         raise InputError(f"experiment {together.name}: {name} names experiments itself")
+    if together.suite:
+        file = find_experiment_file(name)
+        found = compute_problem_hash(file, frozenset(_UNHASHED_KEYS))
+        check_problem_hash(together.suite, together.problem_hashes, experiment.name, found)
     # Tuners are replaced as a whole: options of one experiment may be invalid in the other.
-    given = {
+    shared = {
         key: getattr(together, key) for key in SHARED_KEYS if key != "tuners" or together.tuners
     }
-    return expand_sweep(one.chosen(**given))
+    return expand_sweep(experiment.chosen(**shared))
 
 
 def _beside(name: str, experiment: Path) -> str:

@@ -178,12 +178,22 @@ def _draw(problem: TargetProblem, kind: str, index: int, number: int) -> Target 
     theta = problem.cube.to_physical(truth[None])[:, : len(problem.world.parameters)]
     clean = problem.world.simulate(theta, scenarios[0])[0]
     observed = clean + problem.noise * streams.get_stream("noise").standard_normal(clean.shape)
-    fitting = ObservedRuns(scenarios, observed)
+    fitting = ObservedRuns(scenarios, _quantise(observed, problem))
     held_out = _held_out(problem, theta, streams)
     if any(_diverges(each, problem.channels) for each in (clean, held_out.observed)):
         return None
     sealed = BlindedTarget(name, kind, start, fitting, held_out)
     return Target(sealed, problem.cube.to_physical(truth), number)
+
+
+def _quantise(observed: Array, problem: TargetProblem) -> Array:
+    """Round samples (T, C) to the resolution of the channels that have one."""
+    steps = [problem.experiment.resolution.get(c.name, 0.0) for c in problem.channels]
+    rounded = observed.copy()
+    for column, step in enumerate(steps):
+        if step:
+            rounded[:, column] = step * np.round(observed[:, column] / step)
+    return rounded
 
 
 def _diverges(observed: Array, channels: Sequence[Channel]) -> bool:

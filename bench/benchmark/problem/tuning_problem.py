@@ -85,7 +85,7 @@ class TuningProblem:
 
         self.recording: RecordedRuns | None = None
         noise = dict(experiment.noise)
-        for name in noise:
+        for name in (*noise, *experiment.resolution):
             self._channel(name)
         if experiment.recording:
             self.recording = load_recorded_runs(experiment.recording.path, self.simulator)

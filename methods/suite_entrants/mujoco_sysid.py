@@ -1,0 +1,40 @@
+"""Least squares of mujoco.sysid, the system identification toolbox of MuJoCo.
+
+Sources: E. Todorov, T. Erez, Y. Tassa, MuJoCo: a physics engine for model-based control, IROS
+2012; https://github.com/google-deepmind/mujoco, python/mujoco/sysid.
+"""
+
+import io
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from methods.tuner import Array, Task, Tuner, TunerGenerator, from_callback
+
+
+@dataclass(eq=False)
+class MuJoCoSysId(Tuner):
+    """mujoco.sysid.optimize with its defaults, from the start; works with every simulator."""
+
+    name: ClassVar[str] = "mujoco_sysid"
+    requires: ClassVar[tuple[str, ...]] = ("mujoco", "colorama", "plotly")  # mujoco[sysid]
+    stochastic: ClassVar[bool] = False
+
+    def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
+        """Pass the toolbox's points to the harness, finite differences in one batch."""
+
+        def minimise(residuals: Callable[[Array], Array]) -> str:
+            # MuJoCo would look for a display in a process of its own, which isolation forbids.
+            os.environ.setdefault("MUJOCO_GL", "disable")
+            from mujoco import sysid
+
+            unknown = sysid.ParameterDict()
+            unknown.add(sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim)))
+            ask: Any = lambda x, _: ([residuals(x.reshape(task.dim, -1).T).T], None, None)  # noqa: E731
+            sysid.optimize(unknown, ask, verbose=False, output=io.StringIO())
+            return "mujoco.sysid reached its tolerance"
+
+        return from_callback(minimise, task.compute_finite_residuals)
