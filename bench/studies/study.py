@@ -128,9 +128,9 @@ def begin_studies(
     def begin(one: Experiment, place: Path | None) -> Study:
         return get_study_class(one).begin(prepare_study(one, plugins, place, jobs, salt))
 
-    wanted = expand_sweep(experiment)
-    if len(wanted) == 1:
-        return [begin(wanted[0], folder)]
+    experiments = expand_sweep(experiment)
+    if len(experiments) == 1:
+        return [begin(experiments[0], folder)]
     # Separate experiments have separate salts, so that a complete one does not reveal another's.
     if salt is None and not experiment.salt and not experiment.experiments:
         salt = generate_salt()
@@ -138,8 +138,8 @@ def begin_studies(
     begun: list[Study] = []
     try:
         # All are planned before the first is run, so that an error in the last one shows at once.
-        for one in wanted:
-            begun.append(begin(one, parent / one.name))
+        for part in experiments:
+            begun.append(begin(part, parent / part.name))
     except BaseException:
         for study in begun:
             study.close()
@@ -154,8 +154,8 @@ def list_study_folders(folder: Path) -> list[Path]:
     """Return the folders of the studies in a folder: itself, or the subfolders of a sweep."""
     if (folder / CONFIGURATION_FILE).exists() or not folder.is_dir():
         return [folder]
-    inside = sorted(path for path in folder.iterdir() if (path / CONFIGURATION_FILE).exists())
-    return inside or [folder]
+    subfolders = sorted(path for path in folder.iterdir() if (path / CONFIGURATION_FILE).exists())
+    return subfolders or [folder]
 
 
 def report_jointly(folder: Path, say: PrintLine) -> None:
@@ -171,6 +171,10 @@ def report_jointly(folder: Path, say: PrintLine) -> None:
         from bench.misspecification.misspecification_report import write_joint_report
 
         write_joint_report(folder, parts, say)
+    if experiments and all(experiment.suite for experiment in experiments):
+        from bench.studies.suite.suite_report import report_suite
+
+        report_suite(folder, say)
 
 
 def resume_study(folder: Path, plugins: Sequence[str] = ()) -> Study:
@@ -180,7 +184,7 @@ def resume_study(folder: Path, plugins: Sequence[str] = ()) -> Study:
         folder: result folder.
         plugins: additional plugin files.
     """
-    return _kind_in(folder).resume(folder, plugins)
+    return _find_study_class(folder).resume(folder, plugins)
 
 
 def open_study(folder: Path) -> Study:
@@ -189,7 +193,7 @@ def open_study(folder: Path) -> Study:
     Raises:
         InputError: there is no study, or it is damaged.
     """
-    return _kind_in(folder)(folder)
+    return _find_study_class(folder)(folder)
 
 
 def get_study_class(experiment: Experiment) -> type[Study]:
@@ -212,5 +216,5 @@ def get_study_class(experiment: Experiment) -> type[Study]:
     return Comparison
 
 
-def _kind_in(folder: Path) -> type[Study]:
+def _find_study_class(folder: Path) -> type[Study]:
     return get_study_class(read_configuration(folder).experiment)

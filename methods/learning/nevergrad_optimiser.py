@@ -11,6 +11,11 @@ _FAILED_LOSS = 1e300
 """Loss that represents a failed simulation; nevergrad refuses infinite losses."""
 
 
+def _to_float(value: object) -> float:
+    """Convert a number, or an array of one element."""
+    return float(np.asarray(value).item())
+
+
 def tune_with_nevergrad(method: str, task: Task, rng: np.random.Generator) -> TunerGenerator:
     """Propose the points of a nevergrad optimiser, the task's start first.
 
@@ -21,7 +26,10 @@ def tune_with_nevergrad(method: str, task: Task, rng: np.random.Generator) -> Tu
     """
     with isolated_library_call(rng):
         import nevergrad
+        from nevergrad.optimization import metamodel
 
+        # nevergrad 1.0.12 converts arrays of one element by float(), which NumPy 2.4 refuses.
+        metamodel.float = _to_float
         # The start may lie on a bound, where the default transform of bounds is not defined.
         box = nevergrad.p.Array(init=np.clip(task.start, 1e-6, 1.0 - 1e-6))
         box.set_bounds(0.0, 1.0)

@@ -25,7 +25,7 @@ def tune_with_optuna(
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     names = [f"x{i}" for i in range(task.dim)]
-    box = {name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names}
+    box: dict[str, Any] = {name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Experimental options of Optuna warn.
         study = optuna.create_study(sampler=make_sampler(int(rng.integers(2**31))))

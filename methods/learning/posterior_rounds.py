@@ -35,8 +35,8 @@ class PosteriorRounds:
         self._trainer: Any = None
         self._posterior: Any = None
         self._components: Array | None = None
-        self._centre: Array | None = None
-        self._widths: Array | None = None
+        self._centre: Array = np.zeros(0)
+        self._widths: Array = np.ones(0)
 
     def update(self, evaluation: Evaluation, count: int, rng: np.random.Generator) -> Array:
         """Train on one more round of simulations, and draw the points of the next.
@@ -90,7 +90,7 @@ class PosteriorRounds:
             proposal=self._posterior,
         )
         self._trainer.train(training_batch_size=min(50, len(points)))
-        zero = self._compute_features(np.zeros((1, len(self._centre))))  # type: ignore[arg-type]
+        zero = self._compute_features(np.zeros((1, len(self._centre))))
         target = torch.as_tensor(zero, dtype=torch.float32)
         self._posterior = self._trainer.build_posterior().set_default_x(target)
         draws = self._posterior.sample((max(count, _POSTERIOR_DRAWS),)).numpy().astype(np.float64)

@@ -4,6 +4,7 @@ Sources: E. Todorov, T. Erez, Y. Tassa, MuJoCo: a physics engine for model-based
 2012; https://github.com/google-deepmind/mujoco, python/mujoco/sysid.
 """
 
+import importlib
 import io
 import os
 from collections.abc import Callable
@@ -29,8 +30,7 @@ class MuJoCoSysId(Tuner):
         def minimise(residuals: Callable[[Array], Array]) -> str:
             # MuJoCo would look for a display in a process of its own, which isolation forbids.
             os.environ.setdefault("MUJOCO_GL", "disable")
-            from mujoco import sysid
-
+            sysid = importlib.import_module("mujoco.sysid")  # it has no types
             unknown = sysid.ParameterDict()
             unknown.add(sysid.Parameter("cube", task.start, np.zeros(task.dim), np.ones(task.dim)))
             ask: Any = lambda x, _: ([residuals(x.reshape(task.dim, -1).T).T], None, None)  # noqa: E731

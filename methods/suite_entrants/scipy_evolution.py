@@ -27,9 +27,9 @@ class DifferentialEvolution(Tuner):
         """Pass SciPy's points to the harness one by one."""
 
         def minimise(loss: Callable[[Array], float]) -> str:
-            from scipy.optimize import differential_evolution
+            from scipy.optimize import Bounds, differential_evolution
 
-            bounds = [(0.0, 1.0)] * task.dim
-            return str(differential_evolution(loss, bounds, x0=task.start, rng=rng).message)
+            box = Bounds(np.zeros(task.dim), np.ones(task.dim))
+            return str(differential_evolution(loss, box, x0=task.start, rng=rng).message)
 
         return from_callback(minimise)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from bench.benchmark.problem.experiment import Experiment
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_PLACES = (_PACKAGE.parent / "results" / "reference", _PACKAGE / "reference")
+REFERENCE_FOLDERS = (_PACKAGE.parent / "results" / "reference", _PACKAGE / "reference")
 """Folders of references: in the root of a checkout, or in the package of a wheel."""
 _TABLE = "table.csv"
 _DRAWN = ("tuner", "range", "simulations", "metric", "median")
@@ -152,7 +152,7 @@ def list_reference_names() -> list[str]:
     """List the names of the references of simgap, which are the names of their folders."""
     found = [
         table.parent.relative_to(place).as_posix()
-        for place in _PLACES
+        for place in REFERENCE_FOLDERS
         for table in sorted(place.rglob(_TABLE))
         if _is_one(table.parent)
     ]
@@ -191,7 +191,7 @@ def find_reference(name: str) -> ReferenceResult:
 
 
 def _place(name: str) -> Path:
-    return next(place / name for place in _PLACES if (place / name / _TABLE).is_file())
+    return next(place / name for place in REFERENCE_FOLDERS if (place / name / _TABLE).is_file())
 
 
 def _read(name: str, folder: Path) -> ReferenceResult:

@@ -46,8 +46,13 @@ def _plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
     from bench.benchmark.storage.reference_results import find_reference
     from bench.studies.study import list_study_folders, open_study
+    from bench.studies.suite.suite_report import report_suite
+    from bench.studies.suite.suite_runs import is_stored_suite
     from sims.core.simulator import InputError
 
+    if len(options.runs) == 1 and is_stored_suite(options.runs[0]):
+        report_suite(options.runs[0], say)
+        return CommandResult({"comparisons": []})
     files = [str(path.resolve()) for path in map(Path, options.plugin)]
     for folder in options.runs:
         for part in list_study_folders(folder):

@@ -1,0 +1,334 @@
+"""Errors of all runs of a benchmark suite: collected from its folders, stored, and merged.
+
+A cell is a problem and a range of targets, or a problem before or after its simulator's extension.
+The stored form has one row per run, so that a method can be ranked against methods that were run
+elsewhere on the same targets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bench.benchmark.figures.comparison_figures import compute_statistics
+from bench.benchmark.problem.experiment import Experiment
+from bench.benchmark.results_report import REQUIRED_RUN_COLUMNS
+from bench.benchmark.storage.journal_segments import SEGMENTS_FOLDER
+from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_comparison
+from bench.misspecification.calibration import MODEL_LABELS, PLAIN
+from sims.core.atomic_files import atomic_replacement, write_atomically
+from sims.core.simulator import Array, InputError
+
+CURVES_FILE = "curves.parquet"
+"""File of the errors of all runs."""
+CELLS_FILE = "cells.csv"
+"""File of the cells with the properties of their problems."""
+TRAINING_FILE = "training.csv"
+"""File of the cost of each training."""
+SKIPPED_FILE = "skipped.csv"
+"""File of the tuners that could not be used, with the reason."""
+RUN_COLUMNS = ["cell", "tuner", "target", "seed", "simulations", "seconds", "failed"]
+CELL_COLUMNS = [
+    "cell",
+    "problem",
+    "range",
+    "parameters",
+    "tags",
+    "negligible_error",
+    "metric",
+    "title",
+    "tests",
+    "identifiable",
+    "suite",
+]
+TRAINING_COLUMNS = ["cell", "tuner", "fit_simulations", "fit_seconds"]
+SKIPPED_COLUMNS = ["tuner", "reason"]
+_STORED_DIGITS = 4
+"""Significant digits of stored errors."""
+_ERROR_PREFIX = "after_"
+"""Beginning of the columns of errors; the number of simulations follows."""
+
+
+@dataclass(frozen=True)
+class SuiteRuns:
+    """Runs of a suite.
+
+    Attributes:
+        runs: one row per run, columns `RUN_COLUMNS`.
+        errors: (R, K + 1) error after k simulations; NaN where a run had a smaller budget, infinite
+            for a failed run. In widths of the training range, or in the channel's unit for measured
+            data.
+        cells: one row per cell, columns `CELL_COLUMNS`.
+        training: cost of a training by cell and tuner, columns `TRAINING_COLUMNS`.
+        skipped: tuners that could not be used, columns `SKIPPED_COLUMNS`.
+    """
+
+    runs: pd.DataFrame
+    errors: Array
+    cells: pd.DataFrame
+    training: pd.DataFrame
+    skipped: pd.DataFrame
+
+    @property
+    def budget(self) -> int:
+        """Largest number of simulations on one target."""
+        return int(self.errors.shape[1]) - 1
+
+    @property
+    def tuners(self) -> list[str]:
+        """Tuner labels in the order of their first run."""
+        return [str(name) for name in dict.fromkeys(self.runs["tuner"])]
+
+    @property
+    def version(self) -> str:
+        """Name and version of the suite."""
+        return str(self.cells["suite"].iloc[0])
+
+    def select(self, mask: pd.Series[bool]) -> SuiteRuns:
+        """Return the runs selected by a mask, and their cells."""
+        kept = self.runs[mask].reset_index(drop=True)
+        cells = self.cells[self.cells["cell"].isin(kept["cell"])].reset_index(drop=True)
+        return replace(self, runs=kept, errors=self.errors[mask.to_numpy()], cells=cells)
+
+
+def is_stored_suite(folder: Path) -> bool:
+    """Return whether a folder has the stored runs of a suite without its comparisons."""
+    return (folder / CURVES_FILE).is_file() and not any(list_comparison_folders(folder))
+
+
+def list_comparison_folders(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Yield the folders of a suite's comparisons, each with its condition.
+
+    The condition is ``before`` or ``after`` the extension of a misspecified simulator, or empty.
+    """
+    for part in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if (part / CONFIGURATION_FILE).is_file():
+            models = [label for label in MODEL_LABELS if (part / label).is_dir()]
+            if models:
+                yield from ((part / m, "before" if m == PLAIN else "after") for m in models)
+            else:
+                yield part, ""
+
+
+def collect_suite_runs(folder: Path) -> SuiteRuns:
+    """Collect the runs of all finished comparisons in the folder of a suite.
+
+    Args:
+        folder: folder that contains one subfolder per problem.
+
+    Raises:
+        InputError: no comparison is finished, or a folder is damaged.
+    """
+    parts = [
+        _collect_comparison(part, condition)
+        for part, condition in list_comparison_folders(folder)
+        if (part / "runs.parquet").is_file() and not (part / SEGMENTS_FOLDER).exists()
+    ]
+    parts = [part for part in parts if len(part.runs)]
+    if not parts:
+        raise InputError(
+            f"{folder}: expected at least one finished comparison of a suite, found none; finish "
+            f"it with simgap compare --resume {folder}"
+        )
+    return concatenate(parts)
+
+
+def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
+    stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
+    experiment = stored.experiment
+    problem = folder.parent.name if condition else folder.name
+    skipped = stored.statuses[stored.statuses["status"] == "skipped"]
+    if stored.runs.empty:
+        return _make_empty(skipped)
+    statistics = compute_statistics(stored)
+    curves = statistics.curves
+    statuses = stored.statuses.drop_duplicates("run").set_index("run")
+    status = statuses.reindex(curves.keys["run"])
+    keys = curves.keys
+    cells = [name_cell(problem, str(kind), condition, experiment) for kind in keys["range"]]
+    runs = pd.DataFrame(
+        {
+            "cell": cells,
+            "tuner": keys["tuner"].astype(str),
+            "target": keys["target"].astype(str),
+            "seed": keys["seed"],
+            "simulations": curves.used,
+            "seconds": status["seconds"].to_numpy(),
+            "failed": curves.failed,
+        }
+    )
+    errors = curves.values.copy()
+    # A run that used up a smaller budget says nothing about more simulations.
+    ended = (status["status"] == "done").to_numpy() & (curves.used < experiment.budget)
+    later = np.arange(errors.shape[1]) > curves.used[:, None]
+    errors[ended[:, None] & later] = np.nan
+    errors[curves.failed] = np.inf
+    parameter_count = _count_parameters(experiment)
+    described = [
+        (
+            cell,
+            problem,
+            condition or str(kind),
+            parameter_count,
+            ";".join(experiment.tags),
+            experiment.negligible_error,
+            statistics.metric,
+            experiment.title,
+            experiment.says,
+            experiment.identifiable,
+            experiment.suite,
+        )
+        for cell, kind in dict(zip(cells, keys["range"], strict=True)).items()
+    ]
+    training = pd.DataFrame(
+        [
+            (cell, tuner, *cost)
+            for cell in dict.fromkeys(cells)
+            for tuner, cost in stored.costs.items()
+        ],
+        columns=TRAINING_COLUMNS,
+    )
+    reasons = skipped[SKIPPED_COLUMNS].drop_duplicates("tuner")
+    return SuiteRuns(runs, errors, pd.DataFrame(described, columns=CELL_COLUMNS), training, reasons)
+
+
+def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -> str:
+    """Return the name of a cell: the problem, and what distinguishes it from its other cells."""
+    if condition:
+        return f"{problem} {condition}"
+    return f"{problem} {kind}" if len(experiment.ranges) > 1 else problem
+
+
+def _count_parameters(experiment: Experiment) -> int:
+    """Return the number of tuned parameters."""
+    from bench.benchmark.problem.tuning_problem import TuningProblem
+
+    problem = TuningProblem(experiment)
+    problem.close()
+    return problem.cube.dim
+
+
+def _make_empty(skipped: pd.DataFrame) -> SuiteRuns:
+    return SuiteRuns(
+        pd.DataFrame(columns=RUN_COLUMNS),
+        np.empty((0, 1)),
+        pd.DataFrame(columns=CELL_COLUMNS),
+        pd.DataFrame(columns=TRAINING_COLUMNS),
+        skipped[SKIPPED_COLUMNS],
+    )
+
+
+def concatenate(parts: Sequence[SuiteRuns]) -> SuiteRuns:
+    """Concatenate runs; of several rows for one cell, training or skipped tuner the first stays."""
+    width = max(part.errors.shape[1] for part in parts)
+    errors = np.concatenate(
+        [
+            np.pad(part.errors, ((0, 0), (0, width - part.errors.shape[1])), constant_values=np.nan)
+            for part in parts
+        ]
+    )
+    skipped = pd.concat([part.skipped for part in parts]).drop_duplicates("tuner")
+    runs = pd.concat([part.runs for part in parts], ignore_index=True)
+    return SuiteRuns(
+        runs,
+        errors,
+        pd.concat([part.cells for part in parts]).drop_duplicates("cell").reset_index(drop=True),
+        pd.concat([part.training for part in parts])
+        .drop_duplicates(["cell", "tuner"])
+        .reset_index(drop=True),
+        skipped[~skipped["tuner"].isin(runs["tuner"])].reset_index(drop=True),
+    )
+
+
+def merge_runs(own: SuiteRuns, stored: SuiteRuns) -> SuiteRuns:
+    """Add stored runs of other tuners to own runs, in the cells and on the targets of both.
+
+    Own runs in cells of which no target is stored are left out, unless nothing is in common.
+
+    Args:
+        own: runs of one or more tuners.
+        stored: runs of any tuners; those of a tuner that `own` has in the same cell are left out.
+    """
+    own_places, stored_places = (
+        pd.MultiIndex.from_frame(part.runs[["cell", "target"]]) for part in (own, stored)
+    )
+    common = own_places.isin(stored_places)
+    if not common.any():
+        return own
+    present = pd.MultiIndex.from_frame(own.runs[["cell", "tuner"]])
+    added = stored_places.isin(own_places)
+    added &= ~pd.MultiIndex.from_frame(stored.runs[["cell", "tuner"]]).isin(present)
+    return concatenate(
+        [
+            own.select(pd.Series(common, index=own.runs.index)),
+            stored.select(pd.Series(added, index=stored.runs.index)),
+        ]
+    )
+
+
+def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
+    """Write runs in the stored form; errors are rounded to four significant digits.
+
+    Args:
+        suite: runs.
+        folder: existing folder.
+
+    Returns:
+        Written files.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    columns = {f"{_ERROR_PREFIX}{k}": _round(suite.errors[:, k]) for k in range(suite.budget + 1)}
+    frame = pd.concat([suite.runs, pd.DataFrame(columns)], axis=1)
+    table = pa.Table.from_pandas(frame, preserve_index=False)
+    with atomic_replacement(folder / CURVES_FILE) as path:
+        parquet.write_table(table, path, compression="zstd", compression_level=15)
+    texts = {CELLS_FILE: suite.cells, TRAINING_FILE: suite.training, SKIPPED_FILE: suite.skipped}
+    for name, table_frame in texts.items():
+        write_atomically(folder / name, table_frame.to_csv(index=False))
+    return [folder / name for name in (CURVES_FILE, *texts)]
+
+
+def _round(values: Array) -> NDArray[np.float32]:
+    """Round to `_STORED_DIGITS` significant digits, which compress well."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.floor(np.log10(np.abs(values)))
+    scale = 10.0 ** (_STORED_DIGITS - 1 - np.where(np.isfinite(size), size, 0.0))
+    rounded = np.where(np.isfinite(values), np.round(values * scale) / scale, values)
+    return rounded.astype(np.float32)
+
+
+def read_suite_runs(folder: Path) -> SuiteRuns:
+    """Read runs in the stored form.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    from pyarrow import ArrowException, parquet
+
+    try:
+        frame = parquet.read_table(folder / CURVES_FILE).to_pandas()
+        cells, training, skipped = (
+            pd.read_csv(folder / name, keep_default_na=False)
+            for name in (CELLS_FILE, TRAINING_FILE, SKIPPED_FILE)
+        )
+        names = [name for name in frame if str(name).startswith(_ERROR_PREFIX)]
+        errors = frame[names].to_numpy(dtype=np.float64)
+        return SuiteRuns(
+            frame[RUN_COLUMNS],
+            errors,
+            cells[CELL_COLUMNS],
+            training[TRAINING_COLUMNS],
+            skipped[SKIPPED_COLUMNS],
+        )
+    except (OSError, ArrowException, KeyError, ValueError) as error:
+        raise InputError(
+            f"{folder}: expected the stored runs of a suite ({CURVES_FILE}, {CELLS_FILE}), found "
+            f"{str(error).splitlines()[0]:.200}; run simgap plot {folder} to write them again"
+        ) from None

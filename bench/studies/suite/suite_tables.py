@@ -1,0 +1,365 @@
+"""Statistics of a benchmark suite over its cells: errors, running times, ranks, tests and profiles.
+
+Sources: J. Demsar, Statistical comparisons of classifiers over multiple data sets, JMLR 7, 2006,
+for ranks and signed-rank tests over problems; S. Holm, Scand. J. Statist. 6, 1979; N. Hansen et
+al., Anytime performance assessment in blackbox optimization benchmarking, IEEE TEVC 26(6), 2022,
+for expected running times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from bench.benchmark.statistics.error_curves import RunCurves
+from bench.benchmark.statistics.expected_running_time import (
+    compute_effort,
+    compute_percentile_interval,
+    draw_target_resamples,
+)
+from bench.benchmark.statistics.paired_tests import (
+    compare_pair,
+    compute_log_errors,
+    correct_holm,
+)
+from bench.core.random_streams import make_rng
+from bench.studies.suite.suite_runs import SuiteRuns
+from sims.core.simulator import Array
+
+CHECKPOINTS = (1, 3, 10, 30, 100)
+"""Numbers of simulations after which tuners are compared."""
+ERROR_LEVELS = (0.1, 0.01, 0.001)
+"""Error levels of expected running times, in widths of the training range."""
+MEASURED_LEVELS = (2.0, 1.1, 1.01)
+"""Error levels for measured data, as multiples of the smallest median error of any tuner."""
+TARGETS_SHARING_TRAINING = 10
+"""Number of targets that share one training when its cost is counted."""
+_RESAMPLES = 2000
+"""Number of bootstrap resamples of cells."""
+ERROR_COLUMNS = ["cell", "tuner", "simulations", "median_error", "rank", "targets", "failures"]
+RANK_COLUMNS = ["training", "simulations", "tuner", "mean_rank", "low", "high", "cells"]
+PAIR_COLUMNS = [
+    "training",
+    "simulations",
+    "best",
+    "tuner",
+    "cells",
+    "best_better",
+    "error_ratio",
+    "p_value",
+    "p_holm",
+]
+ERT_COLUMNS = [
+    "cell",
+    "tuner",
+    "level",
+    "threshold",
+    "ert",
+    "low",
+    "high",
+    "ert_with_training",
+    "successes",
+    "runs",
+]
+PROFILE_COLUMNS = ["property", "value", "simulations", "tuner", "mean_rank", "cells"]
+FREE, COUNTED = "free", "counted"
+"""Whether the cost of training is counted."""
+
+
+@dataclass(frozen=True)
+class SuiteTables:
+    """Tables of a suite, each computed once.
+
+    Attributes:
+        suite: runs.
+    """
+
+    suite: SuiteRuns
+
+    @cached_property
+    def curves(self) -> dict[str, RunCurves]:
+        """Error curves of each cell."""
+        runs, result = self.suite.runs, {}
+        for cell in self.suite.cells["cell"]:
+            rows = (runs["cell"] == cell).to_numpy()
+            keys = runs[rows].reset_index(drop=True)
+            result[str(cell)] = RunCurves(
+                keys,
+                self.suite.errors[rows],
+                keys["simulations"].to_numpy(dtype=np.int64),
+                keys["failed"].to_numpy(dtype=bool),
+            )
+        return result
+
+    @cached_property
+    def floors(self) -> dict[str, float]:
+        """Error of each cell below which tuners count as equal."""
+        floors = {}
+        for row in self.suite.cells.itertuples():
+            floor = float(row.negligible_error)  # type: ignore[arg-type]
+            smallest = self._find_smallest_error(str(row.cell))
+            measured = row.range == "real"
+            floors[str(row.cell)] = (1.0 + floor) * smallest if measured else floor
+        return floors
+
+    def _find_smallest_error(self, cell: str) -> float:
+        """Return the smallest median error of any tuner after all simulations."""
+        curves = self.curves[cell]
+        with np.errstate(invalid="ignore"):
+            medians = [
+                np.median(curves.select(tuner=tuner).values[:, -1])
+                for tuner in curves.list_tuners()
+            ]
+        return min((float(m) for m in medians if np.isfinite(m)), default=0.0)
+
+    @cached_property
+    def checkpoints(self) -> tuple[int, ...]:
+        """Numbers of simulations after which tuners are compared, within the budget."""
+        return tuple(k for k in CHECKPOINTS if k <= self.suite.budget)
+
+    def compute_log_errors(self, cell: str, k: int, training: str = FREE) -> pd.DataFrame:
+        """Compute logarithms of errors after k simulations: a row per target, a column per tuner.
+
+        With training counted, a trained tuner has k less its share of the training simulations, and
+        no advance over the start before that.
+
+        Args:
+            cell: name of the cell.
+            k: number of simulations.
+            training: `FREE` or `COUNTED`.
+        """
+        curves, columns = self.curves[cell], {}
+        for tuner in curves.list_tuners():
+            mine = curves.select(tuner=tuner)
+            share = self._share_of_training(cell, tuner) if training == COUNTED else 0.0
+            column = mine.values[:, max(int(k - share), 0)]
+            means = pd.Series(column).groupby(mine.keys["target"]).mean()
+            means_array: Array = np.asarray(means, dtype=np.float64)
+            logs = compute_log_errors(means_array, self.floors[cell])
+            columns[tuner] = pd.Series(logs, index=means.index)
+        return pd.DataFrame(columns)
+
+    def _share_of_training(self, cell: str, tuner: str) -> float:
+        """Return a target's share of the training simulations of a tuner; 0 without training."""
+        return self._fit_simulations.get((cell, tuner), 0.0) / TARGETS_SHARING_TRAINING
+
+    @cached_property
+    def _fit_simulations(self) -> Mapping[tuple[str, str], float]:
+        rows = self.suite.training.itertuples()
+        return {(str(r.cell), str(r.tuner)): float(r.fit_simulations) for r in rows}  # type: ignore[arg-type]
+
+    def get_trained_tuners(self) -> set[str]:
+        """Return the tuners that need training simulations."""
+        return {tuner for (_, tuner), cost in self._fit_simulations.items() if cost > 0}
+
+    @cached_property
+    def _medians(self) -> dict[tuple[str, int], pd.DataFrame]:
+        """Median log errors: a row per cell, a column per tuner, by training and simulations."""
+        result = {}
+        for training in (FREE, COUNTED):
+            for k in self.checkpoints:
+                rows = {
+                    cell: _median_over_targets(self.compute_log_errors(cell, k, training))
+                    for cell in self.curves
+                }
+                frame = pd.DataFrame(rows).T
+                result[training, k] = frame[[t for t in self.suite.tuners if t in frame]]
+        return result
+
+    def get_medians(self, k: int, training: str = FREE) -> pd.DataFrame:
+        """Return median log errors after k simulations: a row per cell, a column per tuner."""
+        return self._medians[training, k]
+
+    def get_ranks(self, k: int, training: str = FREE) -> pd.DataFrame:
+        """Rank the tuners in each cell; 1 is best, NaN where a tuner has no such run."""
+        # Rounding gives errors that differ by the last bit the same rank.
+        return self.get_medians(k, training).round(9).rank(axis=1)
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """Median errors and ranks by cell, tuner and number of simulations."""
+        lines = []
+        for k in self.checkpoints:
+            ranks = self.get_ranks(k)
+            for cell, curves in self.curves.items():
+                for tuner in curves.list_tuners():
+                    mine = curves.select(tuner=tuner)
+                    with np.errstate(invalid="ignore"):
+                        median = float(np.median(mine.values[:, k]))
+                    counts = mine.keys["target"].nunique(), int(mine.failed.sum())
+                    lines.append((cell, tuner, k, median, ranks.at[cell, tuner], *counts))
+        return pd.DataFrame(lines, columns=ERROR_COLUMNS)
+
+    @cached_property
+    def complete_tuners(self) -> list[str]:
+        """Tuners with results in all cells at all checkpoints; only these are compared overall."""
+        present = [self.get_medians(k).notna().all(axis=0) for k in self.checkpoints]
+        return [t for t in self.suite.tuners if all(column.get(t, False) for column in present)]
+
+    @cached_property
+    def ranks(self) -> pd.DataFrame:
+        """Mean ranks over cells with 95 % bootstrap intervals, best first."""
+        lines = []
+        for training in (FREE, COUNTED):
+            for k in self.checkpoints:
+                ranks = self.get_medians(k, training)[self.complete_tuners].round(9).rank(axis=1)
+                if ranks.empty:
+                    continue
+                rng = make_rng("suite ranks", k)
+                picked = rng.integers(len(ranks), size=(_RESAMPLES, len(ranks)))
+                for tuner, mean in ranks.mean().sort_values(kind="stable").items():
+                    resampled = ranks[tuner].to_numpy()[picked].mean(axis=1)
+                    interval = compute_percentile_interval(resampled)
+                    lines.append((training, k, tuner, mean, *interval, len(ranks)))
+        return pd.DataFrame(lines, columns=RANK_COLUMNS)
+
+    def find_best(self, k: int, training: str = FREE, trained: bool = True) -> str:
+        """Return the tuner with the lowest mean rank after k simulations.
+
+        Args:
+            k: number of simulations.
+            training: `FREE` or `COUNTED`.
+            trained: whether tuners that need training are included.
+        """
+        rows = self.ranks
+        rows = rows[(rows["training"] == training) & (rows["simulations"] == k)]
+        if not trained:
+            rows = rows[~rows["tuner"].isin(self.get_trained_tuners())]
+        return str(rows["tuner"].iloc[0])
+
+    @cached_property
+    def pairs(self) -> pd.DataFrame:
+        """Test the best tuner against each other one, by signed ranks over cells (Holm)."""
+        lines = []
+        for training in (FREE, COUNTED):
+            for k in self.checkpoints:
+                medians = self.get_medians(k, training)[self.complete_tuners]
+                if medians.shape[1] < 2:
+                    continue
+                best = self.find_best(k, training)
+                others = [tuner for tuner in medians if tuner != best]
+                tests = {
+                    t: compare_pair(medians[best].to_numpy(), medians[t].to_numpy()) for t in others
+                }
+                corrected = correct_holm(np.array([tests[t].p_value for t in others]))
+                for tuner, p_holm in zip(others, corrected, strict=True):
+                    test = tests[tuner]
+                    values = test.targets, test.a_better, test.ratio, test.p_value, float(p_holm)
+                    lines.append((training, k, best, tuner, *values))
+        return pd.DataFrame(lines, columns=PAIR_COLUMNS)
+
+    @cached_property
+    def running_times(self) -> pd.DataFrame:
+        """Expected running times to three error levels, without and with the cost of training."""
+        lines = []
+        for row in self.suite.cells.itertuples():
+            cell = str(row.cell)
+            smallest = self._find_smallest_error(cell)
+            levels = (
+                [factor * smallest for factor in MEASURED_LEVELS]
+                if row.range == "real"
+                else list(ERROR_LEVELS)
+            )
+            for tuner in self.curves[cell].list_tuners():
+                curves = self.curves[cell].select(tuner=tuner)
+                share = self._share_of_training(cell, tuner)
+                for number, threshold in enumerate(levels, 1):
+                    lines.append(
+                        (cell, tuner, number, threshold, *self._measure(curves, threshold, share))
+                    )
+        return pd.DataFrame(lines, columns=ERT_COLUMNS)
+
+    def _measure(self, curves: RunCurves, threshold: float, share: float) -> tuple[float, ...]:
+        """Compute the ERT with its interval, the ERT with training, successes and runs."""
+        # Beyond the end of a smaller budget nothing is known.
+        known = ~np.isnan(curves.values).any(axis=1)
+        budget = self.suite.budget if known.all() else int(np.max(curves.used))
+        effort = compute_effort(curves, threshold, budget)
+        picked = draw_target_resamples(len(effort.successes), "suite")
+        low, high = compute_percentile_interval(effort.compute_ert(picked))
+        ert = float(effort.compute_ert())
+        return ert, low, high, ert + share, int(effort.successes.sum()), effort.runs
+
+    @cached_property
+    def profile(self) -> pd.DataFrame:
+        """Mean ranks by problem property: dimension, noise, range, misspecification and others."""
+        lines = []
+        groups = [
+            (name, value, cells) for name, value, cells in self.list_properties() if len(cells)
+        ]
+        for k in self.checkpoints:
+            ranks = self.get_medians(k)[self.complete_tuners].round(9).rank(axis=1)
+            for name, value, cells in groups:
+                for tuner, mean in ranks.loc[cells].mean().sort_values(kind="stable").items():
+                    lines.append((name, value, k, tuner, mean, len(cells)))
+        return pd.DataFrame(lines, columns=PROFILE_COLUMNS)
+
+    def list_properties(self) -> Iterator[tuple[str, str, list[str]]]:
+        """Yield each property of problems with one of its values, and the cells that have it."""
+        cells = self.suite.cells
+        tags = cells["tags"].str.split(";")
+        dimension = cells["parameters"].astype(int)
+        kind = cells["range"]
+
+        def pick(mask: pd.Series[bool]) -> list[str]:
+            return [str(cell) for cell in cells.loc[mask, "cell"]]
+
+        def tagged(tag: str) -> pd.Series[bool]:
+            return tags.map(lambda words: tag in words).astype(bool)
+
+        # Once explain has extended a simulator, nothing is missing any more.
+        misspecified = tagged("misspecified") & (kind != "after")
+        yield "parameters", "1", pick(dimension == 1)
+        yield "parameters", "2 or 3", pick((dimension > 1) & (dimension <= 3))
+        yield "parameters", "4 to 10", pick(dimension > 3)
+        for tag in ("noise-free", "low-noise", "noisy"):
+            yield "noise", tag, pick(tagged(tag))
+        yield "range", "in range", pick(kind.isin(["in", "before", "after"]))
+        yield "range", "wide", pick(kind == "wide")
+        yield "simulator", "complete", pick(~misspecified & (kind != "real"))
+        yield "simulator", "an effect is missing", pick(misspecified & (kind != "real"))
+        yield "data", "measured", pick(kind == "real")
+        yield "data", "robot from a model file", pick(tagged("robot"))
+
+    def find_losses(self, tuner: str, k: int, factor: float = 3.0) -> pd.DataFrame:
+        """Find the cells in which a tuner's error is larger than the best one's by a factor.
+
+        Args:
+            tuner: label of the tuner.
+            k: number of simulations.
+            factor: smallest ratio of the errors.
+
+        Returns:
+            Columns cell, winner and ratio; the largest ratio first.
+        """
+        medians = self.get_medians(k)
+        if tuner not in medians:
+            return pd.DataFrame(columns=["cell", "winner", "ratio"])
+        lines = []
+        smallest, winners = medians.min(axis=1), medians.idxmin(axis=1)
+        excess = medians[tuner] - smallest
+        for cell in medians.index[excess > np.log(factor)]:
+            ratio = float(np.exp(min(float(excess[cell]), 700.0)))
+            lines.append((str(cell), str(winners[cell]), ratio))
+        frame = pd.DataFrame(lines, columns=["cell", "winner", "ratio"])
+        return frame.sort_values("ratio", ascending=False, kind="stable", ignore_index=True)
+
+    def build_tables(self) -> dict[str, pd.DataFrame]:
+        """Return all tables by name."""
+        return {
+            "errors": self.errors,
+            "ranks": self.ranks,
+            "pairs": self.pairs,
+            "ert": self.running_times,
+            "profile": self.profile,
+        }
+
+
+def _median_over_targets(logs: pd.DataFrame) -> pd.Series[float]:
+    """Return the median of each tuner; NaN where a target has no value."""
+    values: Array = logs.to_numpy(dtype=np.float64)
+    return pd.Series(np.median(values, axis=0), index=logs.columns)

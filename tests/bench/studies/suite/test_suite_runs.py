@@ -1,0 +1,49 @@
+"""Stored runs of a suite, and their union with own runs."""
+
+import numpy as np
+import pytest
+
+from bench.studies.suite.suite_runs import (
+    CURVES_FILE,
+    merge_runs,
+    read_suite_runs,
+    write_suite_runs,
+)
+from sims.core.simulator import InputError
+from tests.bench.studies.suite.synthetic_suite import make_suite, power_law
+
+CURVE = power_law(0.123456789, 1.0)
+
+
+def test_stored_runs_come_back_with_four_digits(tmp_path):
+    failed = np.full(101, np.inf)
+    suite = make_suite({"a": {"one": CURVE, "two": failed}, "b": {"one": CURVE}})
+    write_suite_runs(suite, tmp_path)
+    again = read_suite_runs(tmp_path)
+    assert again.runs.to_dict("list") == suite.runs.to_dict("list")
+    assert again.errors == pytest.approx(suite.errors, rel=6e-4)
+    assert again.cells.astype(str).equals(suite.cells.astype(str))
+    assert again.version == "suite 1"
+
+
+def test_damaged_store_is_one_message(tmp_path):
+    (tmp_path / CURVES_FILE).write_bytes(b"nothing")
+    with pytest.raises(InputError, match="expected the stored runs of a suite"):
+        read_suite_runs(tmp_path)
+
+
+def test_own_runs_are_joined_by_the_others_on_common_targets():
+    own = make_suite({"a": {"mine": CURVE, "one": CURVE * 3}}, targets=6)
+    stored = make_suite({"a": {"one": CURVE, "two": CURVE}, "b": {"one": CURVE}}, targets=4)
+    merged = merge_runs(own, stored)
+    assert set(merged.cells["cell"]) == {"a"}
+    assert merged.tuners == ["mine", "one", "two"]
+    counts = merged.runs.groupby("tuner")["target"].nunique()
+    assert counts.to_dict() == {"mine": 4, "one": 4, "two": 4}
+    # The user's own run of a stored method is the one that counts.
+    assert merged.errors[(merged.runs["tuner"] == "one").to_numpy()][0, 1] == CURVE[1] * 3
+
+
+def test_runs_on_other_targets_stay_alone():
+    own = make_suite({"c": {"mine": CURVE}})
+    assert merge_runs(own, make_suite({"a": {"one": CURVE}})).tuners == ["mine"]

@@ -1,0 +1,145 @@
+"""Statistics, headline, guide and page of a suite on given error curves."""
+
+import numpy as np
+import pytest
+
+from bench.studies.suite.suite_guide import (
+    build_guide,
+    build_headline,
+    describe_losses,
+    describe_tests,
+    join_segments,
+)
+from bench.studies.suite.suite_page import render_suite_page
+from bench.studies.suite.suite_tables import COUNTED, FREE, SuiteTables
+from tests.bench.studies.suite.synthetic_suite import BUDGET, make_suite, power_law
+
+CELLS = [f"problem-{number}" for number in range(8)]
+EARLY, LATE = power_law(0.01, 0.1), power_law(0.5, 2.0)  # they cross after about 8 simulations
+NEVER = power_law(0.9, 0.01)
+
+
+def make_tables(names=("early", "late", "never"), training=None, **changes):
+    curves = dict(zip(names, (EARLY, LATE, NEVER), strict=True))
+    return SuiteTables(make_suite(dict.fromkeys(CELLS, curves), training=training, **changes))
+
+
+@pytest.mark.parametrize("names", [("early", "late", "never"), ("alpha", "beta", "gamma")])
+def test_headline_follows_from_the_ranks(names):
+    tables = make_tables(names)
+    assert build_headline(tables) == f"Use {names[0]} up to 3 simulations, then {names[1]}."
+    for k, best in ((1, names[0]), (3, names[0]), (10, names[1]), (100, names[1])):
+        rows = tables.ranks[(tables.ranks["simulations"] == k) & (tables.ranks["training"] == FREE)]
+        assert rows.iloc[0][["tuner", "mean_rank", "low", "high"]].tolist() == [best, 1, 1, 1]
+
+
+def test_headline_names_the_best_untrained_method_too():
+    tables = make_tables(training={"early": 400})
+    assert build_headline(tables) == (
+        "If you can train on your simulator beforehand, use early up to 3 simulations, then late. "
+        "Without training, use late."
+    )
+
+
+def test_joined_segments():
+    best = {1: "a", 3: "a", 10: "b", 30: "a"}
+    assert join_segments(list(best), best.get) == (
+        "a up to 3 simulations, b up to 10 simulations, then a"
+    )
+
+
+def test_counted_training_delays_a_trained_method():
+    tables = make_tables(training={"early": 200})  # 20 simulations for each of ten targets
+    free, counted = (tables.get_medians(30, training) for training in (FREE, COUNTED))
+    expected = np.median(np.log(EARLY[10] * (1 + 0.01 * np.arange(4))))
+    assert counted["early"].tolist() == pytest.approx([expected] * len(CELLS))
+    assert counted["late"].tolist() == free["late"].tolist()
+    before = tables.get_medians(10, COUNTED)["early"]
+    assert np.exp(before).tolist() == pytest.approx([np.sqrt(1.01 * 1.02)] * len(CELLS))
+
+
+def test_expected_running_time():
+    times = make_tables(targets=1).running_times
+    late = times[(times["cell"] == CELLS[0]) & (times["tuner"] == "late")]
+    # 0.5 / k^2 is below 0.1 from k = 3, below 0.01 from 8, below 0.001 from 23.
+    assert late["ert"].tolist() == [3, 8, 23]
+    assert late["successes"].tolist() == [1, 1, 1]
+    never = times[(times["cell"] == CELLS[0]) & (times["tuner"] == "never")]
+    assert np.isinf(never["ert"]).all()
+
+
+def test_best_against_each_other_by_holm():
+    rows = make_tables().pairs
+    last = rows[(rows["simulations"] == BUDGET) & (rows["training"] == FREE)]
+    assert set(last["best"]) == {"late"}
+    # Eight wins of eight: p = 2 / 2^8, times two comparisons.
+    assert last["p_holm"].tolist() == pytest.approx([2 / 128, 2 / 128])
+    assert last["best_better"].tolist() == [1, 1]
+    assert list(describe_tests(make_tables()))[-1] == (
+        "After 100: late is significantly better than 2 of 2 others."
+    )
+
+
+def test_guide_depends_on_the_property_of_the_problem():
+    few = {"early": EARLY, "late": LATE}
+    swapped = {"early": LATE, "late": EARLY}
+    noisy = CELLS[:3]
+    curves = {cell: swapped if cell in noisy else few for cell in CELLS}
+    cells = {cell: {"tags": "noisy"} for cell in noisy}
+    guide = build_guide(SuiteTables(make_suite(curves, cells=cells)))
+    last = guide[guide["simulations"] == BUDGET].set_index(["property", "value"])
+    assert last.at[("noise", "noisy"), "best"] == "early"
+    assert last.at[("noise", "low-noise"), "best"] == "late"
+    assert last.at[("all problems", ""), "best"] == "late"
+    assert last.at[("noise", "noisy"), "cells"] == 3
+
+
+def test_guide_follows_from_the_profile():
+    tables = make_tables(training={"early": 400})
+    profile = tables.profile
+    for row in build_guide(tables).itertuples():
+        if row.property != "all problems":
+            same = (profile["property"] == row.property) & (profile["value"] == row.value)
+            rows = profile[same & (profile["simulations"] == row.simulations)]
+            ranks = rows.set_index("tuner")["mean_rank"]
+            assert ranks[row.best] == ranks.min()
+            assert ranks[row.best_untrained] == ranks.drop("early").min()
+
+
+def test_losses_of_the_reference_methods():
+    curves = {cell: {"hybrid": LATE, "tunenet": NEVER, "random": LATE * 2} for cell in CELLS}
+    curves[CELLS[2]] = {"hybrid": LATE * 10, "tunenet": NEVER, "random": LATE}
+    lines = list(describe_losses(SuiteTables(make_suite(curves))))
+    assert (
+        lines[0] == f"hybrid loses in 1 of 8 cells after 10 simulations: {CELLS[2]} (random, 10×)."
+    )
+    assert lines[2].startswith("tunenet loses in 8 of 8 cells after 10 simulations: ")
+
+
+def test_failed_and_missing_runs_are_visible():
+    curves = {cell: {"early": EARLY, "late": LATE} for cell in CELLS}
+    curves[CELLS[0]]["broken"] = np.full(BUDGET + 1, np.inf)
+    short = np.where(np.arange(BUDGET + 1) > 30, np.nan, EARLY)
+    for cell in CELLS:
+        curves[cell]["short"] = short
+    tables = SuiteTables(make_suite(curves))
+    assert tables.complete_tuners == ["early", "late"]
+    assert tables.get_ranks(10).at[CELLS[0], "broken"] == 4
+    assert tables.get_ranks(100)["short"].isna().all()
+    assert tables.get_ranks(10)["short"].notna().all()
+    page = render_suite_page(tables)
+    assert 'class="rank-4 failed"' in page
+    assert (
+        f'<a href="#cell-{CELLS[0]}" title="broken on {CELLS[0]}: median error inf, 4 failed'
+        in page
+    )
+
+
+def test_every_cell_of_the_page_leads_to_its_curves():
+    tables = make_tables()
+    page = render_suite_page(tables)
+    assert build_headline(tables) in page
+    for cell in CELLS:
+        assert f'<div id="cell-{cell}">' in page
+        assert f'id="cell-{cell}-curves"' in page
+        assert page.count(f'href="#cell-{cell}"') >= 1 + 3 * 3
