@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -32,6 +33,7 @@ from bench.core.options import with_options
 from bench.core.plugin_registries import diagnosers
 from bench.core.plugin_registries import tuners as registered
 from bench.diagnosis_benchmark import table_columns as diagnosis
+from bench.diagnosis_benchmark.diagnosers import language_model
 from bench.figures.figure_files import pdf_figures
 from bench.misspecification.calibration import MODEL_LABELS
 from bench.studies import study
@@ -145,12 +147,23 @@ def build_experiment(
     Raises:
         InputError: The experiment, a tuner or a plugin does not exist or cannot be used.
     """
-    trust = options.trust or not options.jobs
+    # A command of the user's cannot run where processes are forbidden.
+    trust = options.trust or not options.jobs or options.model_command is not None
     source = resolve_experiment(experiment, options)
-    loaded = load_experiment_plugins(source, options.plugins, trust, options.isolation)
+    loaded = load_experiment_plugins(source, _list_plugin_files(options), trust, options.isolation)
     labels = None if options.tuners is None else [_label(tuner) for tuner in options.tuners]
+    if options.model_command is not None:
+        # Workers inherit the environment.
+        os.environ[language_model.COMMAND_VARIABLE] = options.model_command
+        labels = [*(labels or ()), language_model.LanguageModel.name]
     changes = {name: getattr(options, name) for name in _EXPERIMENT_OPTIONS}
     return _apply_changes(loaded, labels, options.seeds, changes)
+
+
+def _list_plugin_files(options: ComparisonOptions) -> list[str]:
+    """List the plugin files, with that of the language model if its command is given."""
+    files = [str(Path(plugin).resolve()) for plugin in options.plugins]
+    return files + ([str(language_model.__file__)] if options.model_command is not None else [])
 
 
 def begin_studies(chosen: Experiment, options: ComparisonOptions) -> list[study.Study]:
@@ -164,7 +177,7 @@ def begin_studies(chosen: Experiment, options: ComparisonOptions) -> list[study.
         InputError: They need more than this machine has, or the folder is not free.
     """
     folder = None if options.out is None else Path(options.out)
-    jobs, files = options.jobs, [str(Path(plugin).resolve()) for plugin in options.plugins]
+    jobs, files = options.jobs, _list_plugin_files(options)
     check_comparison_size(chosen, folder, jobs, options.cluster is not None, options.force)
     return study.begin_studies(chosen, files, folder, jobs, options.salt)
 

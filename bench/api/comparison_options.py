@@ -71,6 +71,8 @@ class ComparisonOptions(StudyOptions):
         isolation: `run` starts a new process for every run of a tuner, `tuner` one for all runs
             with the same seed (default: run).
         cluster: Address of a Dask scheduler to run on.
+        model_command: Command of a language model to compare with other diagnosers; it reads a
+            prompt, prints JSON as in verdict.json, and runs without isolation.
     """
 
     model: str | Path | None = None
@@ -85,3 +87,4 @@ class ComparisonOptions(StudyOptions):
     memory: Natural | None = option(None, "MIB")
     isolation: Name | None = option(None, "ISOLATION", choices=("run", "tuner"))
     cluster: str | None = option(None, "ADDRESS")
+    model_command: str | None = option(None, "COMMAND", flags=("--model-command", "--command"))

@@ -58,7 +58,7 @@ def collect_options(values: argparse.Namespace, options: type) -> dict[str, Any]
     given = {}
     for declared in fields(options):
         flags = declared.metadata.get("flags") or [declared.name]
-        value = getattr(values, flags[0].strip("-"), None)
+        value = getattr(values, flags[0].strip("-").replace("-", "_"), None)
         if value not in (None, ""):
             given[declared.name] = value
     return given

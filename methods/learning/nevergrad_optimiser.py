@@ -35,16 +35,11 @@ def tune_with_nevergrad(method: str, task: Task, rng: np.random.Generator) -> Tu
         box.set_bounds(0.0, 1.0)
         box.random_state.seed(int(rng.integers(2**31)))
         optimiser = nevergrad.optimizers.registry[method](box, budget=max(task.budget, 2))
+        candidate = box.spawn_child()
     evaluation = yield task.start
-    first = True
     while True:
         with isolated_library_call(rng):
-            if first:
-                candidate = box.spawn_child(new_value=box.value)
-            else:
-                candidate.loss_told = True
             loss = float(evaluation.losses[0])
             optimiser.tell(candidate, loss if np.isfinite(loss) else _FAILED_LOSS)
             candidate = optimiser.ask()
-        first = False
         evaluation = yield np.array(candidate.value, dtype=np.float64)

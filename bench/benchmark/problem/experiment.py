@@ -18,7 +18,11 @@ from typing import Any, TypedDict
 from bench.benchmark.problem import experiment_sweep
 from bench.benchmark.problem.recorded_runs import resolve_recording_path
 from bench.benchmark.problem.salt import check_commitment
-from bench.benchmark.problem.suite_version import check_problem_hash, compute_problem_hash
+from bench.benchmark.problem.suite_version import (
+    check_problem_hash,
+    compute_hash,
+    compute_problem_hash,
+)
 from bench.benchmark.problem.tuner_entries import TunerEntry, parse_entries
 from sims.core.simulator import InputError, make_unknown_name_error
 from sims.core.toml_validation import (
@@ -205,8 +209,8 @@ class Experiment:
             budgets, limits and tuners of this one.
         suite: name and version of the benchmark suite that the experiment belongs to; empty for
             none.
-        problem_hashes: hash by name of each of the `experiments` of a suite
-            (`problem.suite_version`); a changed problem is refused.
+        problem_hashes: hash by name of each of the `experiments` of a suite, or of the questions
+            of a comparison of diagnosers (`problem.suite_version`); a changed problem is refused.
         tuners: a list of registered names, and of tables with ``tuner`` and, where two entries have
             the same, a ``label``; or a table for each by its label.
     """
@@ -481,6 +485,10 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     _expanded(experiment, path)  # an error in a swept value is an error of this file
+    # The stored configuration of a result may select some of the questions.
+    if experiment.suite and experiment.diagnosis and experiment.problem_hashes:
+        found = compute_hash({k: document["diagnosis"].get(k) for k in ("seed", "questions")})
+        check_problem_hash(experiment.suite, experiment.problem_hashes, "questions", found)
     return experiment
 
 

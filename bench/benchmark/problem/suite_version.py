@@ -1,8 +1,8 @@
 """Version of a benchmark suite: a changed problem needs a new version.
 
 A suite is an experiment file that names its problems with their hashes. A hash covers everything in
-the problem's file that determines its results, and the files beside it to which it refers: model
-and recording. Words, and the numbers that the suite states for all its problems, are not hashed.
+the problem's file that determines its results, and the model and the recording in its folder.
+Words, and the numbers that the suite states for all its problems, are not hashed.
 """
 
 from __future__ import annotations
@@ -33,15 +33,23 @@ def compute_problem_hash(path: Path, ignored_keys: frozenset[str]) -> str:
     """
     tables = read_toml(path)
     definition = {key: value for key, value in tables.items() if key not in ignored_keys}
-    digest = hashlib.sha256(json.dumps(definition, sort_keys=True).encode())
-    for file in _list_referenced_files(path, tables):
-        # Line ends depend on the settings of a version-control system.
-        digest.update(file.read_bytes().replace(b"\r\n", b"\n"))
-    return digest.hexdigest()[:16]
+    # Line ends depend on the settings of a version-control system.
+    files = [f.read_bytes().replace(b"\r\n", b"\n") for f in _list_referenced_files(path, tables)]
+    return compute_hash(definition, *files)
+
+
+def compute_hash(tables: Mapping[str, Any], *contents: bytes) -> str:
+    """Compute the hash of tables and of the contents of files.
+
+    Returns:
+        First 16 hexadecimal digits of the SHA-256.
+    """
+    text = json.dumps(tables, sort_keys=True, default=list)
+    return hashlib.sha256(b"".join([text.encode(), *contents])).hexdigest()[:16]
 
 
 def _list_referenced_files(path: Path, tables: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield the model file and the recording, if they come with the project or are beside it."""
+    """Yield the model file and the recording, if they come with the project or the problem."""
     model = str(tables.get("model", ""))
     if model.startswith(_OWN_PACKAGE):
         yield Path(str(resources.files("bench").joinpath(model.removeprefix(_OWN_PACKAGE))))

@@ -6,8 +6,7 @@ the results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import groupby
+from collections.abc import Iterator, Sequence
 
 import pandas as pd
 
@@ -20,6 +19,8 @@ LOSS_FACTOR = 3.0
 """Ratio to the smallest error above which a method counts as losing."""
 REFERENCE_TUNERS = ("hybrid", "tunenet")
 """Methods of this project, whose losses the page lists."""
+RANK_TOLERANCE = 0.5
+"""Difference from the lowest mean rank up to which the headline keeps a method."""
 _SIGNIFICANCE = 0.05
 """Significance level of the tests against the best method."""
 
@@ -30,36 +31,52 @@ def build_headline(tables: SuiteTables) -> str:
     Args:
         tables: tables of the suite.
     """
-    trained = join_segments(tables.checkpoints, lambda k: tables.find_best(k))
-    untrained = join_segments(tables.checkpoints, lambda k: tables.find_best(k, trained=False))
-    if trained == untrained:
-        return f"Use {trained}."
+    ranks = tables.ranks[tables.ranks["training"] == FREE]
+    means = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
+    untrained = means[~means.index.isin(tables.get_trained_tuners())]
+    best = join_segments(choose_segments(means))
+    best_untrained = join_segments(choose_segments(untrained))
+    if best == best_untrained or untrained.empty:
+        return f"Use {best}."
     return (
-        f"If you can train on your simulator beforehand, use {trained}. "
-        f"Without training, use {untrained}."
+        f"If you can train on your simulator beforehand, use {best}. "
+        f"Without training, use {best_untrained}."
     )
 
 
-def join_segments(checkpoints: Sequence[int], choose: Callable[[int], str]) -> str:
+def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
+    """Choose as few methods as possible, each near the lowest mean rank at its checkpoints.
+
+    Args:
+        means: mean ranks, a row per tuner, a column per number of simulations.
+
+    Returns:
+        Methods, each with the last number of simulations for which it is chosen.
+    """
+    near = means <= means.min() + RANK_TOLERANCE
+    checkpoints, segments, start = list(means), [], 0
+    while start < len(checkpoints):
+        reach = near.iloc[:, start:].cumprod(axis=1).sum(axis=1)
+        longest = reach.index[reach == reach.max()]
+        stop = start + int(reach.max())
+        tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
+        segments.append((tuner, int(checkpoints[stop - 1])))
+        start = stop
+    return segments
+
+
+def join_segments(segments: Sequence[tuple[str, int]]) -> str:
     """Describe which method is best up to which number of simulations.
 
     Args:
-        checkpoints: numbers of simulations.
-        choose: best method after a number of simulations.
+        segments: methods, each with its last number of simulations.
 
     Returns:
         For example ``hybrid up to 30 simulations, then least_squares``.
     """
-    segments = [(name, list(ks)) for name, ks in groupby(checkpoints, key=choose)]
-    if len(segments) == 1:
-        return segments[0][0]
-    words = []
-    for number, (name, ks) in enumerate(segments):
-        if number == len(segments) - 1:
-            words.append(f"then {name}")
-        else:
-            words.append(f"{name} up to {ks[-1]} simulation{'' if ks[-1] == 1 else 's'}")
-    return ", ".join(words)
+    *first, (last, _) = segments
+    words = [f"{name} up to {k} simulation{'' if k == 1 else 's'}" for name, k in first]
+    return ", ".join([*words, f"then {last}" if words else last])
 
 
 def build_guide(tables: SuiteTables) -> pd.DataFrame:
@@ -104,6 +121,9 @@ def describe_tests(tables: SuiteTables) -> Iterator[str]:
         best = str(rows["best"].iloc[0])
         better = rows[(rows["p_holm"] < _SIGNIFICANCE) & (rows["best_better"] > 0.5)]
         undecided = [str(name) for name in rows["tuner"] if name not in set(better["tuner"])]
+        if better.empty:
+            yield f"After {k}: none of the {len(rows)} differences from {best} is significant."
+            continue
         text = f"After {k}: {best} is significantly better than {len(better)} of {len(rows)} others"
         yield text + (f"; not decided: {', '.join(undecided)}." if undecided else ".")
 

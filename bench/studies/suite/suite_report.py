@@ -28,12 +28,12 @@ _MAX_PRINTED_TUNERS = 30
 """Maximum number of tuners in the printed table."""
 
 
-def report_suite(folder: Path, say: PrintLine) -> SuiteTables:
+def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
     """Write and print the results of a suite, together with the stored runs of other methods.
 
     Args:
         folder: folder of the suite, with one subfolder per problem or with stored runs.
-        say: callback that prints one line.
+        print_line: callback that prints one line.
 
     Raises:
         InputError: there are no results.
@@ -50,8 +50,8 @@ def report_suite(folder: Path, say: PrintLine) -> SuiteTables:
     for name, frame in {**tables.build_tables(), "guide": build_guide(tables)}.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
     write_atomically(folder / REPORT_FILE, render_suite_page(tables, own.tuners))
-    _print_results(tables, own, say)
-    say(f"report  {folder / REPORT_FILE}")
+    _print_results(tables, own, print_line)
+    print_line(f"report  {folder / REPORT_FILE}")
     return tables
 
 
@@ -66,30 +66,30 @@ def find_stored_runs(version: str) -> SuiteRuns | None:
     return None
 
 
-def _print_results(tables: SuiteTables, own: SuiteRuns, say: PrintLine) -> None:
+def _print_results(tables: SuiteTables, own: SuiteRuns, print_line: PrintLine) -> None:
     """Print the headline, the mean ranks and the losses of the reference methods."""
     targets = own.runs.groupby("cell")["target"].nunique()
     added = [name for name in tables.suite.tuners if name not in own.tuners]
     count = (
         f"{targets.min()} to {targets.max()}" if targets.min() != targets.max() else targets.max()
     )
-    say(f"\n{own.version}: {len(tables.curves)} cells, {count} targets in each")
+    print_line(f"\n{own.version}: {len(tables.curves)} cells, {count} targets in each")
     if added:
-        say(f"stored results of {len(added)} other methods on the same targets are included")
+        print_line(f"stored results of {len(added)} other methods on the same targets are included")
     for row in tables.suite.skipped.itertuples():
-        say(f"skipped: {row.tuner}: {row.reason}")
+        print_line(f"skipped: {row.tuner}: {row.reason}")
     missing = [name for name in tables.suite.tuners if name not in tables.complete_tuners]
     if missing:
-        say(f"not ranked, because results are missing in some cells: {', '.join(missing)}")
+        print_line(f"not ranked, because results are missing in some cells: {', '.join(missing)}")
     if not tables.complete_tuners:
-        say("no method has results in all cells; there are no mean ranks")
+        print_line("no method has results in all cells; there are no mean ranks")
         return
-    say(f"\n{build_headline(tables)}")
+    print_line(f"\n{build_headline(tables)}")
     ranks = tables.ranks[tables.ranks["training"] == FREE]
     table = ranks.pivot(index="tuner", columns="simulations", values="mean_rank")
     table = table.sort_values(by=table.columns[-1]).head(_MAX_PRINTED_TUNERS).round(1)
-    say("\nmean rank after N simulations (1 is best)")
-    say(table.rename_axis(index=None, columns=None).to_string())
-    say("")
+    print_line("\nmean rank after N simulations (1 is best)")
+    print_line(table.rename_axis(index=None, columns=None).to_string())
+    print_line("")
     for line in describe_losses(tables):
-        say(line)
+        print_line(line)

@@ -67,7 +67,7 @@ ERT_COLUMNS = [
 ]
 PROFILE_COLUMNS = ["property", "value", "simulations", "tuner", "mean_rank", "cells"]
 FREE, COUNTED = "free", "counted"
-"""Whether the cost of training is counted."""
+"""Names of the two ways to count the cost of training: not at all, or shared by targets."""
 
 
 @dataclass(frozen=True)

@@ -219,7 +219,7 @@ def test_what_only_describes_enters_no_name_of_a_run_or_of_weights(spring):
 def test_every_shipped_experiment_has_tags():
     assert {tag for name in list_experiment_names() for tag in load_experiment(name).tags} == {
         "diagnosis", "misspecified", "other-engine", "published", "quick", "real", "robot",
-        "several-parameters", "video",
+        "several-parameters", "suite", "video",
     }  # fmt: skip
     assert all(load_experiment(name).tags for name in list_experiment_names())
 

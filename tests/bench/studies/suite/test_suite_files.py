@@ -164,3 +164,15 @@ def test_a_cell_comes_out_again_with_its_salt(tmp_path, small_suite, monkeypatch
     first, second = (read_suite_runs(tmp_path / str(number)) for number in range(2))
     assert np.array_equal(first.errors, second.errors, equal_nan=True)
     assert len(first.runs) == 2 * 3 * 2
+
+
+@pytest.mark.parametrize("name", ["diagnosis-small", "diagnosis-full", "diagnosis-machines"])
+def test_questions_for_diagnosers_have_a_version(name, tmp_path):
+    assert load_experiment(name).suite == "diagnosers 1"
+    text = (FOLDER / f"{name}.toml").read_text()
+    path = tmp_path / "board.toml"
+    path.write_text(text.replace('title = "', 'title = "My '))
+    assert load_experiment(str(path)).diagnosis == load_experiment(name).diagnosis
+    path.write_text(re.sub(r"(?m)^seed = \d+", "seed = 7", text))
+    with pytest.raises(InputError, match="problem questions has the hash"):
+        load_experiment(str(path))

@@ -1,11 +1,13 @@
 """Statistics, headline, guide and page of a suite on given error curves."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from bench.studies.suite.suite_guide import (
     build_guide,
     build_headline,
+    choose_segments,
     describe_losses,
     describe_tests,
     join_segments,
@@ -41,11 +43,17 @@ def test_headline_names_the_best_untrained_method_too():
     )
 
 
-def test_joined_segments():
-    best = {1: "a", 3: "a", 10: "b", 30: "a"}
-    assert join_segments(list(best), best.get) == (
-        "a up to 3 simulations, b up to 10 simulations, then a"
+def test_the_headline_does_not_change_method_for_a_small_difference():
+    means = pd.DataFrame(
+        {1: [1.2, 1.0, 3.0], 3: [1.0, 1.6, 3.0], 10: [1.4, 2.0, 1.0], 30: [2.0, 3.0, 1.0]},
+        index=["a", "b", "c"],
     )
+    assert choose_segments(means) == [("a", 10), ("c", 30)]
+    assert join_segments(choose_segments(means)) == "a up to 10 simulations, then c"
+    assert join_segments([("a", 1), ("b", 3), ("c", 30)]) == (
+        "a up to 1 simulation, b up to 3 simulations, then c"
+    )
+    assert join_segments([("a", 30)]) == "a"
 
 
 def test_counted_training_delays_a_trained_method():

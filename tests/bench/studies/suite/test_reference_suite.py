@@ -1,0 +1,47 @@
+"""The published results of the suite: headline, guide and pages follow from the stored runs."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from bench.benchmark.problem.experiment import load_experiment
+from bench.studies.suite.suite_guide import build_guide, build_headline, describe_losses
+from bench.studies.suite.suite_runs import read_suite_runs
+from bench.studies.suite.suite_tables import FREE, SuiteTables
+
+FOLDER = Path(__file__).parents[4] / "results" / "reference" / "suite"
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return SuiteTables(read_suite_runs(FOLDER))
+
+
+def test_stored_runs_are_of_this_version(tables):
+    experiment = load_experiment("suite")
+    assert tables.suite.version == experiment.suite
+    assert tables.suite.budget == experiment.budget
+    assert tables.suite.runs.groupby("cell")["target"].nunique().min() >= 2
+
+
+def test_tables_follow_from_the_runs(tables):
+    for name, frame in {**tables.build_tables(), "guide": build_guide(tables)}.items():
+        stored = pd.read_csv(FOLDER / f"{name}.csv", keep_default_na=False, na_values=["nan"])
+        assert len(stored) == len(frame), name
+        for column in frame.select_dtypes("number"):
+            expected = pd.to_numeric(stored[column], errors="coerce").to_numpy()
+            assert frame[column].to_numpy() == pytest.approx(expected, nan_ok=True), name
+
+
+def test_pages_state_the_headline_and_where_the_methods_lose(tables):
+    readme = (FOLDER / "README.md").read_text(encoding="utf-8")
+    page = (FOLDER / "report.html").read_text(encoding="utf-8")
+    for text in (readme, page):
+        assert build_headline(tables) in text
+        for line in describe_losses(tables):
+            assert line in text
+    ranks = tables.ranks[tables.ranks["training"] == FREE]
+    for row in ranks[ranks["simulations"] == 100].itertuples():
+        assert f"| `{row.tuner}` |" in readme
+        assert f"| {row.mean_rank:.1f} |" in readme
