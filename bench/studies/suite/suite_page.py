@@ -247,7 +247,7 @@ def _make_grid(page: HtmlPage, name: str, title: str, frame: pd.DataFrame, sort:
     """Show a table with all its columns; empty if the table is."""
     if frame.empty:
         return ""
-    page.add_table(name, frame, _DIGITS)
+    page.add_table(name, frame)
     columns = tuple(
         GridColumn(str(column), digits=_DIGITS if is_numeric_dtype(frame[column]) else 0)
         for column in frame

@@ -187,7 +187,7 @@ def test_interrupt_ends_cleanly_and_keeps_what_is_finished(experiment, tmp_path)
         (["compare", "none.toml"], "none.toml: no such file"),
         (
             ["compare", "ball-drop", "--tuners", "cma"],
-            "unknown tuner 'cma'; there are: bayes, cma_es",
+            "unknown tuner 'cma'; there are: bayes, bobyqa, cma_es",
         ),
         (["compare", "ball-drop", "--plugin", "none.py"], "none.py: no such file"),
         (["compare"], "expected an experiment (see `simgap list experiments`), or --resume DIR"),
