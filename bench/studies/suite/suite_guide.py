@@ -54,13 +54,14 @@ def choose_segments(means: pd.DataFrame) -> list[tuple[str, int]]:
         Methods, each with the last number of simulations for which it is chosen.
     """
     near = means <= means.min() + RANK_TOLERANCE
-    checkpoints, segments, start = list(means), [], 0
+    checkpoints = [int(str(k)) for k in means]
+    segments, start = [], 0
     while start < len(checkpoints):
         reach = near.iloc[:, start:].cumprod(axis=1).sum(axis=1)
         longest = reach.index[reach == reach.max()]
         stop = start + int(reach.max())
         tuner = str(means.loc[longest, checkpoints[start:stop]].mean(axis=1).idxmin())
-        segments.append((tuner, int(checkpoints[stop - 1])))
+        segments.append((tuner, checkpoints[stop - 1]))
         start = stop
     return segments
 

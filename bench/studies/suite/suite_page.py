@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from pandas.api.types import is_numeric_dtype
 
 from bench.figures.style import MarkStyle, get_mark_style
-from bench.pages.chart import Axis, Chart, Panel, Series
-from bench.pages.data_grid import DataGrid, GridColumn
+from bench.pages.chart import Axis, Panel, Series
 from bench.pages.html_page import HtmlPage
 from bench.studies.suite.suite_guide import (
     LOSS_FACTOR,
@@ -25,9 +23,7 @@ from bench.studies.suite.suite_guide import (
 )
 from bench.studies.suite.suite_tables import FREE, SuiteTables
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
+_TEMPLATE = Path(__file__).with_name("suite_page.html")
 _CURVE_POINTS = (0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 30, 40, 50, 65, 80, 100)
 """Numbers of simulations at which curves are drawn."""
 _GUIDE_CHECKPOINTS = (3, 10, 30, 100)
@@ -40,6 +36,8 @@ _AIM_TARGETS, _AIM_SEEDS = 30, 3
 """Numbers of targets and seeds that the suite aims at."""
 _DIGITS = 4
 """Significant digits of values in the page's tables."""
+_FILTERED_COLUMNS = ("training", "property", "value", "cell", "tuner", "simulations", "level")
+"""Columns by which the page's tables are filtered."""
 _STYLE = """
 table.suite-ranks { font-size: 0.8rem; }
 table.suite-ranks thead th { writing-mode: vertical-rl; transform: rotate(180deg); }
@@ -54,22 +52,31 @@ td.failed { outline: 2px solid #c00000; outline-offset: -2px; }
 """
 
 
-def render_suite_page(tables: SuiteTables, highlighted: Sequence[str] = ()) -> str:
+def render_suite_page(tables: SuiteTables) -> str:
     """Render the page as HTML.
 
     Args:
         tables: tables of the suite.
-        highlighted: tuners of the user's own run, which the curves show first.
     """
     suite = tables.suite
-    page = HtmlPage(f"{suite.version}: benchmark of tuners", "Made by simgap compare.", _STYLE)
+    page = HtmlPage(_STYLE)
+    frames = {
+        "ranks": tables.ranks,
+        "pairs": tables.pairs,
+        "ert": tables.running_times,
+        "profile": tables.profile,
+    }
+    shown = {name: frame for name, frame in frames.items() if len(frame)}
+    for name, frame in shown.items():
+        page.add_table(name, frame)
     order = _order_tuners(tables)
     styles = {name: get_mark_style(place) for place, name in enumerate(order)}
     targets = suite.runs.groupby("cell")["target"].nunique()
     seeds = int(suite.runs.groupby(["cell", "tuner", "target"])["seed"].nunique().max())
     trained = suite.training[suite.training["fit_simulations"] > 0]
     ranked = bool(tables.complete_tuners)
-    content = _load_template().render(
+    return page.render(
+        _TEMPLATE,
         version=suite.version,
         tuners=suite.tuners,
         problem_count=suite.cells["problem"].nunique(),
@@ -88,32 +95,16 @@ def render_suite_page(tables: SuiteTables, highlighted: Sequence[str] = ()) -> s
             if k in tables.checkpoints
         ],
         skipped=[f"{row.tuner}: {row.reason}" for row in suite.skipped.itertuples()],
-        rank_chart=_make_rank_chart(tables, page, styles) if ranked else "",
-        rank_grid=_make_grid(page, "ranks", "Mean ranks: ranks.csv", tables.ranks, "mean_rank"),
-        pair_grid=_make_grid(
-            page, "pairs", "Best method against each other: pairs.csv", tables.pairs, "p_holm"
-        ),
-        ert_grid=_make_grid(
-            page, "ert", "Expected running times: ert.csv", tables.running_times, "ert"
-        ),
-        profile_grid=_make_grid(
-            page, "profile", "Mean ranks by property: profile.csv", tables.profile, "mean_rank"
-        ),
+        rank_panel=_make_rank_panel(tables, page, styles) if ranked else None,
+        columns={name: _list_columns(frame) for name, frame in shown.items()},
+        filters={
+            name: tuple(column for column in _FILTERED_COLUMNS if column in frame)
+            for name, frame in shown.items()
+        },
         budget=suite.budget,
         fit_simulations=_join_range(trained["fit_simulations"].astype(int)),
         is_small=targets.min() < _AIM_TARGETS or seeds < _AIM_SEEDS,
-        highlighted=highlighted,
     )
-    page.append(content)
-    return page.to_html()
-
-
-@cache
-def _load_template() -> Template:
-    from jinja2 import Environment
-
-    text = Path(__file__).with_name("suite_page.html").read_text(encoding="utf-8")
-    return Environment(autoescape=True).from_string(text)
 
 
 def _join_range(values: pd.Series[Any]) -> str:
@@ -180,7 +171,7 @@ def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[
 def _build_cells(
     tables: SuiteTables, page: HtmlPage, styles: dict[str, MarkStyle]
 ) -> list[dict[str, Any]]:
-    """Build name, description and chart of each cell."""
+    """Build name, description and panel of each cell."""
     points = [k for k in _CURVE_POINTS if k <= tables.suite.budget]
     parts = []
     for cell, curves in tables.curves.items():
@@ -207,9 +198,6 @@ def _build_cells(
         unit = "held-out RMSE" if row.range == "real" else "error [training widths]"
         panel = Panel(cell, "curves", "simulations", series, across, Axis(f"{unit}, median", "log"))
         anchor = _make_anchor(cell)
-        chart = Chart(
-            f"{anchor}-curves", "Error against simulations", "Median over targets.", (panel,)
-        )
         cells.append(
             {
                 "name": cell,
@@ -217,52 +205,28 @@ def _build_cells(
                 "title": row.title,
                 "tests": row.tests,
                 "identifiable": row.identifiable,
-                "chart": _mark_safe(page.render_chart(chart)),
+                "panel": panel,
             }
         )
     return cells
 
 
-def _make_rank_chart(tables: SuiteTables, page: HtmlPage, styles: dict[str, MarkStyle]) -> Any:
-    """Draw mean ranks against the number of simulations."""
+def _make_rank_panel(tables: SuiteTables, page: HtmlPage, styles: dict[str, MarkStyle]) -> Panel:
+    """Make the panel of mean ranks against the number of simulations."""
     page.add_table("mean-ranks", tables.ranks[tables.ranks["training"] == FREE], _DIGITS)
     series = tuple(
-        Series(name, "mean_rank", style, {"tuner": name}, "low", "high")
+        Series(name, "mean_rank", style, {"tuner": name})
         for name, style in styles.items()
         if name in tables.complete_tuners
     )
     ticks = tuple(float(k) for k in tables.checkpoints)
     across = Axis("simulations used on the target", "log", ("log", "linear"), ticks)
-    panel = Panel(
-        "Mean rank over all cells", "mean-ranks", "simulations", series, across,
-        Axis("mean rank, 1 is best", scales=("linear",)),
-    )  # fmt: skip
-    caption = "The band is the 95 % bootstrap interval over cells. Training is not counted."
-    return _mark_safe(
-        page.render_chart(Chart("mean-rank", "Mean rank against simulations", caption, (panel,)))
-    )
+    up = Axis("mean rank, 1 is best", scales=("linear",))
+    return Panel("Mean rank over all cells", "mean-ranks", "simulations", series, across, up)
 
 
-def _make_grid(page: HtmlPage, name: str, title: str, frame: pd.DataFrame, sort: str) -> Any:
-    """Show a table with all its columns; empty if the table is."""
-    if frame.empty:
-        return ""
-    page.add_table(name, frame)
-    columns = tuple(
-        GridColumn(str(column), digits=_DIGITS if is_numeric_dtype(frame[column]) else 0)
-        for column in frame
-    )
-    filters = tuple(
-        column
-        for column in ("training", "property", "value", "cell", "tuner", "simulations", "level")
-        if column in frame
-    )
-    return _mark_safe(
-        page.render_grid(DataGrid(f"{name}-grid", title, name, columns, filters, {}, sort))
-    )
-
-
-def _mark_safe(html: str) -> Any:
-    from markupsafe import Markup
-
-    return Markup(html)
+def _list_columns(frame: pd.DataFrame) -> list[tuple[str, str, int]]:
+    """Return name, heading and significant digits of each column; 0 digits for text."""
+    return [
+        (str(column), "", _DIGITS if is_numeric_dtype(frame[column]) else 0) for column in frame
+    ]

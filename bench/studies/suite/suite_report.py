@@ -49,7 +49,7 @@ def report_suite(folder: Path, print_line: PrintLine) -> SuiteTables:
     tables = SuiteTables(suite)
     for name, frame in {**tables.build_tables(), "guide": build_guide(tables)}.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
-    write_atomically(folder / REPORT_FILE, render_suite_page(tables, own.tuners))
+    write_atomically(folder / REPORT_FILE, render_suite_page(tables))
     _print_results(tables, own, print_line)
     print_line(f"report  {folder / REPORT_FILE}")
     return tables
