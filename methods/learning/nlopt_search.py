@@ -17,7 +17,7 @@ def minimise_with_nlopt(
     initial_step: float | None = None,
     failed_loss: float = np.inf,
 ) -> str:
-    """Run an algorithm from the task's start until it converges; return the reason.
+    """Run an algorithm from the task's start until it converges; return what it reached.
 
     Args:
         algorithm: nlopt's name of it.
@@ -45,5 +45,5 @@ def minimise_with_nlopt(
         optimiser.optimize(task.start)
     except nlopt.RoundoffLimited:
         # With a tolerance of 0 this is the usual end, and not an error.
-        return "nlopt reached the limit of rounding"
-    return "nlopt reached its tolerance"
+        return "reached the limit of rounding"
+    return "reached its tolerance"

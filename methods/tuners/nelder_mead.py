@@ -43,6 +43,6 @@ class NelderMead(Tuner):
         return from_callback(lambda loss: self._minimise(task, loss))
 
     def _minimise(self, task: Task, loss: Callable[[Array], float]) -> str:
-        return minimise_with_nlopt(
-            "LN_NELDERMEAD", loss, task, self.step_tolerance, self.initial_step
-        )
+        step = self.initial_step
+        reached = minimise_with_nlopt("LN_NELDERMEAD", loss, task, self.step_tolerance, step)
+        return f"the simplex {reached}"
