@@ -83,9 +83,8 @@ check: $(STAMP)
 	$(BIN)/python -m tests.language
 
 benchmark: $(STAMP)
-	$(BIN)/python -m tests.benchmarks.ball_with_drag
 	$(BIN)/python -m tests.benchmarks.harness_overhead
-	$(BIN)/python -m tests.benchmarks.engine_speed
+	$(BIN)/python -m tests.benchmarks.stepping_speed
 	$(BIN)/python -m tests.benchmarks.comparison_scaling
 	$(BIN)/python -m tests.benchmarks.peer_libraries
 	$(BIN)/python -m tests.benchmarks.isolation_overhead
