@@ -107,7 +107,7 @@ def write_report(study: ReportableDiagnosisStudy, say: Callable[[str], None]) ->
     for line in format_summary(tables, order):
         say(line)
     for name, reason, count in summarise_unsupported(left_out):
-        say(f"{name} cannot be asked {count} of these: {reason}")
+        say(f"{name} does not support {count} of the questions: {reason}")
     asked, planned = rows["question"].nunique(), len(study.cases)
     hopeless = sum(not one["item"] for one in study.answers.values())
     say(f"{asked} questions of {planned}; of {hopeless} the sensors cannot show what is hidden")

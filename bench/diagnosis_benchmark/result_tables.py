@@ -9,11 +9,13 @@ together by Holm's method (Scand. J. Stat. 6, 65, 1979).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+
+from bench.benchmark.statistics.paired_tests import correct_holm
 
 MIN_GRADED_SIZE = 1.0
 """Minimum size of an effect that must be diagnosed, in units of the noise."""
@@ -21,19 +23,38 @@ P_VALUE_LEVELS = (0.01, 0.05, 0.1, 0.2, 0.5)
 """Significance levels at which p-values of clean recordings are counted."""
 REFERENCE_DIAGNOSER = "simgap"
 """Diagnoser with which all others are compared."""
-SET_SIZE_BINS = ((1, 1), (2, 2), (3, 4), (5, 10**6))
-"""Bins of set sizes, as inclusive (low, high)."""
-SET_SIZE_LABELS = ("1", "2", "3 to 4", "5 or more")
+SET_SIZE_BINS = {"1": (1, 1), "2": (2, 2), "3 to 4": (3, 4), "5 or more": (5, 10**6)}
+"""Bins of set sizes, as inclusive (low, high), by label."""
+SET_SIZE_LABELS = tuple(SET_SIZE_BINS)
 """Labels of the bins of set sizes."""
+CONDITIONS = ("system", "noise", "stated", "rate", "runs", "source", "driven")
+"""Recording conditions by which answers are counted."""
 
 PRIMARY_METRIC = "the same, up to equivalence"
 """Primary metric: cause named alone or in a set of at most two, equivalent effects counted once."""
 
+TableRow = dict[str, Any]
 RowFilter = Callable[[pd.DataFrame], pd.DataFrame]
 RowPredicate = Callable[[pd.DataFrame], "pd.Series[bool]"]
 
 
-def compute_share(hits: int, of: int, exact: bool = False) -> dict[str, Any]:
+class Metric(NamedTuple):
+    """Fraction of the selected answers for which a predicate holds.
+
+    Attributes:
+        name: name of the metric.
+        select: selects the answers that count.
+        predicate: returns whether each of them is a success.
+        is_exact: whether to use the Clopper-Pearson interval instead of Wilson's.
+    """
+
+    name: str
+    select: RowFilter
+    predicate: RowPredicate
+    is_exact: bool = False
+
+
+def compute_share(hits: int, of: int, exact: bool = False) -> TableRow:
     """Compute a fraction with its 95 % interval.
 
     Args:
@@ -53,6 +74,10 @@ def compute_share(hits: int, of: int, exact: bool = False) -> dict[str, Any]:
     return {"count": hits, "of": of, "share": hits / of, **ends}
 
 
+def _share_of(successes: pd.Series[bool], exact: bool = False) -> TableRow:
+    return compute_share(int(successes.sum()), len(successes), exact)
+
+
 def select_single_effects(rows: pd.DataFrame) -> pd.DataFrame:
     """Select cases with one hidden effect that is large enough to be diagnosed."""
     return rows[(rows["kind"] == "single") & (rows["size"] >= MIN_GRADED_SIZE)]
@@ -63,101 +88,121 @@ def select_clean(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["kind"] == "clean"]
 
 
-def _within(rows: pd.DataFrame) -> pd.Series[bool]:
+def _select_foreign(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows[rows["kind"] == "foreign"]
+
+
+def _is_in_any_set(rows: pd.DataFrame) -> pd.Series[bool]:
     """Return whether the cause is in a named set of any size and no other cause is named."""
     return rows["outcome"].isin(("right", "set"))
 
 
-METRICS: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame], RowPredicate, bool], ...] = (
-    ("false alarms", select_clean, lambda rows: rows["alarm"], True),
-    ("named, alone", select_single_effects, lambda rows: rows["outcome"] == "right", False),
-    ("named, in a set of at most two", select_single_effects, lambda rows: rows["found"], False),
-    (PRIMARY_METRIC, select_single_effects, lambda rows: rows["found_class"], False),
-    ("named, in a set of any size", select_single_effects, _within, False),
-    ("something seen", select_single_effects, lambda rows: rows["alarm"], False),
-    ("pairs: both named", lambda r: r[r["kind"] == "double"], lambda r: r["found_class"], False),
-    (
-        "foreign causes: unknown or partial",
-        lambda rows: rows[rows["kind"] == "foreign"],
-        lambda rows: rows["outcome"] == "right",
-        False,
-    ),
-    ("without an answer", lambda rows: rows, lambda rows: rows["status"] != "done", True),
+def _is_right(rows: pd.DataFrame) -> pd.Series[bool]:
+    return rows["outcome"] == "right"
+
+
+def _is_named(rows: pd.DataFrame) -> pd.Series[bool]:
+    return rows["found_class"]
+
+
+def _is_alarm(rows: pd.DataFrame) -> pd.Series[bool]:
+    return rows["alarm"]
+
+
+METRICS = (
+    Metric("false alarms", select_clean, _is_alarm, is_exact=True),
+    Metric("named, alone", select_single_effects, _is_right),
+    Metric("named, in a set of at most two", select_single_effects, lambda rows: rows["found"]),
+    Metric(PRIMARY_METRIC, select_single_effects, _is_named),
+    Metric("named, in a set of any size", select_single_effects, _is_in_any_set),
+    Metric("something seen", select_single_effects, _is_alarm),
+    Metric("pairs: both named", lambda rows: rows[rows["kind"] == "double"], _is_named),
+    Metric("foreign causes: unknown or partial", _select_foreign, _is_right),
+    Metric("without an answer", lambda rows: rows, lambda rows: rows["status"] != "done", True),
 )
-"""Metrics: name, row filter, success predicate, and whether to use the Clopper-Pearson interval."""
+"""Metrics of the table of all metrics."""
+GROUPED_METRICS = (
+    (Metric("false alarms", select_clean, _is_alarm, is_exact=True), CONDITIONS),
+    (Metric("named", select_single_effects, _is_named), (*CONDITIONS, "hidden")),
+    (Metric("foreign", _select_foreign, _is_right), ("hidden", "system")),
+)
+"""Metrics that are counted by group, with the columns that define the groups."""
+PAIR_METRICS = (
+    Metric("named", select_single_effects, _is_named),
+    Metric("named, alone", select_single_effects, _is_right),
+    Metric("no false alarm", select_clean, lambda rows: ~rows["alarm"]),
+)
+"""Metrics by which each diagnoser is compared with simgap."""
 
 
-def build_metric_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Build the table of all metrics, one row per diagnoser and metric.
-
-    Args:
-        rows: one row per answer.
-        order: names of the diagnosers.
-    """
-    lines = []
-    for name in order:
-        own = rows[rows["diagnoser"] == name]
-        for metric, of, right, exact in METRICS:
-            part = of(own)
-            counted = compute_share(int(right(part).sum()), len(part), exact)
-            lines.append({"diagnoser": name, "metric": metric, **counted})
-        intervals = compute_share(int(own["holding"].sum()), int(own["intervals"].sum()))
-        lines.append({"diagnoser": name, "metric": "95 % intervals that hold", **intervals})
-    return pd.DataFrame(lines)
-
-
-def build_group_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Build the table of false alarms and diagnosed causes by recording condition and effect.
+def _by_diagnoser(
+    rows: pd.DataFrame,
+    order: Sequence[str],
+    list_lines: Callable[[pd.DataFrame], Iterator[TableRow]],
+) -> pd.DataFrame:
+    """Build a table from the lines of each diagnoser.
 
     Args:
         rows: one row per answer.
         order: names of the diagnosers.
+        list_lines: lists the lines of one diagnoser from its rows.
     """
-    lines = []
-    keys = ("system", "noise", "stated", "rate", "runs", "source", "driven")
-    asked: tuple[tuple[str, RowFilter, RowPredicate, tuple[str, ...], bool], ...] = (
-        ("false alarms", select_clean, lambda part: part["alarm"], keys, True),
-        (
-            "named",
-            select_single_effects,
-            lambda part: part["found_class"],
-            (*keys, "hidden"),
-            False,
-        ),
-        (
-            "foreign",
-            lambda part: part[part["kind"] == "foreign"],
-            lambda part: part["outcome"] == "right",
-            ("hidden", "system"),
-            False,
-        ),
-    )
-    for name in order:
-        own = rows[rows["diagnoser"] == name]
-        for metric, of, right, by, exact in asked:
-            for key in by:
-                for value, part in of(own).groupby(key):
-                    counted = compute_share(int(right(part).sum()), len(part), exact)
-                    place = {"diagnoser": name, "metric": metric, "by": key, "value": str(value)}
-                    lines.append({**place, **counted})
+    lines = [
+        {"diagnoser": name, **line}
+        for name in order
+        for line in list_lines(rows[rows["diagnoser"] == name])
+    ]
     return pd.DataFrame(lines)
 
 
-def build_power_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Build the table of diagnosed and detected single effects by size.
+def _list_metrics(own: pd.DataFrame) -> Iterator[TableRow]:
+    for metric in METRICS:
+        successes = metric.predicate(metric.select(own))
+        yield {"metric": metric.name, **_share_of(successes, metric.is_exact)}
+    intervals = compute_share(int(own["holding"].sum()), int(own["intervals"].sum()))
+    yield {"metric": "95 % intervals that hold", **intervals}
 
-    Args:
-        rows: one row per answer.
-        order: names of the diagnosers.
+
+def _list_groups(own: pd.DataFrame) -> Iterator[TableRow]:
+    for metric, columns in GROUPED_METRICS:
+        for column in columns:
+            for value, part in metric.select(own).groupby(column):
+                place = {"metric": metric.name, "by": column, "value": str(value)}
+                yield {**place, **_share_of(metric.predicate(part), metric.is_exact)}
+
+
+def _list_power(own: pd.DataFrame) -> Iterator[TableRow]:
+    for size, part in own[own["kind"] == "single"].groupby("size"):
+        for metric, successes in (("named", _is_named(part)), ("seen", _is_alarm(part))):
+            yield {"size": size, "metric": metric, **_share_of(successes)}
+
+
+def _list_calibration(own: pd.DataFrame) -> Iterator[TableRow]:
+    """List the fraction of clean recordings whose p-value is at most a level.
+
+    For a calibrated p-value this fraction equals the level.
     """
-    lines = []
-    for name in order:
-        own = rows[(rows["diagnoser"] == name) & (rows["kind"] == "single")]
-        for size, part in own.groupby("size"):
-            for metric, right in (("named", part["found_class"]), ("seen", part["alarm"])):
-                counted = compute_share(int(right.sum()), len(part))
-                lines.append({"diagnoser": name, "size": size, "metric": metric, **counted})
-    return pd.DataFrame(lines)
+    p_values = pd.to_numeric(select_clean(own)["p_value"]).dropna()
+    for level in P_VALUE_LEVELS if len(p_values) else ():
+        yield {"level": level, **_share_of(p_values <= level, exact=True)}
+
+
+def _list_set_sizes(own: pd.DataFrame) -> Iterator[TableRow]:
+    """List answers about single effects, and those that contain the truth, by largest set size."""
+    answered = select_single_effects(own)
+    for label, (low, high) in SET_SIZE_BINS.items():
+        part = answered[answered["largest_set"].between(low, high)]
+        yield {"largest_set": label, **_share_of(_is_in_any_set(part))}
+
+
+def _list_costs(own: pd.DataFrame) -> Iterator[TableRow]:
+    done = own[own["status"] == "done"]
+    line: TableRow = {"answers": len(done)}
+    for column in ("simulations", "processor_seconds", "seconds"):
+        values = pd.to_numeric(done[column]).dropna().to_numpy(dtype=float)
+        for name, quantile in (("median", 0.5), ("p95", 0.95)):
+            line[f"{column}_{name}"] = np.quantile(values, quantile) if values.size else np.nan
+    yield line
 
 
 def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
@@ -168,86 +213,18 @@ def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFr
         order: names of the diagnosers.
     """
     asked = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)].copy()
-    hidden = asked["hidden"].where(asked["kind"] == "single", "(" + asked["kind"] + ")")
-    asked["hidden"] = hidden
-    pairs_of = zip(asked["verdict"].astype(str), asked["named"].astype(str), strict=True)
-    asked["said"] = [_said(verdict, named) for verdict, named in pairs_of]
+    asked["hidden"] = asked["hidden"].where(asked["kind"] == "single", "(" + asked["kind"] + ")")
+    answers = zip(asked["verdict"].astype(str), asked["named"].astype(str), strict=True)
+    asked["said"] = [_leading_name(verdict, named) for verdict, named in answers]
     counted = asked.groupby(["diagnoser", "hidden", "said"]).size()
     counts: pd.DataFrame = counted.rename("count").reset_index()
     return counts
 
 
-def _said(verdict: str, named: str) -> str:
+def _leading_name(verdict: str, named: str) -> str:
     if verdict in ("", "adequate", "unknown", "unidentifiable") or not named:
         return f"({verdict or 'nothing'})"
     return "(several)" if " + " in named else named.partition("|")[0]
-
-
-def build_calibration_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Build the calibration table of p-values on clean recordings.
-
-    It gives the fraction of clean recordings whose p-value is at most a level; for a calibrated
-    p-value this fraction equals the level. Diagnosers without p-values are omitted.
-
-    Args:
-        rows: one row per answer.
-        order: names of the diagnosers.
-    """
-    lines = []
-    for name in order:
-        own = select_clean(rows[rows["diagnoser"] == name])
-        given = pd.to_numeric(own["p_value"]).dropna()
-        if given.empty:
-            continue
-        for level in P_VALUE_LEVELS:
-            counted = compute_share(int((given <= level).sum()), len(given), exact=True)
-            lines.append({"diagnoser": name, "level": level, **counted})
-    columns = ["diagnoser", "level", "count", "of", "share", "low", "high"]
-    return pd.DataFrame(lines, columns=columns)
-
-
-def build_set_size_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Count answers about single effects, and those that contain the truth, by largest set size.
-
-    Args:
-        rows: one row per answer.
-        order: names of the diagnosers.
-    """
-    lines = []
-    for name in order:
-        own = select_single_effects(rows[rows["diagnoser"] == name])
-        own = own[own["largest_set"] > 0]
-        for (low, high), said in zip(SET_SIZE_BINS, SET_SIZE_LABELS, strict=True):
-            part = own[own["largest_set"].between(low, high)]
-            counted = compute_share(int(_within(part).sum()), len(part))
-            lines.append({"diagnoser": name, "largest_set": said, **counted})
-    return pd.DataFrame(lines)
-
-
-def build_cost_table(
-    rows: pd.DataFrame, order: Sequence[str], training: Sequence[dict[str, str]]
-) -> pd.DataFrame:
-    """Build the table of costs per answer and of training costs.
-
-    Args:
-        rows: one row per answer.
-        order: names of the diagnosers.
-        training: rows of training.csv.
-    """
-    lines = []
-    for name in order:
-        own = rows[(rows["diagnoser"] == name) & (rows["status"] == "done")]
-        lessons = [lesson for lesson in training if lesson["diagnoser"] == name]
-        line: dict[str, Any] = {"diagnoser": name, "answers": len(own)}
-        for column in ("simulations", "processor_seconds", "seconds"):
-            values = pd.to_numeric(own[column]).dropna().to_numpy(dtype=float)
-            for what, quantile in (("median", 0.5), ("p95", 0.95)):
-                value = float(np.quantile(values, quantile)) if values.size else np.nan
-                line[f"{column}_{what}"] = value
-        line["training_simulations"] = sum(int(one["simulations"]) for one in lessons)
-        line["training_seconds"] = sum(float(one["seconds"]) for one in lessons)
-        lines.append(line)
-    return pd.DataFrame(lines)
 
 
 def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
@@ -257,39 +234,24 @@ def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
         rows: one row per answer.
         order: names of the diagnosers.
     """
-    asked: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame], RowPredicate], ...] = (
-        ("named", select_single_effects, lambda part: part["found_class"]),
-        ("named, alone", select_single_effects, lambda part: part["outcome"] == "right"),
-        ("no false alarm", select_clean, lambda part: ~part["alarm"]),
-    )
+    columns = ["metric", "diagnoser", "questions", "only_simgap", "only_other", "p_value"]
     lines = []
-    for metric, of, right in asked:
-        part = of(rows)
-        wide = part.assign(right=right(part)).pivot(
+    for metric in PAIR_METRICS:
+        part = metric.select(rows)
+        wide = part.assign(right=metric.predicate(part)).pivot(
             index="question", columns="diagnoser", values="right"
         )
-        for name in order:
-            if name == REFERENCE_DIAGNOSER or REFERENCE_DIAGNOSER not in wide or name not in wide:
-                continue
-            both = wide[[REFERENCE_DIAGNOSER, name]].dropna()
-            ours = int((both[REFERENCE_DIAGNOSER].astype(bool) & ~both[name].astype(bool)).sum())
-            theirs = int((~both[REFERENCE_DIAGNOSER].astype(bool) & both[name].astype(bool)).sum())
-            lines.append(
-                {
-                    "metric": metric,
-                    "diagnoser": name,
-                    "questions": len(both),
-                    "only_simgap": ours,
-                    "only_other": theirs,
-                    "p_value": compute_mcnemar_p_value(ours, theirs),
-                }
-            )
-    columns = ["metric", "diagnoser", "questions", "only_simgap", "only_other", "p_value"]
+        others = [name for name in order if name != REFERENCE_DIAGNOSER and name in wide]
+        for name in others if REFERENCE_DIAGNOSER in wide else ():
+            both = wide[[REFERENCE_DIAGNOSER, name]].dropna().astype(bool)
+            ours = int((both[REFERENCE_DIAGNOSER] & ~both[name]).sum())
+            theirs = int((~both[REFERENCE_DIAGNOSER] & both[name]).sum())
+            p_value = compute_mcnemar_p_value(ours, theirs)
+            lines.append((metric.name, name, len(both), ours, theirs, p_value))
     frame = pd.DataFrame(lines, columns=columns)
-    held = [
-        correct_holm(part["p_value"].tolist()) for _, part in frame.groupby("metric", sort=False)
-    ]
-    frame["p_holm"] = [value for part in held for value in part]
+    frame["p_holm"] = frame.groupby("metric")["p_value"].transform(
+        lambda p_values: correct_holm(p_values.to_numpy())
+    )
     return frame
 
 
@@ -302,23 +264,7 @@ def compute_mcnemar_p_value(ours: int, theirs: int) -> float:
     """
     from scipy.stats import binomtest
 
-    if not ours + theirs:
-        return 1.0
-    return float(binomtest(ours, ours + theirs).pvalue)
-
-
-def correct_holm(chances: Sequence[float]) -> list[float]:
-    """Correct p-values for multiple tests by Holm's method; the order is kept."""
-    order = np.argsort(chances, kind="stable")
-    corrected = np.ones(len(chances))
-    highest = 0.0
-    for rank, place in enumerate(order.tolist()):
-        highest = max(highest, min(1.0, (len(chances) - rank) * chances[place]))
-        corrected[place] = highest
-    return [float(value) for value in corrected]
-
-
-TableRow = dict[str, Any]
+    return float(binomtest(ours, ours + theirs).pvalue) if ours + theirs else 1.0
 
 
 def index_by_diagnoser(frame: pd.DataFrame, metric: str = "") -> dict[str, TableRow]:
@@ -341,10 +287,9 @@ def select_fully_answered_cases(rows: pd.DataFrame, order: Sequence[str]) -> pd.
         rows: one row per answer.
         order: names of the diagnosers.
     """
-    counts = rows.groupby("question")["diagnoser"].nunique()
-    whole = counts.index[counts == len(order)]
-    chosen: pd.DataFrame = rows[rows["question"].isin(whole)]
-    return chosen
+    counts = rows.groupby("question")["diagnoser"].transform("nunique")
+    selected: pd.DataFrame = rows[counts == len(order)]
+    return selected
 
 
 def build_all_tables(
@@ -357,13 +302,23 @@ def build_all_tables(
         order: names of the diagnosers.
         training: rows of training.csv.
     """
+    costs = _by_diagnoser(rows, order, _list_costs)
+    for column, kind in (("simulations", int), ("seconds", float)):
+        costs[f"training_{column}"] = [
+            sum(kind(lesson[column]) for lesson in training if lesson["diagnoser"] == name)
+            for name in order
+        ]
+    calibration = _by_diagnoser(rows, order, _list_calibration)
+    if calibration.empty:
+        names = ["diagnoser", "level", "count", "of", "share", "low", "high"]
+        calibration = pd.DataFrame(columns=names)
     return {
-        "table": build_metric_table(rows, order),
-        "groups": build_group_table(rows, order),
-        "power": build_power_table(rows, order),
+        "table": _by_diagnoser(rows, order, _list_metrics),
+        "groups": _by_diagnoser(rows, order, _list_groups),
+        "power": _by_diagnoser(rows, order, _list_power),
         "confusion": build_confusion_table(rows, order),
-        "calibration": build_calibration_table(rows, order),
-        "sets": build_set_size_table(rows, order),
-        "costs": build_cost_table(rows, order, training),
+        "calibration": calibration,
+        "sets": _by_diagnoser(rows, order, _list_set_sizes),
+        "costs": costs,
         "pairs": build_pair_table(rows, order),
     }

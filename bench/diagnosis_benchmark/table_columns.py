@@ -114,7 +114,7 @@ def build_leaderboard(table: pd.DataFrame) -> pd.DataFrame:
     """Build the leaderboard: one row per diagnoser and one column per metric.
 
     Args:
-        table: the table of all metrics, see `result_tables.build_metric_table`.
+        table: the table of all metrics, see `result_tables.METRICS`.
 
     Returns:
         Fractions; the diagnoser with the highest primary metric comes first.

@@ -153,11 +153,11 @@ def test_a_damaged_table_is_one_line(made, tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_who_cannot_be_asked_counts_nowhere(tmp_path, capsys):
+def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
     path, out = written(tmp_path, "fifteen", "declines"), tmp_path / "out"
     given = ["--plugin", str(PLUGIN), "--out", str(out), "--jobs", "0"]
     assert main(["compare", str(path), *given]) == 0
-    assert "declines cannot be asked 2 of these: it knows no sliders" in capsys.readouterr().out
+    assert "declines does not support 2 of the questions: it knows no sliders" in capsys.readouterr().out
     run = simgap.ComparisonResult(out)
     rows = run.runs.set_index("diagnoser")
     assert set(rows.loc["declines", "outcome"]) == {"skipped"}
@@ -166,7 +166,7 @@ def test_who_cannot_be_asked_counts_nowhere(tmp_path, capsys):
     assert counted["fifteen", "false alarms"] == 1
     assert "declines" not in set(run.tables["failures"]["diagnoser"])
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "declines cannot be asked 2 of the questions: it knows no sliders." in page
+    assert "declines does not support 2 of the questions: it knows no sliders." in page
 
 
 @pytest.mark.slow
