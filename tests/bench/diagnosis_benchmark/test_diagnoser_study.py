@@ -157,7 +157,10 @@ def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
     path, out = written(tmp_path, "fifteen", "declines"), tmp_path / "out"
     given = ["--plugin", str(PLUGIN), "--out", str(out), "--jobs", "0"]
     assert main(["compare", str(path), *given]) == 0
-    assert "declines does not support 2 of the questions: it knows no sliders" in capsys.readouterr().out
+    assert (
+        "declines does not support 2 of the questions: it knows no sliders"
+        in capsys.readouterr().out
+    )
     run = simgap.ComparisonResult(out)
     rows = run.runs.set_index("diagnoser")
     assert set(rows.loc["declines", "outcome"]) == {"skipped"}
