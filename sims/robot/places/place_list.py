@@ -35,14 +35,6 @@ MUJOCO_EFFECT_WORDS = {
 """MuJoCo's words for numbers of a model file, and the effects that change them."""
 
 
-MAX_PAYLOAD_DISTANCE = 2.0
-"""Maximum distance of a payload from the middle of its link along each axis, as a multiple of half
-the longest side of the link's box.
-
-A payload may stick out of the link that carries it.
-"""
-
-
 class EffectPlace(NamedTuple):
     """A place at which an effect may act.
 
@@ -60,8 +52,9 @@ class EffectPlace(NamedTuple):
         last: whether it is the last joint of its body.
         coupled: whether it is a joint whose drive may be coupled to the preceding joint.
         limits: for a body, lowest and highest coefficients by effect and coefficient. Offsets in
-            metres leave a centre of mass within the link, and a payload near it; both ends are zero
-            along an axis where an offset cannot be observed.
+            metres leave a centre of mass within the link. A payload may stick out of it: from the
+            middle of the link by the longest side of its box, or half the length of the robot's
+            longest link. Both ends are zero along an axis where an offset cannot be observed.
         mass: for a body, the mass in kg of all moving bodies.
         tilts: for a joint, the axes of its body's frame about which a tilt of its axis shows in the
             motion.
@@ -135,15 +128,17 @@ def list_places(
             )
         )
     mass = sum(body.mass for body in robot.bodies)
+    longest = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
     for body in robot.bodies:
         words = f"body {body.name}"
         box = reach(robot, body.name)
         axes = observable_axes(robot, body.name)
         ends = np.where(np.isin(range(3), axes)[:, None], box, 0.0).tolist()
         offsets = {axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)}
-        middle, half = box.mean(axis=1), MAX_PAYLOAD_DISTANCE * 0.5 * np.ptp(box, axis=1).max()
+        middle = box.mean(axis=1).tolist()
+        distance = max(float(np.ptp(box, axis=1).max()), 0.5 * longest)
         loads = {
-            axis: (middle[k] - half, middle[k] + half) if k in axes else (0.0, 0.0)
+            axis: (middle[k] - distance, middle[k] + distance) if k in axes else (0.0, 0.0)
             for k, axis in enumerate("xyz")
         }
         spot = EffectPlace(
