@@ -167,6 +167,23 @@ class Effect(ABC):
         """
         return c
 
+    def probe_points(self) -> Sequence[Array]:
+        """Return small coefficients (k,) whose changes of the motion add up (`combine`).
+
+        They replace the small change of each coefficient where the effect is not linear in them,
+        such as a mass at a position. By default, there are none.
+        """
+        return ()
+
+    def combine(self, points: Array, weights: Array) -> Array:
+        """Return the coefficients (k,) whose change is nearly a weighted sum of changes.
+
+        Args:
+            points: (n, k) coefficients of `probe_points`.
+            weights: (n,) multiple of each.
+        """
+        raise NotImplementedError
+
     @classmethod
     def fits(cls, system: System | type[System]) -> bool:
         """Return whether the system can have this effect."""

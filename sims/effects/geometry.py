@@ -14,9 +14,12 @@ The coefficients are differences or relative errors, so that zero is the number 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sims.core.effect import Coefficient, ModelValueEffect
+from sims.core.simulator import Array
 
 _CALIBRATION = (
     "J. M. Hollerbach, W. Khalil, M. Gautier, Model Identification, in Springer Handbook of "
@@ -28,6 +31,8 @@ _RADIANS = (None, "rad", "rad")
 _LENGTH = ("m", "m", "m")
 _OFFSET = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
 """Plausible distances of a payload from the centre of mass of its body, in metres."""
+_SMALL_MASS = 1e-4
+"""Mass whose change of the motion is linear in it, as a share of the largest plausible one."""
 _MASS = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
 """Plausible mass of a payload in kg."""
 
@@ -85,3 +90,33 @@ class PayloadMass(ModelValueEffect):
         Coefficient("mass", ("kg", "kg", "kg"), _MASS, least=0.0),
         *(Coefficient(axis, _LENGTH, _OFFSET) for axis in "xyz"),
     )
+
+    def probe_points(self) -> Sequence[Array]:
+        """Return a small mass at the middle of the link, and moved along each observable axis.
+
+        At a place, the plausible positions are those within the link.
+        """
+        ends = np.array([c.plausible[0] for c in self.coefficients])
+        middle = ends.mean(axis=1)
+        middle[0] = _SMALL_MASS * ends[0, 1]
+        moved = [k for k, c in enumerate(self.coefficients) if k and c.least != c.most]
+        middle[[k for k in range(1, len(middle)) if k not in moved]] = 0.0
+        points = [middle]
+        for k in moved:
+            point = middle.copy()
+            point[k] = 0.5 * (ends[k].mean() + ends[k, 1])
+            points.append(point)
+        return points
+
+    def combine(self, points: Array, weights: Array) -> Array:
+        """Return the sum of point masses (n, 4), at their centre of mass.
+
+        Args:
+            points: masses and positions.
+            weights: (n,) multiple of each mass.
+        """
+        masses = weights * points[:, 0]
+        total = float(masses.sum())
+        centre = masses @ points[:, 1:] / total if total > 0.0 else np.zeros(3)
+        result: Array = np.array([max(total, 0.0), *centre])
+        return result

@@ -178,7 +178,12 @@ def group_coefficients(
         group: columns of the effect.
         solution: regression coefficients of these columns.
     """
-    c = probes[group.column_indices[0]].coefficients.copy()
+    own, effect = [probes[i] for i in group.column_indices], world.available_effects[group.effect]
+    if effect.probe_points():
+        sizes = np.array([probe.coefficients[probe.place] for probe in own])
+        points = np.array([probe.coefficients for probe in own])
+        return clip_coefficients(world, group.effect, effect.combine(points, solution / sizes))
+    c = own[0].coefficients.copy()
     for column, value in zip(group.column_indices, solution, strict=True):
         # A fixed change is valid only at its own size.
         if not probes[column].fixed:

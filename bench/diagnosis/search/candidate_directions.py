@@ -155,9 +155,12 @@ def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[
     """
     parameters = list_coefficients(world, name)
     # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
-    # One that is tried at several values, such as the position of a payload, is one as well.
-    coefficients = world.available_effects[name].coefficients
-    shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0 or coefficients[i].tried]
+    effect = world.available_effects[name]
+    coefficients = effect.coefficients
+    for c in effect.probe_points():
+        # Changes at several points add up to that at a point between them (`Effect.combine`).
+        yield CandidateDirection(name, 0, 0, c, signed=True)
+    shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
     count = len(parameters)
     scaling = [i for i in range(count) if i not in shaping]
     travel = world.get_effect_travel(name)
@@ -172,7 +175,8 @@ def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[
     # Scaling coefficients at one grid point act together, such as a sine and a cosine.
     for point in product(*grids):
         # A small limit of a force or a rate would remove all of it.
-        for place in scaling if leading.of not in NONLINEAR_COEFFICIENT_KINDS else ():
+        smooth = leading.of not in NONLINEAR_COEFFICIENT_KINDS and not effect.probe_points()
+        for place in scaling if smooth else ():
             low, high = parameters[place].bounds
             c = np.zeros(count)
             c[shaping] = point

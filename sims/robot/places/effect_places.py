@@ -73,9 +73,6 @@ It is small since each value requires an integration over time.
 """
 MAX_PAYLOAD_SHARE = 0.5
 """Largest plausible payload, as a share of the mass of all moving bodies."""
-PAYLOAD_SHARES = (-0.5, 0.5)
-"""Positions of a payload that are tried along each axis, as shares of the half width of the link.
-"""
 MIN_LOAD_FREQUENCY = 15.0
 """Minimum natural frequency of the load on a flexible joint, in rad/s."""
 _KINDS: Mapping[str, SystemKind] = {"hinge": "rotary", "slide": "linear"}
@@ -310,19 +307,14 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coeffic
         low = least = min(0.0 - stated, 0.0)
     if effect.name == "payload" and c.name == "mass":
         high = MAX_PAYLOAD_SHARE * spot.mass
-    tried = c.tried
     if c.name in spot.limits.get(effect.name, {}):
         least, most = spot.limits[effect.name][c.name]
         if effect.name == "payload":
             begin, end = spot.limits["mass.offset"][c.name]
             low, high = (begin, end) if begin < end else (low, high)
-            middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
-            tried = tuple(dict.fromkeys(middle + share * half for share in PAYLOAD_SHARES))
         elif least < most:
             low, high = max(low, least), min(high, most)
-    return replace(
-        c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most, tried=tried
-    )
+    return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most)
 
 
 def make_effect_classes(

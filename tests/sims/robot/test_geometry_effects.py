@@ -169,3 +169,18 @@ def test_a_urdf_states_geometry(tmp_path: Path) -> None:
     assert [note for note in done.notes if "not in the URDF" in note] == [
         "gravity.compensation@d: 0.5 (95 %: 0.45 to 0.55): not in the URDF: URDF has no word for it"
     ]
+
+
+def test_small_masses_at_points_add_up_to_a_payload(tmp_path: Path) -> None:
+    """Their mass and first moment are those of the payload (Steiner, for the moment of inertia)."""
+    payload = make_robot_simulator(robot(tmp_path)).system.effect("payload@fore")()
+    points = np.array(payload.probe_points())
+    # The arm moves in one plane until the wheel, so that y does not show in the forearm.
+    assert points.shape == (3, 4)
+    assert (points[:, 0] == points[0, 0]).all()
+    assert not points[:, 2].any()
+    wanted = np.array([0.4, 0.12, 0.0, -0.03])
+    moments = np.concatenate([points[:, :1], points[:, :1] * points[:, [1, 3]]], axis=1)
+    weights = np.linalg.solve(moments.T, wanted[0] * np.array([1.0, wanted[1], wanted[3]]))
+    np.testing.assert_allclose(payload.combine(points, weights), wanted, rtol=0, atol=1e-12)
+    assert not payload.combine(points, -weights)[0], "a negative mass is none"
