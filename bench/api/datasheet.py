@@ -69,7 +69,9 @@ def datasheet(recording: Sources, options: DatasheetOptions) -> DataSheet:
     else:
         extended, verdict = _read_explanation_folder(Path(explained))
     free = extended.robot.free if extended.robot is not None else ()
-    loaded, kind = load_joined(sources, options.system, options.model, free)
+    loaded, kind = load_joined(
+        sources, options.system, options.model, free, fix_base=options.fix_base
+    )
     if extended.kind is None or kind.name != extended.kind.name:
         raise InputError(
             f"{loaded.path}: expected a recording of {extended.system}, as what was explained; "
@@ -91,7 +93,9 @@ def check_joint_exists(
     Raises:
         InputError: There is no joint with this name, or there are several and none is named.
     """
-    loaded, kind = load_joined(sources, options.system, options.model, options.free)
+    loaded, kind = load_joined(
+        sources, options.system, options.model, options.free, fix_base=options.fix_base
+    )
     if not issubclass(kind, SystemSimulator):
         raise InputError(f"{loaded.path}: simulator {loaded.system} takes no effects")
     make_subject(kind, options.joint)

@@ -209,7 +209,12 @@ class _ExplainRun:
         self.watch = options.make_search_control()
         self.crew = crew
         self.recording, kind = load_joined(
-            sources, options.system, options.model, options.free, _without_inactive_drives
+            sources,
+            options.system,
+            options.model,
+            options.free,
+            _without_inactive_drives,
+            options.fix_base,
         )
         self.path = self.recording.path
         if not issubclass(kind, SystemSimulator):

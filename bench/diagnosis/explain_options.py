@@ -30,6 +30,8 @@ class ExplainOptions(FrameDescription):
         seed: Seed of all random numbers: surrogate data and bootstrap.
         free: Constants to estimate together with the parameters; for a robot, numbers of its model
             file, as damping@* or mass@forearm.
+        fix_base: For a robot whose model file floats: fix it in the pose of the file, as on a
+            stand; keyframes are left out.
         tuner: Name of a tuner that finds the starting point of the base fit (default: a grid).
         budget: Time limit of the search in seconds; at the limit it ends with the results so far,
             as after Ctrl-C (default: no limit).
@@ -54,6 +56,7 @@ class ExplainOptions(FrameDescription):
     engine: Name = "batch"
     seed: int = 0
     free: Names = ()
+    fix_base: bool = False
     tuner: Name | None = None
     budget: Seconds | None = None
     jobs: Count | None = None

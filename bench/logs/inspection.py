@@ -54,6 +54,7 @@ def load_recording(
     model: str | Path | None = None,
     free: Sequence[str] = (),
     divide: bool = True,
+    fix_base: bool = False,
 ) -> tuple[Recording, type[Simulator]]:
     """Read a recording and find its simulator.
 
@@ -64,6 +65,7 @@ def load_recording(
         free: Numbers of a robot's model file to tune; empty for those of the description.
         divide: Whether to divide the runs for fitting and validation as `simgap explain` does;
             False to hold out marked runs only.
+        fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
 
     Returns:
         The recording, and the simulator class of its system.
@@ -72,7 +74,7 @@ def load_recording(
         InputError: It cannot be read, or there is no such system.
     """
     path = source.path if isinstance(source, Recording) else Path(source)
-    kind = get_simulator_class(source, path, system, model, free)
+    kind = get_simulator_class(source, path, system, model, free, fix_base)
     memory = source if isinstance(source, Recording) else None
     recording = memory or read_recording(path, kind, whole=True)
     if divide:
@@ -87,6 +89,7 @@ def get_simulator_class(
     system: str | None = None,
     model: str | Path | None = None,
     free: Sequence[str] = (),
+    fix_base: bool = False,
 ) -> type[Simulator]:
     """Find the simulator of the system or robot of a recording.
 
@@ -96,6 +99,7 @@ def get_simulator_class(
         system: Registered system to use instead of the one that the recording names.
         model: Model file of a robot to use instead of the one that the recording names.
         free: Numbers of a robot's model file to tune; empty for those of the description.
+        fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
 
     Raises:
         InputError: A system and a model file are both given, or the system is unknown.
@@ -109,9 +113,8 @@ def get_simulator_class(
     else:
         of_file = None if system is not None else read_model_reference(path, model)
     if of_file is not None and system is None:
-        return make_robot_simulator(
-            of_file.path, of_file.actuators, of_file.engine, free or of_file.free
-        )
+        engine = {**of_file.engine, **({"fix_base": True} if fix_base else {})}
+        return make_robot_simulator(of_file.path, of_file.actuators, engine, free or of_file.free)
     name = system or (source.system if isinstance(source, Recording) else read_system_name(path))
     try:
         return simulators.get(name)

@@ -19,6 +19,7 @@ def load_joined(
     model: str | Path | None = None,
     free: Sequence[str] = (),
     prepared: Callable[[Recording, type[Simulator]], Recording] | None = None,
+    fix_base: bool = False,
 ) -> tuple[Recording, type[Simulator]]:
     """Read several recordings, join them into one, and find their simulator.
 
@@ -33,6 +34,7 @@ def load_joined(
         model: Model file of a robot to use instead of the one that the recordings name.
         free: Numbers of a robot's model file to tune; empty for those of the description.
         prepared: Function applied to each recording before its runs are divided.
+        fix_base: Whether to fix floating bodies of a robot in the pose of its model file.
 
     Returns:
         The joined recording, and the simulator class of its system.
@@ -40,7 +42,10 @@ def load_joined(
     Raises:
         InputError: One cannot be read, or they are not of one system with the same channels.
     """
-    loaded = [load_recording(source, system, model, free, divide=False) for source in sources]
+    loaded = [
+        load_recording(source, system, model, free, divide=False, fix_base=fix_base)
+        for source in sources
+    ]
     if prepared is not None:
         loaded = [(prepared(recording, kind), kind) for recording, kind in loaded]
     first, kind = loaded[0]

@@ -32,7 +32,7 @@ _FIGURE_SUFFIXES = (".html", ".png", ".pdf")
 
 _RESULT_RELEVANT_OPTIONS = (
     "system", "model", "engine", "free", "tuner", "seed", "budget", "whole", "pieces", "thorough",
-    "force", "plugin",
+    "force", "fix_base", "plugin",
 )  # fmt: skip
 """Options that affect the result."""
 
@@ -184,7 +184,7 @@ def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandRe
         name: getattr(options, name)
         for name in (
             "system", "model", "engine", "tuner", "seed", "force", "budget", "whole", "pieces",
-            "thorough",
+            "thorough", "fix_base",
         )
     } | {"free": tuple(parse_name_list(options.free))}  # fmt: skip
     out = options.out or make_timestamped_path(Path("results"), "explain-each")

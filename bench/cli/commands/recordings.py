@@ -117,6 +117,11 @@ def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
         help="table of the recording; its .toml is in the same folder",
     )
     add_system_options(parser)
+    parser.add_argument(
+        "--fix-base",
+        action="store_true",
+        help="for a robot whose model file floats: fix it in the pose of the file",
+    )
     add_out_option(parser, "folder of the figure (default: results/inspect)")
     parser.add_argument(
         "--check",
@@ -195,7 +200,9 @@ def _inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     load_plugins(options.plugin)
     if options.free and not options.check:
         raise InputError("--free is used by --check; add --check, or leave out --free")
-    recording, kind = load_recording(options.recording, options.system, options.model)
+    recording, kind = load_recording(
+        options.recording, options.system, options.model, fix_base=options.fix_base
+    )
     about = list(robot_summary.format_robot_summary(kind))
     found = [
         *odd_logs(recording),

@@ -109,9 +109,12 @@ def render_with_series_joints(applied: ModifiedModel) -> bytes:
     """
     robot = applied.robot
     text = robot.path.read_bytes()
-    if not robot.series and not robot.coupled:
+    fixed = robot.engine_table.get("fix_base", False)
+    if not robot.series and not robot.coupled and not fixed:
         return text
     document = MjcfDocument(text, robot.path)
+    if fixed:
+        _fix_base(document)
     if robot.coupled:
         _couple(document, applied)
     tags = {tag.attributes.get("name"): tag for tag in document.walk() if tag.name == "joint"}
@@ -121,6 +124,14 @@ def render_with_series_joints(applied: ModifiedModel) -> bytes:
             raise NotEditableError(f"no joint of its text is in series with {second.name}")
         first.after.append(_joint(second))
     return document.to_text().encode()
+
+
+def _fix_base(document: MjcfDocument) -> None:
+    """Remove free joints and keyframes, as `parsing.added_actuators.fix_bases` does."""
+    for tag in document.walk():
+        is_free = tag.name == "joint" and tag.attributes.get("type") == "free"
+        if tag.name in ("freejoint", "keyframe") or is_free:
+            tag.text = b""
 
 
 def _couple(document: MjcfDocument, applied: ModifiedModel) -> None:

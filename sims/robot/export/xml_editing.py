@@ -54,7 +54,10 @@ class XmlElement:
     def has_changes(self) -> bool:
         """Whether the element or any of its descendants has changes."""
         own = self.new or self.removed or self.renamed or self.before or self.within
-        return bool(own or self.after) or any(child.has_changes for child in self.children)
+        replaced = self.text is not None
+        return bool(own or self.after or replaced) or any(
+            child.has_changes for child in self.children
+        )
 
     def get_attribute(self, name: str) -> str | None:
         """Return the value of an attribute, including changes; None if it is missing."""

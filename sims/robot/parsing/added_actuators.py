@@ -34,6 +34,7 @@ class EngineTable(TypedDict, total=False):
 
     timestep: float
     integrator: str
+    fix_base: bool
 
 
 COMMON_ACTUATOR_KEYS = ("joint", "kind", "gear", "control_range", "force_range")
@@ -165,13 +166,16 @@ def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
     actuator.set_to_pid(**gains, ctrlspec=inputs)
 
 
-def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> None:
-    """Apply the time step and integrator of a recording to a model.
+def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> list[str]:
+    """Apply the time step and integrator of a recording to a model, and fix its base.
 
     Args:
         spec: a mujoco.MjSpec; it is changed in place.
-        table: ``timestep`` in s, ``integrator`` by MuJoCo's name.
+        table: ``timestep`` in s, ``integrator`` by MuJoCo's name, and whether to ``fix_base``.
         source: beginning of error messages.
+
+    Returns:
+        Notes about what was left out.
 
     Raises:
         InputError: the table is invalid.
@@ -195,3 +199,25 @@ def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> N
                 f"{source}: engine: {make_unknown_name_error('integrator', name, INTEGRATORS)}"
             )
         spec.option.integrator = int(mujoco.mjtIntegrator(INTEGRATORS.index(name)))
+    return fix_bases(spec) if given.get("fix_base") else []
+
+
+def fix_bases(spec: Any) -> list[str]:
+    """Fix all free bodies where the model file has them, and return notes about it.
+
+    Keyframes are left out, since they have the coordinates of free joints.
+
+    Args:
+        spec: a mujoco.MjSpec; it is changed in place.
+    """
+    import mujoco
+
+    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    if not free:
+        return ["fix_base: no body of the model file floats"]
+    names = [joint.parent.name for joint in free]
+    keyframes = list(spec.keys)
+    for element in (*free, *keyframes):
+        spec.delete(element)
+    left_out = f"; {len(keyframes)} keyframes are left out" if keyframes else ""
+    return [f"fixed in the pose of the model file: {', '.join(names)}{left_out}"]

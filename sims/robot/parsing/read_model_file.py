@@ -50,7 +50,8 @@ def read_robot(
     Args:
         path: path of an MJCF or a URDF; the content determines the format.
         actuators: actuators to add, by name: tables as in a recording's ``[actuators.NAME]``.
-        engine: ``timestep`` (s) and ``integrator`` that replace those of the file.
+        engine: ``timestep`` (s) and ``integrator`` that replace those of the file, and whether to
+            ``fix_base``.
 
     Returns:
         The robot, with a note for everything that was repaired or omitted.
@@ -93,7 +94,7 @@ def _robot(
         spec = _parsed(files, root)
         absent.remove_from_spec(spec, mends.left)
     rated = added_actuators.add_actuators(spec, actuators, source)
-    added_actuators.apply_engine_settings(spec, engine, source)
+    notes += added_actuators.apply_engine_settings(spec, engine, source)
     notes += element_names.name_unnamed_elements(spec)
     above = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
     spec, model = mends.compile(spec)
