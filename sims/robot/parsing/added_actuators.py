@@ -175,7 +175,7 @@ def apply_engine_settings(spec: Any, table: Mapping[str, Any], source: str) -> l
         source: beginning of error messages.
 
     Returns:
-        Notes about what was left out.
+        Notes about the fixed bodies and omitted keyframes.
 
     Raises:
         InputError: the table is invalid.

@@ -65,7 +65,7 @@ def test_a_robot_that_does_not_float_is_said(tmp_path: Path) -> None:
     assert "fix_base: no body of the model file floats" in robot.notes
 
 
-def test_what_is_no_truth_value_is_refused(tmp_path: Path) -> None:
+def test_a_number_instead_of_a_boolean_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"engine.fix_base: expected a bool"):
         read_robot(floating(tmp_path), engine={"fix_base": 1.5})
 

@@ -183,4 +183,4 @@ def test_small_masses_at_points_add_up_to_a_payload(tmp_path: Path) -> None:
     moments = np.concatenate([points[:, :1], points[:, :1] * points[:, [1, 3]]], axis=1)
     weights = np.linalg.solve(moments.T, wanted[0] * np.array([1.0, wanted[1], wanted[3]]))
     np.testing.assert_allclose(payload.combine(points, weights), wanted, rtol=0, atol=1e-12)
-    assert not payload.combine(points, -weights)[0], "a negative mass is none"
+    assert not payload.combine(points, -weights)[0], "a negative mass is not a payload"
