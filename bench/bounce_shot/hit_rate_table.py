@@ -30,32 +30,24 @@ NO_SHOT_STATUSES = (*FAILED_STATUSES, "no plan", "no recording")
 """Statuses of a method without a shot, or without one that was planned in a tuned model."""
 
 
-def compute_wilson_interval(
-    hits: int, shots: int, z: float = 1.959963984540054
-) -> tuple[float, float]:
+def compute_wilson_interval(hits: int, shots: int) -> tuple[float, float]:
     """Compute the 95 % score interval of a proportion by Wilson's method.
 
-    For a proportion p of n shots (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
-    doi:10.2307/2276774):
-
-        centre = (p + z^2 / 2n) / (1 + z^2 / n)                                  (1)
-        half = z / (1 + z^2 / n) sqrt(p (1 - p) / n + z^2 / 4n^2)                (2)
+    Source: E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927, doi:10.2307/2276774 (scipy).
 
     Args:
         hits: number of hits.
         shots: number of shots.
-        z: quantile of the normal distribution.
 
     Returns:
         Lower and upper bound; NaN without shots.
     """
+    from scipy.stats import binomtest
+
     if shots < 1:
         return float("nan"), float("nan")
-    share, n = hits / shots, float(shots)
-    centre = (share + z * z / (2 * n)) / (1 + z * z / n)  # (1)
-    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))  # (2)
-    # Rounding errors may exceed the range of a proportion slightly.
-    return max(0.0, centre - half), min(1.0, centre + half)
+    interval = binomtest(hits, shots).proportion_ci(0.95, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def build_result_table(rows: pd.DataFrame) -> pd.DataFrame:
