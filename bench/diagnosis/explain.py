@@ -87,6 +87,8 @@ MIN_EXTRA_SAMPLES = 4
 """Minimum number of samples for fitting in addition to `MIN_SAMPLES_PER_UNKNOWN` per unknown."""
 MAX_CHANNEL_SIZE_FACTOR = 1e9
 """Recorded values of at least this multiple of a channel's typical size are refused."""
+MAX_EXCESS_SHARE_WITH_RIGHT_UNITS = 0.1
+"""Maximum excess over the noise, as a share of that of the base model, with right units."""
 EXPLAINED = ("adequate", "named", "ambiguous")
 """Verdicts for which the model explains the data down to the noise."""
 RecordingSource: TypeAlias = str | Path | Recording
@@ -501,6 +503,12 @@ class _ExplainRun:
         """Return wrong units and signs of a robot's recording that no effect explains."""
         explained = finding.verdict in EXPLAINED
         if not self._asks_units_late or explained or self.watch.has_abandoned_fits():
+            return ()
+        left, before = (
+            search.compute_excess(model) for model in (finding.model, search.base_model)
+        )
+        # With a wrong unit or sign, effects would leave more of the discrepancy.
+        if left < MAX_EXCESS_SHARE_WITH_RIGHT_UNITS * before:
             return ()
         base = BaseFit(search.base_model.fit, frozenset(search.frozen))
         fault = wrong_units(self._units, self.fitting, self.noise, base)
