@@ -376,7 +376,7 @@ class _ExplainRun:
         if not self.kind.has_model:
             return _Found(base, search, self._finding(search), rng)
         # This import is needed for robots only.
-        from bench.diagnosis.prediction_error.dry_friction import SoftFrictionError
+        from bench.diagnosis.prediction_error.selection_fits import SoftFrictionError
 
         stiff = _Worlds(self.kind, self.fitting, self.validation)
         try:

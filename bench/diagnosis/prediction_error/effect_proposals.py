@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bench.diagnosis.evaluation.coefficient_bounds import compute_coefficient_bounds
+from bench.diagnosis.evaluation.run_evaluator import RunEvaluator
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 from bench.diagnosis.kalman.likelihood_fit import gauss_newton_step
@@ -25,6 +26,7 @@ from bench.diagnosis.prediction_error.joint_effects import (
 )
 from bench.diagnosis.prediction_error.library_columns import LibraryColumns, regression_about
 from bench.diagnosis.prediction_error.model_filters import FilteredSet, ModelFilters
+from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.refit_starts import with_effect
 from sims.core.simulator import Array
 from sims.robot.places.typical_forces import compute_joint_scales
@@ -146,3 +148,32 @@ class EffectProposals:
                 found.append((gain, name, np.array([change])))
         found.sort(key=lambda one: -one[0])
         return [(name, c) for _, name, c in found]
+
+
+@dataclass(frozen=True)
+class SearchContext:
+    """Shared state of a search.
+
+    Attributes:
+        search: the search, with all models fitted by simulation.
+        filters: filters with effects in the model.
+        columns: columns of regressions.
+        proposals: effects that a set may lack.
+    """
+
+    search: EffectSearch
+    filters: ModelFilters
+    columns: LibraryColumns
+    proposals: EffectProposals
+
+    @classmethod
+    def of(cls, search: EffectSearch) -> SearchContext:
+        """Create the context of a new search."""
+        filters = ModelFilters(search)
+        columns = LibraryColumns(filters)
+        return cls(search, filters, columns, EffectProposals(filters, columns))
+
+    @property
+    def world(self) -> RunEvaluator:
+        """The runs for fitting."""
+        return self.search.world

@@ -14,18 +14,20 @@ import numpy as np
 
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import FittedModel
-from bench.diagnosis.prediction_error.dry_friction import (
+from bench.diagnosis.prediction_error.effect_proposals import (
+    MAX_REGRESSION_PROPOSALS,
+    SearchContext,
+)
+from bench.diagnosis.prediction_error.effect_selection import Selected
+from bench.diagnosis.prediction_error.joint_effects import SERVO_MODEL
+from bench.diagnosis.prediction_error.model_filters import FilteredSet
+from bench.diagnosis.prediction_error.selection_fits import (
+    LEAST_SHARE,
     check_filter,
     check_fit,
     dry_friction_of,
     stands_alone,
 )
-from bench.diagnosis.prediction_error.effect_proposals import MAX_REGRESSION_PROPOSALS
-from bench.diagnosis.prediction_error.effect_selection import Selected
-from bench.diagnosis.prediction_error.joint_effects import SERVO_MODEL
-from bench.diagnosis.prediction_error.model_filters import FilteredSet
-from bench.diagnosis.prediction_error.search_context import SearchContext
-from bench.diagnosis.prediction_error.selected_sets import LEAST_SHARE
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,
     higher_merit,

@@ -5,15 +5,15 @@ whole simulated runs (output errors), which decide. The search ends as soon as t
 is only noise. The order is:
 
     1. Select effects with few shapes by regression. Fit the dry friction among them first, because
-       it is not linear where a joint sticks (`dry_friction`), and then the set (`selected_sets`).
+       it is not linear where a joint sticks and then the set (`selection_fits`).
     2. If a force is still missing, fit each of the effects with the largest gains alone, and those
-       of the standard joint model (`single_effects`, `effect_proposals`).
+       of the standard joint model (`selection_fits`, `effect_proposals`).
     3. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
        filters with the effect in the model (`forward_growth`).
     4. Select again, with effects of many shapes at the joints where a force is missing
-       (`selected_sets`).
-    5. Simulate elasticity and backlash between a drive and its links (`single_effects`).
-    6. Try one effect in place of several (`rivals`).
+       (`selection_fits`).
+    5. Simulate elasticity and backlash between a drive and its links (`selection_fits`).
+    6. Try one effect in place of several (`rival_sets`).
 
 `PredictionErrorSearch.fit_rivals` then fits the sets that are nearly as good, because they may be
 equivalent. All steps share filters with effects in the model (`model_filters`), columns of
@@ -29,11 +29,7 @@ import numpy as np
 
 from bench.diagnosis.fitting.fit_state import FitStart, TrajectoryFit
 from bench.diagnosis.fitting.model_set import FittedModel
-from bench.diagnosis.prediction_error.dry_friction import (
-    check_fit,
-    check_selection,
-    fit_dry_friction,
-)
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.effect_selection import Selected
 from bench.diagnosis.prediction_error.forward_growth import (
     add_to_dry_friction,
@@ -41,12 +37,16 @@ from bench.diagnosis.prediction_error.forward_growth import (
     select_in_model,
 )
 from bench.diagnosis.prediction_error.joint_effects import has_series
-from bench.diagnosis.prediction_error.null_distribution import null_scores, p_value_of_gain
+from bench.diagnosis.prediction_error.regression_selection import null_scores, p_value_of_gain
 from bench.diagnosis.prediction_error.rival_sets import fit_rivals, fit_single_in_place
-from bench.diagnosis.prediction_error.search_context import SearchContext
-from bench.diagnosis.prediction_error.selected_sets import (
+from bench.diagnosis.prediction_error.selection_fits import (
+    check_fit,
+    check_selection,
+    fit_dry_friction,
     fit_quick_selection,
     fit_selection,
+    fit_series_effects,
+    fit_single_effects,
     select_with_shapes,
 )
 from bench.diagnosis.prediction_error.simulated_fits import (
@@ -56,7 +56,6 @@ from bench.diagnosis.prediction_error.simulated_fits import (
     is_nearly_explained,
     without_idle_effects,
 )
-from bench.diagnosis.prediction_error.single_effects import fit_series_effects, fit_single_effects
 from bench.diagnosis.search.candidate_directions import DirectionSet
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.search.refit_starts import with_effect

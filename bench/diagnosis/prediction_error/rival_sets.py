@@ -12,6 +12,7 @@ import numpy as np
 from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.model_set import MAX_ITERATIONS, FittedModel
 from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.forward_growth import (
     LINEARISATION_ERROR,
     RIVAL_MARGIN,
@@ -25,14 +26,13 @@ from bench.diagnosis.prediction_error.joint_effects import (
     plain_effects_beside,
 )
 from bench.diagnosis.prediction_error.model_filters import GAUSS_NEWTON_STEPS
-from bench.diagnosis.prediction_error.search_context import SearchContext
+from bench.diagnosis.prediction_error.selection_fits import MAX_IMPROVED_SIZE, refine_single_effects
 from bench.diagnosis.prediction_error.simulated_fits import (
     fit_filtered,
     higher_merit,
     in_place_of,
     is_explained,
 )
-from bench.diagnosis.prediction_error.single_effects import MAX_IMPROVED_SIZE, refine_single_effects
 from sims.core.simulator import Array
 
 MAX_RIVALS = 5

@@ -16,8 +16,8 @@ from bench.diagnosis.fitting.fit_state import FitStart
 from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 from bench.diagnosis.fitting.model_set import FittedModel
 from bench.diagnosis.friction_form_verdict import has_dry_friction
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
 from bench.diagnosis.prediction_error.model_filters import FilteredSet
-from bench.diagnosis.prediction_error.search_context import SearchContext
 from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
 from sims.core.effect import members_of
 from sims.core.simulator import Array

@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bench.diagnosis.fitting.model_set import FittedModel
-from bench.diagnosis.prediction_error.null_distribution import p_value_of_gain
 from bench.diagnosis.prediction_error.prediction_error_search import PredictionErrorSearch
+from bench.diagnosis.prediction_error.regression_selection import p_value_of_gain
 from bench.diagnosis.search.alternative_causes import AlternativeFinder
 from bench.diagnosis.search.diagnose import DiagnosisResult, Inquiry, compute_gap_closed
 from bench.diagnosis.search.effect_search import EffectSearch

@@ -1,0 +1,372 @@
+"""Fit by simulation what regression selects: whole sets, dry friction alone, single effects.
+
+The force of dry friction is not linear in its limit where a joint sticks or creeps. Therefore it is
+fitted before other effects, and filters compare whether it has MuJoCo's soft form. A servo at its
+limit is not linear either, so the effects that are most likely missing are simulated alone, as one
+batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bench.diagnosis.fitting.fit_state import FitStart
+from bench.diagnosis.fitting.model_set import FittedModel
+from bench.diagnosis.friction_form_verdict import (
+    has_dry_friction,
+    is_likelier_soft,
+    with_plain_friction,
+)
+from bench.diagnosis.prediction_error.effect_proposals import SearchContext
+from bench.diagnosis.prediction_error.effect_selection import Selected
+from bench.diagnosis.prediction_error.joint_effects import (
+    JOINT_MODEL,
+    SERVO_MODEL,
+    acts_at,
+    has_many_shapes,
+)
+from bench.diagnosis.prediction_error.simulated_fits import (
+    fit,
+    fit_nearby,
+    higher_merit,
+    is_at_noise,
+    is_explained,
+    is_nearly_explained,
+    lowest_of_each,
+    starts_nearby,
+    without_idle_effects,
+)
+from bench.diagnosis.search.verdict_rules import INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+from sims.core.effect import members_of
+from sims.core.simulator import Array
+from sims.robot.dynamics.effect_forces import TIME_DEPENDENT_EFFECTS
+from sims.robot.dynamics.series_joints import is_series_effect
+from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
+
+MAX_SURPLUS = 2
+"""Maximum number of consecutive effects with too little gain before a selection is cut."""
+MAX_SLOW_EFFECTS = 2
+"""Maximum number of effects in a set that is fitted by simulation although this is slow."""
+LEAST_SHARE = 0.01
+"""Minimum gain of a further effect, as a share of the gain of the set.
+
+The model of a real robot is never complete, and long recordings show this with certainty.
+"""
+
+
+def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit the selected set by simulation, without effects that gain little.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Returns:
+        The fitted model, or the base model if simulation is slow and a force is still missing.
+    """
+    kept = without_surplus(context, selected)
+    slow = len(kept.groups) > MAX_SLOW_EFFECTS and _is_slow(context, kept)
+    if slow and selected.followed.lacks_force:
+        return context.search.base_model
+    return fit_selection(context, kept)
+
+
+def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit the selected set by simulation, and drop effects that do not pay there.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+    """
+    base = context.search.base_model
+    if not selected.groups:
+        return base
+    start = context.columns.start(selected.groups, selected.coefficients)
+    states = context.filters.first_states(selected.followed)
+    found = fit(context, replace(start, states=states))
+    if not np.isfinite(found.fit.cost):
+        return base
+    found = without_idle_effects(context, found)
+    if selected.shows_steps:
+        found = context.search.without_step_errors(found)
+    return higher_merit(found, base)
+
+
+def without_surplus(context: SearchContext, selected: Selected) -> Selected:
+    """Drop the last effects of a selection that gain little with the set in a filter's model.
+
+    Far from the base model, the linear regression is wrong.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+    """
+    filters = context.filters
+    own = filters.log_likelihood(filters.reference)
+    best, kept, gained = 0.0, 0, 0.0
+    found: list[Array] = []
+    for count in range(1, len(selected.groups) + 1):
+        if count > kept + MAX_SURPLUS:
+            break
+        groups = selected.groups[:count]
+        coefficients = selected.regression.solve(groups)[1]
+        theta = context.columns.start(groups, coefficients).theta
+        gain = 2.0 * (filters.log_likelihood(theta) - own)
+        penalty = sum(filters.penalty(group.effect) for group in groups)
+        least = LEAST_SHARE * max(gained, 0.0) * (count - kept)
+        if gain - penalty > best and gain - gained > least:
+            best, kept, gained, found = gain - penalty, count, gain, coefficients
+    return replace(selected, groups=selected.groups[:kept], coefficients=found)
+
+
+def _is_slow(context: SearchContext, selected: Selected) -> bool:
+    """Return whether a set is slow to simulate.
+
+    This is the case if forces are computed in every step, or have their own states.
+    """
+    effects = [context.world.available_effects[name] for name in selected.effects]
+    return any(
+        member.of not in MODEL_FIELD_EFFECTS
+        and member.hook in ("force", "hidden")
+        and member.of not in TIME_DEPENDENT_EFFECTS
+        for effect in effects
+        for member in members_of(effect)
+    )
+
+
+def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
+    """Select again with effects of many shapes, at the joints where a force is missing.
+
+    Args:
+        context: context of the search.
+        selected: the previous selection.
+    """
+    world, joints = context.world, np.flatnonzero(selected.followed.missing_forces).tolist()
+    rich = [n for n in world.library if has_many_shapes(n) and acts_at(world, n, joints)]
+    if not rich:
+        return selected
+    world.watch.stage(f"testing {len(rich)} effects with many shapes", 1)
+    context.columns.add(rich)
+    return context.columns.select()
+
+
+class SoftFrictionError(Exception):
+    """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form.
+
+    Attributes:
+        start: the model whose filter shows this; None if a simulation does.
+        is_preliminary: whether only filters show this, before any fit.
+    """
+
+    def __init__(self, start: FitStart | None = None, is_preliminary: bool = False) -> None:
+        super().__init__()
+        self.start, self.is_preliminary = start, is_preliminary
+
+
+def check_selection(context: SearchContext, selected: Selected) -> None:
+    """Compare a selection with soft dry friction, before anything is fitted.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Raises:
+        SoftFrictionError: soft friction is likelier than the selection.
+    """
+    filters = context.filters
+    if filters.is_soft or not filters.base.lacks_force:
+        return
+    friction = dry_friction_of(context, selected)
+    # Stiff friction that explains the runs needs no comparison.
+    if friction.effects and is_explained(context, context.search.fit_one(friction)):
+        return
+    kept = without_surplus(context, selected)
+    own = filters.log_likelihood(context.columns.start(kept.groups, kept.coefficients).theta)
+    check_filter(context, own, is_preliminary=True)
+
+
+def check_filter(
+    context: SearchContext, log_likelihood: float, is_preliminary: bool = False
+) -> None:
+    """Compare the log-likelihood of a filter with that of soft dry friction.
+
+    Args:
+        context: context of the search.
+        log_likelihood: log-likelihood of the filter.
+        is_preliminary: whether nothing has been fitted yet.
+
+    Raises:
+        SoftFrictionError: soft friction is likelier.
+    """
+    soft = context.filters.soft_friction
+    if soft is None:
+        return
+    softer = context.filters.log_likelihood(soft.theta, is_soft=True)
+    if softer > log_likelihood + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+        raise SoftFrictionError(soft, is_preliminary)
+
+
+def check_fit(context: SearchContext, model: FittedModel) -> None:
+    """Compare a fitted model with the same effects in the soft form of dry friction.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+
+    Raises:
+        SoftFrictionError: the soft form is likelier.
+    """
+    if is_likelier_soft(context.search, model, INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO):
+        raise SoftFrictionError
+
+
+def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit the dry friction of a selection alone.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Returns:
+        The fitted model, or the base model if the selection has no friction or leaves no force
+        missing.
+    """
+    friction = dry_friction_of(context, selected)
+    if not friction.effects or not selected.followed.lacks_force:
+        return context.search.base_model
+    known = context.search.models.get(frozenset(friction.effects))
+    if known is not None and is_explained(context, known):
+        return without_idle_effects(context, known)
+    found = fit(context, friction)
+    return without_idle_effects(context, found) if is_explained(context, found) else found
+
+
+def dry_friction_of(context: SearchContext, selected: Selected) -> FitStart:
+    """Return a start with only the dry friction of a selection, in its form without a state.
+
+    A family replaces its members.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+    """
+    world, filters = context.world, context.filters
+    start = context.columns.start(selected.groups, selected.coefficients)
+    plain, own = with_plain_friction(world, start.effects, start.theta)
+    native = [name for name in plain if name.partition("@")[0] in MODEL_FIELD_EFFECTS]
+    friction = [name for name in native if has_dry_friction(world, [name])]
+    contained = {part for name in friction for part in world.available_effects[name].contains}
+    names = tuple(name for name in friction if name not in contained)
+    theta = filters.reference.copy()
+    for name in names:
+        theta[world.slots[name]] = own[world.slots[name]]
+    return FitStart(names, theta, filters.first_states(filters.base))
+
+
+def stands_alone(context: SearchContext, selected: Selected, friction: FittedModel) -> bool:
+    """Return whether dry friction without a state follows the data as well as the selection.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+        friction: its dry friction, fitted alone.
+
+    Raises:
+        SoftFrictionError: the friction has MuJoCo's soft form.
+    """
+    filters = context.filters
+    start = context.columns.start(selected.groups, selected.coefficients)
+    _, plain = with_plain_friction(context.world, start.effects, start.theta)
+    stiff = filters.log_likelihood(plain)
+    soft = -np.inf if filters.is_soft else filters.log_likelihood(plain, is_soft=True)
+    own = -np.inf if np.array_equal(plain, start.theta) else filters.log_likelihood(start.theta)
+    if not max(stiff, soft) > own - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+        return False
+    if soft > max(stiff, own) + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+        check_fit(context, friction)
+    return True
+
+
+MAX_REFINED = 3
+"""Maximum number of effects that are fitted alone to convergence."""
+MAX_IMPROVED_SIZE = 3
+"""Maximum number of coefficients of an effect that is refined alone or improved by a filter."""
+
+
+def fit_single_effects(context: SearchContext) -> FittedModel:
+    """Fit each of the proposed effects alone.
+
+    Returns:
+        The best model, or the base model if none explains the runs.
+
+    Raises:
+        SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
+    """
+    search, filters = context.search, context.filters
+    states = filters.first_states(filters.base)
+    starts = context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
+    found = search.fit_all([replace(start, states=states) for start in starts])
+    best = max(found, key=lambda model: model.penalised_log_likelihood, default=search.base_model)
+    if not is_explained(context, best):
+        best = higher_merit(best, refine_single_effects(context, found))
+    if is_explained(context, best):
+        return without_idle_effects(context, best)
+    check_filter(context, filters.of_model(best).log_likelihood)
+    check_fit(context, best)
+    return search.base_model
+
+
+def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel]) -> FittedModel:
+    """Fit some effects alone to convergence, and return the model with the highest merit.
+
+    Those with the lowest cost are fitted first. Fits may stop in local minima where joints stick
+    and at force limits, and likelihoods with coloured noise are unreliable if the residual is
+    large.
+
+    Args:
+        context: context of the search.
+        fitted: models with a single effect.
+    """
+    starts: list[FitStart] = []
+    for model in fitted:
+        (name,) = model.effects
+        if len(context.world.get_coefficient_indices(name)) <= MAX_IMPROVED_SIZE:
+            starts += [model.fit.make_start(), *starts_nearby(context, model, name)]
+    best = context.search.base_model
+    for _, start in lowest_of_each(context, starts)[:MAX_REFINED]:
+        found = fit(context, start)
+        if not is_at_noise(context, found) and is_nearly_explained(context, found):
+            found = fit_nearby(context, found, found.effects[0])
+        best = higher_merit(best, found)
+        if is_explained(context, best) or context.world.watch.has_abandoned_fits():
+            break
+    return best
+
+
+def fit_series_effects(context: SearchContext, selected: Selected) -> FittedModel:
+    """Fit elastic joints and backlash between drive and links at the most affected joint.
+
+    These effects have their own states, so each shape is simulated.
+
+    Args:
+        context: context of the search.
+        selected: the selection, whose missing forces determine the joint.
+    """
+    world, search = context.world, context.search
+    joints = selected.followed.joints_by_loss[:1]
+    names = [name for name in world.library if is_series_effect(world.available_effects[name])]
+    probes = context.columns.probes([name for name in names if acts_at(world, name, joints)])
+    if not probes:
+        return search.base_model
+    world.watch.stage("testing elasticity and play between drives and links", len(probes))
+    starts = []
+    for probe in probes:
+        theta = context.filters.theta_with(probe.effect, probe.coefficients)
+        starts.append(FitStart((probe.effect,), theta, world.guess))
+    found = search.fit_all([start for _, start in lowest_of_each(context, starts)])
+    return fit(
+        context, max(found, key=lambda model: model.penalised_log_likelihood).fit.make_start()
+    )
