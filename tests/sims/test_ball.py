@@ -425,24 +425,6 @@ def test_constants_of_one_run_do_not_stay(settings):
 @pytest.mark.parametrize(
     ("refused", "says"),
     [
-        (lambda: Ball({"colour": 1.0}), "unknown constant .* there are: gravity, .*, radius"),
-        (lambda: Ball({"mass": 0.0}), "'mass' .* must be > 0"),
-        (
-            lambda: Ball(observe=["height"]),
-            "unknown channel .* there are: accel_z, x, y, z|x, y, z",
-        ),
-        (
-            lambda: Ball().simulate([[0.5]], Scenario([0.0], {"q": 1.0})),
-            "unknown initial state .* vx, vy, vz, x, y, z",
-        ),
-        (
-            lambda: Ball().simulate([[0.5]], Scenario([0.0], inputs={"u": [1.0]})),
-            "unknown input .* there are: none",
-        ),
-        (
-            lambda: Ball().simulate([[0.5]], Scenario([0.0], constants={"g": 1.0})),
-            "unknown constant .*: gravity",
-        ),
         (
             lambda: Ball(linear_damping=0.1),
             "linear_damping belongs to Bullet's own contact: set native_contact = true",
@@ -465,6 +447,6 @@ def test_constants_of_one_run_do_not_stay(settings):
         ),
     ],
 )
-def test_errors_list_the_names(refused, says):
+def test_settings_of_native_contact_are_checked(refused, says):
     with pytest.raises(InputError, match=says):
         refused()

@@ -1,11 +1,10 @@
 """Tests of the batch engine against SciPy, closed forms and itself."""
 
-from time import process_time
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from bench.diagnosis_benchmark.case_generation.true_system import TrueSystem
 from sims import effects as library
 from sims.core.engine import IntegrationBatch
 from sims.core.simulator import InputError, Parameter, Scenario
@@ -17,8 +16,14 @@ from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.servo import Servo
 from sims.systems.slider import Slider
-from tests.sims import scipy_reference
-from tests.sims.simulation_cases import FORCES, SIMULATORS, errors, simulated, steps
+from tests.sims.simulation_cases import (
+    FORCES,
+    SIMULATORS,
+    errors,
+    simulate,
+    simulate_reference,
+    steps,
+)
 
 T = np.arange(201) / 100
 
@@ -33,11 +38,11 @@ def force_program(request, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "position", "rate"),
-    [("ball", 5e-7, 1e-6), ("pendulum", 5e-4, 1e-3), ("slider", 1e-5, 5e-5), ("servo", 2e-5, 0)],
+    [("ball", 5e-7, 0), ("pendulum", 5e-4, 1e-3), ("slider", 1e-5, 5e-5), ("servo", 2e-5, 0)],
 )
 def test_agrees_with_scipy_on_fifty_random_lanes(system, position, rate):
     worst = np.max([errors(system, seed) for seed in range(50)], axis=0)
-    tolerance = {"ball": [position] * 3 + [rate], "servo": [position]}.get(system, [position, rate])
+    tolerance = {"ball": [position] * 3, "servo": [position]}.get(system, [position, rate])
     assert (worst < tolerance).all(), worst
 
 
@@ -272,40 +277,41 @@ def test_steps_of_no_length_change_nothing():
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("system", ["ball", "pendulum"])
-def test_finite_differences_are_smooth_through_events(system):
-    names = {
-        "ball": {"drag.quadratic": [0.1], "contact.friction": [0.05]},
-        "pendulum": {"friction.coulomb": [0.01]},
-    }
-    t = np.arange(81) / 40
-    inputs = {} if system == "ball" else {"u": 0 * t}
-    start = np.array([0, 0, 2.0, 3.0, 0, 0.5]) if system == "ball" else {"x": 1.0, "v": 0.0}
-    constants = {c.name: c.value for c in SIMULATORS[system].constants}
-    parameter = SIMULATORS[system].parameters[0].name
-
-    def case(value):
-        return scipy_reference.Case(
-            system, {parameter: value}, constants, start, names[system], t, inputs
-        )
-
-    value = {"ball": 0.7, "pendulum": 4e-3}[system]
-    columns = [0, 2] if system == "ball" else [0]
+@pytest.mark.parametrize(
+    ("system", "value", "effects"),
+    [
+        ("ball", 0.7, {"drag.quadratic": [0.1], "contact.friction": [0.05]}),
+        ("pendulum", 4e-3, {"friction.coulomb": [0.01]}),
+    ],
+)
+def test_finite_differences_are_smooth_through_events(system, value, effects):
+    cls, t = SIMULATORS[system], np.arange(81) / 40
+    initial = {"z": 2.0, "vx": 3.0, "vz": 0.5} if system == "ball" else {"q": 1.0, "qd": 0.0}
+    scenario = Scenario(
+        t,
+        {**cls.states, "x": 0.0, **initial} if system == "ball" else initial,
+        {} if system == "ball" else {"u": 0 * t},
+    )
+    constants = {c.name: c.value for c in cls.constants}
 
     def slopes(solve, share):
-        step = share * value
-        return (solve(case(value + step)) - solve(case(value - step)))[:, columns] / (2 * step)
+        low, high = (
+            solve(TrueSystem(system, {cls.parameters[0].name: v}, constants, effects), scenario)
+            for v in (value * (1 - share), value * (1 + share))
+        )
+        return (high - low) / (2 * share * value)
 
-    def scipy(c):
-        return scipy_reference.ball(c)[0] if system == "ball" else scipy_reference.hinge(c)
-
-    expected = slopes(scipy, 1e-4)
+    expected = slopes(simulate_reference, 1e-4)
     away = np.ones(t.size, dtype=bool)
-    if system == "ball":
-        away = np.abs(t[:, None] - scipy_reference.ball(case(value))[1]).min(axis=1) > 0.02
-    scale = np.abs(expected).max(axis=0)
+    if system == "ball":  # The slope jumps at an impact; samples near one are not compared.
+        z = Ball(observe=["z"], engine="batch", fixed=effects, time_step=1e-3).simulate(
+            np.array([[value]]), Scenario(np.arange(8001) / 4000, scenario.initial)
+        )[0, :, 0]
+        lows = np.flatnonzero((z[1:-1] <= z[:-2]) & (z[1:-1] < z[2:])) + 1
+        away = np.abs(t[:, None] - lows / 4000).min(axis=1) > 0.02
+    scale = np.abs(expected).max(axis=0) + 1e-12
     for share in (1e-3, 1e-5, 1e-7):
-        found = slopes(simulated, share)
+        found = slopes(simulate, share)
         assert (np.abs(found - expected)[away] < 1e-3 * scale).all(), share
 
 
@@ -351,24 +357,6 @@ def test_one_sample_and_no_lanes():
 def test_refuses_settings_it_cannot_use(settings, says):
     with pytest.raises(InputError, match=says):
         Ball(engine="batch", **settings)
-
-
-@pytest.mark.slow
-def test_ball_rollouts_are_fifty_times_as_many_as_in_pybullet():
-    scenario = Scenario(np.arange(400) / 60, {"z": 4.5})
-    theta = np.random.default_rng(1).uniform(0.3, 0.7, (1000, 1))
-    batch, bullet = Ball(engine="batch"), Ball(engine="pybullet")
-    bullet.simulate(theta[:1], scenario)
-    seconds = []
-    for _ in range(5):  # The engines alternate, so that changes of the machine affect both.
-        started = process_time()
-        batch.simulate(theta, scenario)
-        between = process_time()
-        bullet.simulate(theta[:10], scenario)
-        seconds.append(((between - started) / 1000, (process_time() - between) / 10))
-    bullet.close()
-    batch_seconds, bullet_seconds = np.min(seconds, axis=0)
-    assert bullet_seconds > 50.0 * batch_seconds
 
 
 def test_a_lane_that_needs_too_many_steps_is_given_up_and_no_other():

@@ -310,7 +310,14 @@ def test_a_numerical_failure_gives_nan_and_harms_nobody(system, engine, settings
 
 @pytest.mark.parametrize("engine", OTHERS)
 @pytest.mark.parametrize(
-    ("system", "theta"), [("slider", [0.0]), ("slider", [-1.0]), ("servo", [0.5, 4.0, -1.0])]
+    ("system", "theta"),
+    [
+        ("slider", [0.0]),
+        ("slider", [-1.0]),
+        ("servo", [0.5, 4.0, -1.0]),
+        ("pendulum", [0.0]),
+        ("pendulum", [0.15 * 0.15**2 / 1000]),  # mass length^2 / 1000: the smallest
+    ],
 )
 def test_impossible_inertia_gives_nan(system, engine, theta):
     simulator = SIMULATORS[system](engine=engine)
@@ -338,7 +345,7 @@ def test_a_copy_has_a_world_of_its_own(system, engine, settings, copied):
 
 
 @pytest.mark.parametrize("engine", OTHERS)
-@pytest.mark.parametrize("system", ["slider", "servo"])
+@pytest.mark.parametrize("system", ["pendulum", "slider", "servo"])
 def test_a_used_world_gives_the_same_bits_as_a_new_one(system, engine):
     rng, kind = np.random.default_rng(5), SIMULATORS[system]
     chosen = ["drag.linear", "friction.coulomb"]

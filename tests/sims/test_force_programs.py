@@ -1,6 +1,7 @@
 """Tests of force programs: traced ones, and those whose functions NumPy evaluates."""
 
 from dataclasses import replace
+from time import process_time
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from sims.engines.compiled.expression_graph import LANE, OPERATION_CODES, Expres
 from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.node_arrays import NotTraceableError
 from sims.engines.compiled.traced_array import TracedArray
+from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider
 from tests.benchmarks import stepping_speed
@@ -184,14 +186,13 @@ def damaged_batches(lanes, rng):
 
 @pytest.mark.parametrize("system", list(SIMULATORS))
 def test_damaged_batches_end_in_the_same_state_with_evaluated_forces(system, monkeypatch):
-    case = random_case(system, 11)
+    world, whole = random_case(system, 11)
     cls = SIMULATORS[system]
-    values = case.initial if system == "ball" else (case.initial["x"], case.initial["v"])
-    initial = dict(zip(cls.states, values, strict=True))
-    scenario = Scenario(case.t[:15], initial, {k: u[:15] for k, u in case.inputs.items()})
-    simulator = cls(engine="batch", effects=list(case.effects))
-    coefficients = [x for values in case.effects.values() for x in values]
-    theta = np.array([[case.parameters[p.name] for p in cls.parameters] + coefficients] * 2)
+    inputs = {name: u[:15] for name, u in whole.inputs.items()}
+    scenario = Scenario(whole.times[:15], whole.initial, inputs)
+    simulator = cls(engine="batch", effects=list(world.effects))
+    coefficients = [x for values in world.effects.values() for x in values]
+    theta = np.array([[world.parameters[p.name] for p in cls.parameters] + coefficients] * 2)
     theta[1] *= 0.97
     lanes = record_batch(simulator, theta, [scenario] * 2, monkeypatch)
     engine = BatchEngine(patience=20.0)
@@ -220,6 +221,24 @@ def test_a_system_with_too_many_coordinates_is_refused():
     wide = type("Wide", (Slider.system,), {"coordinates": names})
     with pytest.raises(InputError, match="16 coordinates, and the engine at most 15"):
         make_engine("batch", wide, {})
+
+
+@pytest.mark.slow
+def test_ball_rollouts_are_fifty_times_as_many_as_in_pybullet():
+    scenario = Scenario(np.arange(400) / 60, {"z": 4.5})
+    theta = np.random.default_rng(1).uniform(0.3, 0.7, (1000, 1))
+    batch, bullet = Ball(engine="batch"), Ball(engine="pybullet")
+    bullet.simulate(theta[:1], scenario)
+    seconds = []
+    for _ in range(5):  # The engines alternate, so that changes of the machine affect both.
+        started = process_time()
+        batch.simulate(theta, scenario)
+        between = process_time()
+        bullet.simulate(theta[:10], scenario)
+        seconds.append(((between - started) / 1000, (process_time() - between) / 10))
+    bullet.close()
+    batch_seconds, bullet_seconds = np.min(seconds, axis=0)
+    assert bullet_seconds > 50.0 * batch_seconds
 
 
 def run_operation(name, values):
