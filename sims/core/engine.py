@@ -61,7 +61,7 @@ class Engine(Protocol):
     largest_step: float
     """Maximum step in seconds, to which sampling intervals are divided."""
 
-    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+    def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate every batch element over its steps."""
         ...
 

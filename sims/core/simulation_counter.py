@@ -25,24 +25,24 @@ class SimulationCounter:
     used: int = 0
     limit: int | None = None
 
-    def count(self, lanes: int) -> None:
+    def count(self, count: int) -> None:
         """Count simulations before they are made.
 
         Args:
-            lanes: Number of batch elements, each of which is one simulation.
+            count: Number of batch elements, each of which is one simulation.
 
         Raises:
             SimulationBudgetExceededError: They exceed the limit; none of them is counted.
         """
-        if self.limit is not None and self.used + lanes > self.limit:
+        if self.limit is not None and self.used + count > self.limit:
             raise SimulationBudgetExceededError(
-                f"{self.used + lanes} simulations asked for, {self.limit} are allowed"
+                f"{self.used + count} simulations asked for, {self.limit} are allowed"
             )
-        self.used += lanes
+        self.used += count
 
-    def reset(self, most: int | None = None) -> None:
+    def reset(self, limit: int | None = None) -> None:
         """Reset the counter to zero, and set the limit."""
-        self.used, self.limit = 0, most
+        self.used, self.limit = 0, limit
 
 
 SIMULATION_COUNTER = SimulationCounter()

@@ -74,8 +74,9 @@ def similar(name: str, known: Iterable[str]) -> str:
     # Ignore case and accept prefixes: users write Pendulum for pendulum, or a family for a member.
     names = {one.lower(): one for one in known}
     wanted = name.lower()[:MAX_QUOTED_NAME_LENGTH]
-    begun = [one for one in names if len(wanted) >= 3 and one.startswith(wanted)]
-    near = [names[one] for one in (begun or get_close_matches(wanted, names, cutoff=_ALIKE))[:3]]
+    similar = [key for key in names if len(wanted) >= 3 and key.startswith(wanted)]
+    similar = similar or get_close_matches(wanted, names, cutoff=_ALIKE)
+    near = [names[key] for key in similar[:3]]
     return f"; did you mean {' or '.join(near)}?" if near else ""
 
 

@@ -97,8 +97,8 @@ class StateSnapshot:
 
         With equal signs, they press on the transmission from both sides.
         """
-        place = slice(self.system.primary, self.system.primary + 1)
-        return self.system.drive(self)[:, place], self.system.passive(self)[:, place]
+        primary = slice(self.system.primary, self.system.primary + 1)
+        return self.system.drive(self)[:, primary], self.system.passive(self)[:, primary]
 
     @property
     def drawn(self) -> Array:
@@ -120,8 +120,8 @@ class StateSnapshot:
         """
         name = self.system.servo
         moved = replace(self, inputs={**self.inputs, name: self.inputs[name] + shift})
-        more: Array = self.system.drive(moved) - self.system.drive(self)
-        return more
+        difference: Array = self.system.drive(moved) - self.system.drive(self)
+        return difference
 
     @property
     def inertia(self) -> Array:

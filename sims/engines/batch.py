@@ -65,13 +65,13 @@ class BatchEngine:
                 f"engine batch: jobs must be a number of threads, found {truncate_text(str(jobs))}"
             )
         self.largest_step = float(time_step)
-        self._turn = float(turn)
+        self._max_phase = float(turn)
         self._patience = float(patience)
         self._jobs = jobs
 
-    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+    def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate every element over its steps; an element that overflows is NaN throughout."""
-        trajectories = integrate_batch(lanes, self._turn, self._patience, self._jobs)
+        trajectories = integrate_batch(batch, self._max_phase, self._patience, self._jobs)
         # Values that are not finite stay so; therefore the last state shows whether the whole run
         # is.
         is_finite = np.isfinite(trajectories.x[:, -1]) & np.isfinite(trajectories.v[:, -1])

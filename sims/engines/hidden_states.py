@@ -50,13 +50,13 @@ class AugmentedSystem(System):
     @classmethod
     def split_coefficients(cls, theta: Array) -> list[Array]:
         """Return the coefficients (K, L, 1) of each effect."""
-        found = []
+        coefficients = []
         place = len(cls.base_system.parameters)
         for effect in cls.effects:
             count = len(effect.coefficients)
-            found.append(theta[:, place : place + count].T[:, :, None])
+            coefficients.append(theta[:, place : place + count].T[:, :, None])
             place += count
-        return found
+        return coefficients
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
         """Return the inertia (L, 1) of the system's own coordinates.
@@ -65,12 +65,12 @@ class AugmentedSystem(System):
             theta: (L, p) parameters of the augmented system.
             constants: (L, 1) constants by name.
         """
-        whole = self.base_system.mass(theta[:, : len(self.base_system.parameters)], constants)
+        total_mass = self.base_system.mass(theta[:, : len(self.base_system.parameters)], constants)
         pairs = zip(self.effects, self.split_coefficients(theta), strict=True)
-        left = np.ones_like(whole)
+        remaining_share = np.ones_like(total_mass)
         for effect, c in pairs:
-            left = left - effect.behind(c)
-        return whole * left  # (1)
+            remaining_share = remaining_share - effect.behind(c)
+        return total_mass * remaining_share  # (1)
 
     def weight(self, moment: StateSnapshot) -> Array:
         """Return the force of gravity (L, D) of the system."""
@@ -107,7 +107,7 @@ class AugmentedSystem(System):
 
 
 class _BaseForce(Force):
-    """Force on the system's own coordinates; `_acting` makes one."""
+    """Force on the system's own coordinates; `_wrap_effect` makes one."""
 
     inner: ClassVar[Force]
 
@@ -118,11 +118,11 @@ class _BaseForce(Force):
             c: (K, L, 1) coefficients.
             moment: state snapshot of the augmented system.
         """
-        return pad_force(self.inner.force(c, _plain(moment)), moment)
+        return pad_force(self.inner.force(c, _get_base_snapshot(moment)), moment)
 
 
 class _BaseFriction(Friction):
-    """Dry friction on the system's own coordinates; `_acting` makes one."""
+    """Dry friction on the system's own coordinates; `_wrap_effect` makes one."""
 
     inner: ClassVar[Friction]
 
@@ -133,58 +133,58 @@ class _BaseFriction(Friction):
             c: (K, L, 1) coefficients.
             moment: state snapshot of the augmented system.
         """
-        return self.inner.limit(c, _plain(moment))
+        return self.inner.limit(c, _get_base_snapshot(moment))
 
 
-def integrate_with_hidden_states(engine: Engine, lanes: IntegrationBatch) -> Trajectories:
+def integrate_with_hidden_states(engine: Engine, batch: IntegrationBatch) -> Trajectories:
     """Integrate batch elements, on some of which hidden-state effects may be active.
 
     Args:
         engine: engine for several coordinates.
-        lanes: batch to integrate.
+        batch: batch to integrate.
 
     Returns:
         The trajectories of the system's own coordinates.
     """
-    hidden = [(e, c) for e, c in lanes.effects if isinstance(e, HiddenStateEffect)]
+    hidden = [(e, c) for e, c in batch.effects if isinstance(e, HiddenStateEffect)]
     if not hidden:
-        return engine.integrate(lanes)
-    others = tuple((e, c) for e, c in lanes.effects if not isinstance(e, HiddenStateEffect))
-    on = np.array([c[0, :, 0] > 0 for _, c in hidden])
+        return engine.integrate(batch)
+    others = tuple((e, c) for e, c in batch.effects if not isinstance(e, HiddenStateEffect))
+    active = np.array([c[0, :, 0] > 0 for _, c in hidden])
     # Most calls have no hidden-state effects; they must not become slower.
-    if not on.any():
-        return engine.integrate(replace(lanes, effects=others))
+    if not active.any():
+        return engine.integrate(replace(batch, effects=others))
     motions = []
-    numbers = (1 << np.arange(len(hidden))) @ on
+    numbers = (1 << np.arange(len(hidden))) @ active
     for number in sorted(set(numbers.tolist())):
         members = np.flatnonzero(numbers == number)
-        there = [pair for k, pair in enumerate(hidden) if number >> k & 1]
-        part = slice_batch(replace(lanes, effects=others), members)
-        effects = [(e, c[:, members]) for e, c in there]
-        motion = engine.integrate(_enlarged(part, effects) if there else part)
-        own = lanes.x.shape[1]
+        acting = [pair for k, pair in enumerate(hidden) if number >> k & 1]
+        part = slice_batch(replace(batch, effects=others), members)
+        effects = [(e, c[:, members]) for e, c in acting]
+        motion = engine.integrate(_augment_batch(part, effects) if acting else part)
+        own = batch.x.shape[1]
         parts = (values[:, :, :own] for values in (motion.x, motion.v, motion.a))
         motions.append((members, Trajectories(*parts)))
-    return join_trajectories(motions, lanes)
+    return join_trajectories(motions, batch)
 
 
-def _enlarged(
-    lanes: IntegrationBatch, effects: Sequence[tuple[HiddenStateEffect, Array]]
+def _augment_batch(
+    batch: IntegrationBatch, effects: Sequence[tuple[HiddenStateEffect, Array]]
 ) -> IntegrationBatch:
     """Return the batch for the augmented system."""
     kinds = tuple(type(effect) for effect, _ in effects)
-    system = make_augmented_system(type(lanes.system), kinds)()
-    inputs = {name: values[:, :1] for name, values in lanes.inputs.items()}
-    start = np.zeros((len(lanes.x), 1))
-    at = StateSnapshot(lanes.system, lanes.theta, lanes.constants, start, lanes.x, lanes.v, inputs)
+    system = make_augmented_system(type(batch.system), kinds)()
+    inputs = {name: values[:, :1] for name, values in batch.inputs.items()}
+    start = np.zeros((len(batch.x), 1))
+    at = StateSnapshot(batch.system, batch.theta, batch.constants, start, batch.x, batch.v, inputs)
     states = [effect.begin(c, at) for effect, c in effects]
     return replace(
-        lanes,
+        batch,
         system=system,
-        theta=np.concatenate([lanes.theta, *(c[:, :, 0].T for _, c in effects)], axis=1),
-        x=np.concatenate([lanes.x, *(state.x for state in states)], axis=1),
-        v=np.concatenate([lanes.v, *(state.v for state in states)], axis=1),
-        effects=tuple((_acting(type(effect))(), c) for effect, c in lanes.effects),
+        theta=np.concatenate([batch.theta, *(c[:, :, 0].T for _, c in effects)], axis=1),
+        x=np.concatenate([batch.x, *(state.x for state in states)], axis=1),
+        v=np.concatenate([batch.v, *(state.v for state in states)], axis=1),
+        effects=tuple((_wrap_effect(type(effect))(), c) for effect, c in batch.effects),
     )
 
 
@@ -222,7 +222,7 @@ def make_augmented_system(
 
 
 @cache
-def _acting(effect: type[Effect]) -> type[Effect]:
+def _wrap_effect(effect: type[Effect]) -> type[Effect]:
     """Return an effect that acts on the system's own coordinates of the augmented system."""
     if not issubclass(effect, (Force, Friction)):
         return effect
@@ -231,7 +231,7 @@ def _acting(effect: type[Effect]) -> type[Effect]:
     return type("PlainEffect", (base,), {**declared, "says": effect.says})
 
 
-def _plain(moment: StateSnapshot) -> StateSnapshot:
+def _get_base_snapshot(moment: StateSnapshot) -> StateSnapshot:
     assert isinstance(moment.system, AugmentedSystem)
     return moment.system.get_base_snapshot(moment)
 

@@ -103,9 +103,9 @@ def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> 
         earlier = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
         read = tuple(sorted(scenario.linear)), scenario.offset, earlier
         stated = tuple(sorted(scenario.initial.items())) if by_initial else ()
-        told = ((name, u.tobytes()) for name, u in signals)
+        signals_content = ((name, u.tobytes()) for name, u in signals)
         off = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
-        content = scenario.times.tobytes(), read, stated, off, *told
+        content = scenario.times.tobytes(), read, stated, off, *signals_content
         group = by_content.setdefault(content, len(distinct))
         if group == len(distinct):
             distinct.append(scenario)
@@ -117,8 +117,8 @@ def group_by_identity(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], In
     """Return the distinct objects among scenarios, and the number of each element's object (L,)."""
     # One dictionary lookup per batch element, of which there may be thousands.
     objects = {id(scenario): scenario for scenario in scenarios}
-    place = {key: i for i, key in enumerate(objects)}
-    of = np.array([place[id(scenario)] for scenario in scenarios], dtype=np.intp)
+    index = {key: i for i, key in enumerate(objects)}
+    of = np.array([index[id(scenario)] for scenario in scenarios], dtype=np.intp)
     return list(objects.values()), of
 
 
@@ -127,7 +127,7 @@ Commands = Sequence[Mapping[str, Array]]
 
 
 def build_time_grid(
-    runs: ScenarioGroups, commands: Commands, acting: ActiveEffects, largest_step: float
+    runs: ScenarioGroups, commands: Commands, effects: ActiveEffects, largest_step: float
 ) -> TimeGrid:
     """Build steps through all times at which a sample is taken or a changed command is applied.
 
@@ -136,17 +136,17 @@ def build_time_grid(
     Args:
         runs: Scenarios of the batch elements.
         commands: Inputs of each distinct scenario.
-        acting: Effects on input and sensors.
+        effects: Effects on input and sensors.
         largest_step: Maximum length of a step, s.
     """
     samples = max(s.times.size for s in runs.unique_scenarios)
-    instants = np.stack([_padded(_since_start(s), samples) for s in runs.unique_scenarios])
-    shifting = [(e, c) for e, c in acting if c.any() and _shifts(e)]
+    instants = np.stack([_pad_with_last(_sample_times(s), samples) for s in runs.unique_scenarios])
+    shifting = [(e, c) for e, c in effects if c.any() and _shifts_time(e)]
     if not shifting and not any(s.offset for s in runs.unique_scenarios):
         # Runs with the same sample times share one row and everything computed from it.
         if (instants == instants[:1]).all():
             instants = instants[:1]
-        steps, ends, every, rows = _divided(instants, largest_step)
+        steps, ends, every, rows = _divide_intervals(instants, largest_step)
         return TimeGrid(
             runs.expand_rows(steps),
             runs.expand_rows(ends),
@@ -161,45 +161,45 @@ def build_time_grid(
     # Times must increase and begin with the run, whatever an effect returns.
     instants = np.maximum(instants, 0.0)
     instants = np.maximum.accumulate(instants, axis=1)
-    changes = _changes(runs, commands, shifting)
-    marks = np.concatenate([instants, changes], axis=1)
-    marks = np.clip(marks, 0.0, instants[:, -1:])
-    order = np.argsort(marks, axis=1, kind="stable")
-    marks = np.take_along_axis(marks, order, axis=1)
-    steps, ends, every, rows = _divided(marks, largest_step)
+    changes = _find_change_times(runs, commands, shifting)
+    event_times = np.concatenate([instants, changes], axis=1)
+    event_times = np.clip(event_times, 0.0, instants[:, -1:])
+    order = np.argsort(event_times, axis=1, kind="stable")
+    event_times = np.take_along_axis(event_times, order, axis=1)
+    steps, ends, every, rows = _divide_intervals(event_times, largest_step)
     # Rows in the original order of the marks, of which the first are samples.
-    back = np.empty_like(rows)
-    np.put_along_axis(back, order, rows, axis=1)
-    return TimeGrid(steps, ends, every, back[:, :samples])
+    sample_rows = np.empty_like(rows)
+    np.put_along_axis(sample_rows, order, rows, axis=1)
+    return TimeGrid(steps, ends, every, sample_rows[:, :samples])
 
 
-def _changes(
+def _find_change_times(
     runs: ScenarioGroups, commands: Commands, shifting: Sequence[tuple[Effect, Array]]
 ) -> Array:
     """Return the times (L, K) at which a changed command is applied; zero where there are fewer."""
     columns = []
-    for place, name in enumerate(commands[0]):
+    for index, name in enumerate(commands[0]):
         rows = []
         for s, u in zip(runs.unique_scenarios, commands, strict=True):
             changed = np.diff(u[name]) != 0
-            later = np.maximum(_commanded(s)[1:], 0.0)
+            later = np.maximum(_command_times(s)[1:], 0.0)
             # Commands from before the run may be applied within it.
-            rows.append(np.concatenate([_earlier(s, name), later[changed]]))
+            rows.append(np.concatenate([_history_times(s, name), later[changed]]))
         size = max(row.size for row in rows)
         padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
-        felt = np.stack(padded)[runs.scenario_index]
+        applied = np.stack(padded)[runs.scenario_index]
         # Effects act on the first input only.
-        for effect, c in shifting if place == 0 else ():
+        for effect, c in shifting if index == 0 else ():
             if isinstance(effect, Input):
-                commanded = effect.times(c, felt)
-                felt = np.where(is_active(c), felt + (felt - commanded), felt)  # (2)
-        columns.append(felt)
+                commanded = effect.times(c, applied)
+                applied = np.where(is_active(c), applied + (applied - commanded), applied)  # (2)
+        columns.append(applied)
     if not columns:
         return np.zeros((runs.scenario_index.size, 0))
     return np.concatenate(columns, axis=1)
 
 
-def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
+def _divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
     """Divide the intervals between times into equal steps.
 
     The steps are arranged in blocks of the most frequent number of steps per interval; steps of
@@ -214,8 +214,8 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
         Steps (N, S), their ends (N, S), the number of steps per stored state, and the number of the
         stored state at each time (N, T).
     """
-    lanes, samples = instants.shape
-    start = np.zeros((lanes, 1))
+    elements, samples = instants.shape
+    start = np.zeros((elements, 1))
     before = np.concatenate([start, instants[:, :-1]], axis=1)
     intervals = instants - before
     # Tolerate rounding where an interval is an integer number of steps.
@@ -227,39 +227,39 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     size = max(int(rows[:, -1].max()), 1)
     # Arrays with one entry per block: its interval, its number in the batch element, and the
     # numbers of its steps in the interval.
-    interval = np.repeat(np.arange(lanes * samples), blocks.ravel())
-    lane = interval // samples
+    interval = np.repeat(np.arange(elements * samples), blocks.ravel())
+    element = interval // samples
     in_lane = rows[:, -1]
     in_lanes_before = np.cumsum(in_lane) - in_lane
-    block = np.arange(interval.size) - in_lanes_before[lane]
+    block = np.arange(interval.size) - in_lanes_before[element]
     blocks_before = (rows - blocks).ravel()[interval]
     in_interval = (block - blocks_before)[:, None]
     number = in_interval * every + np.arange(every)
     count = parts.ravel()[interval, None]
     length = intervals.ravel()[interval, None] / count
-    steps = np.zeros((lanes, size, every))
-    ends = np.repeat(instants[:, -1], size * every).reshape(lanes, size, every)
-    steps[lane, block] = np.where(number < count, length, 0.0)
+    steps = np.zeros((elements, size, every))
+    ends = np.repeat(instants[:, -1], size * every).reshape(elements, size, every)
+    steps[element, block] = np.where(number < count, length, 0.0)
     # The last step of an interval ends exactly at the given time.
     inside = before.ravel()[interval, None] + (number + 1) * length
     instant = instants.ravel()[interval, None]
-    ends[lane, block] = np.where(number + 1 < count, inside, instant)
-    return steps.reshape(lanes, -1), ends.reshape(lanes, -1), every, rows
+    ends[element, block] = np.where(number + 1 < count, inside, instant)
+    return steps.reshape(elements, -1), ends.reshape(elements, -1), every, rows
 
 
-def _since_start(scenario: Scenario) -> Array:
+def _sample_times(scenario: Scenario) -> Array:
     """Return the sample times (T,) since the first sample, s."""
     seconds: Array = scenario.times - scenario.times[0]
     return seconds
 
 
-def _commanded(scenario: Scenario) -> Array:
+def _command_times(scenario: Scenario) -> Array:
     """Return the times (T,) since the first sample at which inputs change, s."""
-    seconds: Array = _since_start(scenario) + scenario.offset
+    seconds: Array = _sample_times(scenario) + scenario.offset
     return seconds
 
 
-def _earlier(scenario: Scenario, name: str) -> Array:
+def _history_times(scenario: Scenario, name: str) -> Array:
     """Return the times (K,) of an input's known history before the run, s."""
     if name not in scenario.before:
         return np.empty(0)
@@ -267,7 +267,7 @@ def _earlier(scenario: Scenario, name: str) -> Array:
     return earlier
 
 
-def _signal(scenario: Scenario, name: str, values: Array) -> Array:
+def _command_values(scenario: Scenario, name: str, values: Array) -> Array:
     """Return the values (K + T,) of an input, including its known history before the run.
 
     Args:
@@ -280,7 +280,7 @@ def _signal(scenario: Scenario, name: str, values: Array) -> Array:
     return np.concatenate([scenario.before[name][1], values])
 
 
-def _padded(values: Array, size: int) -> Array:
+def _pad_with_last(values: Array, size: int) -> Array:
     """Repeat the last of `values` up to the given size."""
     more = np.full(size - values.size, values[-1])
     return np.concatenate([values, more])
@@ -305,13 +305,13 @@ def compute_applied_inputs(
         Applied inputs (L, S) by name.
     """
     effects = tuple((effect, c, is_active(c)) for effect, c in acting if c.any())
-    begin, end, steps = _before(plan.ends), plan.ends, plan.steps
+    begin, end, steps = _step_begins(plan.ends), plan.ends, plan.steps
     first, *others = commands[0]
-    felt = {}
+    applied = {}
     for name in others if effects else (first, *others):
-        felt[name] = _felt(runs, name, commands, begin, end, plan.has_uniform_steps)
+        applied[name] = _average_command(runs, name, commands, begin, end, plan.has_uniform_steps)
     if not effects:
-        return felt
+        return applied
     lead = _build_lead_in_steps(
         runs, first, max(float(steps.max(initial=0.0)), MAX_LEAD_IN_STEP_SECONDS)
     )
@@ -323,22 +323,24 @@ def compute_applied_inputs(
     for effect, c, on in reversed(effects):
         assert isinstance(effect, Input)
         # Most effects do not shift time; skip them.
-        if not _shifts(effect):
+        if not _shifts_time(effect):
             continue
         begin = np.where(on, effect.times(c, begin), begin)
         end = np.where(on, effect.times(c, end), end)
     # Forwards with the values.
-    means = _felt(runs, first, commands, begin, end, plan.has_uniform_steps)
+    means = _average_command(runs, first, commands, begin, end, plan.has_uniform_steps)
     for effect, c, on in effects:
         if isinstance(effect, Input) and effect.between:
-            other = _felt(runs, first, commands, begin, end, plan.has_uniform_steps, other=True)
+            other = _average_command(
+                runs, first, commands, begin, end, plan.has_uniform_steps, other=True
+            )
             means = np.where(on, means + c[0] * (other - means), means)
     pairs = zip(runs.unique_scenarios, commands, strict=True)
-    beginnings = np.array([_signal(s, first, u[first])[0] for s, u in pairs])
-    passed = _apply_input_effects(
+    beginnings = np.array([_command_values(s, first, u[first])[0] for s, u in pairs])
+    result = _apply_input_effects(
         effects, steps, ends, means, beginnings[runs.scenario_index, None]
     )
-    return {first: passed[:, lead[0].shape[1] :], **felt}
+    return {first: result[:, lead[0].shape[1] :], **applied}
 
 
 def _build_lead_in_steps(
@@ -355,14 +357,16 @@ def _build_lead_in_steps(
         Beginnings, ends and lengths (N, K) of the steps, s; the length is zero where the history is
         unknown.
     """
-    marks = [_earlier(s, name) for s in runs.unique_scenarios]
-    marks = [np.append(row[row < 0], 0.0) for row in marks]
-    size = max(row.size for row in marks)
+    event_times = [_history_times(s, name) for s in runs.unique_scenarios]
+    event_times = [np.append(row[row < 0], 0.0) for row in event_times]
+    size = max(row.size for row in event_times)
     if size == 1:
-        nothing = np.empty((len(marks), 0))
+        nothing = np.empty((len(event_times), 0))
         return nothing, nothing, nothing
-    first = np.array([[row[0]] for row in marks])
-    steps, ends, _, _ = _divided(np.stack([_padded(row, size) for row in marks]) - first, largest)
+    first = np.array([[row[0]] for row in event_times])
+    steps, ends, _, _ = _divide_intervals(
+        np.stack([_pad_with_last(row, size) for row in event_times]) - first, largest
+    )
     ends = ends + first
     return np.hstack([first, ends[:, :-1]]), ends, steps
 
@@ -387,23 +391,23 @@ def _apply_input_effects(
     Returns:
         Applied values (L, S).
     """
-    lasting = _last_nonzero_step(steps)
-    values = np.take_along_axis(means, lasting, axis=1)
+    last_steps = _last_nonzero_step(steps)
+    values = np.take_along_axis(means, last_steps, axis=1)
     start = start.copy()
     for effect, c, on in effects:
         assert isinstance(effect, Input)
         # An effect may be active in few of the batch elements; evaluate only these.
-        lanes = np.flatnonzero(on)
-        own, begin = c[:, lanes], start[lanes]
+        elements = np.flatnonzero(on)
+        own, begin = c[:, elements], start[elements]
         nothing = np.zeros_like(begin)
-        signal = Signal(values[lanes], steps[lanes], begin, ends[lanes])
-        passed = effect.feel(own, signal)
-        values[lanes] = np.take_along_axis(passed, lasting[lanes], axis=1)
-        start[lanes] = effect.feel(own, Signal(begin, nothing, begin, nothing))
+        signal = Signal(values[elements], steps[elements], begin, ends[elements])
+        result = effect.feel(own, signal)
+        values[elements] = np.take_along_axis(result, last_steps[elements], axis=1)
+        start[elements] = effect.feel(own, Signal(begin, nothing, begin, nothing))
     return values
 
 
-def _before(ends: Array) -> Array:
+def _step_begins(ends: Array) -> Array:
     """Return the beginnings (L, S) of steps from their ends; memory is shared as in `ends`."""
     own = ends[:1] if ends.strides[0] == 0 else ends
     start = np.zeros((len(own), 1))
@@ -417,18 +421,18 @@ def _last_nonzero_step(steps: Array) -> Indices:
     The input does not change while a batch element waits.
     """
     own = np.arange(steps.shape[1])
-    lasting = np.where(steps > 0, own, 0)
-    last: Indices = np.maximum.accumulate(lasting, axis=1)
+    last_steps = np.where(steps > 0, own, 0)
+    last: Indices = np.maximum.accumulate(last_steps, axis=1)
     return last
 
 
-def _felt(
+def _average_command(
     runs: ScenarioGroups,
     name: str,
     commands: Commands,
     begin: Array,
     end: Array,
-    alike: bool,
+    has_uniform_steps: bool,
     other: bool = False,
 ) -> Array:
     """Return the mean of each batch element's signal over each step.
@@ -439,29 +443,29 @@ def _felt(
         commands: Inputs of each distinct scenario.
         begin: (L, S) beginnings of the steps, s.
         end: (L, S) ends of the steps, s.
-        alike: Whether batch elements with the same scenario have the same steps, so that only the
-            first of them is evaluated.
+        has_uniform_steps: Whether batch elements with the same scenario have the same steps, so
+            that only the first of them is evaluated.
         other: Whether to interpolate held signals linearly, and to hold linear ones.
 
     Returns:
         Means (L, S).
     """
-    count = len(commands) if alike else len(begin)
+    count = len(commands) if has_uniform_steps else len(begin)
     result = np.empty((count, begin.shape[1]))
     # Process all batch elements with the same scenario in one call.
     by_run = np.argsort(runs.scenario_index, kind="stable")
     borders = np.flatnonzero(np.diff(runs.scenario_index[by_run])) + 1
-    for lanes in np.split(by_run, borders):
-        run = runs.scenario_index[lanes[0]]
+    for elements in np.split(by_run, borders):
+        run = runs.scenario_index[elements[0]]
         scenario = runs.unique_scenarios[run]
         means = (
             _average_linear_signal if (name in scenario.linear) != other else _average_held_signal
         )
-        to, of = (slice(run, run + 1), lanes[:1]) if alike else (lanes, lanes)
-        instants = np.concatenate([_earlier(scenario, name), _commanded(scenario)])
-        signal = _signal(scenario, name, commands[run][name])
+        to, of = (slice(run, run + 1), elements[:1]) if has_uniform_steps else (elements, elements)
+        instants = np.concatenate([_history_times(scenario, name), _command_times(scenario)])
+        signal = _command_values(scenario, name, commands[run][name])
         result[to] = means(instants, signal, begin[of], end[of])
-    return runs.expand_rows(result) if alike else result
+    return runs.expand_rows(result) if has_uniform_steps else result
 
 
 def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) -> Array:
@@ -473,19 +477,19 @@ def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) 
         begin: Beginnings of the intervals, s.
         end: Ends of the intervals, s.
     """
-    place = np.searchsorted(times, begin, side="right") - 1
-    place = np.clip(place, 0, times.size - 1)
-    value: Array = values[place]
+    index = np.searchsorted(times, begin, side="right") - 1
+    index = np.clip(index, 0, times.size - 1)
+    value: Array = values[index]
     last = np.searchsorted(times, end, side="left") - 1
     last = np.clip(last, 0, times.size - 1)
     # Equation (1) only where the command changes within the interval; elsewhere its value is exact.
-    crossing = last > place
+    crossing = last > index
     if crossing.any():
         held = values[:-1] * np.diff(times)
         area = np.concatenate([[0.0], np.cumsum(held)])
         a = begin[crossing]
         b = end[crossing]
-        over = _area(times, values, area, b) - _area(times, values, area, a)
+        over = _held_integral(times, values, area, b) - _held_integral(times, values, area, a)
         value[crossing] = over / (b - a)  # (1)
     return value
 
@@ -509,13 +513,13 @@ def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array
     crossing = np.searchsorted(times, end, side="left") > first
     if crossing.any():
         a, b = begin[crossing], end[crossing]
-        over = _straight_area(times, values, area, b) - _straight_area(times, values, area, a)
+        over = _linear_integral(times, values, area, b) - _linear_integral(times, values, area, a)
         value[crossing] = over / (b - a)  # (1)
     result: Array = value
     return result
 
 
-def _straight_area(times: Array, values: Array, area: Array, t: Array) -> Array:
+def _linear_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
     """Return the integral A(t) of (1) of a linearly interpolated signal.
 
     Args:
@@ -524,13 +528,13 @@ def _straight_area(times: Array, values: Array, area: Array, t: Array) -> Array:
         area: (T,) integral up to each of `times`.
         t: Times, s.
     """
-    place = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
-    here = np.interp(t, times, values)
-    result: Array = area[place] + 0.5 * (values[place] + here) * (t - times[place])
+    index = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
+    value_at_t = np.interp(t, times, values)
+    result: Array = area[index] + 0.5 * (values[index] + value_at_t) * (t - times[index])
     return result
 
 
-def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
+def _held_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
     """Return the integral A(t) of (1) of a held signal.
 
     Args:
@@ -539,13 +543,13 @@ def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
         area: (T,) integral up to each of `times`.
         t: Times, s.
     """
-    place = np.searchsorted(times, t, side="right") - 1
-    place = np.clip(place, 0, times.size - 1)
-    result: Array = area[place] + values[place] * (t - times[place])
+    index = np.searchsorted(times, t, side="right") - 1
+    index = np.clip(index, 0, times.size - 1)
+    result: Array = area[index] + values[index] * (t - times[index])
     return result
 
 
-def _shifts(effect: Effect) -> bool:
+def _shifts_time(effect: Effect) -> bool:
     """Return whether an effect shifts time, that is, overrides `times`."""
     if not isinstance(effect, (Input, Sensor)):
         return False

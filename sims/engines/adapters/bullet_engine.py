@@ -34,9 +34,9 @@ REQUIRED_PACKAGES = ("pybullet",)
 
 _PUBLISHED_SETTINGS = {"linear_damping": 0.04, "lateral_friction": 0.2, "plane_restitution": 1.0}
 """Settings of the published scene (TuneNet, arXiv 1907.11200): 1/s, and dimensionless numbers."""
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+_NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 """Identity rotation as a quaternion x, y, z, w."""
-_NOWHERE = (0.0, 0.0, 0.0)
+_ZERO_VECTOR = (0.0, 0.0, 0.0)
 """Zero vector: the origin, or zero velocity."""
 _IMPACT = 1e-4
 """Length of the time step of an impact, in seconds."""
@@ -74,12 +74,12 @@ def make_engine(
     Raises:
         InputError: a setting is not valid.
     """
-    own = {
+    native_settings = {
         "linear_damping": linear_damping,
         "lateral_friction": lateral_friction,
         "plane_restitution": plane_restitution,
     }
-    given = {name: value for name, value in own.items() if value is not None}
+    given = {name: value for name, value in native_settings.items() if value is not None}
     if not native_contact:
         if given:
             raise InputError(
@@ -106,22 +106,27 @@ class BulletEngine:
     requires: tuple[str, ...] = REQUIRED_PACKAGES
 
     def __init__(
-        self, system: type[System], largest_step: float, own: Mapping[str, float] | None = None
+        self,
+        system: type[System],
+        largest_step: float,
+        native_settings: Mapping[str, float] | None = None,
     ) -> None:
         self.largest_step = largest_step
         self._rollout: RolloutFunction | None = None
         protocol = BulletWorldModule if system.bounces else BulletJointWorldModule
-        if own is not None:
+        if native_settings is not None:
             protocol = BulletBallWorldModule
         module, self._reason = find_world_module(system, "bullet_world", protocol)
         if module is None:
             return
         build = cast(BulletWorldModule, module).build
-        if own is not None:
-            build = partial(cast(BulletBallWorldModule, module).build_native, settings=own)
+        if native_settings is not None:
+            build = partial(
+                cast(BulletBallWorldModule, module).build_native, settings=native_settings
+            )
         self._world = bullet_world.PersistentBulletWorld(build)
-        if own is not None:
-            native_ball = BulletNativeBall(self._world, own)
+        if native_settings is not None:
+            native_ball = BulletNativeBall(self._world, native_settings)
             self._rollout = partial(native_contact.integrate_native_ball, native_ball)
         elif system.bounces:
             self._rollout = partial(ball_rollout.integrate_ball, BulletBall(self._world))
@@ -129,10 +134,10 @@ class BulletEngine:
             joint = bullet_joints.BulletJoint(self._world, cast(BulletJointWorldModule, module))
             self._rollout = partial(joint_rollout.integrate_joint, joint)
 
-    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+    def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""
         assert self._rollout is not None, "a system that the engine refuses"
-        return integrate_batch(lanes, [self._rollout], self._world.invalidate)
+        return integrate_batch(batch, [self._rollout], self._world.invalidate)
 
     def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
         """Return why the engine cannot integrate the system; see `Engine`."""
@@ -152,7 +157,7 @@ class _BulletMover:
         self._client = self._body = -1
         self._mass = math.nan
         self._contact = math.nan, math.nan
-        self._x: Vector = _NOWHERE
+        self._x: Vector = _ZERO_VECTOR
 
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants, without contact points of the previous rollout."""
@@ -164,7 +169,7 @@ class _BulletMover:
         # contact points survive a reset, and Bullet would use them as old contacts, which changes
         # the results by rounding. They are removed by placing the ball where it touches nothing.
         far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
-        p.resetBasePositionAndOrientation(self._body, far, _UPRIGHT, self._client)
+        p.resetBasePositionAndOrientation(self._body, far, _NO_ROTATION, self._client)
         p.performCollisionDetection(self._client)
 
     def set_step(self, step: float) -> None:
@@ -174,9 +179,9 @@ class _BulletMover:
     def set_state(self, x: Vector, w: Vector) -> None:
         """Set position and velocity; the ball is upright and does not spin."""
         bullet_world.import_pybullet().resetBasePositionAndOrientation(
-            self._body, x, _UPRIGHT, self._client
+            self._body, x, _NO_ROTATION, self._client
         )
-        bullet_world.import_pybullet().resetBaseVelocity(self._body, w, _NOWHERE, self._client)
+        bullet_world.import_pybullet().resetBaseVelocity(self._body, w, _ZERO_VECTOR, self._client)
         self._x = x
 
     def advance(self, force: Vector) -> BallState:
@@ -194,13 +199,13 @@ class _BulletMover:
         client = self._client
         body = self._body
         step = p.stepSimulation
-        at = p.getBasePositionAndOrientation
-        moving = p.getBaseVelocity
+        get_position = p.getBasePositionAndOrientation
+        get_velocity = p.getBaseVelocity
         states: list[BallState] = []
         for count in counts:
             for _ in range(count):
                 step(client)
-            states.append((at(body, client)[0], moving(body, client)[0]))
+            states.append((get_position(body, client)[0], get_velocity(body, client)[0]))
         self._x = states[-1][0]
         return states
 
@@ -228,9 +233,9 @@ class BulletBall(_BulletMover):
         self._floor = constants["radius"]
         self._gravity = constants["gravity"]
         super().reset_world(constants)
-        self._meets(False)
+        self._set_contact(False)
 
-    def _meets(self, ground: bool) -> None:
+    def _set_contact(self, ground: bool) -> None:
         """Switch contact between ball and ground on or off."""
         # Contact is off in flight, because `ball_rollout` computes when the ball meets the ground.
         p = bullet_world.import_pybullet()
@@ -250,17 +255,17 @@ class BulletBall(_BulletMover):
         self.set_step(_IMPACT)
         # Bullet adds gravity's velocity change of the step before it solves the contact. This is
         # compensated, so that the solver sees v.
-        inside = x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION
-        self.set_state(inside, (v[0], v[1], v[2] + self._gravity * _IMPACT))
-        self._meets(True)
+        contact_position = x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION
+        self.set_state(contact_position, (v[0], v[1], v[2] + self._gravity * _IMPACT))
+        self._set_contact(True)
         _, after = self.advance_freely((1,))[0]
-        self._meets(False)
+        self._set_contact(False)
         return after
 
     def set_resting_contact(self) -> None:
         """Set contact with zero restitution and zero friction."""
         self.set_contact_parameters(0.0, 0.0)
-        self._meets(True)
+        self._set_contact(True)
 
 
 class BulletNativeBall(_BulletMover):
@@ -271,7 +276,7 @@ class BulletNativeBall(_BulletMover):
     ) -> None:
         super().__init__(world)
         self.damping = settings["linear_damping"]
-        self._rough = settings["lateral_friction"]
+        self._lateral_friction = settings["lateral_friction"]
         self._reach = math.nan
 
     def reset_world(self, constants: dict[str, float]) -> None:
@@ -289,16 +294,16 @@ class BulletNativeBall(_BulletMover):
             return
         # The contact uses the product of both bodies' friction. With 1 for the ground, the ball's
         # coefficient is the product from the settings plus the friction of the effect.
-        own = self._rough
-        ground = self._rough
+        ball_friction = self._lateral_friction
+        ground_friction = self._lateral_friction
         if friction:
-            own = self._rough**2 + friction
-            ground = 1.0
+            ball_friction = self._lateral_friction**2 + friction
+            ground_friction = 1.0
         p = bullet_world.import_pybullet()
         if friction or self._contact[1]:
             floor = p.getBodyUniqueId(0, self._client)
-            p.changeDynamics(floor, -1, lateralFriction=ground, physicsClientId=self._client)
-            p.changeDynamics(self._body, -1, lateralFriction=own, physicsClientId=self._client)
+            for body, value in ((floor, ground_friction), (self._body, ball_friction)):
+                p.changeDynamics(body, -1, lateralFriction=value, physicsClientId=self._client)
         p.changeDynamics(self._body, -1, restitution=restitution, physicsClientId=self._client)
         self._contact = restitution, friction
 

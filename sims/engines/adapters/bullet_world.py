@@ -34,9 +34,9 @@ def _output_discarded() -> Iterator[None]:
     with contextlib.ExitStack() as undo:
         for stream in (1, 2):
             with contextlib.suppress(OSError):  # a process may lack this stream
-                kept = os.dup(stream)
-                undo.callback(os.close, kept)
-                undo.callback(os.dup2, kept, stream)
+                original = os.dup(stream)
+                undo.callback(os.close, original)
+                undo.callback(os.dup2, original, stream)
                 sink = os.open(os.devnull, os.O_WRONLY)
                 undo.callback(os.close, sink)
                 os.dup2(sink, stream)

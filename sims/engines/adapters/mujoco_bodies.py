@@ -167,24 +167,24 @@ class MujocoMover:
         self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self._model.geom_solimp[:] = _IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0
         self._step = mujoco.mj_step
-        self._hertz = math.nan
-        self._meets(False)
+        self._inverse_step = math.nan
+        self._set_contact(False)
 
-    def _meets(self, ground: bool) -> None:
+    def _set_contact(self, ground: bool) -> None:
         """Switch contact on or off."""
         flags = self._model.opt.disableflags
         self._model.opt.disableflags = (
             flags & ~self._no_contact if ground else flags | self._no_contact
         )
 
-    def _contact(self, stiffness: float, damping: float) -> None:
+    def _set_contact_parameters(self, stiffness: float, damping: float) -> None:
         """Set stiffness (1/s^2) and damping (1/s) of the following contacts."""
         self._model.geom_solref[:] = -stiffness, -damping
 
     def set_step(self, step: float) -> None:
         """Set the step in seconds."""
         self._model.opt.timestep = step
-        self._hertz = 1.0 / step
+        self._inverse_step = 1.0 / step
 
     def set_state(self, x: Vector, w: Vector) -> None:
         """Set position and velocity."""
@@ -222,13 +222,13 @@ class MujocoBall(MujocoMover):
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants, with contact switched off."""
         super().reset_world(constants)
-        self._held = False
+        self._is_supported = False
 
     def set_step(self, step: float) -> None:
         """Set the step in seconds."""
         super().set_step(step)
-        if self._held:
-            self._contact(0.1 * self._hertz**2, self._hertz)  # (4)
+        if self._is_supported:
+            self._set_contact_parameters(0.1 * self._inverse_step**2, self._inverse_step)  # (4)
 
     def solve_impact(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
         """Return the velocity after an impact, from MuJoCo's contact solver in one short step.
@@ -241,24 +241,24 @@ class MujocoBall(MujocoMover):
             restitution: restitution coefficient.
             friction: friction coefficient.
         """
-        self._held = False
+        self._is_supported = False
         self.set_step(_IMPACT)
         self.set_state((x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION), v)
-        self._contact(0.0, (1.0 + restitution) * self._hertz)  # (3)
+        self._set_contact_parameters(0.0, (1.0 + restitution) * self._inverse_step)  # (3)
         # The impact removes tangential speed mu (1 + e) |vn| (`engines.ground_contact`), in this
         # one # step.
         along = math.hypot(v[0], v[1])
         share = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) if along else 0.0
-        lost = share * self._hertz
-        self._meets(True)
-        _, after = self.advance((-lost * v[0], -lost * v[1], self._gravity))
-        self._meets(False)
+        deceleration = share * self._inverse_step
+        self._set_contact(True)
+        _, after = self.advance((-deceleration * v[0], -deceleration * v[1], self._gravity))
+        self._set_contact(False)
         return after
 
     def set_resting_contact(self) -> None:
         """Set contact that supports the ball: damping, and a weak spring."""
-        self._held = True
-        self._meets(True)
+        self._is_supported = True
+        self._set_contact(True)
         # (4) depends on the step; if a step is already set, the contact is set for it.
-        if not math.isnan(self._hertz):
-            self.set_step(1.0 / self._hertz)
+        if not math.isnan(self._inverse_step):
+            self.set_step(1.0 / self._inverse_step)

@@ -39,8 +39,8 @@ REQUIRED_PACKAGES = ("mujoco",)
 
 _STIFFNESS = 1e5
 """Default stiffness of the native contact in 1/s^2: contacts then last 10 ms."""
-_MOST_THREADS = 1024
-_OWN_STEP = 2e-3
+_MAX_THREADS = 1024
+_DEFAULT_STEP = 2e-3
 """MuJoCo's default time step in seconds."""
 
 
@@ -73,11 +73,11 @@ def make_engine(
         InputError: a setting is not valid.
     """
     if native_contact and time_step is None:
-        time_step = _OWN_STEP
+        time_step = _DEFAULT_STEP
     step = resolve_time_step(time_step, system)
-    if not (isinstance(threads, int) and 1 <= threads <= _MOST_THREADS):
+    if not (isinstance(threads, int) and 1 <= threads <= _MAX_THREADS):
         raise InputError(
-            f"threads must be a whole number from 1 to {_MOST_THREADS}, "
+            f"threads must be a whole number from 1 to {_MAX_THREADS}, "
             f"found {truncate_text(str(threads))}"
         )
     if not native_contact:
@@ -132,11 +132,11 @@ class MujocoEngine:
                 rollout = partial(joint_rollout.integrate_joint, joint)
             self._rollouts.append(rollout)
 
-    def integrate(self, lanes: IntegrationBatch) -> Trajectories:
+    def integrate(self, batch: IntegrationBatch) -> Trajectories:
         """Integrate all batch elements; see `Engine`."""
         assert self._rollouts, "a system that the engine refuses"
         with _suppress_warnings():
-            return integrate_batch(lanes, self._rollouts, self.close)
+            return integrate_batch(batch, self._rollouts, self.close)
 
     def find_unsupported_reason(self, system: type[System]) -> str:  # noqa: ARG002
         """Return why the engine cannot integrate the system; see `Engine`."""

@@ -27,16 +27,16 @@ class MujocoSoftBall(MujocoMover):
     def reset_world(self, constants: dict[str, float]) -> None:
         """Prepare a world for these constants, with contact switched on."""
         super().reset_world(constants)
-        self._meets(True)
-        self._touched = math.nan, math.nan
+        self._set_contact(True)
+        self._contact_values = math.nan, math.nan
 
     def set_contact_parameters(self, restitution: float, friction: float) -> None:
         """Set friction, and the damping that gives this restitution for short steps."""
-        if (restitution, friction) != self._touched:
-            self._touched = restitution, friction
+        if (restitution, friction) != self._contact_values:
+            self._contact_values = restitution, friction
             # For stiffness k and damping b per unit mass, the damping ratio is b / (2 sqrt k).
             damping = 2.0 * compute_damping_ratio(restitution) * math.sqrt(self._stiffness)
-            self._contact(self._stiffness, damping)
+            self._set_contact_parameters(self._stiffness, damping)
 
     def is_near_contact(self, gap: float) -> bool:
         """Return whether the ball touches the ground."""
@@ -44,13 +44,13 @@ class MujocoSoftBall(MujocoMover):
 
     def advance(self, force: Vector) -> BallState:
         """Advance by one step with a force per unit mass at the centre, and contact friction."""
-        friction = self._touched[1]
+        friction = self._contact_values[1]
         if friction and self._data.nefc:
             vx, vy, _ = self._w.tolist()
             slip = math.hypot(vx, vy)
             normal = float(self._data.efc_force[0])
             # Friction must not do more than stop the slip within the step.
-            share = min(friction * normal / self._mass / slip, self._hertz) if slip else 0.0
+            share = min(friction * normal / self._mass / slip, self._inverse_step) if slip else 0.0
             force = force[0] - share * vx, force[1] - share * vy, force[2]
         return super().advance(force)
 

@@ -21,9 +21,9 @@ import numpy as np
 from sims.engines.compiled.data_layout import (
     BOUNCES,
     DIMENSIONS,
+    ELEMENT,
+    FLOOR_LEVEL,
     K1,
-    LANE,
-    LEVEL,
     BatchArrays,
     BlockBuffers,
     ProgramArrays,
@@ -38,68 +38,68 @@ from sims.engines.compiled.events import compute_rebound_velocity
 from sims.engines.compiled.interpreter import run_instructions
 
 
-def fly_elements(program: ProgramArrays, work: BatchArrays, block: BlockBuffers) -> None:
+def fly_elements(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers) -> None:
     """Integrate elements on which only a constant force acts.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
     """
-    for place in range(work.order.size):
-        load_element(program, work, block, 0, place)
+    for order_index in range(arrays.order.size):
+        load_element(program, arrays, block, 0, order_index)
         run_instructions(program.code, program.ends[0], program.ends[1], block.r, 1)
         if program.flags[BOUNCES] != 0:
-            resolve_initial_ground_contact(program, work, block, 1)
+            resolve_initial_ground_contact(program, arrays, block, 1)
         evaluate_forces(program, block, 1)
         compute_frictionless_acceleration(program, block, 1, K1)
-        record_flight(program, work, block)
+        record_flight(program, arrays, block)
 
 
-def record_flight(program: ProgramArrays, work: BatchArrays, block: BlockBuffers) -> None:
+def record_flight(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers) -> None:
     """Record the states of the element at all sample times.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
     """
-    lane = block.n[LANE, 0]
-    row = lane if work.steps.shape[0] > 1 else 0
+    element = block.n[ELEMENT, 0]
+    row = element if arrays.steps.shape[0] > 1 else 0
     time = 0.0
     impact = compute_impact_time(program, block)
-    for step in range(work.steps.shape[1] + 1):
-        if step % work.every == 0:
+    for step in range(arrays.steps.shape[1] + 1):
+        if step % arrays.every == 0:
             while impact <= time:
-                bounce(program, work, block, impact)
+                bounce(program, arrays, block, impact)
                 impact = compute_impact_time(program, block)
-            record_arc(program, work, block, step // work.every, time)
-        if step < work.steps.shape[1]:
-            time += work.steps[row, step]
+            record_arc(program, arrays, block, step // arrays.every, time)
+        if step < arrays.steps.shape[1]:
+            time += arrays.steps[row, step]
 
 
 def record_arc(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, record: int, time: float
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, record: int, time: float
 ) -> None:
     """Record the state on the present parabola at a time.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         record: index of the record.
         time: seconds since the start of the run.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
-    lane = block.n[LANE, 0]
+    element = block.n[ELEMENT, 0]
     s = time - a[T, 0]
     for k in range(d):
         v = a[V + k, 0]
         acceleration = a[K1 + k, 0]
-        work.kept[lane, record, k] = a[X + k, 0] + s * (v + s * (0.5 * acceleration))  # (1)
-        work.kept[lane, record, d + k] = v + s * acceleration  # (2)
-        work.kept[lane, record, 2 * d + k] = acceleration
+        arrays.kept[element, record, k] = a[X + k, 0] + s * (v + s * (0.5 * acceleration))  # (1)
+        arrays.kept[element, record, d + k] = v + s * acceleration  # (2)
+        arrays.kept[element, record, 2 * d + k] = acceleration
 
 
 def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
@@ -113,7 +113,7 @@ def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
         return np.inf
     a = block.a
     last = program.flags[DIMENSIONS] - 1
-    height = a[X + last, 0] - a[LEVEL, 0]
+    height = a[X + last, 0] - a[FLOOR_LEVEL, 0]
     up = a[V + last, 0]
     down = -a[K1 + last, 0]
     root = np.sqrt(up * up + 2.0 * down * height)  # NaN if it does not reach the ground
@@ -124,12 +124,12 @@ def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:
     return float(np.inf if seconds != seconds else a[T, 0] + seconds)
 
 
-def bounce(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, impact: float) -> None:
+def bounce(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, impact: float) -> None:
     """Move the element to its impact and begin the parabola after it.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         impact: time of the impact in seconds since the start of the run.
     """
@@ -141,6 +141,6 @@ def bounce(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, impac
         a[X + k, 0] += s * (a[V + k, 0] + s * (0.5 * acceleration))  # (1)
         a[V + k, 0] += s * acceleration  # (2)
     a[T, 0] = impact
-    a[X + last, 0] = a[LEVEL, 0]  # removes the rounding of (1) and (3)
-    compute_rebound_velocity(program, work, block, 0, a[K1 + last, 0])
+    a[X + last, 0] = a[FLOOR_LEVEL, 0]  # removes the rounding of (1) and (3)
+    compute_rebound_velocity(program, arrays, block, 0, a[K1 + last, 0])
     compute_frictionless_acceleration(program, block, 1, K1)

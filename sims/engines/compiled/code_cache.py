@@ -32,13 +32,13 @@ def read_cached(path: Path) -> bytes | None:
     return content if hashlib.sha256(content).digest() == data[:_DIGEST] else None
 
 
-def make_cached(path: Path, make: Callable[[], bytes], waits: Callable[[], None]) -> bytes:
+def make_cached(path: Path, make: Callable[[], bytes], report_wait: Callable[[], None]) -> bytes:
     """Return the cached content of a file, made by one of all processes that request it.
 
     Args:
         path: path of the file.
         make: function that makes the content if it does not exist.
-        waits: called once if another process is making the content.
+        report_wait: called once if another process is making the content.
 
     Returns:
         The content.
@@ -47,7 +47,7 @@ def make_cached(path: Path, make: Callable[[], bytes], waits: Callable[[], None]
         OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _alone(path.with_suffix(".lock"), waits):
+    with _hold_lock(path.with_suffix(".lock"), report_wait):
         # Another process may have made it meanwhile.
         content = read_cached(path)
         if content is None:
@@ -68,7 +68,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 @contextlib.contextmanager
-def _alone(path: Path, waits: Callable[[], None]) -> Iterator[None]:
+def _hold_lock(path: Path, report_wait: Callable[[], None]) -> Iterator[None]:
     """Hold an exclusive lock between processes, if the operating system supports it."""
     try:
         import fcntl
@@ -79,6 +79,6 @@ def _alone(path: Path, waits: Callable[[], None]) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            waits()
+            report_wait()
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -16,7 +16,7 @@ from sims.core.engine import IntegrationBatch
 from sims.core.simulator import Array
 from sims.core.system import System
 from sims.engines.compiled.data_layout import (
-    DRY,
+    HAS_FRICTION,
     IN_E,
     IN_P,
     IN_T,
@@ -39,57 +39,59 @@ _RESTITUTION, _FRICTION = 0.6, 0.2
 
 
 def get_force_program(
-    lanes: IntegrationBatch, chosen: Indices, effects: Sequence[Effect]
+    batch: IntegrationBatch, elements: Indices, effects: Sequence[Effect]
 ) -> ForceProgram | NumpyForceProgram:
     """Return the program for some elements.
 
     Args:
-        lanes: whole batch.
-        chosen: (n,) indices of the elements.
+        batch: whole batch.
+        elements: (n,) indices of the elements.
         effects: effects that act on them.
     """
     names = InputNames(
-        tuple(lanes.constants), tuple(lanes.inputs), lanes.theta.shape[1], lanes.x.shape[1]
+        tuple(batch.constants), tuple(batch.inputs), batch.theta.shape[1], batch.x.shape[1]
     )
     # The lock prevents that a trace in progress in another thread is taken as not traceable.
     with _lock:
-        tracer = _get_tracer(lanes, chosen, names)
+        tracer = _get_tracer(batch, elements, names)
         if tracer is not None and all(
-            _is_traceable(tracer, effect, lanes, chosen, names) for effect in effects
+            _is_traceable(tracer, effect, batch, elements, names) for effect in effects
         ):
             try:
                 return tracer.build_program(effects)
             except NotTraceableError as reason:  # the program would be too long
                 _report("this set of effects", reason)
-    return NumpyForceProgram(lanes.system, names, effects)
+    return NumpyForceProgram(batch.system, names, effects)
 
 
-def _get_tracer(lanes: IntegrationBatch, chosen: Indices, names: InputNames) -> SystemTracer | None:
-    key = type(lanes.system), names
+def _get_tracer(
+    batch: IntegrationBatch, elements: Indices, names: InputNames
+) -> SystemTracer | None:
+    key = type(batch.system), names
     if key not in _tracers:
         _tracers[key] = None
         try:
-            tracer = SystemTracer(lanes.system, names)
-            _check(tracer, lanes, chosen, names, None)
+            tracer = SystemTracer(batch.system, names)
+            _check(tracer, batch, elements, names, None)
             _tracers[key] = tracer
         # A user's system may raise any error when called with traced arrays.
         except Exception as reason:
-            _report(f"system {lanes.system.name}", reason)
+            _report(f"system {batch.system.name}", reason)
     return _tracers[key]
 
 
 def _is_traceable(
     tracer: SystemTracer,
     effect: Effect,
-    lanes: IntegrationBatch,
-    chosen: Indices,
+    batch: IntegrationBatch,
+    elements: Indices,
     names: InputNames,
 ) -> bool:
-    key = type(lanes.system), names, type(effect)
+    key = type(batch.system), names, type(effect)
     if key not in _effects:
         _effects[key] = False
         try:
-            _check(tracer, lanes, chosen, names, effect)
+            _check(tracer, batch, elements, names, effect)
             _effects[key] = True
         except Exception as reason:
             _report(f"effect {effect.name}", reason)
@@ -104,8 +106,8 @@ def _report(subject: str, reason: Exception) -> None:
 
 def _check(
     tracer: SystemTracer,
-    lanes: IntegrationBatch,
-    chosen: Indices,
+    batch: IntegrationBatch,
+    elements: Indices,
     names: InputNames,
     effect: Effect | None,
 ) -> None:
@@ -113,27 +115,27 @@ def _check(
 
     Args:
         tracer: traced system.
-        lanes: whole batch.
-        chosen: (n,) indices of the elements.
+        batch: whole batch.
+        elements: (n,) indices of the elements.
         names: input names and sizes.
         effect: effect under test; None to test the system.
 
     Raises:
         NotTraceableError: the results differ, or the traced object has its own state.
     """
-    if getattr(effect or lanes.system, "__dict__", None):
+    if getattr(effect or batch.system, "__dict__", None):
         raise NotTraceableError("it has a state of its own")
     effects = [] if effect is None else [effect]
-    lane = chosen[:1]
-    coefficients = [c[:, lane, 0].T for acting, c in lanes.effects if acting is effect]
-    constants = [values[lane] for values in lanes.constants.values()]
-    parameters = np.concatenate([lanes.theta[lane], *constants, *coefficients], axis=1)[0]
-    inputs = np.array([values[lane[0], 0] for values in lanes.inputs.values()])
+    first = elements[:1]
+    coefficients = [c[:, first, 0].T for active, c in batch.effects if active is effect]
+    constants = [values[first] for values in batch.constants.values()]
+    parameters = np.concatenate([batch.theta[first], *constants, *coefficients], axis=1)[0]
+    inputs = np.array([values[first[0], 0] for values in batch.inputs.values()])
     states = [
-        np.concatenate([[t], lanes.x[lane[0]] + shift, lanes.v[lane[0]] - 2.0 * shift, inputs])
+        np.concatenate([[t], batch.x[first[0]] + shift, batch.v[first[0]] - 2.0 * shift, inputs])
         for t, shift in ((0.0, 0.0), (0.37, 0.1))
     ]
-    programs = tracer.build_program(effects), NumpyForceProgram(lanes.system, names, effects)
+    programs = tracer.build_program(effects), NumpyForceProgram(batch.system, names, effects)
     values, expected_values = (_evaluate(program, parameters, states) for program in programs)
     for value, expected in zip(values, expected_values, strict=True):
         size = _TOLERANCE * np.abs(expected).max()
@@ -155,7 +157,7 @@ def _evaluate(
         r[rows[IN_T] : rows[IN_P], 0] = state
         run_moment()
         results.append(r[out, 0])
-        if flags[DRY]:
+        if flags[HAS_FRICTION]:
             results.append(r[rows[OUT_LIMIT], :1].copy())
     for speed in (0.3, 2.0):
         r[rows[IN_E] : rows[IN_E] + 3, 0] = _RESTITUTION, _FRICTION, speed

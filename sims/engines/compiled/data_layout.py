@@ -97,38 +97,51 @@ class BlockBuffers(NamedTuple):
 # Entries of `ProgramArrays.rows`.
 IN_T, IN_X, IN_V, IN_U, IN_P, IN_E, IN_MU, IN_SPEED, OUT_LIMIT, OUT_E, OUT_MU = range(11)
 # Entries of `ProgramArrays.flags`.
-DIMENSIONS, DRY, PUSHED, BOUNCES, GUIDED = range(5)
+DIMENSIONS, HAS_FRICTION, HAS_FORCES, BOUNCES, GUIDED_COUNT = range(5)
 # Rows of `BatchArrays.ground`.
-FLOOR, RESTITUTION, RUBBING, LEAST = range(4)
-# Rows of `BlockBuffers.a`: first the rows with one number per slot, then the first of the LARGEST
-# rows of # each vector.
+FLOOR, RESTITUTION, GROUND_FRICTION, MIN_REMAINING_SHARE = range(4)
+# Rows of `BlockBuffers.a`: first the rows with one number per slot, then the first row of each
+# vector. MAX_ACCELERATION is the square of the largest acceleration so far.
 (
     T,
-    LEFT,
-    LIMIT,
-    LONGEST,
-    PEAK,
-    RUBBED,
-    TRY,
+    REMAINING_TIME,
+    STEP_LIMIT,
+    MAX_STEP,
+    MAX_ACCELERATION,
+    MAX_FRICTION,
+    EVENT_DELAY,
     H,
     MASS,
     BEFORE,
     AFTER,
-    TAKEN,
-    STARTS,
-    BEND,
-    SPARE,
-    LEVEL,
-    FIRST,
+    STEP_COUNT,
+    STEP_START,
+    NONLINEARITY,
+    SCRATCH,
+    FLOOR_LEVEL,
+    FIRST_VECTOR,
 ) = range(17)
-X, V, K1, K2, K3, K4, NEXT_X, NEXT_V, WAY, F1, F2, F3, F4, ROWS = range(
-    FIRST, FIRST + 14 * MAX_COORDINATES, MAX_COORDINATES
+X, V, K1, K2, K3, K4, NEXT_X, NEXT_V, DIRECTION, F1, F2, F3, F4, NUMBER_ROW_COUNT = range(
+    FIRST_VECTOR, FIRST_VECTOR + 14 * MAX_COORDINATES, MAX_COORDINATES
 )
 # Rows of `BlockBuffers.n`.
-PLACE, LANE, STEP, GOAL, EVENTS, SHORTS, BEGINS, STICKS, RESTS, IDLE, BUSY, ASKED = range(12)
-STATE_ROW_COUNT = ASKED + 6
+(
+    ORDER_INDEX,
+    ELEMENT,
+    STEP_INDEX,
+    PENDING_EVENT,
+    EVENT_COUNT,
+    SHORT_FLIGHT_COUNT,
+    IS_STEP_START,
+    IS_STICKING,
+    IS_RESTING,
+    IS_IDLE,
+    MAY_HAVE_EVENT,
+    SAMPLED_STEP,
+) = range(12)
+STATE_ROW_COUNT = SAMPLED_STEP + 6
 
-NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
+NO_EVENT, IMPACT, STANDSTILL, BREAK_AWAY = range(4)
 """Event to which a slot's next step leads."""
 
 
@@ -150,11 +163,11 @@ class InputNames(NamedTuple):
 
 def make_flags(system: System, names: InputNames, effects: Sequence[Effect]) -> IntTable:
     """Return `ProgramArrays.flags` of a system with these effects."""
-    rubs, pushes = (
+    has_friction, has_forces = (
         any(isinstance(effect, kind) for effect in effects) for kind in (Friction, Force)
     )
     guided = system.guided or names.coordinates
-    flags = names.coordinates, rubs, pushes or system.bends, system.bounces, guided
+    flags = names.coordinates, has_friction, has_forces or system.bends, system.bounces, guided
     return np.array(flags, dtype=np.int64)
 
 
@@ -162,60 +175,75 @@ def allocate_block(registers: int, width: int = BLOCK_WIDTH) -> BlockBuffers:
     """Allocate the buffers of a block with these numbers of registers and slots."""
     return BlockBuffers(
         np.zeros((registers, width)),
-        np.zeros((ROWS, width)),
+        np.zeros((NUMBER_ROW_COUNT, width)),
         np.zeros((STATE_ROW_COUNT, width), dtype=np.int64),
     )
 
 
 def check_array_layout(
     program: ProgramArrays,
-    work: BatchArrays,
+    arrays: BatchArrays,
     block: BlockBuffers,
     w: int,
     spans: FloatArray,
-    parts: FloatArray,
+    divisions: FloatArray,
 ) -> None:
     """Check that all arrays have the specified shapes, because machine code does not check them.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
         spans: (L,) step sizes in seconds.
-        parts: (L,) numbers of parts.
+        divisions: (L,) numbers of parts.
 
     Raises:
         ValueError: an array is not as specified.
     """
-    lanes, d = work.x.shape
-    chosen, columns = work.parameters.shape
-    steps = work.steps.shape[1]
+    element_count, d = arrays.x.shape
+    selected_count, columns = arrays.parameters.shape
+    steps = arrays.steps.shape[1]
     width = block.r.shape[1]
     rows = program.rows
-    whole = [
+    int_arrays = [
         *((program.code, (len(program.code), 5)), (program.ends, (4,)), (rows, (11,))),
         *((program.out, (d,)), (program.flags, (5,))),
-        *((work.order, (chosen,)), (block.n, (STATE_ROW_COUNT, width))),
+        *((arrays.order, (selected_count,)), (block.n, (STATE_ROW_COUNT, width))),
     ]
-    real = [
-        *((work.parameters, (chosen, columns)), (work.x, (lanes, d)), (work.v, (lanes, d))),
-        *((work.mass, (lanes,)), (work.longest, (lanes,)), (work.planned, (lanes,))),
-        *((spans, (lanes,)), (parts, (lanes,)), (work.ground, (4, lanes))),
-        (work.steps, (1 if len(work.steps) == 1 else lanes, steps)),
-        (work.inputs, (len(work.inputs), 1 if work.inputs.shape[1] == 1 else lanes, steps)),
-        (work.kept, (lanes, steps // work.every + 1, 3 * d)),
-        *((block.r, (len(block.r), width)), (block.a, (ROWS, width))),
+    real_arrays = [
+        *(
+            (arrays.parameters, (selected_count, columns)),
+            (arrays.x, (element_count, d)),
+            (arrays.v, (element_count, d)),
+        ),
+        *(
+            (arrays.mass, (element_count,)),
+            (arrays.longest, (element_count,)),
+            (arrays.planned, (element_count,)),
+        ),
+        *(
+            (spans, (element_count,)),
+            (divisions, (element_count,)),
+            (arrays.ground, (4, element_count)),
+        ),
+        (arrays.steps, (1 if len(arrays.steps) == 1 else element_count, steps)),
+        (
+            arrays.inputs,
+            (len(arrays.inputs), 1 if arrays.inputs.shape[1] == 1 else element_count, steps),
+        ),
+        (arrays.kept, (element_count, steps // arrays.every + 1, 3 * d)),
+        *((block.r, (len(block.r), width)), (block.a, (NUMBER_ROW_COUNT, width))),
     ]
-    for arrays, kind in ((whole, np.int64), (real, np.float64)):
-        for array, shape in arrays:
+    for group, kind in ((int_arrays, np.int64), (real_arrays, np.float64)):
+        for array, shape in group:
             if array.shape != shape or array.dtype != kind or not array.flags.c_contiguous:
                 raise ValueError(f"expected {shape} {kind.__name__}, found {array.shape}")
     groups = rows[IN_V] - rows[IN_X], rows[IN_P] - rows[IN_U], rows[IN_E] - rows[IN_P]
     if (
-        groups != (d, len(work.inputs), columns)
-        or not (1 <= w <= width and 1 <= d <= MAX_COORDINATES and chosen and steps)
-        or not 0 <= work.order.min() <= work.order.max() < lanes
+        groups != (d, len(arrays.inputs), columns)
+        or not (1 <= w <= width and 1 <= d <= MAX_COORDINATES and selected_count and steps)
+        or not 0 <= arrays.order.min() <= arrays.order.max() < element_count
         or not uses_registers(program.code, len(block.r))
     ):
         raise ValueError("the program is not one for these lanes")

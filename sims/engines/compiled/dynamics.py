@@ -22,18 +22,18 @@ from sims.engines.compiled.data_layout import (
     BEFORE,
     BOUNCES,
     DIMENSIONS,
-    DRY,
+    DIRECTION,
     F1,
-    GUIDED,
+    GUIDED_COUNT,
+    HAS_FRICTION,
     IN_T,
     IN_V,
     IN_X,
+    IS_RESTING,
+    IS_STICKING,
     K1,
     MASS,
     OUT_LIMIT,
-    RESTS,
-    STICKS,
-    WAY,
     BlockBuffers,
     ProgramArrays,
     T,
@@ -76,7 +76,7 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
         w: number of slots in use.
     """
     d = program.flags[DIMENSIONS]
-    if program.flags[DRY] == 0:
+    if program.flags[HAS_FRICTION] == 0:
         compute_frictionless_acceleration(program, block, w, K1)
         return
     if d == 1 and program.flags[BOUNCES] == 0:
@@ -85,7 +85,7 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
-    guided = program.flags[GUIDED]
+    guided = program.flags[GUIDED_COUNT]
     for i in range(w):
         limit = r[limits, i]
         compute_pulling_force(program, block, i, K1)
@@ -93,20 +93,20 @@ def begin_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
         speed = compute_norm(a, V, guided, i)
         a[BEFORE, i] = size - limit
         a[AFTER, i] = size - limit
-        still = speed == 0.0
-        sticks = still and size <= limit  # (2)
-        block.n[STICKS, i] = sticks
+        is_still = speed == 0.0
+        sticks = is_still and size <= limit  # (2)
+        block.n[IS_STICKING, i] = sticks
         # (1) and (3): along the motion, or at rest along the pulling force.
         divisor = speed
-        if still:
+        if is_still:
             divisor = size if size > 0.0 else 1.0
         for k in range(guided):
             pull = a[K1 + k, i]
-            way = (pull if still else a[V + k, i]) / divisor
-            rub = limit * way
-            a[WAY + k, i] = way
-            a[F1 + k, i] = rub
-            a[K1 + k, i] = 0.0 if sticks else (pull - rub) / a[MASS, i]
+            direction = (pull if is_still else a[V + k, i]) / divisor
+            friction = limit * direction
+            a[DIRECTION + k, i] = direction
+            a[F1 + k, i] = friction
+            a[K1 + k, i] = 0.0 if sticks else (pull - friction) / a[MASS, i]
         compute_unguided_acceleration(program, block, i, K1, F1)
 
 
@@ -128,23 +128,23 @@ def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
         v = a[V, i]
         size = abs(pull)
         excess = size - limit
-        still = v == 0.0
-        towards = pull if still else v
-        divisor = (size if size > 0.0 else 1.0) if still else abs(v)
-        way = towards / divisor
-        rub = limit * way
-        slips = (pull - rub) / a[MASS, i]
-        holds = still and size <= limit
+        is_still = v == 0.0
+        towards = pull if is_still else v
+        divisor = (size if size > 0.0 else 1.0) if is_still else abs(v)
+        direction = towards / divisor
+        friction = limit * direction
+        slipping = (pull - friction) / a[MASS, i]
+        is_held = is_still and size <= limit
         a[BEFORE, i] = excess
         a[AFTER, i] = excess
-        a[WAY, i] = way
-        a[F1, i] = rub
-        a[K1, i] = 0.0 if holds else slips
-        block.n[STICKS, i] = 1 if holds else 0
+        a[DIRECTION, i] = direction
+        a[F1, i] = friction
+        a[K1, i] = 0.0 if is_held else slipping
+        block.n[IS_STICKING, i] = 1 if is_held else 0
 
 
 def compute_acceleration(
-    program: ProgramArrays, block: BlockBuffers, w: int, to: int, rub_to: int
+    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
 ) -> None:
     """Compute the accelerations within the present step.
 
@@ -152,22 +152,22 @@ def compute_acceleration(
         program: program of the system and its effects.
         block: buffers of the slots.
         w: number of slots in use.
-        to: first row of the accelerations.
-        rub_to: first row of dry friction.
+        row_of_result: first row of the accelerations.
+        friction_row: first row of dry friction.
     """
     run_instructions(program.code, program.ends[1], program.ends[2], block.r, w)
-    if program.flags[DRY] == 0:
-        compute_frictionless_acceleration(program, block, w, to)
+    if program.flags[HAS_FRICTION] == 0:
+        compute_frictionless_acceleration(program, block, w, row_of_result)
         return
     if program.flags[DIMENSIONS] == 1 and program.flags[BOUNCES] == 0:
-        compute_acceleration_1d(program, block, w, to, rub_to)
+        compute_acceleration_1d(program, block, w, row_of_result, friction_row)
         return
     for i in range(w):
-        compute_acceleration_nd(program, block, i, to, rub_to)
+        compute_acceleration_nd(program, block, i, row_of_result, friction_row)
 
 
 def compute_acceleration_1d(
-    program: ProgramArrays, block: BlockBuffers, w: int, to: int, rub_to: int
+    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
 ) -> None:
     """Compute `compute_acceleration` for one coordinate without ground.
 
@@ -175,8 +175,8 @@ def compute_acceleration_1d(
         program: program of the system and its effects.
         block: buffers of the slots.
         w: number of slots in use.
-        to: row of the acceleration.
-        rub_to: row of dry friction.
+        row_of_result: row of the acceleration.
+        friction_row: row of dry friction.
     """
     a = block.a
     r = block.r
@@ -185,15 +185,15 @@ def compute_acceleration_1d(
     for i in range(w):
         pull = r[force, i]
         limit = r[limits, i]
-        rub = limit * a[WAY, i]
-        slips = (pull - rub) / a[MASS, i]
+        friction = limit * a[DIRECTION, i]
+        slipping = (pull - friction) / a[MASS, i]
         a[AFTER, i] = abs(pull) - limit
-        a[rub_to, i] = rub
-        a[to, i] = 0.0 if block.n[STICKS, i] != 0 else slips
+        a[friction_row, i] = friction
+        a[row_of_result, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slipping
 
 
 def compute_acceleration_nd(
-    program: ProgramArrays, block: BlockBuffers, i: int, to: int, rub_to: int
+    program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int, friction_row: int
 ) -> None:
     """Compute `compute_acceleration` for an element of several coordinates.
 
@@ -201,15 +201,15 @@ def compute_acceleration_nd(
         program: program of the system and its effects.
         block: buffers of the slots.
         i: index of the slot.
-        to: first row of the accelerations.
-        rub_to: first row of dry friction.
+        row_of_result: first row of the accelerations.
+        friction_row: first row of dry friction.
     """
     a = block.a
-    guided = program.flags[GUIDED]
+    guided = program.flags[GUIDED_COUNT]
     velocity = program.rows[IN_V]
     limit = block.r[program.rows[OUT_LIMIT], i]
-    compute_pulling_force(program, block, i, to)
-    a[AFTER, i] = compute_norm(a, to, guided, i) - limit
+    compute_pulling_force(program, block, i, row_of_result)
+    a[AFTER, i] = compute_norm(a, row_of_result, guided, i) - limit
     # The direction may turn within the step, but must not reverse: a reversal is an event at which
     # the step is cut.
     square = 0.0
@@ -218,21 +218,21 @@ def compute_acceleration_nd(
     speed = np.sqrt(square)
     along = 0.0
     for k in range(guided):
-        way = a[WAY + k, i]
-        unit = block.r[velocity + k, i] / speed if speed > 0.0 else way
-        a[rub_to + k, i] = unit
-        along += unit * way
-    side = -1.0 if along < 0.0 else 1.0
+        direction = a[DIRECTION + k, i]
+        unit = block.r[velocity + k, i] / speed if speed > 0.0 else direction
+        a[friction_row + k, i] = unit
+        along += unit * direction
+    sign = -1.0 if along < 0.0 else 1.0
     for k in range(guided):
-        rub = limit * (a[rub_to + k, i] * side)
-        a[rub_to + k, i] = rub
-        slips = (a[to + k, i] - rub) / a[MASS, i]
-        a[to + k, i] = 0.0 if block.n[STICKS, i] != 0 else slips
-    compute_unguided_acceleration(program, block, i, to, rub_to)
+        friction = limit * (a[friction_row + k, i] * sign)
+        a[friction_row + k, i] = friction
+        slipping = (a[row_of_result + k, i] - friction) / a[MASS, i]
+        a[row_of_result + k, i] = 0.0 if block.n[IS_STICKING, i] != 0 else slipping
+    compute_unguided_acceleration(program, block, i, row_of_result, friction_row)
 
 
 def compute_unguided_acceleration(
-    program: ProgramArrays, block: BlockBuffers, i: int, to: int, rub_to: int
+    program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int, friction_row: int
 ) -> None:
     """Convert forces to accelerations for the coordinates without dry friction.
 
@@ -240,54 +240,56 @@ def compute_unguided_acceleration(
         program: program of the system and its effects.
         block: buffers of the slots.
         i: index of the slot.
-        to: first row of the accelerations, which contains the forces before.
-        rub_to: first row of dry friction.
+        row_of_result: first row of the accelerations, which contains the forces before.
+        friction_row: first row of dry friction.
     """
     a = block.a
-    for k in range(program.flags[GUIDED], program.flags[DIMENSIONS]):
-        a[WAY + k, i] = 0.0
-        a[rub_to + k, i] = 0.0
-        a[to + k, i] = a[to + k, i] / a[MASS, i]
+    for k in range(program.flags[GUIDED_COUNT], program.flags[DIMENSIONS]):
+        a[DIRECTION + k, i] = 0.0
+        a[friction_row + k, i] = 0.0
+        a[row_of_result + k, i] = a[row_of_result + k, i] / a[MASS, i]
 
 
-def compute_pulling_force(program: ProgramArrays, block: BlockBuffers, i: int, to: int) -> None:
+def compute_pulling_force(
+    program: ProgramArrays, block: BlockBuffers, i: int, row_of_result: int
+) -> None:
     """Compute all forces except dry friction, without the part that the ground supports.
 
     Args:
         program: program of the system and its effects.
         block: buffers of the slots.
         i: index of the slot.
-        to: first row of the forces.
+        row_of_result: first row of the forces.
     """
     d = program.flags[DIMENSIONS]
     for k in range(d):
-        block.a[to + k, i] = block.r[program.out[k], i]
-    if block.n[RESTS, i] != 0:
+        block.a[row_of_result + k, i] = block.r[program.out[k], i]
+    if block.n[IS_RESTING, i] != 0:
         # The ground pushes but does not pull: an upward force remains.
-        up = to + d - 1
+        up = row_of_result + d - 1
         block.a[up, i] = nan_maximum(block.a[up, i], 0.0)
 
 
 def compute_frictionless_acceleration(
-    program: ProgramArrays, block: BlockBuffers, w: int, to: int
+    program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int
 ) -> None:
-    """Compute accelerations without dry friction, in rows `to`.
+    """Compute accelerations without dry friction, in rows `row_of_result`.
 
     Args:
         program: program of the system and its effects.
         block: buffers of the slots.
         w: number of slots in use.
-        to: first row of the accelerations.
+        row_of_result: first row of the accelerations.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
     for k in range(d):
         force = program.out[k]
-        row = to + k
+        row = row_of_result + k
         for i in range(w):
             a[row, i] = block.r[force, i] / a[MASS, i]
     if program.flags[BOUNCES] != 0:
-        up = to + d - 1
+        up = row_of_result + d - 1
         for i in range(w):
-            if block.n[RESTS, i] != 0:
+            if block.n[IS_RESTING, i] != 0:
                 a[up, i] = nan_maximum(block.r[program.out[d - 1], i], 0.0) / a[MASS, i]

@@ -5,27 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from sims.engines.compiled.data_layout import (
-    BEGINS,
     DIMENSIONS,
-    EVENTS,
-    FIRST,
+    ELEMENT,
+    EVENT_COUNT,
+    EVENT_DELAY,
+    FIRST_VECTOR,
     FLOOR,
-    GOAL,
+    FLOOR_LEVEL,
     IN_P,
     IN_U,
+    IS_STEP_START,
     K1,
-    LANE,
-    LEFT,
-    LEVEL,
-    LIMIT,
-    LONGEST,
     MASS,
-    NOTHING,
-    PLACE,
-    STARTS,
-    STEP,
-    TAKEN,
-    TRY,
+    MAX_STEP,
+    NO_EVENT,
+    ORDER_INDEX,
+    PENDING_EVENT,
+    REMAINING_TIME,
+    STEP_COUNT,
+    STEP_INDEX,
+    STEP_LIMIT,
+    STEP_START,
     BatchArrays,
     BlockBuffers,
     ProgramArrays,
@@ -36,67 +36,67 @@ from sims.engines.compiled.data_layout import (
 
 
 def load_element(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int, place: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, order_index: int
 ) -> None:
     """Load an element into a slot, at the beginning of its run.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
-        place: index of the element in `work.order`.
+        order_index: index of the element in `arrays.order`.
     """
     a = block.a
     n = block.n
     d = program.flags[DIMENSIONS]
-    lane = work.order[place]
-    for row in range(FIRST):
+    element = arrays.order[order_index]
+    for row in range(FIRST_VECTOR):
         a[row, i] = 0.0
     n[:, i] = 0
-    n[PLACE, i] = place
-    n[LANE, i] = lane
-    n[GOAL, i] = NOTHING
-    n[BEGINS, i] = 1
+    n[ORDER_INDEX, i] = order_index
+    n[ELEMENT, i] = element
+    n[PENDING_EVENT, i] = NO_EVENT
+    n[IS_STEP_START, i] = 1
     for k in range(d):
-        a[X + k, i] = work.x[lane, k]
-        a[V + k, i] = work.v[lane, k]
-    a[LONGEST, i] = work.longest[lane]
-    a[LIMIT, i] = work.longest[lane]
-    a[TRY, i] = np.inf
-    a[MASS, i] = work.mass[lane]
-    a[LEVEL, i] = work.ground[FLOOR, lane]
-    a[LEFT, i] = work.steps[lane if work.steps.shape[0] > 1 else 0, 0]
+        a[X + k, i] = arrays.x[element, k]
+        a[V + k, i] = arrays.v[element, k]
+    a[MAX_STEP, i] = arrays.longest[element]
+    a[STEP_LIMIT, i] = arrays.longest[element]
+    a[EVENT_DELAY, i] = np.inf
+    a[MASS, i] = arrays.mass[element]
+    a[FLOOR_LEVEL, i] = arrays.ground[FLOOR, element]
+    a[REMAINING_TIME, i] = arrays.steps[element if arrays.steps.shape[0] > 1 else 0, 0]
     first = program.rows[IN_P]
-    for p in range(work.parameters.shape[1]):
-        block.r[first + p, i] = work.parameters[place, p]
-    set_inputs(program, work, block, i)
+    for p in range(arrays.parameters.shape[1]):
+        block.r[first + p, i] = arrays.parameters[order_index, p]
+    set_inputs(program, arrays, block, i)
 
 
-def set_inputs(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int) -> None:
+def set_inputs(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
     """Set the inputs of the element's step; after the last step, those of the last step.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
     """
     first = program.rows[IN_U]
-    step = min(block.n[STEP, i], work.steps.shape[1] - 1)
-    row = block.n[LANE, i] if work.inputs.shape[1] > 1 else 0
-    for u in range(work.inputs.shape[0]):
-        block.r[first + u, i] = work.inputs[u, row, step]
+    step = min(block.n[STEP_INDEX, i], arrays.steps.shape[1] - 1)
+    row = block.n[ELEMENT, i] if arrays.inputs.shape[1] > 1 else 0
+    for u in range(arrays.inputs.shape[0]):
+        block.r[first + u, i] = arrays.inputs[u, row, step]
 
 
 def record_and_check_remaining(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int
 ) -> bool:
     """Record the state of an element that begins a step at a sample time.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
 
@@ -105,60 +105,60 @@ def record_and_check_remaining(
     """
     a = block.a
     n = block.n
-    step = n[STEP, i]
-    if n[BEGINS, i] != 0:
-        n[BEGINS, i] = 0
-        if step % work.every == 0:
-            record_state(program, work, block, i, step // work.every)
-        if step == work.steps.shape[1]:
+    step = n[STEP_INDEX, i]
+    if n[IS_STEP_START, i] != 0:
+        n[IS_STEP_START, i] = 0
+        if step % arrays.every == 0:
+            record_state(program, arrays, block, i, step // arrays.every)
+        if step == arrays.steps.shape[1]:
             return False
-    if work.patience < np.inf and a[LEFT, i] > 0.0:
-        a[TAKEN, i] += 1.0
-        if a[TAKEN, i] > work.patience * work.planned[n[LANE, i]]:
+    if arrays.patience < np.inf and a[REMAINING_TIME, i] > 0.0:
+        a[STEP_COUNT, i] += 1.0
+        if a[STEP_COUNT, i] > arrays.patience * arrays.planned[n[ELEMENT, i]]:
             # Failed elements are recognised by their last recorded state.
-            work.kept[n[LANE, i], work.kept.shape[1] - 1, :] = np.nan
+            arrays.kept[n[ELEMENT, i], arrays.kept.shape[1] - 1, :] = np.nan
             return False
     return True
 
 
 def record_state(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int, record: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, record: int
 ) -> None:
     """Record the element's state.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
         record: index of the record.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
-    lane = block.n[LANE, i]
+    element = block.n[ELEMENT, i]
     for k in range(d):
-        work.kept[lane, record, k] = a[X + k, i]
-        work.kept[lane, record, d + k] = a[V + k, i]
-        work.kept[lane, record, 2 * d + k] = a[K1 + k, i]
+        arrays.kept[element, record, k] = a[X + k, i]
+        arrays.kept[element, record, d + k] = a[V + k, i]
+        arrays.kept[element, record, 2 * d + k] = a[K1 + k, i]
 
 
-def next_step(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int) -> None:
+def next_step(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
     """Advance the element to its next planned step.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
     """
     a = block.a
     n = block.n
-    row = n[LANE, i] if work.steps.shape[0] > 1 else 0
-    step = n[STEP, i] + 1
-    n[STEP, i] = step
-    n[BEGINS, i] = 1
-    n[EVENTS, i] = 0
-    a[STARTS, i] += work.steps[row, step - 1]
-    a[T, i] = a[STARTS, i]
-    a[LEFT, i] = work.steps[row, step] if step < work.steps.shape[1] else 0.0
-    set_inputs(program, work, block, i)
+    row = n[ELEMENT, i] if arrays.steps.shape[0] > 1 else 0
+    step = n[STEP_INDEX, i] + 1
+    n[STEP_INDEX, i] = step
+    n[IS_STEP_START, i] = 1
+    n[EVENT_COUNT, i] = 0
+    a[STEP_START, i] += arrays.steps[row, step - 1]
+    a[T, i] = a[STEP_START, i]
+    a[REMAINING_TIME, i] = arrays.steps[row, step] if step < arrays.steps.shape[1] else 0.0
+    set_inputs(program, arrays, block, i)

@@ -30,46 +30,46 @@ import numpy as np
 
 from sims.engines.compiled.data_layout import (
     AFTER,
-    BEGINS,
-    BEND,
     BOUNCES,
-    BUSY,
     DIMENSIONS,
-    DRY,
+    DIRECTION,
+    ELEMENT,
+    EVENT_DELAY,
     F1,
     F2,
     F3,
     F4,
     FLOOR,
-    GOAL,
-    IDLE,
+    FLOOR_LEVEL,
+    HAS_FORCES,
+    HAS_FRICTION,
     IN_T,
     IN_V,
     IN_X,
+    IS_IDLE,
+    IS_RESTING,
+    IS_STEP_START,
+    IS_STICKING,
     K1,
     K2,
     K3,
     K4,
-    LANE,
-    LEFT,
-    LEVEL,
-    LIMIT,
-    LONGEST,
     MASS,
+    MAX_ACCELERATION,
     MAX_COORDINATES,
+    MAX_FRICTION,
+    MAX_STEP,
+    MAY_HAVE_EVENT,
     NEXT_V,
     NEXT_X,
-    NOTHING,
-    PEAK,
-    PLACE,
-    PUSHED,
-    RESTS,
-    RUBBED,
-    SPARE,
-    STEP,
-    STICKS,
-    TRY,
-    WAY,
+    NO_EVENT,
+    NONLINEARITY,
+    ORDER_INDEX,
+    PENDING_EVENT,
+    REMAINING_TIME,
+    SCRATCH,
+    STEP_INDEX,
+    STEP_LIMIT,
     BatchArrays,
     BlockBuffers,
     H,
@@ -92,60 +92,61 @@ from sims.engines.compiled.events import (
 from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 
 
-def step_block(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int) -> None:
+def step_block(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int) -> None:
     """Make all steps of all elements.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
     """
-    begun = 0
-    alive = 0
+    loaded_count = 0
+    active_count = 0
     for i in range(w):
-        block.n[PLACE, i] = -1
-        if begun < work.order.size:
-            load_element(program, work, block, i, begun)
-            begun += 1
-            alive += 1
+        block.n[ORDER_INDEX, i] = -1
+        if loaded_count < arrays.order.size:
+            load_element(program, arrays, block, i, loaded_count)
+            loaded_count += 1
+            active_count += 1
         else:
-            load_element(program, work, block, i, work.order.size - 1)  # its result is not used
-            block.n[PLACE, i] = -1
-    fresh = True
-    while alive > 0:
-        if fresh:
+            load_element(program, arrays, block, i, arrays.order.size - 1)  # its result is not used
+            block.n[ORDER_INDEX, i] = -1
+    has_new_elements = True
+    while active_count > 0:
+        if has_new_elements:
             run_instructions(program.code, program.ends[0], program.ends[1], block.r, w)
             if program.flags[BOUNCES] != 0:
-                resolve_initial_ground_contact(program, work, block, w)
-            fresh = False
+                resolve_initial_ground_contact(program, arrays, block, w)
+            has_new_elements = False
         evaluate_forces(program, block, w)
         begin_step(program, block, w)
         for i in range(w):
-            block.n[IDLE, i] = block.n[PLACE, i] < 0
-            if block.n[PLACE, i] >= 0 and not record_and_check_remaining(program, work, block, i):
-                alive -= 1
-                block.n[PLACE, i] = -1
-                if begun < work.order.size:
-                    load_element(program, work, block, i, begun)
-                    begun += 1
-                    alive += 1
-                    fresh = True
-                block.n[IDLE, i] = 1
+            block.n[IS_IDLE, i] = block.n[ORDER_INDEX, i] < 0
+            is_used = block.n[ORDER_INDEX, i] >= 0
+            if is_used and not record_and_check_remaining(program, arrays, block, i):
+                active_count -= 1
+                block.n[ORDER_INDEX, i] = -1
+                if loaded_count < arrays.order.size:
+                    load_element(program, arrays, block, i, loaded_count)
+                    loaded_count += 1
+                    active_count += 1
+                    has_new_elements = True
+                block.n[IS_IDLE, i] = 1
             a = block.a
-            a[H, i] = min(min(a[LEFT, i], a[LIMIT, i]), a[TRY, i])
-            if block.n[IDLE, i] != 0:
+            a[H, i] = min(min(a[REMAINING_TIME, i], a[STEP_LIMIT, i]), a[EVENT_DELAY, i])
+            if block.n[IS_IDLE, i] != 0:
                 a[H, i] = 0.0
         try_step(program, block, w)
         detect_possible_events(program, block, w)
-        accept_steps(program, work, block, w)
+        accept_steps(program, arrays, block, w)
         for i in range(w):
-            if block.n[BUSY, i] != 0 and block.n[IDLE, i] == 0:
-                accept_or_retry(program, work, block, i)
+            if block.n[MAY_HAVE_EVENT, i] != 0 and block.n[IS_IDLE, i] == 0:
+                accept_or_retry(program, arrays, block, i)
 
 
 def resolve_initial_ground_contact(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int
 ) -> None:
     """Apply ground contact at the initial state of newly loaded elements.
 
@@ -154,38 +155,38 @@ def resolve_initial_ground_contact(
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
     """
     a = block.a
     n = block.n
     d = program.flags[DIMENSIONS]
-    high = X + d - 1
-    up = V + d - 1
-    some = False
+    height_row = X + d - 1
+    rate_row = V + d - 1
+    any_on_ground = False
     for i in range(w):
         if is_newly_loaded(block, i):
-            floor = work.ground[FLOOR, n[LANE, i]]
-            a[high, i] = nan_maximum(a[high, i], floor)
-            some |= a[high, i] <= floor and a[up, i] <= 0.0
-    if not some:
+            floor = arrays.ground[FLOOR, n[ELEMENT, i]]
+            a[height_row, i] = nan_maximum(a[height_row, i], floor)
+            any_on_ground |= a[height_row, i] <= floor and a[rate_row, i] <= 0.0
+    if not any_on_ground:
         return
     evaluate_forces(program, block, w)
     begin_step(program, block, w)
     for i in range(w):
         if is_newly_loaded(block, i):
-            floor = work.ground[FLOOR, n[LANE, i]]
-            if a[high, i] <= floor and a[up, i] < 0.0:
-                handle_impact(program, work, block, i, K1)
-            elif a[high, i] <= floor and a[up, i] == 0.0:
-                n[RESTS, i] = 1
+            floor = arrays.ground[FLOOR, n[ELEMENT, i]]
+            if a[height_row, i] <= floor and a[rate_row, i] < 0.0:
+                handle_impact(program, arrays, block, i, K1)
+            elif a[height_row, i] <= floor and a[rate_row, i] == 0.0:
+                n[IS_RESTING, i] = 1
 
 
 def is_newly_loaded(block: BlockBuffers, i: int) -> bool:
     """Return whether an element has just been loaded into slot `i`."""
     n = block.n
-    return bool(n[PLACE, i] >= 0 and n[STEP, i] == 0 and n[BEGINS, i] == 1)
+    return bool(n[ORDER_INDEX, i] >= 0 and n[STEP_INDEX, i] == 0 and n[IS_STEP_START, i] == 1)
 
 
 def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
@@ -204,7 +205,7 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
     t = program.rows[IN_T]
     for stage in range(1, 4):
         share = 0.5 if stage < 3 else 1.0
-        last = K1 + (stage - 1) * MAX_COORDINATES
+        acceleration_row = K1 + (stage - 1) * MAX_COORDINATES
         for i in range(w):
             r[t, i] = a[T, i] + share * a[H, i]
         for k in range(d):
@@ -221,7 +222,7 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
                 for i in range(w):
                     r[x, i] = a[X + k, i] + a[H, i] * r[v, i]  # (4)
             for i in range(w):
-                r[v, i] = a[V + k, i] + share * a[H, i] * a[last + k, i]
+                r[v, i] = a[V + k, i] + share * a[H, i] * a[acceleration_row + k, i]
         compute_acceleration(
             program, block, w, K1 + stage * MAX_COORDINATES, F1 + stage * MAX_COORDINATES
         )
@@ -248,27 +249,28 @@ def detect_possible_events(program: ProgramArrays, block: BlockBuffers, w: int) 
     n = block.n
     d = program.flags[DIMENSIONS]
     for i in range(w):
-        n[BUSY, i] = 1 if n[IDLE, i] != 0 or n[GOAL, i] != NOTHING else 0
-    if program.flags[PUSHED] != 0 or program.flags[DRY] != 0:
+        n[MAY_HAVE_EVENT, i] = 1 if n[IS_IDLE, i] != 0 or n[PENDING_EVENT, i] != NO_EVENT else 0
+    if program.flags[HAS_FORCES] != 0 or program.flags[HAS_FRICTION] != 0:
         for i in range(w):
-            a[BEND, i] = 0.0
-            a[SPARE, i] = 0.0
+            a[NONLINEARITY, i] = 0.0
+            a[SCRATCH, i] = 0.0
         for k in range(d):
             for i in range(w):
                 bend = (a[K1 + k, i] + a[K4 + k, i]) - (a[K2 + k, i] + a[K3 + k, i])
-                a[BEND, i] += bend * bend
-                a[SPARE, i] += a[K1 + k, i] * a[K1 + k, i]
+                a[NONLINEARITY, i] += bend * bend
+                a[SCRATCH, i] += a[K1 + k, i] * a[K1 + k, i]
         for i in range(w):
-            a[PEAK, i] = nan_maximum(a[PEAK, i], a[SPARE, i])
-    if program.flags[PUSHED] != 0:
+            a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], a[SCRATCH, i])
+    if program.flags[HAS_FORCES] != 0:
         for i in range(w):
-            n[BUSY, i] |= 1 if a[BEND, i] > FORCE_NONLINEARITY_TOLERANCE * a[PEAK, i] else 0
+            largest = FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
+            n[MAY_HAVE_EVENT, i] |= 1 if a[NONLINEARITY, i] > largest else 0
     if program.flags[BOUNCES] != 0:
         for i in range(w):
-            low = a[NEXT_X + d - 1, i] < a[LEVEL, i]
-            lifts = n[RESTS, i] != 0 and not a[NEXT_V + d - 1, i] <= 0.0
-            n[BUSY, i] |= 1 if low or lifts else 0
-    if program.flags[DRY] != 0:
+            low = a[NEXT_X + d - 1, i] < a[FLOOR_LEVEL, i]
+            lifts = n[IS_RESTING, i] != 0 and not a[NEXT_V + d - 1, i] <= 0.0
+            n[MAY_HAVE_EVENT, i] |= 1 if low or lifts else 0
+    if program.flags[HAS_FRICTION] != 0:
         detect_friction_events(program, block, w)
 
 
@@ -286,26 +288,28 @@ def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) 
     n = block.n
     if program.flags[DIMENSIONS] > 1:
         for i in range(w):
-            n[BUSY, i] = 1
+            n[MAY_HAVE_EVENT, i] = 1
         return
     for i in range(w):
-        a[RUBBED, i] = nan_maximum(a[RUBBED, i], nan_maximum(abs(a[F1, i]), abs(a[F4, i])))
-        a[SPARE, i] = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[PEAK, i]) * a[MASS, i]
+        friction = nan_maximum(abs(a[F1, i]), abs(a[F4, i]))
+        a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], friction)
+        a[SCRATCH, i] = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
     for i in range(w):
         bend = abs(a[F1, i] - a[F2, i] - a[F3, i] + a[F4, i])
-        sharp = bend > FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(a[RUBBED, i], a[SPARE, i])
-        turns = a[NEXT_V, i] * a[WAY, i] < 0.0
-        slips = 1 if sharp or turns else 0
+        largest = nan_maximum(a[MAX_FRICTION, i], a[SCRATCH, i])
+        is_nonlinear = bend > FRICTION_NONLINEARITY_TOLERANCE * largest
+        reverses = a[NEXT_V, i] * a[DIRECTION, i] < 0.0
+        slips = 1 if is_nonlinear or reverses else 0
         loosens = 1 if a[AFTER, i] > 0.0 else 0
-        n[BUSY, i] |= loosens if n[STICKS, i] != 0 else slips
+        n[MAY_HAVE_EVENT, i] |= loosens if n[IS_STICKING, i] != 0 else slips
 
 
-def accept_steps(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int) -> None:
+def accept_steps(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int) -> None:
     """Accept the steps just tried of elements that are not busy.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
     """
@@ -315,42 +319,45 @@ def accept_steps(program: ProgramArrays, work: BatchArrays, block: BlockBuffers,
         for i in range(w):
             x = a[NEXT_X + k, i]
             v = a[NEXT_V + k, i]
-            a[X + k, i] = a[X + k, i] if n[BUSY, i] != 0 else x
-            a[V + k, i] = a[V + k, i] if n[BUSY, i] != 0 else v
+            a[X + k, i] = a[X + k, i] if n[MAY_HAVE_EVENT, i] != 0 else x
+            a[V + k, i] = a[V + k, i] if n[MAY_HAVE_EVENT, i] != 0 else v
     for i in range(w):
-        h = 0.0 if n[BUSY, i] != 0 else a[H, i]
-        left = a[LEFT, i] - h
-        grown = 2.0 * a[LIMIT, i]
-        grown = grown if grown < a[LONGEST, i] else a[LONGEST, i]
+        h = 0.0 if n[MAY_HAVE_EVENT, i] != 0 else a[H, i]
+        remaining = a[REMAINING_TIME, i] - h
+        doubled = 2.0 * a[STEP_LIMIT, i]
+        doubled = doubled if doubled < a[MAX_STEP, i] else a[MAX_STEP, i]
         a[T, i] += h
         # By rounding, parts of a step may add up to more than its length; a negative rest would run
         # backwards in time.
-        a[LEFT, i] = left if left > 0.0 else 0.0
+        a[REMAINING_TIME, i] = remaining if remaining > 0.0 else 0.0
         # The limit doubles with each accepted step of that length, as the nonlinearity may still be
         # near.
-        a[LIMIT, i] = grown if n[BUSY, i] == 0 and h >= a[LIMIT, i] else a[LIMIT, i]
+        limit = a[STEP_LIMIT, i]
+        a[STEP_LIMIT, i] = doubled if n[MAY_HAVE_EVENT, i] == 0 and h >= limit else limit
     for i in range(w):
-        if a[LEFT, i] <= 0.0 and n[BUSY, i] == 0:
-            next_step(program, work, block, i)
+        if a[REMAINING_TIME, i] <= 0.0 and n[MAY_HAVE_EVENT, i] == 0:
+            next_step(program, arrays, block, i)
 
 
-def accept_or_retry(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int) -> None:
+def accept_or_retry(
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int
+) -> None:
     """Accept the step just tried if it contains no event, otherwise prepare to repeat it.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
     """
     a = block.a
     n = block.n
     d = program.flags[DIMENSIONS]
-    bends = program.flags[DRY] != 0 or program.flags[PUSHED] != 0
+    bends = program.flags[HAS_FRICTION] != 0 or program.flags[HAS_FORCES] != 0
     if bends and is_too_nonlinear(program, block, i):
         return
-    if (program.flags[DRY] != 0 or program.flags[BOUNCES] != 0) and detect_event(
-        program, work, block, i
+    if (program.flags[HAS_FRICTION] != 0 or program.flags[BOUNCES] != 0) and detect_event(
+        program, arrays, block, i
     ):
         return
     for k in range(d):
@@ -360,10 +367,10 @@ def accept_or_retry(program: ProgramArrays, work: BatchArrays, block: BlockBuffe
     a[T, i] += h
     # By rounding, parts of a step may add up to more than its length; a negative rest would run
     # backwards in time.
-    a[LEFT, i] = nan_maximum(a[LEFT, i] - h, 0.0)
-    if n[GOAL, i] != NOTHING:
-        handle_event(program, work, block, i)
-    if n[RESTS, i] != 0 and not a[V + d - 1, i] <= 0.0:
-        n[RESTS, i] = 0
-    if a[LEFT, i] <= 0.0:
-        next_step(program, work, block, i)
+    a[REMAINING_TIME, i] = nan_maximum(a[REMAINING_TIME, i] - h, 0.0)
+    if n[PENDING_EVENT, i] != NO_EVENT:
+        handle_event(program, arrays, block, i)
+    if n[IS_RESTING, i] != 0 and not a[V + d - 1, i] <= 0.0:
+        n[IS_RESTING, i] = 0
+    if a[REMAINING_TIME, i] <= 0.0:
+        next_step(program, arrays, block, i)

@@ -31,47 +31,47 @@ from sims.engines.compiled.data_layout import (
     AFTER,
     BEFORE,
     BOUNCES,
+    BREAK_AWAY,
     DIMENSIONS,
-    DRY,
-    EVENTS,
+    DIRECTION,
+    ELEMENT,
+    EVENT_COUNT,
+    EVENT_DELAY,
     F1,
     F2,
     F3,
     F4,
     FLOOR,
-    GOAL,
-    GUIDED,
+    GROUND_FRICTION,
+    GUIDED_COUNT,
+    HAS_FORCES,
+    HAS_FRICTION,
     IMPACT,
     IN_E,
     IN_MU,
     IN_SPEED,
+    IS_RESTING,
+    IS_STICKING,
     K1,
     K2,
     K3,
     K4,
-    LANE,
-    LEAST,
-    LEFT,
-    LIMIT,
-    LONGEST,
-    LOOSE,
     MASS,
+    MAX_ACCELERATION,
+    MAX_FRICTION,
+    MAX_STEP,
+    MIN_REMAINING_SHARE,
     NEXT_V,
     NEXT_X,
-    NOTHING,
+    NO_EVENT,
     OUT_E,
     OUT_MU,
-    PEAK,
-    PUSHED,
+    PENDING_EVENT,
+    REMAINING_TIME,
     RESTITUTION,
-    RESTS,
-    RUBBED,
-    RUBBING,
-    SHORTS,
+    SHORT_FLIGHT_COUNT,
     STANDSTILL,
-    STICKS,
-    TRY,
-    WAY,
+    STEP_LIMIT,
     BatchArrays,
     BlockBuffers,
     FloatArray,
@@ -112,37 +112,37 @@ REST_SPEED_SHARE = 1e-9
 """Fraction of the speed change in a full step below which a stopped element is at rest."""
 
 
-def dot(a: FloatArray, one: int, other: int, d: int, i: int) -> float:
+def dot(a: FloatArray, first_vector: int, second_vector: int, d: int, i: int) -> float:
     """Return the inner product of two vectors.
 
     Args:
         a: numbers of the slots.
-        one: first row of the first vector.
-        other: first row of the second vector.
+        first_vector: first row of the first vector.
+        second_vector: first row of the second vector.
         d: number of dimensions.
         i: index of the slot.
     """
-    total = a[one, i] * a[other, i]
+    total = a[first_vector, i] * a[second_vector, i]
     for k in range(1, d):
-        total += a[one + k, i] * a[other + k, i]
+        total += a[first_vector + k, i] * a[second_vector + k, i]
     return total  # type: ignore[no-any-return]
 
 
-def compute_norm(a: FloatArray, one: int, d: int, i: int) -> float:
+def compute_norm(a: FloatArray, first_vector: int, d: int, i: int) -> float:
     """Return the magnitude of a vector.
 
     Args:
         a: numbers of the slots.
-        one: first row of the vector.
+        first_vector: first row of the vector.
         d: number of dimensions.
         i: index of the slot.
     """
     if d == 1:
-        return abs(a[one, i])  # type: ignore[no-any-return]
-    return np.sqrt(dot(a, one, one, d, i))  # type: ignore[no-any-return]
+        return abs(a[first_vector, i])  # type: ignore[no-any-return]
+    return np.sqrt(dot(a, first_vector, first_vector, d, i))  # type: ignore[no-any-return]
 
 
-def find_event_time(value: float, rate: float, later: float, h: float) -> float:
+def find_event_time(value: float, rate: float, end_value: float, h: float) -> float:
     """Return the seconds to the last root of the interpolating parabola.
 
     The error is of third order in h; it is corrected when the root is reached.
@@ -150,13 +150,13 @@ def find_event_time(value: float, rate: float, later: float, h: float) -> float:
     Args:
         value: value >= 0 at the beginning.
         rate: rate at the beginning.
-        later: value < 0 after h seconds.
+        end_value: value < 0 after h seconds.
         h: step size in seconds.
     """
-    bend = (value + h * rate - later) / (h * h)  # (8)
-    turn = np.sqrt(rate * rate + 4.0 * bend * value)
+    curvature = (value + h * rate - end_value) / (h * h)  # (8)
+    root = np.sqrt(rate * rate + 4.0 * curvature * value)
     # (9): the form that adds numbers of equal sign is used.
-    seconds = 2.0 * value / (turn - rate) if rate < 0.0 else (turn + rate) / (2.0 * bend)
+    seconds = 2.0 * value / (root - rate) if rate < 0.0 else (root + rate) / (2.0 * curvature)
     # Without a root, which only rounding can cause, the event is at the end of the step.
     return float(seconds if abs(seconds) < np.inf else h)
 
@@ -172,119 +172,120 @@ def is_too_nonlinear(program: ProgramArrays, block: BlockBuffers, i: int) -> boo
     a = block.a
     d = program.flags[DIMENSIONS]
     h = a[H, i]
-    a[PEAK, i] = nan_maximum(a[PEAK, i], dot(a, K1, K1, d, i))
-    sharp = False
-    if program.flags[PUSHED] != 0:
+    a[MAX_ACCELERATION, i] = nan_maximum(a[MAX_ACCELERATION, i], dot(a, K1, K1, d, i))
+    is_nonlinear = False
+    if program.flags[HAS_FORCES] != 0:
         square = 0.0
         for k in range(d):
             outer = a[K1 + k, i] + a[K4 + k, i]
             inner = a[K2 + k, i] + a[K3 + k, i]
             square += (outer - inner) * (outer - inner)
-        sharp = square > FORCE_NONLINEARITY_TOLERANCE * a[PEAK, i]
-    if program.flags[DRY] != 0:
-        most = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
-        a[RUBBED, i] = nan_maximum(a[RUBBED, i], most)
-        faint = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[PEAK, i]) * a[MASS, i]
+        is_nonlinear = square > FORCE_NONLINEARITY_TOLERANCE * a[MAX_ACCELERATION, i]
+    if program.flags[HAS_FRICTION] != 0:
+        largest = nan_maximum(compute_norm(a, F1, d, i), compute_norm(a, F4, d, i))
+        a[MAX_FRICTION, i] = nan_maximum(a[MAX_FRICTION, i], largest)
+        negligible = NEGLIGIBLE_ACCELERATION_SHARE * np.sqrt(a[MAX_ACCELERATION, i]) * a[MASS, i]
         square = 0.0
         for k in range(d):
             change = a[F1 + k, i] - a[F2 + k, i] - a[F3 + k, i] + a[F4 + k, i]
             square += change * change
         size = abs(change) if d == 1 else np.sqrt(square)
-        if block.n[STICKS, i] == 0 and size > FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(
-            a[RUBBED, i], faint
+        if block.n[IS_STICKING, i] == 0 and size > FRICTION_NONLINEARITY_TOLERANCE * nan_maximum(
+            a[MAX_FRICTION, i], negligible
         ):
-            sharp = True
-    if sharp:
-        sharp = h > MIN_STEP_SHARE * a[LONGEST, i] and has_no_pending_event(block, i)
-    if sharp:
-        a[LIMIT, i] = STEP_REDUCTION_FACTOR * h
-    elif h >= a[LIMIT, i]:
+            is_nonlinear = True
+    if is_nonlinear:
+        is_nonlinear = h > MIN_STEP_SHARE * a[MAX_STEP, i] and has_no_pending_event(block, i)
+    if is_nonlinear:
+        a[STEP_LIMIT, i] = STEP_REDUCTION_FACTOR * h
+    elif h >= a[STEP_LIMIT, i]:
         # The limit doubles with each accepted step of that length, as the nonlinearity may still be
         # near.
-        a[LIMIT, i] = min(2.0 * a[LIMIT, i], a[LONGEST, i])
-    return sharp
+        a[STEP_LIMIT, i] = min(2.0 * a[STEP_LIMIT, i], a[MAX_STEP, i])
+    return is_nonlinear
 
 
 def has_no_pending_event(block: BlockBuffers, i: int) -> bool:
     """Return whether the element has no pending event and not too many events in its step."""
-    return bool(block.n[GOAL, i] == NOTHING and block.n[EVENTS, i] < MAX_EVENTS_PER_STEP)
+    n = block.n
+    return bool(n[PENDING_EVENT, i] == NO_EVENT and n[EVENT_COUNT, i] < MAX_EVENTS_PER_STEP)
 
 
-def detect_event(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int) -> bool:
+def detect_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> bool:
     """Return whether an event is within the step just tried; schedule the event.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
     h = a[H, i]
-    watched = has_no_pending_event(block, i)
-    found = False
-    if watched and program.flags[BOUNCES] != 0:
-        floor = work.ground[FLOOR, block.n[LANE, i]]
-        later = a[NEXT_X + d - 1, i]
-        if later < floor:
+    is_open = has_no_pending_event(block, i)
+    has_event = False
+    if is_open and program.flags[BOUNCES] != 0:
+        floor = arrays.ground[FLOOR, block.n[ELEMENT, i]]
+        end_value = a[NEXT_X + d - 1, i]
+        if end_value < floor:
             height = a[X + d - 1, i] - floor
             rate = a[V + d - 1, i]
-            schedule_event(block, i, find_event_time(height, rate, later - floor, h), IMPACT)
-            found = True
-    if program.flags[DRY] != 0:
-        sticks = block.n[STICKS, i] != 0
-        if watched and not sticks:
-            later = dot(a, NEXT_V, WAY, d, i)
-            if later < 0.0:
-                speed = dot(a, V, WAY, d, i)
-                rate = dot(a, K1, WAY, d, i)
-                schedule_event(block, i, find_event_time(speed, rate, later, h), STANDSTILL)
-                found = True
-        to_loose = block.n[GOAL, i] == LOOSE
-        if sticks and (watched or to_loose):
+            schedule_event(block, i, find_event_time(height, rate, end_value - floor, h), IMPACT)
+            has_event = True
+    if program.flags[HAS_FRICTION] != 0:
+        is_sticking = block.n[IS_STICKING, i] != 0
+        if is_open and not is_sticking:
+            end_value = dot(a, NEXT_V, DIRECTION, d, i)
+            if end_value < 0.0:
+                speed = dot(a, V, DIRECTION, d, i)
+                rate = dot(a, K1, DIRECTION, d, i)
+                schedule_event(block, i, find_event_time(speed, rate, end_value, h), STANDSTILL)
+                has_event = True
+        awaits_break_away = block.n[PENDING_EVENT, i] == BREAK_AWAY
+        if is_sticking and (is_open or awaits_break_away):
             before = a[BEFORE, i]
             after = a[AFTER, i]
             # A scheduled break-away is checked again with a tolerance.
-            if after > (BREAK_AWAY_TIME_TOLERANCE * (after - before) if to_loose else 0.0):
+            if after > (BREAK_AWAY_TIME_TOLERANCE * (after - before) if awaits_break_away else 0.0):
                 seconds = h * (before / (before - after) + 0.1 * BREAK_AWAY_TIME_TOLERANCE)
-                schedule_event(block, i, seconds, LOOSE)
-                found = True
-    return found
+                schedule_event(block, i, seconds, BREAK_AWAY)
+                has_event = True
+    return has_event
 
 
-def schedule_event(block: BlockBuffers, i: int, seconds: float, goal: int) -> None:
+def schedule_event(block: BlockBuffers, i: int, seconds: float, event: int) -> None:
     """Schedule an event at the end of the next step; of two events the first counts.
 
     Args:
         block: buffers of the slots.
         i: index of the slot.
         seconds: seconds to the event.
-        goal: kind of event.
+        event: kind of event.
     """
-    if seconds < block.a[TRY, i]:
-        block.a[TRY, i] = min(max(seconds, 0.0), block.a[H, i])
-        block.n[GOAL, i] = goal
-        block.n[EVENTS, i] += 1
+    if seconds < block.a[EVENT_DELAY, i]:
+        block.a[EVENT_DELAY, i] = min(max(seconds, 0.0), block.a[H, i])
+        block.n[PENDING_EVENT, i] = event
+        block.n[EVENT_COUNT, i] += 1
 
 
-def handle_event(program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int) -> None:
+def handle_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
     """Apply the event to which the step led.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
     """
-    goal = block.n[GOAL, i]
-    if goal == IMPACT:
-        handle_impact(program, work, block, i, K4)
-    elif goal == STANDSTILL:
+    event = block.n[PENDING_EVENT, i]
+    if event == IMPACT:
+        handle_impact(program, arrays, block, i, K4)
+    elif event == STANDSTILL:
         handle_standstill(program, block, i)
     # Break-away needs no action: the next step finds that the element slips.
-    block.a[TRY, i] = np.inf
-    block.n[GOAL, i] = NOTHING
+    block.a[EVENT_DELAY, i] = np.inf
+    block.n[PENDING_EVENT, i] = NO_EVENT
 
 
 def shift_time(block: BlockBuffers, i: int, seconds: float) -> float:
@@ -298,48 +299,48 @@ def shift_time(block: BlockBuffers, i: int, seconds: float) -> float:
     Returns:
         The applied correction in seconds.
     """
-    step = block.a[LONGEST, i]
+    step = block.a[MAX_STEP, i]
     if seconds != seconds:
         seconds = 0.0
     seconds = min(max(seconds, -step), step)
     block.a[T, i] += seconds
-    block.a[LEFT, i] = nan_maximum(block.a[LEFT, i] - seconds, 0.0)
+    block.a[REMAINING_TIME, i] = nan_maximum(block.a[REMAINING_TIME, i] - seconds, 0.0)
     return seconds
 
 
 def handle_impact(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int, k: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, k: int
 ) -> None:
     """Apply the impact to which a step led up to rounding.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
         k: first row of the acceleration before the impact.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
-    floor = work.ground[FLOOR, block.n[LANE, i]]
-    high = X + d - 1
-    up = V + d - 1
+    floor = arrays.ground[FLOOR, block.n[ELEMENT, i]]
+    height_row = X + d - 1
+    rate_row = V + d - 1
     pull = a[k + d - 1, i]
-    rate = a[up, i]
-    late = 0.0
+    rate = a[rate_row, i]
+    correction = 0.0
     if rate < 0.0:
-        late = (floor - a[high, i]) / rate
-        late *= 1.0 - 0.5 * late * pull / rate  # (10)
-    late = shift_time(block, i, late)
+        correction = (floor - a[height_row, i]) / rate
+        correction *= 1.0 - 0.5 * correction * pull / rate  # (10)
+    correction = shift_time(block, i, correction)
     for j in range(d):
         acceleration = a[k + j, i]
-        a[X + j, i] += late * (a[V + j, i] + 0.5 * late * acceleration)
-        a[V + j, i] += late * acceleration
+        a[X + j, i] += correction * (a[V + j, i] + 0.5 * correction * acceleration)
+        a[V + j, i] += correction * acceleration
     # Exactly on the ground and not moving up, otherwise the next step would contain the same
     # impact.
-    a[high, i] = floor
-    a[up, i] = clip_to_non_positive(a[up, i])
-    compute_rebound_velocity(program, work, block, i, pull)
+    a[height_row, i] = floor
+    a[rate_row, i] = clip_to_non_positive(a[rate_row, i])
+    compute_rebound_velocity(program, arrays, block, i, pull)
 
 
 def clip_to_non_positive(rate: float) -> float:
@@ -348,13 +349,13 @@ def clip_to_non_positive(rate: float) -> float:
 
 
 def compute_rebound_velocity(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, i: int, pull: float
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, pull: float
 ) -> None:
     """Compute the velocity after an impact.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
         pull: upward acceleration before the impact.
@@ -363,52 +364,53 @@ def compute_rebound_velocity(
     r = block.r
     d = program.flags[DIMENSIONS]
     rows = program.rows
-    lane = block.n[LANE, i]
-    up = V + d - 1
-    speed = abs(a[up, i])
+    element = block.n[ELEMENT, i]
+    rate_row = V + d - 1
+    speed = abs(a[rate_row, i])
     # The program runs on all slots up to this one; the results of the others are not used.
     width = i + 1
     for s in range(width):
-        r[rows[IN_E], s] = work.ground[RESTITUTION, lane]
-        r[rows[IN_MU], s] = work.ground[RUBBING, lane]
+        r[rows[IN_E], s] = arrays.ground[RESTITUTION, element]
+        r[rows[IN_MU], s] = arrays.ground[GROUND_FRICTION, element]
         r[rows[IN_SPEED], s] = speed
     run_instructions(program.code, program.ends[2], program.ends[3], r, width)
     e = r[rows[OUT_E], i]
     mu = r[rows[OUT_MU], i]
-    leaves = e * speed
-    lost = mu * (1.0 + e) * speed
-    if is_bouncing_over(block, i, leaves, -pull):
+    rebound_speed = e * speed
+    lost_speed = mu * (1.0 + e) * speed
+    if is_bouncing_over(block, i, rebound_speed, -pull):
         if e < 1.0:
-            lost += mu * (1.0 + e) * leaves / (1.0 - e)
-        leaves = 0.0
-        block.n[RESTS, i] = 1
+            lost_speed += mu * (1.0 + e) * rebound_speed / (1.0 - e)
+        rebound_speed = 0.0
+        block.n[IS_RESTING, i] = 1
     if mu > 0.0:
         square = 0.0
         for j in range(d - 1):
             square += a[V + j, i] * a[V + j, i]
         along = abs(a[V, i]) if d == 2 else np.sqrt(square)
-        share = 1.0 - lost / (along if along > 0.0 else 1.0)
-        kept = nan_maximum(share, work.ground[LEAST, lane])
+        share = 1.0 - lost_speed / (along if along > 0.0 else 1.0)
+        remaining_share = nan_maximum(share, arrays.ground[MIN_REMAINING_SHARE, element])
         for j in range(d - 1):
-            a[V + j, i] *= kept
-    a[up, i] = leaves
+            a[V + j, i] *= remaining_share
+    a[rate_row, i] = rebound_speed
 
 
-def is_bouncing_over(block: BlockBuffers, i: int, leaves: float, down: float) -> bool:
+def is_bouncing_over(block: BlockBuffers, i: int, rebound_speed: float, down: float) -> bool:
     """Return whether bouncing is finished after an impact.
 
     Args:
         block: buffers of the slots.
         i: index of the slot.
-        leaves: rebound speed.
+        rebound_speed: rebound speed.
         down: downward acceleration.
     """
     if not down > 0.0:
-        block.n[SHORTS, i] = 0
+        block.n[SHORT_FLIGHT_COUNT, i] = 0
         return False
-    flight = 2.0 * leaves / down
-    block.n[SHORTS, i] = block.n[SHORTS, i] + 1 if flight < SHORT_FLIGHT_SECONDS else 0
-    return bool(flight < MIN_FLIGHT_SECONDS or block.n[SHORTS, i] > MAX_SHORT_FLIGHTS)
+    flight = 2.0 * rebound_speed / down
+    count = block.n[SHORT_FLIGHT_COUNT, i] + 1 if flight < SHORT_FLIGHT_SECONDS else 0
+    block.n[SHORT_FLIGHT_COUNT, i] = count
+    return bool(flight < MIN_FLIGHT_SECONDS or count > MAX_SHORT_FLIGHTS)
 
 
 def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> None:
@@ -421,20 +423,20 @@ def handle_standstill(program: ProgramArrays, block: BlockBuffers, i: int) -> No
     """
     a = block.a
     d = program.flags[DIMENSIONS]
-    slows = dot(a, K4, WAY, d, i)
-    late = -dot(a, V, WAY, d, i) / slows if slows < 0.0 else 0.0
-    late = shift_time(block, i, late)
+    deceleration = dot(a, K4, DIRECTION, d, i)
+    correction = -dot(a, V, DIRECTION, d, i) / deceleration if deceleration < 0.0 else 0.0
+    correction = shift_time(block, i, correction)
     for k in range(d):
-        a[X + k, i] += late * a[V + k, i]
-        a[V + k, i] += late * a[K4 + k, i]
-    along = dot(a, V, WAY, d, i)
+        a[X + k, i] += correction * a[V + k, i]
+        a[V + k, i] += correction * a[K4 + k, i]
+    along = dot(a, V, DIRECTION, d, i)
     for k in range(d):
-        a[V + k, i] -= a[WAY + k, i] * along
+        a[V + k, i] -= a[DIRECTION + k, i] * along
     # The speed becomes exactly zero, because only an element with zero speed can stick.
-    guided = program.flags[GUIDED]
+    guided = program.flags[GUIDED_COUNT]
     if (
         compute_norm(a, V, guided, i)
-        <= REST_SPEED_SHARE * compute_norm(a, K4, guided, i) * a[LONGEST, i]
+        <= REST_SPEED_SHARE * compute_norm(a, K4, guided, i) * a[MAX_STEP, i]
     ):
         for k in range(guided):
             a[V + k, i] = 0.0

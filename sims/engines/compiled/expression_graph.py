@@ -52,12 +52,12 @@ class ExpressionGraph:
     """Factory of nodes in which equal expressions are one node."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[object, ...], ExpressionNode] = {}
+        self._nodes: dict[tuple[object, ...], ExpressionNode] = {}
 
     def make_constant(self, value: float) -> ExpressionNode:
         """Return the node of a number; zeros of different sign and different NaN are distinct."""
         bits = np.float64(value).tobytes()
-        return self._once(
+        return self._get_or_make(
             ("constant", bits), lambda: ExpressionNode("constant", value=float(value))
         )
 
@@ -73,18 +73,22 @@ class ExpressionGraph:
             *args: argument nodes.
         """
         if all(arg.change_frequency == CONSTANT for arg in args):
-            return self.make_constant(_computed(operation, [arg.value for arg in args]))
+            return self.make_constant(_compute_constant(operation, [arg.value for arg in args]))
         changes = max(arg.change_frequency for arg in args)
         key = operation, *map(id, args)
-        return self._once(key, lambda: ExpressionNode(operation, args, change_frequency=changes))
+        return self._get_or_make(
+            key, lambda: ExpressionNode(operation, args, change_frequency=changes)
+        )
 
-    def _once(self, key: tuple[object, ...], make: Callable[[], ExpressionNode]) -> ExpressionNode:
-        if key not in self._known:
-            self._known[key] = make()
-        return self._known[key]
+    def _get_or_make(
+        self, key: tuple[object, ...], make: Callable[[], ExpressionNode]
+    ) -> ExpressionNode:
+        if key not in self._nodes:
+            self._nodes[key] = make()
+        return self._nodes[key]
 
 
-def _computed(operation: str, values: list[float]) -> float:
+def _compute_constant(operation: str, values: list[float]) -> float:
     with np.errstate(all="ignore"):
         if operation == "where":
             return values[1] if values[0] else values[2]

@@ -179,8 +179,8 @@ class SystemTracer:
         self.parameters = collect_nodes(theta, *constants.values())
         self._moment = StateSnapshot(system, theta, constants, self.t, self.x, self.v, self.u)
         self._shape = 1, names.coordinates
-        self._force = self._shaped(system.force(self._moment), self._shape)
-        self._pieces: dict[type[Effect], EffectProgram] = {}
+        self._force = self._broadcast(system.force(self._moment), self._shape)
+        self._effects: dict[type[Effect], EffectProgram] = {}
         self._programs: dict[tuple[type[Effect], ...], ForceProgram] = {}
 
     def build_program(self, effects: Sequence[Effect]) -> ForceProgram:
@@ -193,7 +193,7 @@ class SystemTracer:
         if key not in self._programs:
             if len(self._programs) == MAX_CACHED_PROGRAMS:
                 self._programs.clear()
-            self._programs[key] = _write_program(self._composed(effects))
+            self._programs[key] = _write_program(self._compose(effects))
         return self._programs[key]
 
     def trace_effect(self, effect: Effect) -> EffectProgram:
@@ -203,34 +203,34 @@ class SystemTracer:
             NotTraceableError: the effect cannot be traced.
         """
         kind = type(effect)
-        if kind not in self._pieces:
+        if kind not in self._effects:
             count = len(effect.coefficients)
             c = make_input_vector(self.graph, count, LANE).T[:, :, None]
             force = limit = None
             if isinstance(effect, Force):
-                force = self._shaped(effect.force(c, self._moment), self._shape)
+                force = self._broadcast(effect.force(c, self._moment), self._shape)
             elif isinstance(effect, Friction):
-                limit = self._shaped(effect.limit(c, self._moment), (1, 1))
-            self._pieces[kind] = EffectProgram(c, force, limit)
-        return self._pieces[kind]
+                limit = self._broadcast(effect.limit(c, self._moment), (1, 1))
+            self._effects[kind] = EffectProgram(c, force, limit)
+        return self._effects[kind]
 
-    def _composed(self, effects: Sequence[Effect]) -> _Composed:
+    def _compose(self, effects: Sequence[Effect]) -> _ProgramNodes:
         force: Any = self._force
         limit: Any = None
         e: Any = self.e
         mu: Any = self.mu
         parameters = list(self.parameters)
         for effect in effects:
-            c, own, rubs = self.trace_effect(effect)
+            c, effect_force, effect_limit = self.trace_effect(effect)
             parameters += collect_nodes(c)
-            if own is not None:
-                force = force + own
-            if rubs is not None:
-                limit = rubs if limit is None else limit + rubs
+            if effect_force is not None:
+                force = force + effect_force
+            if effect_limit is not None:
+                limit = effect_limit if limit is None else limit + effect_limit
             if isinstance(effect, Contact):
-                e = self._shaped(effect.restitution(c, e, self.speed), (1, 1))
-                mu = self._shaped(mu + effect.friction(c), (1, 1))
-        return _Composed(
+                e = self._broadcast(effect.restitution(c, e, self.speed), (1, 1))
+                mu = self._broadcast(mu + effect.friction(c), (1, 1))
+        return _ProgramNodes(
             inputs=[
                 *map(collect_nodes, (self.t, self.x, self.v)),
                 collect_nodes(*self.u.values()),
@@ -243,14 +243,14 @@ class SystemTracer:
             flags=make_flags(self._system, self._names, effects),
         )
 
-    def _shaped(self, values: Any, shape: tuple[int, int]) -> TracedArray:
+    def _broadcast(self, values: Any, shape: tuple[int, int]) -> TracedArray:
         """Return the result of an array function, broadcast to its expected shape."""
         if not isinstance(values, TracedArray):
             values = TracedArray(self.graph, make_constant_nodes(self.graph, values))
         return TracedArray(self.graph, np.broadcast_to(values.nodes, shape))
 
 
-class _Composed(NamedTuple):
+class _ProgramNodes(NamedTuple):
     """Input and output nodes of a program, in order."""
 
     inputs: list[list[ExpressionNode]]
@@ -260,18 +260,18 @@ class _Composed(NamedTuple):
     flags: IntTable
 
 
-def _write_program(composed: _Composed) -> ForceProgram:
+def _write_program(nodes: _ProgramNodes) -> ForceProgram:
     """Return the composed expressions as a program."""
-    outputs = [*composed.force, *composed.limit, *composed.impact]
-    written = emit_instructions(composed.inputs, outputs)
-    limit = written.place[composed.limit[0]] if composed.limit else -1
-    rows = [*written.rows, limit, *(written.place[node] for node in composed.impact)]
+    outputs = [*nodes.force, *nodes.limit, *nodes.impact]
+    written = emit_instructions(nodes.inputs, outputs)
+    limit = written.place[nodes.limit[0]] if nodes.limit else -1
+    rows = [*written.rows, limit, *(written.place[node] for node in nodes.impact)]
     arrays = ProgramArrays(
         code=written.code,
         ends=written.ends,
         rows=np.array(rows, dtype=np.int64),
-        out=np.array([written.place[node] for node in composed.force], dtype=np.int64),
-        flags=composed.flags,
+        out=np.array([written.place[node] for node in nodes.force], dtype=np.int64),
+        flags=nodes.flags,
     )
     return ForceProgram(arrays, written.values, written.first, len(written.place))
 
@@ -315,7 +315,7 @@ def emit_instructions(
         for node in group:
             place[node] = len(place)
     first = len(place)
-    order = _ordered(outputs)
+    order = _sort_nodes(outputs)
     # Constants have consecutive registers, so that they are set by one assignment.
     values = []
     for node in order:
@@ -339,7 +339,7 @@ def emit_instructions(
     return InstructionList(code, ends.astype(np.int64), rows, place, first, np.array(values))
 
 
-def _ordered(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
+def _sort_nodes(outputs: Sequence[ExpressionNode]) -> list[ExpressionNode]:
     """Return the outputs and all nodes they depend on, each after its arguments."""
     order: dict[ExpressionNode, None] = {}
     stack = [(node, False) for node in reversed(outputs)]

@@ -53,35 +53,49 @@ class CompiledKernel:
         self._function = function
 
     def choose_step_divisions(
-        self, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int,
-        spans: FloatArray, turn: float, parts: FloatArray,
+        self, program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int,
+        spans: FloatArray, max_phase: float, divisions: FloatArray,
     ) -> None:  # fmt: skip
         """Choose the number of parts of each step; see `sims.engines.compiled.step_size`.
 
         Args:
             program: program of the system and its effects.
-            work: batch of elements.
+            arrays: batch of elements.
             block: buffers of the slots.
             w: number of slots in use.
             spans: (L,) step sizes in seconds.
-            turn: maximum phase of an oscillation per step in radians.
-            parts: (L,) numbers of parts, updated in place.
+            max_phase: maximum phase of an oscillation per step in radians.
+            divisions: (L,) numbers of parts, updated in place.
         """
-        self._call(kernel_entry.CHOOSE_STEP_DIVISIONS, program, work, block, w, spans, turn, parts)
+        self._call(
+            kernel_entry.CHOOSE_STEP_DIVISIONS,
+            program,
+            arrays,
+            block,
+            w,
+            spans,
+            max_phase,
+            divisions,
+        )
 
     def integrate(
-        self, function: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int
+        self,
+        function: int,
+        program: ProgramArrays,
+        arrays: BatchArrays,
+        block: BlockBuffers,
+        w: int,
     ) -> None:
         """Integrate all elements with one of the functions of `kernel_entry`.
 
         Args:
             function: `STEP_BLOCK`, `STEP_IN_LOCKSTEP` or `FLY_ELEMENTS`.
             program: program of the system and its effects.
-            work: batch of elements.
+            arrays: batch of elements.
             block: buffers of the slots.
             w: number of slots in use.
         """
-        self._call(function, program, work, block, w, work.mass, 1.0, work.mass)
+        self._call(function, program, arrays, block, w, arrays.mass, 1.0, arrays.mass)
 
     def make_instruction_runner(
         self, code: IntTable, first: int, last: int, r: FloatArray
@@ -100,10 +114,13 @@ class CompiledKernel:
         Raises:
             ValueError: an instruction uses a register that does not exist.
         """
-        whole = code.flags.c_contiguous and code.dtype == np.int64 and code.shape[1:] == (5,)
-        real = r.flags.c_contiguous and r.dtype == np.float64 and r.ndim == 2
+        has_int_code = code.flags.c_contiguous and code.dtype == np.int64 and code.shape[1:] == (5,)
+        has_real_registers = r.flags.c_contiguous and r.dtype == np.float64 and r.ndim == 2
         if not (
-            whole and real and 0 <= first <= last <= len(code) and uses_registers(code, len(r))
+            has_int_code
+            and has_real_registers
+            and 0 <= first <= last <= len(code)
+            and uses_registers(code, len(r))
         ):
             raise ValueError("the instructions are not for these registers")
         arguments = np.zeros(kernel_entry.ARGUMENT_COUNT, dtype=np.int64)
@@ -116,21 +133,29 @@ class CompiledKernel:
         return run  # type: ignore[no-any-return]
 
     def _call(
-        self, function: int, program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int,
-        spans: FloatArray, turn: float, parts: FloatArray,
+        self, function: int, program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers,
+        w: int, spans: FloatArray, max_phase: float, divisions: FloatArray,
     ) -> None:  # fmt: skip
         # The compiled code does not check array bounds.
-        check_array_layout(program, work, block, w, spans, parts)
-        lanes, dimensions = work.x.shape
-        chosen, columns = work.parameters.shape
-        sizes = [function, lanes, chosen, dimensions, len(program.code), columns, *work.steps.shape]
-        sizes += [*work.inputs.shape[:2], work.every, len(block.r), w, block.r.shape[1]]
-        limits = np.array([work.patience, turn])
-        ints = [*program, work.order, block.n]
+        check_array_layout(program, arrays, block, w, spans, divisions)
+        element_count, dimensions = arrays.x.shape
+        selected_count, columns = arrays.parameters.shape
+        sizes = [
+            function,
+            element_count,
+            selected_count,
+            dimensions,
+            len(program.code),
+            columns,
+            *arrays.steps.shape,
+        ]
+        sizes += [*arrays.inputs.shape[:2], arrays.every, len(block.r), w, block.r.shape[1]]
+        limits = np.array([arrays.patience, max_phase])
+        ints = [*program, arrays.order, block.n]
         reals = [
-            *(block.r, block.a, work.parameters, work.mass, work.x, work.v, work.steps),
-            *(work.inputs, work.longest, work.planned, work.ground, work.kept),
-            *(spans, parts, limits),
+            *(block.r, block.a, arrays.parameters, arrays.mass, arrays.x, arrays.v, arrays.steps),
+            *(arrays.inputs, arrays.longest, arrays.planned, arrays.ground, arrays.kept),
+            *(spans, divisions, limits),
         ]
         arguments = np.array([*sizes, *map(_address, ints), *map(_address, reals)], dtype=np.int64)
         self._function(_address(arguments))
@@ -242,6 +267,6 @@ def _key(offsets: Mapping[str, int] | None = None) -> str:
 
 def list_source_files() -> list[Path]:
     """Return the source files from which the code is compiled."""
-    here = Path(__file__).parent
-    files = [here / f"{name}.py" for name in KERNEL_SOURCE_MODULES]
-    return [*files, here.parent / "ground_contact.py"]
+    folder = Path(__file__).parent
+    files = [folder / f"{name}.py" for name in KERNEL_SOURCE_MODULES]
+    return [*files, folder.parent / "ground_contact.py"]

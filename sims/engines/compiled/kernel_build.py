@@ -43,7 +43,7 @@ KERNEL_MODULES: tuple[ModuleType, ...] = (
     step_size,
 )
 """Modules that contain the compiled functions."""
-_WRITTEN_OUT = frozenset(
+_INLINED = frozenset(
     {
         *("evaluate_forces", "begin_step", "compute_acceleration", "compute_pulling_force"),
         *("compute_frictionless_acceleration", "try_step", "accept_steps", "next_step"),
@@ -74,19 +74,19 @@ def build_kernel(offsets: Mapping[str, int] | None = None) -> bytes:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
     # Everything is optimised once at the end, instead of each function with all its callees.
     environment["NUMBA_OPT"] = "0"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", _START.format(path=sys.path, offsets=offsets)],
         env=environment,
         capture_output=True,
         stdin=subprocess.DEVNULL,
         check=False,
     )
-    if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
+    if process.returncode:
+        error_lines = process.stderr.decode(errors="replace").strip().splitlines()
         raise llvm_code.CodeNotLoadableError(
-            said[-1] if said else f"its compiler ended: {done.returncode}"
+            error_lines[-1] if error_lines else f"its compiler ended: {process.returncode}"
         )
-    return done.stdout
+    return process.stdout
 
 
 def main(offsets: Mapping[str, int] | None = None) -> None:
@@ -141,17 +141,17 @@ def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, A
         space.update(_names_of(module))
     space.update(_make_intrinsics(numba))
     functions = {
-        name: thing
+        name: value
         for module in modules
-        for name, thing in vars(module).items()
-        if isinstance(thing, FunctionType) and thing.__module__ == module.__name__
+        for name, value in vars(module).items()
+        if isinstance(value, FunctionType) and value.__module__ == module.__name__
     }
-    called = {name: functions.keys() & f.__code__.co_names for name, f in functions.items()}
-    arguments = _arguments(numba)
-    for name in TopologicalSorter(called).static_order():
-        given = inspect.signature(functions[name]).parameters.values()
-        made = numba.njit(
-            forceinline=name in _WRITTEN_OUT,
+    callees = {name: functions.keys() & f.__code__.co_names for name, f in functions.items()}
+    arguments = _get_argument_types(numba)
+    for name in TopologicalSorter(callees).static_order():
+        parameters = inspect.signature(functions[name]).parameters.values()
+        compiled = numba.njit(
+            forceinline=name in _INLINED,
             error_model="numpy",
             # Without reference counting: an atomic counter for each used array takes ten times as
             # long as the computation. Wrappers for calls from Python are not needed.
@@ -160,9 +160,9 @@ def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, A
             no_cfunc_wrapper=True,
         )(FunctionType(functions[name].__code__, space, name))
         # Compiled once, instead of again for each constant argument.
-        made.compile(tuple(arguments[p.annotation] for p in given))
-        made.disable_compile()
-        space[name] = made
+        compiled.compile(tuple(arguments[p.annotation] for p in parameters))
+        compiled.disable_compile()
+        space[name] = compiled
     space["carray"] = numba.carray
     return space
 
@@ -172,8 +172,8 @@ def _emit(numba: Any, function: Any, space: dict[str, Any], pointers: int) -> tu
     types = numba.types
     bound = FunctionType(function.__code__, space, "integrate")
     arguments = [types.CPointer(types.int64)] * pointers
-    made = numba.cfunc(types.void(*arguments), error_model="numpy")(bound)
-    return made.inspect_llvm(), made.native_name
+    compiled = numba.cfunc(types.void(*arguments), error_model="numpy")(bound)
+    return compiled.inspect_llvm(), compiled.native_name
 
 
 def _make_intrinsics(numba: Any) -> dict[str, Any]:
@@ -208,11 +208,11 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
     }
 
 
-def _arguments(numba: Any) -> dict[str, Any]:
+def _get_argument_types(numba: Any) -> dict[str, Any]:
     """Return the compiler's types by the names of the annotations."""
     whole, whole_table = (np.zeros((1,) * k, dtype=np.int64) for k in (1, 2))
     row, table, box = (np.zeros((1,) * k) for k in (1, 2, 3))
-    alike = {
+    examples = {
         "bool": True,
         "int": 1,
         "float": 1.0,
@@ -226,4 +226,4 @@ def _arguments(numba: Any) -> dict[str, Any]:
         ),
         "BlockBuffers": data_layout.BlockBuffers(table, table, whole_table),
     }  # fmt: skip
-    return {name: numba.typeof(value) for name, value in alike.items()}
+    return {name: numba.typeof(value) for name, value in examples.items()}

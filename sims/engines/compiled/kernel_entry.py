@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from sims.engines.compiled.ballistic_motion import fly_elements
 from sims.engines.compiled.data_layout import (
-    ROWS,
+    NUMBER_ROW_COUNT,
     STATE_ROW_COUNT,
     BatchArrays,
     BlockBuffers,
@@ -57,8 +57,8 @@ def kernel_entry(arguments_at: Any) -> None:
     if sizes[0] == RUN_INSTRUCTIONS:
         run_instructions(code, sizes[1], sizes[2], r, w)
         return
-    lanes = sizes[1]
-    chosen = sizes[2]
+    element_count = sizes[1]
+    selected_count = sizes[2]
     d = sizes[3]
     steps = sizes[7]
     every = sizes[10]
@@ -70,33 +70,33 @@ def kernel_entry(arguments_at: Any) -> None:
         carray(to_int_pointer(ints[3]), (d,)),
         carray(to_int_pointer(ints[4]), (5,)),
     )
-    work = BatchArrays(
-        carray(to_int_pointer(ints[5]), (chosen,)),
-        carray(to_real_pointer(reals[2]), (chosen, sizes[5])),
-        carray(to_real_pointer(reals[3]), (lanes,)),
-        carray(to_real_pointer(reals[4]), (lanes, d)),
-        carray(to_real_pointer(reals[5]), (lanes, d)),
+    arrays = BatchArrays(
+        carray(to_int_pointer(ints[5]), (selected_count,)),
+        carray(to_real_pointer(reals[2]), (selected_count, sizes[5])),
+        carray(to_real_pointer(reals[3]), (element_count,)),
+        carray(to_real_pointer(reals[4]), (element_count, d)),
+        carray(to_real_pointer(reals[5]), (element_count, d)),
         carray(to_real_pointer(reals[6]), (sizes[6], steps)),
         carray(to_real_pointer(reals[7]), (sizes[8], sizes[9], steps)),
-        carray(to_real_pointer(reals[8]), (lanes,)),
-        carray(to_real_pointer(reals[9]), (lanes,)),
-        carray(to_real_pointer(reals[10]), (4, lanes)),
+        carray(to_real_pointer(reals[8]), (element_count,)),
+        carray(to_real_pointer(reals[9]), (element_count,)),
+        carray(to_real_pointer(reals[10]), (4, element_count)),
         every,
         limits[0],
-        carray(to_real_pointer(reals[11]), (lanes, steps // every + 1, 3 * d)),
+        carray(to_real_pointer(reals[11]), (element_count, steps // every + 1, 3 * d)),
     )
     block = BlockBuffers(
         r,
-        carray(to_real_pointer(reals[1]), (ROWS, width)),
+        carray(to_real_pointer(reals[1]), (NUMBER_ROW_COUNT, width)),
         carray(to_int_pointer(ints[6]), (STATE_ROW_COUNT, width)),
     )
     if sizes[0] == CHOOSE_STEP_DIVISIONS:
-        spans = carray(to_real_pointer(reals[12]), (lanes,))
-        parts = carray(to_real_pointer(reals[13]), (lanes,))
-        choose_step_divisions(program, work, block, w, spans, limits[1], parts)
+        spans = carray(to_real_pointer(reals[12]), (element_count,))
+        divisions = carray(to_real_pointer(reals[13]), (element_count,))
+        choose_step_divisions(program, arrays, block, w, spans, limits[1], divisions)
     elif sizes[0] == STEP_BLOCK:
-        step_block(program, work, block, w)
+        step_block(program, arrays, block, w)
     elif sizes[0] == STEP_IN_LOCKSTEP:
-        step_in_lockstep(program, work, block, w)
+        step_in_lockstep(program, arrays, block, w)
     else:
-        fly_elements(program, work, block)
+        fly_elements(program, arrays, block)

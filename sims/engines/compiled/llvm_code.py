@@ -70,18 +70,18 @@ def compile_llvm(text: str, name: str) -> MachineCode:
 
     module = llvm.parse_assembly(text)
     module.verify()
-    for thing in (*module.functions, *module.global_variables):
-        if not thing.is_declaration and thing.name != name:
-            thing.linkage = "internal"  # so that inlined functions are not also emitted
-    target = _target(llvm)
+    for symbol in (*module.functions, *module.global_variables):
+        if not symbol.is_declaration and symbol.name != name:
+            symbol.linkage = "internal"  # so that inlined functions are not also emitted
+    target = _make_target(llvm)
     tuning = llvm.create_pipeline_tuning_options(speed_level=3)
     tuning.loop_vectorization = True
     builder = llvm.create_pass_builder(target, tuning)
     builder.getModulePassManager().run(module, builder)
     needs = [
-        thing.name
-        for thing in (*module.functions, *module.global_variables)
-        if thing.is_declaration and not thing.name.startswith("llvm.")
+        symbol.name
+        for symbol in (*module.functions, *module.global_variables)
+        if symbol.is_declaration and not symbol.name.startswith("llvm.")
     ]
     return MachineCode(name, needs, target.emit_object(module))
 
@@ -101,7 +101,7 @@ def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., Non
     """
     import llvmlite.binding as llvm
 
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target(llvm))
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _make_target(llvm))
     nowhere = ctypes.CFUNCTYPE(None)(os.abort)
     for symbol in code.needs:
         if symbol.startswith(_NEVER_CALLED):
@@ -115,7 +115,7 @@ def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., Non
     return kind(engine.get_function_address(code.name))
 
 
-def _target(llvm: Any) -> Any:
+def _make_target(llvm: Any) -> Any:
     """Return the target machine of the present processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

@@ -12,8 +12,8 @@ from sims.engines.compiled.data_layout import (
     K1,
     NEXT_V,
     NEXT_X,
-    STARTS,
-    STEP,
+    STEP_INDEX,
+    STEP_START,
     BatchArrays,
     BlockBuffers,
     H,
@@ -29,37 +29,37 @@ from sims.engines.compiled.interpreter import run_instructions
 
 
 def step_in_lockstep(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int
 ) -> None:
     """Make all steps of all elements, w at a time.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
     """
     a = block.a
-    end = work.steps.shape[1]
-    for first in range(0, work.order.size, w):
-        count = min(w, work.order.size - first)
+    step_count = arrays.steps.shape[1]
+    for first in range(0, arrays.order.size, w):
+        count = min(w, arrays.order.size - first)
         for i in range(w):
-            load_element(program, work, block, i, first + min(i, count - 1))
+            load_element(program, arrays, block, i, first + min(i, count - 1))
         run_instructions(program.code, program.ends[0], program.ends[1], block.r, w)
-        for step in range(end + 1):
+        for step in range(step_count + 1):
             evaluate_forces(program, block, w)
             compute_frictionless_acceleration(program, block, w, K1)
-            if step % work.every == 0:
+            if step % arrays.every == 0:
                 for i in range(count):
-                    record_state(program, work, block, i, step // work.every)
-            if step == end:
+                    record_state(program, arrays, block, i, step // arrays.every)
+            if step == step_count:
                 break
-            h = work.steps[0, step]
+            h = arrays.steps[0, step]
             for i in range(w):
                 a[H, i] = h
             try_step(program, block, w)
             accept_step(program, block, w, h)
-            set_shared_inputs(program, work, block, w, step + 1)
+            set_shared_inputs(program, arrays, block, w, step + 1)
 
 
 def accept_step(program: ProgramArrays, block: BlockBuffers, w: int, h: float) -> None:
@@ -77,29 +77,29 @@ def accept_step(program: ProgramArrays, block: BlockBuffers, w: int, h: float) -
             a[X + k, i] = a[NEXT_X + k, i]
             a[V + k, i] = a[NEXT_V + k, i]
     for i in range(w):
-        a[STARTS, i] += h
-        a[T, i] = a[STARTS, i]
+        a[STEP_START, i] += h
+        a[T, i] = a[STEP_START, i]
 
 
 def set_shared_inputs(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int, step: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int, step: int
 ) -> None:
     """Set the inputs of this step; after the last step, those of the last step.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
         step: index of the step.
     """
-    if work.inputs.shape[1] > 1:
+    if arrays.inputs.shape[1] > 1:
         for i in range(w):
-            block.n[STEP, i] = step
-            set_inputs(program, work, block, i)
+            block.n[STEP_INDEX, i] = step
+            set_inputs(program, arrays, block, i)
         return
-    at = min(step, work.steps.shape[1] - 1)
-    for u in range(work.inputs.shape[0]):
-        value = work.inputs[u, 0, at]
+    input_step = min(step, arrays.steps.shape[1] - 1)
+    for u in range(arrays.inputs.shape[0]):
+        value = arrays.inputs[u, 0, input_step]
         for i in range(w):
             block.r[program.rows[IN_U] + u, i] = value

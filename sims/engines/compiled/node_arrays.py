@@ -62,8 +62,8 @@ def make_constant_nodes(graph: ExpressionGraph, value: Any) -> Any:
     if numbers.dtype.kind not in "biuf":
         raise NotTraceableError(f"{type(value).__name__} is not traced")
     result = np.empty(numbers.shape, dtype=object)
-    for place in np.ndindex(numbers.shape):
-        result[place] = graph.make_constant(float(numbers[place]))
+    for index in np.ndindex(numbers.shape):
+        result[index] = graph.make_constant(float(numbers[index]))
     return result
 
 
@@ -83,8 +83,8 @@ def apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) ->
     """
     if name not in OPERATION_CODES:
         raise NotTraceableError(f"numpy.{name} is not traced")
-    spread: Any = np.broadcast_arrays(*args)
-    result = np.empty(spread[0].shape, dtype=object)
-    for place in np.ndindex(result.shape):
-        result[place] = graph.make_operation(name, *(nodes[place] for nodes in spread))
+    broadcast: Any = np.broadcast_arrays(*args)
+    result = np.empty(broadcast[0].shape, dtype=object)
+    for index in np.ndindex(result.shape):
+        result[index] = graph.make_operation(name, *(nodes[index] for nodes in broadcast))
     return result

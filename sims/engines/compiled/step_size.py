@@ -17,16 +17,16 @@ from __future__ import annotations
 import numpy as np
 
 from sims.engines.compiled.data_layout import (
-    ASKED,
     DIMENSIONS,
+    ELEMENT,
     IN_U,
     IN_V,
     IN_X,
     K1,
-    LANE,
     MASS,
-    PEAK,
-    RUBBED,
+    MAX_ACCELERATION,
+    MAX_FRICTION,
+    SAMPLED_STEP,
     BatchArrays,
     BlockBuffers,
     ProgramArrays,
@@ -53,132 +53,135 @@ PHASE_TO_DECAY_RATIO = MAX_PHASE_PER_STEP / MAX_DECAY_PER_STEP
 
 def choose_step_divisions(
     program: ProgramArrays,
-    work: BatchArrays,
+    arrays: BatchArrays,
     block: BlockBuffers,
     w: int,
     spans: Row,
-    turn: float,
-    parts: Row,
+    max_phase: float,
+    divisions: Row,
 ) -> None:
     """Raise `parts` to the number of parts into which steps must be divided.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
         spans: (L,) step sizes in seconds.
-        turn: maximum phase of an oscillation per step in radians.
-        parts: (L,) numbers of parts, updated in place.
+        max_phase: maximum phase of an oscillation per step in radians.
+        divisions: (L,) numbers of parts, updated in place.
     """
-    instants = SAMPLED_INSTANTS if work.inputs.shape[0] > 0 else 1
-    for first in range(0, work.order.size, w):
+    instants = SAMPLED_INSTANTS if arrays.inputs.shape[0] > 0 else 1
+    for first in range(0, arrays.order.size, w):
         for i in range(w):
-            load_element(program, work, block, i, min(first + i, work.order.size - 1))
+            load_element(program, arrays, block, i, min(first + i, arrays.order.size - 1))
             if instants > 1:
-                select_sampled_steps(work, block, i)
+                select_sampled_steps(arrays, block, i)
         run_instructions(program.code, program.ends[0], program.ends[1], block.r, w)
         for instant in range(instants):
             if instants > 1:
-                set_inputs_at(program, work, block, w, instant)
-            for still in range(2):
-                compute_stiffness_and_damping(program, work, block, w, still == 1)
-                for i in range(min(w, work.order.size - first)):
-                    lane = block.n[LANE, i]
-                    turned = np.sqrt(block.a[PEAK, i]) * spans[lane]
-                    decayed = block.a[RUBBED, i] * spans[lane] * PHASE_TO_DECAY_RATIO
-                    needed = np.ceil(nan_maximum(turned, decayed) / turn)
+                set_inputs_at(program, arrays, block, w, instant)
+            for at_rest in range(2):
+                compute_stiffness_and_damping(program, arrays, block, w, at_rest == 1)
+                for i in range(min(w, arrays.order.size - first)):
+                    element = block.n[ELEMENT, i]
+                    phase = np.sqrt(block.a[MAX_ACCELERATION, i]) * spans[element]
+                    decay = block.a[MAX_FRICTION, i] * spans[element] * PHASE_TO_DECAY_RATIO
+                    needed = np.ceil(nan_maximum(phase, decay) / max_phase)
                     # NaN does not change the number of parts.
-                    if needed > parts[lane]:
-                        parts[lane] = min(needed, MAX_STEP_DIVISIONS)
+                    if needed > divisions[element]:
+                        divisions[element] = min(needed, MAX_STEP_DIVISIONS)
 
 
-def select_sampled_steps(work: BatchArrays, block: BlockBuffers, i: int) -> None:
+def select_sampled_steps(arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
     """Select the steps of an element at which the forces are evaluated.
 
     Steps of zero length do not count.
 
     Args:
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         i: index of the slot.
     """
     n = block.n
-    shared = work.steps.shape[0] == 1
+    shared = arrays.steps.shape[0] == 1
     if shared and i > 0:
         for k in range(SAMPLED_INSTANTS):
-            n[ASKED + k, i] = n[ASKED + k, 0]
+            n[SAMPLED_STEP + k, i] = n[SAMPLED_STEP + k, 0]
         return
-    row = 0 if shared else n[LANE, i]
-    steps = work.steps.shape[1]
+    row = 0 if shared else n[ELEMENT, i]
+    steps = arrays.steps.shape[1]
     total = 0
     for s in range(steps):
-        total += work.steps[row, s] > 0.0
-    done = 0
+        total += arrays.steps[row, s] > 0.0
+    passed_count = 0
     k = 0
     for s in range(steps):
-        done += work.steps[row, s] > 0.0
-        while k < SAMPLED_INSTANTS and done >= np.ceil(k * (1.0 / (SAMPLED_INSTANTS - 1)) * total):
-            n[ASKED + k, i] = s
+        passed_count += arrays.steps[row, s] > 0.0
+        while k < SAMPLED_INSTANTS and passed_count >= np.ceil(
+            k * (1.0 / (SAMPLED_INSTANTS - 1)) * total
+        ):
+            n[SAMPLED_STEP + k, i] = s
             k += 1
 
 
 def set_inputs_at(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int, instant: int
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int, instant: int
 ) -> None:
     """Set the inputs of every element to those of one of its selected steps.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
         instant: index of the selected step.
     """
     first = program.rows[IN_U]
     for i in range(w):
-        row = block.n[LANE, i] if work.inputs.shape[1] > 1 else 0
-        for u in range(work.inputs.shape[0]):
-            block.r[first + u, i] = work.inputs[u, row, block.n[ASKED + instant, i]]
+        row = block.n[ELEMENT, i] if arrays.inputs.shape[1] > 1 else 0
+        for u in range(arrays.inputs.shape[0]):
+            block.r[first + u, i] = arrays.inputs[u, row, block.n[SAMPLED_STEP + instant, i]]
 
 
 def compute_stiffness_and_damping(
-    program: ProgramArrays, work: BatchArrays, block: BlockBuffers, w: int, still: bool
+    program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int, at_rest: bool
 ) -> None:
     """Compute the largest slopes of the acceleration with position and with velocity.
 
-    The slope with position (1/s^2) is stored in row PEAK, that with velocity (1/s) in row RUBBED.
+    The slope with position (1/s^2) is stored in row MAX_ACCELERATION, that with velocity (1/s) in
+    row MAX_FRICTION.
 
     Args:
         program: program of the system and its effects.
-        work: batch of elements.
+        arrays: batch of elements.
         block: buffers of the slots.
         w: number of slots in use.
-        still: whether to evaluate at rest at zero instead of the initial state.
+        at_rest: whether to evaluate at rest at zero instead of the initial state.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
     for i in range(w):
-        a[PEAK, i] = 0.0
-        a[RUBBED, i] = 0.0
+        a[MAX_ACCELERATION, i] = 0.0
+        a[MAX_FRICTION, i] = 0.0
         for k in range(d):
-            x = work.x[block.n[LANE, i], k]
-            v = work.v[block.n[LANE, i], k]
-            a[X + k, i] = 0.0 * x if still else x
-            a[V + k, i] = 0.0 * v if still else v
+            x = arrays.x[block.n[ELEMENT, i], k]
+            v = arrays.v[block.n[ELEMENT, i], k]
+            a[X + k, i] = 0.0 * x if at_rest else x
+            a[V + k, i] = 0.0 * v if at_rest else v
     evaluate_forces(program, block, w)
     for k in range(d):
         for i in range(w):
             a[K1 + k, i] = block.r[program.out[k], i]
     for k in range(d):
-        update_max_slope(program, block, w, k, program.rows[IN_X], PEAK)
-        update_max_slope(program, block, w, k, program.rows[IN_V], RUBBED)
+        update_max_slope(program, block, w, k, program.rows[IN_X], MAX_ACCELERATION)
+        update_max_slope(program, block, w, k, program.rows[IN_V], MAX_FRICTION)
 
 
 def update_max_slope(
-    program: ProgramArrays, block: BlockBuffers, w: int, k: int, register: int, to: int
+    program: ProgramArrays, block: BlockBuffers, w: int, k: int, register: int, row_of_result: int
 ) -> None:
-    """Raise row `to` to the slope of the acceleration with one coordinate.
+    """Raise row `row_of_result` to the slope of the acceleration with one coordinate.
 
     Args:
         program: program of the system and its effects.
@@ -186,10 +189,10 @@ def update_max_slope(
         w: number of slots in use.
         k: index of the coordinate.
         register: first register of the positions or velocities.
-        to: row of the result, PEAK for positions or RUBBED for velocities.
+        row_of_result: MAX_ACCELERATION for positions, or MAX_FRICTION for velocities.
     """
     a = block.a
-    if to == RUBBED:
+    if row_of_result == MAX_FRICTION:
         # Both velocities are on one side of rest: a discontinuity at rest is not a faster decay.
         for i in range(w):
             block.r[register + k, i] += FINITE_DIFFERENCE_STEP
@@ -202,8 +205,8 @@ def update_max_slope(
     for i in range(w):
         change = block.r[program.out[k], i] - a[K1 + k, i]
         slope = abs(change / (FINITE_DIFFERENCE_STEP * a[MASS, i]))
-        if slope > a[to, i]:
-            a[to, i] = slope
-    block_row = (X if to == PEAK else V) + k
+        if slope > a[row_of_result, i]:
+            a[row_of_result, i] = slope
+    block_row = (X if row_of_result == MAX_ACCELERATION else V) + k
     for i in range(w):
         block.r[register + k, i] = a[block_row, i]

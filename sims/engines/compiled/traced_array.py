@@ -66,15 +66,15 @@ class TracedArray(NDArrayOperatorsMixin):
     @property
     def T(self) -> TracedArray:  # noqa: N802
         """Transposed array, as of a NumPy array."""
-        return self._like(self.nodes.T)
+        return self._make_like(self.nodes.T)
 
     def reshape(self, *shape: Any) -> TracedArray:
         """Return the array in another shape, as for a NumPy array."""
-        return self._like(self.nodes.reshape(*shape))
+        return self._make_like(self.nodes.reshape(*shape))
 
     def copy(self) -> TracedArray:
         """Return a copy, as for a NumPy array."""
-        return self._like(self.nodes.copy())
+        return self._make_like(self.nodes.copy())
 
     def astype(self, kind: Any, **_: Any) -> TracedArray:
         """Return the array as numbers; only float64 is supported."""
@@ -90,7 +90,7 @@ class TracedArray(NDArrayOperatorsMixin):
             keepdims: whether to keep the axis with size one.
             **_: other options of NumPy, which are ignored.
         """
-        return self._reduced("add", axis, keepdims)
+        return self._reduce("add", axis, keepdims)
 
     def max(self, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
         """Return the maximum, as for a NumPy array.
@@ -100,7 +100,7 @@ class TracedArray(NDArrayOperatorsMixin):
             keepdims: whether to keep the axis with size one.
             **_: other options of NumPy, which are ignored.
         """
-        return self._reduced("maximum", axis, keepdims)
+        return self._reduce("maximum", axis, keepdims)
 
     def min(self, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
         """Return the minimum, as for a NumPy array.
@@ -110,7 +110,7 @@ class TracedArray(NDArrayOperatorsMixin):
             keepdims: whether to keep the axis with size one.
             **_: other options of NumPy, which are ignored.
         """
-        return self._reduced("minimum", axis, keepdims)
+        return self._reduce("minimum", axis, keepdims)
 
     def clip(self, low: Any, high: Any) -> TracedArray:
         """Return the values limited to an interval, as for a NumPy array.
@@ -127,16 +127,16 @@ class TracedArray(NDArrayOperatorsMixin):
     def __iter__(self) -> Iterator[TracedArray]:
         return (self[i] for i in range(len(self)))
 
-    def __getitem__(self, place: Any) -> TracedArray:
-        _check_place(place)
-        found = self.nodes[place]
+    def __getitem__(self, index: Any) -> TracedArray:
+        _check_index(index)
+        found = self.nodes[index]
         if isinstance(found, ExpressionNode):
             found = to_scalar_array(found)
-        return self._like(found)
+        return self._make_like(found)
 
-    def __setitem__(self, place: Any, value: Any) -> None:
-        _check_place(place)
-        self.nodes[place] = _to_nodes(self.graph, value)
+    def __setitem__(self, index: Any, value: Any) -> None:
+        _check_index(index)
+        self.nodes[index] = _to_nodes(self.graph, value)
 
     def __bool__(self) -> bool:
         raise NotTraceableError("it asks whether a number is true, which differs from lane to lane")
@@ -150,13 +150,13 @@ class TracedArray(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: Any, method: str, *args: Any, **kwargs: Any) -> TracedArray:
         if method == "reduce" and ufunc.__name__ in {"add", "maximum", "minimum"}:
             axis = kwargs.get("axis", 0)
-            result = args[0]._reduced(ufunc.__name__, axis, bool(kwargs.get("keepdims")))
+            result = args[0]._reduce(ufunc.__name__, axis, bool(kwargs.get("keepdims")))
             assert isinstance(result, TracedArray)
             return result
         out = kwargs.pop("out", None)
         if method != "__call__" or kwargs or (out and not isinstance(out[0], TracedArray)):
             raise NotTraceableError(f"numpy.{ufunc.__name__} is traced in its plain form only")
-        result = _elementwise(self.graph, ufunc.__name__, args)
+        result = _apply_elementwise(self.graph, ufunc.__name__, args)
         if not out:
             return result
         target = out[0]
@@ -167,33 +167,33 @@ class TracedArray(NDArrayOperatorsMixin):
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         name = func.__name__
         if name in RESHAPING_FUNCTIONS:
-            return _wrapped(self.graph, func(*_unwrap_arguments(self.graph, args), **kwargs))
+            return _wrap_result(self.graph, func(*_unwrap_arguments(self.graph, args), **kwargs))
         known = _FUNCTIONS.get(name)
         if known is None:
             raise NotTraceableError(f"numpy.{name} is not traced")
         return known(*args, **kwargs)
 
-    def _like(self, nodes: Any) -> TracedArray:
+    def _make_like(self, nodes: Any) -> TracedArray:
         return TracedArray(self.graph, nodes, self.mask)
 
-    def _reduced(self, operation: str, axis: Any, keepdims: bool) -> TracedArray:
+    def _reduce(self, operation: str, axis: Any, keepdims: bool) -> TracedArray:
         if axis is None:
-            whole = self.reshape(-1)._reduced(operation, 0, False)
+            whole = self.reshape(-1)._reduce(operation, 0, False)
             return whole.reshape((1,) * self.ndim) if keepdims else whole
         parts = list(np.moveaxis(self.nodes, axis, 0))
         total = TracedArray(self.graph, to_node_array(parts[0]))
         for part in parts[1:]:
-            total = _elementwise(
+            total = _apply_elementwise(
                 self.graph, operation, (total, TracedArray(self.graph, to_node_array(part)))
             )
         if keepdims:
-            total = total._like(np.expand_dims(total.nodes, axis))
+            total = total._make_like(np.expand_dims(total.nodes, axis))
         return total
 
 
-def _check_place(place: Any) -> None:
+def _check_index(index: Any) -> None:
     """Reject a traced index, whose number of selected elements would not be constant."""
-    for part in place if isinstance(place, tuple) else (place,):
+    for part in index if isinstance(index, tuple) else (index,):
         if isinstance(part, TracedArray):
             raise NotTraceableError("it chooses elements by what it computes")
 
@@ -203,35 +203,37 @@ def _to_nodes(graph: ExpressionGraph, value: Any) -> Any:
     return value.nodes if isinstance(value, TracedArray) else make_constant_nodes(graph, value)
 
 
-def _elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -> TracedArray:
+def _apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -> TracedArray:
     if name == "positive":
         return TracedArray(graph, _to_nodes(graph, args[0]))
     if name == "square":
-        return _elementwise(graph, "multiply", (args[0], args[0]))
+        return _apply_elementwise(graph, "multiply", (args[0], args[0]))
     if name == "reciprocal":
-        return _elementwise(graph, "divide", (1.0, args[0]))
+        return _apply_elementwise(graph, "divide", (1.0, args[0]))
     if name == "power" and not isinstance(args[1], TracedArray) and np.ndim(args[1]) == 0:
-        short = _power(graph, args[0], float(args[1]))
+        short = _simplify_power(graph, args[0], float(args[1]))
         if short is not None:
             return short
     if name in SWAPPED_COMPARISONS:
-        return _elementwise(graph, SWAPPED_COMPARISONS[name], args[::-1])
+        return _apply_elementwise(graph, SWAPPED_COMPARISONS[name], args[::-1])
     name = OPERATION_ALIASES.get(name, name)
     masks = [isinstance(arg, TracedArray) and arg.mask for arg in args]
     if all(masks) and name not in BOOLEAN_OPERATIONS:
         raise NotTraceableError(f"numpy.{name} of truth values is not traced")
-    lifted = [to_node_array(_to_nodes(graph, arg)) for arg in args]
-    return TracedArray(graph, apply_elementwise(graph, name, lifted), name in BOOLEAN_OPERATIONS)
+    node_arrays = [to_node_array(_to_nodes(graph, arg)) for arg in args]
+    return TracedArray(
+        graph, apply_elementwise(graph, name, node_arrays), name in BOOLEAN_OPERATIONS
+    )
 
 
-def _power(graph: ExpressionGraph, base: Any, exponent: float) -> TracedArray | None:
+def _simplify_power(graph: ExpressionGraph, base: Any, exponent: float) -> TracedArray | None:
     """Return a power that NumPy computes as a simpler operation; None for other exponents."""
     if exponent == 2.0:
-        return _elementwise(graph, "multiply", (base, base))
+        return _apply_elementwise(graph, "multiply", (base, base))
     if exponent == 0.5:
-        return _elementwise(graph, "sqrt", (base,))
+        return _apply_elementwise(graph, "sqrt", (base,))
     if exponent == -1.0:
-        return _elementwise(graph, "divide", (1.0, base))
+        return _apply_elementwise(graph, "divide", (1.0, base))
     return TracedArray(graph, _to_nodes(graph, base)) if exponent == 1.0 else None
 
 
@@ -248,9 +250,9 @@ def _unwrap_arguments(graph: ExpressionGraph, args: Any) -> list[Any]:
     return [bare(arg) for arg in args]
 
 
-def _wrapped(graph: ExpressionGraph, result: Any) -> Any:
+def _wrap_result(graph: ExpressionGraph, result: Any) -> Any:
     if isinstance(result, list | tuple):
-        return type(result)(_wrapped(graph, part) for part in result)
+        return type(result)(_wrap_result(graph, part) for part in result)
     return TracedArray(graph, to_node_array(result))
 
 
@@ -262,49 +264,49 @@ def _where(condition: Any, *values: Any) -> TracedArray:
     if len(values) != 2:
         raise NotTraceableError("numpy.where with a condition alone is not traced")
     graph = _graph_of(condition, *values)
-    return _elementwise(graph, "where", (condition, *values))
+    return _apply_elementwise(graph, "where", (condition, *values))
 
 
 def _clip(x: Any, low: Any, high: Any) -> TracedArray:
     graph = _graph_of(x, low, high)
     result = x
     if low is not None:
-        result = _elementwise(graph, "maximum", (result, low))
+        result = _apply_elementwise(graph, "maximum", (result, low))
     if high is not None:
-        result = _elementwise(graph, "minimum", (result, high))
+        result = _apply_elementwise(graph, "minimum", (result, high))
     return (
         result if isinstance(result, TracedArray) else TracedArray(graph, _to_nodes(graph, result))
     )
 
 
-def _filled(x: TracedArray, value: float) -> TracedArray:
+def _fill_like(x: TracedArray, value: float) -> TracedArray:
     nodes = np.empty(x.shape, dtype=object)
     nodes[...] = x.graph.make_constant(value)
     return TracedArray(x.graph, nodes)
 
 
-def _summed(x: TracedArray, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
+def _sum(x: TracedArray, axis: Any = None, keepdims: bool = False, **_: Any) -> TracedArray:
     return x.sum(axis, keepdims)
 
 
 def _norm(x: TracedArray, ord: Any = None, axis: Any = None, keepdims: bool = False) -> TracedArray:  # noqa: A002
     if ord is not None:
         raise NotTraceableError("numpy.linalg.norm of a kind of its own is not traced")
-    squares = _elementwise(x.graph, "multiply", (x, x)).sum(axis, keepdims)
-    return _elementwise(x.graph, "sqrt", (squares,))
+    squares = _apply_elementwise(x.graph, "multiply", (x, x)).sum(axis, keepdims)
+    return _apply_elementwise(x.graph, "sqrt", (squares,))
 
 
 _FUNCTIONS: dict[str, Callable[..., TracedArray]] = {
     "where": _where,
     "clip": _clip,
-    "sum": _summed,
+    "sum": _sum,
     "norm": _norm,
     "max": lambda x, axis=None, keepdims=False, **_: x.max(axis, keepdims),
     "min": lambda x, axis=None, keepdims=False, **_: x.min(axis, keepdims),
     "amax": lambda x, axis=None, keepdims=False, **_: x.max(axis, keepdims),
     "amin": lambda x, axis=None, keepdims=False, **_: x.min(axis, keepdims),
-    "zeros_like": lambda x, **_: _filled(x, 0.0),
-    "empty_like": lambda x, **_: _filled(x, 0.0),
-    "ones_like": lambda x, **_: _filled(x, 1.0),
-    "full_like": lambda x, value, **_: _filled(x, float(value)),
+    "zeros_like": lambda x, **_: _fill_like(x, 0.0),
+    "empty_like": lambda x, **_: _fill_like(x, 0.0),
+    "ones_like": lambda x, **_: _fill_like(x, 1.0),
+    "full_like": lambda x, value, **_: _fill_like(x, float(value)),
 }

@@ -42,27 +42,27 @@ BallState = tuple[Vector, Vector]
 """Position and the engine's velocity."""
 
 
-def get_gravity(lane: ElementWork) -> Vector:
+def get_gravity(element: ElementWork) -> Vector:
     """Return the acceleration of gravity, which is constant."""
     start = np.zeros((1, 1))
     nothing = np.zeros((1, 3))
-    moment = lane.make_snapshot(start, nothing, nothing, {})
-    weight: list[float] = lane.system.weight(moment)[0].tolist()
+    moment = element.make_snapshot(start, nothing, nothing, {})
+    weight: list[float] = element.system.weight(moment)[0].tolist()
     return weight
 
 
-def make_trajectory(lane: ElementWork, rows: list[tuple[float, ...]]) -> Trajectory:
+def make_trajectory(element: ElementWork, rows: list[tuple[float, ...]]) -> Trajectory:
     """Split rows of position, velocity and acceleration; all NaN if rows are missing.
 
     Args:
-        lane: integrated batch element.
+        element: integrated batch element.
         rows: nine numbers for each recorded state.
 
     Returns:
         Positions, velocities and accelerations (N, 3).
     """
-    if len(rows) < lane.recorded_steps.size:
-        rows = [(math.nan,) * 9] * lane.recorded_steps.size
+    if len(rows) < element.recorded_steps.size:
+        rows = [(math.nan,) * 9] * element.recorded_steps.size
     table = np.array(rows)
     return table[:, :3], table[:, 3:6], table[:, 6:]
 
@@ -125,28 +125,28 @@ class BallWithImpacts(BallBody, Protocol):
         ...
 
 
-def integrate_ball(ball: BallWithImpacts, lane: ElementWork) -> Trajectory:
+def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
     """Integrate one batch element.
 
     Args:
         ball: ball in an engine.
-        lane: batch element to integrate.
+        element: batch element to integrate.
 
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
     """
-    ball.reset_world(lane.plain_constants)
-    flight = BallRollout(ball, lane)
-    kept = set(lane.recorded_steps.tolist())
-    steps = lane.steps.tolist()
-    rows = [flight.state]
-    for begin, counts in split_into_legs(lane):
-        states = flight.advance_leg(steps[begin], counts)
+    ball.reset_world(element.plain_constants)
+    rollout = BallRollout(ball, element)
+    recorded_steps = set(element.recorded_steps.tolist())
+    steps = element.steps.tolist()
+    rows = [rollout.state]
+    for begin, counts in split_into_legs(element):
+        states = rollout.advance_leg(steps[begin], counts)
         # A leg may end between two samples, where no state is recorded.
-        rows.extend(states if begin + sum(counts) in kept else states[:-1])
-        if not math.isfinite(sum(flight.state)):
+        rows.extend(states if begin + sum(counts) in recorded_steps else states[:-1])
+        if not math.isfinite(sum(rollout.state)):
             break
-    return make_trajectory(lane, rows)
+    return make_trajectory(element, rows)
 
 
 class BallRollout:
@@ -163,25 +163,25 @@ class BallRollout:
         time: seconds since the start.
     """
 
-    def __init__(self, ball: BallWithImpacts, lane: ElementWork) -> None:
+    def __init__(self, ball: BallWithImpacts, element: ElementWork) -> None:
         self._ball = ball
-        self._forces = ElementForces(lane, 1)
+        self._forces = ElementForces(element, 1)
         self._short_flights = 0
-        self._gravity = get_gravity(lane)
-        self._floor = float(lane.system.floor(lane.constants)[0, 0])
-        x, y, z = lane.x.tolist()
+        self._gravity = get_gravity(element)
+        self._floor = float(element.system.floor(element.constants)[0, 0])
+        x, y, z = element.x.tolist()
         self.x: Vector = x, y, max(z, self._floor)  # not inside the ground
-        self.v: Vector = lane.v.tolist()
+        self.v: Vector = element.v.tolist()
         self.a = self._gravity
         self.lift = self._gravity[2]
         self.w: Vector | None = None
         self.step = math.nan
         self.rests = False
         self.time = 0.0
-        self._look()
+        self._update_acceleration()
         if self._time_to_ground() == 0.0 and self.v[2] == 0.0:
-            self._rest()
-            self._look()
+            self._begin_rest()
+            self._update_acceleration()
 
     @property
     def state(self) -> tuple[float, ...]:
@@ -199,67 +199,67 @@ class BallRollout:
             Position, velocity and acceleration after each count.
         """
         if self._forces.acts:
-            return [self._stepwise(step, count) for count in counts]
+            return [self._advance_stepwise(step, count) for count in counts]
         states: list[tuple[float, ...]] = []
-        left = list(counts)
-        while left:
+        remaining_counts = list(counts)
+        while remaining_counts:
             # As many whole sample intervals as fit before the impact are integrated in one engine
             # call.
-            room = math.inf if self.rests else self._time_to_ground() / step
-            whole = 0
-            for count in left:
-                if room < count:
+            steps_to_impact = math.inf if self.rests else self._time_to_ground() / step
+            count_before_impact = 0
+            for count in remaining_counts:
+                if steps_to_impact < count:
                     break
-                room -= count
-                whole += 1
-            if whole:
-                states.extend(self._glide(step, left[:whole]))
-                left = left[whole:]
+                steps_to_impact -= count
+                count_before_impact += 1
+            if count_before_impact:
+                states.extend(self._advance_freely(step, remaining_counts[:count_before_impact]))
+                remaining_counts = remaining_counts[count_before_impact:]
                 continue
             # Then follow the whole steps before the impact, and the step that contains it.
-            if room >= 1.0:
-                self._glide(step, (int(room),))
+            if steps_to_impact >= 1.0:
+                self._advance_freely(step, (int(steps_to_impact),))
             self.advance_with_impacts(step)
-            left[0] -= int(room) + 1
-            if not left[0]:
+            remaining_counts[0] -= int(steps_to_impact) + 1
+            if not remaining_counts[0]:
                 states.append(self.state)
-                left = left[1:]
+                remaining_counts = remaining_counts[1:]
         return states
 
-    def _stepwise(self, step: float, count: int) -> tuple[float, ...]:
+    def _advance_stepwise(self, step: float, count: int) -> tuple[float, ...]:
         """Advance by `count` steps that evaluate the forces; return the state."""
         for _ in range(count):
             # A resting ball that is pulled upward takes off.
             if self.rests and self.lift > 0.0:
                 self.rests = False
                 self.w = None
-                self._look()
+                self._update_acceleration()
             if self.rests or self._time_to_ground() >= step:
-                self._forced(step)
+                self._advance_with_forces(step)
             else:
                 self.advance_with_impacts(step)
         return self.state
 
-    def advance_with_impacts(self, left: float) -> None:
+    def advance_with_impacts(self, remaining: float) -> None:
         """Advance by a step that contains impacts.
 
         Args:
-            left: length of the step in seconds.
+            remaining: length of the step in seconds.
         """
-        while left > _NO_TIME:
-            until = math.inf if self.rests else self._time_to_ground()
-            if until > _NO_TIME:
-                part = min(until, left)
+        while remaining > _NO_TIME:
+            time_to_impact = math.inf if self.rests else self._time_to_ground()
+            if time_to_impact > _NO_TIME:
+                part = min(time_to_impact, remaining)
                 if self._forces.acts:
-                    self._forced(part)
+                    self._advance_with_forces(part)
                 else:
-                    self._glide(part, (1,))
-            if until >= left:
+                    self._advance_freely(part, (1,))
+            if time_to_impact >= remaining:
                 return
-            left -= until
-            self._strike()
+            remaining -= time_to_impact
+            self._apply_impact()
 
-    def _ready(self, step: float) -> Vector:
+    def _prepare_step(self, step: float) -> Vector:
         """Set the engine's step, and its state if necessary; return the engine's velocity."""
         # The velocity half a step earlier depends on the step size.
         if step != self.step:
@@ -275,26 +275,26 @@ class BallRollout:
             self._ball.set_state(self.x, self.w)
         return self.w
 
-    def _glide(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
+    def _advance_freely(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
         """Advance under gravity alone, or at rest; return the state after each count."""
-        self._ready(step)
+        self._prepare_step(step)
         ax, ay, az = self.a
         x = 0.5 * step * ax
         y = 0.5 * step * ay
         z = 0.5 * step * az
-        reached = self._ball.advance_freely(counts)
-        self.x, self.w = reached[-1]
+        states_reached = self._ball.advance_freely(counts)
+        self.x, self.w = states_reached[-1]
         states = []
-        for at, w in reached:
+        for position, w in states_reached:
             v = w[0] + x, w[1] + y, w[2] + z  # (3)
-            states.append((*at, *v, ax, ay, az))
+            states.append((*position, *v, ax, ay, az))
         self.v = states[-1][3:6]
         return states
 
-    def _forced(self, step: float) -> None:
+    def _advance_with_forces(self, step: float) -> None:
         """Advance by one step, in flight or at rest, under all forces."""
         half = 0.5 * step
-        wx, wy, wz = self._ready(step)
+        wx, wy, wz = self._prepare_step(step)
         x, y, z = self.v
         ax, ay, az = self.a
         gx, gy, gz = self._gravity
@@ -308,11 +308,11 @@ class BallRollout:
         # The acceleration at the end is evaluated at the velocity that (3) gives with the
         # acceleration at the beginning; then (3) is evaluated with the result.
         self.v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self.rests else 2.0 * wz - z
-        self._look()
+        self._update_acceleration()
         ax, ay, az = self.a
         self.v = wx + half * ax, wy + half * ay, 0.0 if self.rests else wz + half * az
 
-    def _look(self) -> None:
+    def _update_acceleration(self) -> None:
         """Evaluate the acceleration at the present state; at rest the vertical one is zero."""
         x, y, z = self._gravity
         if self._forces.acts:
@@ -328,24 +328,24 @@ class BallRollout:
         gap = max(self.x[2] - self._floor, 0.0)
         rate = self.v[2]
         lift = self.a[2]
-        inside = rate * rate - 2.0 * lift * gap
+        discriminant = rate * rate - 2.0 * lift * gap
         # (5): of the two forms, the one without cancellation is used.
         if rate > 0.0 or (rate == 0.0 and lift < 0.0):
-            return (rate + math.sqrt(inside)) / -lift if lift < 0.0 else math.inf
-        if inside < 0.0 or (rate == 0.0 and lift >= 0.0):
+            return (rate + math.sqrt(discriminant)) / -lift if lift < 0.0 else math.inf
+        if discriminant < 0.0 or (rate == 0.0 and lift >= 0.0):
             return math.inf
-        return 2.0 * gap / (math.sqrt(inside) - rate)
+        return 2.0 * gap / (math.sqrt(discriminant) - rate)
 
-    def _strike(self) -> None:
+    def _apply_impact(self) -> None:
         speed = -self.v[2]
         self.w = None  # contact changes the velocity, so the engine's state must be set again
-        restitution, friction, over = self._compute_impact(max(speed, 0.0), -self.a[2])
+        restitution, friction, is_last = self._compute_impact(max(speed, 0.0), -self.a[2])
         if speed > 0.0:
             self.v = self._ball.solve_impact(self.x, self.v, restitution, friction)
             self.step = math.nan  # the engine's step is still that of the contact
-        if over:
-            self._rest()
-        self._look()
+        if is_last:
+            self._begin_rest()
+        self._update_acceleration()
 
     def _compute_impact(self, speed: float, down: float) -> tuple[float, float, bool]:
         """Return the parameters of an impact, and whether bouncing ends with it.
@@ -368,11 +368,13 @@ class BallRollout:
             return restitution, friction, False
         # Engines remove mu (1 + e) |vn| with the returned e, which is 0. Therefore all of (4) and
         # the factor 1 + e of this impact are included in the friction.
-        later = up / (1.0 - restitution) if restitution < 1.0 else 0.0  # (4), divided by mu (1 + e)
-        total = friction * (1.0 + restitution) * (1.0 + later / speed) if speed else 0.0
+        omitted_speed = (
+            up / (1.0 - restitution) if restitution < 1.0 else 0.0
+        )  # (4), divided by mu (1 + e)
+        total = friction * (1.0 + restitution) * (1.0 + omitted_speed / speed) if speed else 0.0
         return 0.0, total, True
 
-    def _rest(self) -> None:
+    def _begin_rest(self) -> None:
         self.rests = True
         # Slightly inside the ground, so that the engine's contact acts from the first step on.
         x, y, z = self.x

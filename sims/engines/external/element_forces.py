@@ -9,7 +9,7 @@ from sims.core.effect import Force, Friction
 from sims.core.system import System
 from sims.engines.compiled.data_layout import (
     BOUNCES,
-    DRY,
+    HAS_FRICTION,
     IN_E,
     IN_MU,
     IN_P,
@@ -39,40 +39,40 @@ class ElementForces:
         states: number of states that are evaluated in one call.
     """
 
-    def __init__(self, lane: ElementWork, states: int) -> None:
-        prepared = lane.program.prepare(states)
+    def __init__(self, element: ElementWork, states: int) -> None:
+        prepared = element.program.prepare(states)
         rows, flags = prepared.arrays.rows, prepared.arrays.flags
         r = prepared.block.r
-        r[rows[IN_P] : rows[IN_E]] = lane.parameters[:, None]
+        r[rows[IN_P] : rows[IN_E]] = element.parameters[:, None]
         run_lane, self._run_moment, self._run_impact = prepared.make_runners()
         # Single numbers are read and written much faster by a memory view than by an array.
         self._numbers = memoryview(r.data).cast("B").cast("d")
-        place = (rows * states).tolist()
-        self._t, self._x, self._v, self._u = (place[k] for k in (IN_T, IN_X, IN_V, IN_U))
-        self._e, self._mu, self._speed = (place[k] for k in (IN_E, IN_MU, IN_SPEED))
+        offsets = (rows * states).tolist()
+        self._t, self._x, self._v, self._u = (offsets[k] for k in (IN_T, IN_X, IN_V, IN_U))
+        self._e, self._mu, self._speed = (offsets[k] for k in (IN_E, IN_MU, IN_SPEED))
         self._force = (prepared.arrays.out * states).tolist()
-        self._limit = place[OUT_LIMIT] if flags[DRY] else None
-        self._impact = place[OUT_E], place[OUT_MU]
+        self._limit = offsets[OUT_LIMIT] if flags[HAS_FRICTION] else None
+        self._impact = offsets[OUT_E], offsets[OUT_MU]
         self._states = states
-        self._signals = [values.tolist() for values in lane.inputs.values()]
+        self._signals = [values.tolist() for values in element.inputs.values()]
         self._restitution = (
-            float(lane.system.restitution(lane.theta)[0, 0]) if flags[BOUNCES] else 0.0
+            float(element.system.restitution(element.theta)[0, 0]) if flags[BOUNCES] else 0.0
         )
         # Most systems have no passive force except gravity.
-        is_driven = bool(lane.inputs) or type(lane.system).passive is not System.passive
-        self.acts = is_driven or any(isinstance(e, Force | Friction) for e, _ in lane.effects)
+        is_driven = bool(element.inputs) or type(element.system).passive is not System.passive
+        self.acts = is_driven or any(isinstance(e, Force | Friction) for e, _ in element.effects)
         self.set_inputs(0)
         run_lane()
 
     def set_inputs(self, step: int) -> bool:
         """Set the inputs of a step; return whether any differs from the previous step."""
-        changes = step == 0
+        has_changed = step == 0
         for k, values in enumerate(self._signals):
             if step == 0 or values[step] != values[step - 1]:
-                changes = True
+                has_changed = True
                 for state in range(self._states):
                     self._numbers[self._u + k * self._states + state] = values[step]
-        return changes
+        return has_changed
 
     def evaluate_at_velocities(
         self, t: float, x: float, velocities: tuple[float, float]

@@ -116,12 +116,12 @@ integration failed.
 
 
 def integrate_batch(
-    lanes: IntegrationBatch, rollouts: Sequence[RolloutFunction], discard: Callable[[], None]
+    batch: IntegrationBatch, rollouts: Sequence[RolloutFunction], discard: Callable[[], None]
 ) -> Trajectories:
     """Integrate the batch elements one after the other.
 
     Args:
-        lanes: batch to integrate.
+        batch: batch to integrate.
         rollouts: functions that integrate one element, each with its own world; with several of
             them, each runs in its own thread.
         discard: called after a failure or interruption, which may leave the engine's world in any
@@ -130,23 +130,23 @@ def integrate_batch(
     Returns:
         The trajectories. An element with a number or result that is not finite is all NaN.
     """
-    count = lanes.steps.shape[1] // lanes.steps_per_sample + 1
+    count = batch.steps.shape[1] // batch.steps_per_sample + 1
     trajectories = Trajectories(
-        *(np.full((len(lanes.theta), count, lanes.x.shape[1]), np.nan) for _ in range(3))
+        *(np.full((len(batch.theta), count, batch.x.shape[1]), np.nan) for _ in range(3))
     )
     work: list[tuple[int, ElementWork, Indices]] = []
-    for i in range(len(lanes.theta)):
+    for i in range(len(batch.theta)):
         # Elements of one run are adjacent and have the same steps.
-        if i == 0 or not np.array_equal(lanes.steps[i], lanes.steps[i - 1]):
-            timing = _timing(lanes.steps[i], lanes.steps_per_sample)
-        lane = _lane(lanes, i, *timing[:3])
+        if i == 0 or not np.array_equal(batch.steps[i], batch.steps[i - 1]):
+            timing = _compute_timing(batch.steps[i], batch.steps_per_sample)
+        element = _make_element(batch, i, *timing[:3])
         # A rollout that is certain to fail would cost the engine its world.
-        if all(np.isfinite(values).all() for values in _given(lane)):
-            work.append((i, lane, timing[3]))
+        if all(np.isfinite(values).all() for values in _list_numbers(element)):
+            work.append((i, element, timing[3]))
 
     def integrate_share(k: int) -> None:
-        for i, lane, rows in work[k :: len(rollouts)]:
-            trajectory = rollouts[k](lane)
+        for i, element, rows in work[k :: len(rollouts)]:
+            trajectory = rollouts[k](element)
             if not is_finite(trajectory):
                 discard()
                 continue
@@ -172,7 +172,7 @@ def is_finite(path: Trajectory) -> bool:
     return all(bool(np.isfinite(values).all()) for values in path)
 
 
-def _timing(steps: Array, every: int) -> tuple[Indices, Array, Indices, Indices]:
+def _compute_timing(steps: Array, every: int) -> tuple[Indices, Array, Indices, Indices]:
     """Return the timing of one element.
 
     Args:
@@ -188,46 +188,46 @@ def _timing(steps: Array, every: int) -> tuple[Indices, Array, Indices, Indices]
     moves = steps > 0
     moving = np.flatnonzero(moves)
     taken = np.concatenate([[0], np.cumsum(moves)])[::every]
-    kept, rows = np.unique(taken, return_inverse=True)
-    return moving, equalise_steps(steps[moving], every), kept, rows
+    recorded, rows = np.unique(taken, return_inverse=True)
+    return moving, equalise_steps(steps[moving], every), recorded, rows
 
 
-def _lane(
-    lanes: IntegrationBatch, i: int, moving: Indices, steps: Array, kept: Indices
+def _make_element(
+    batch: IntegrationBatch, i: int, moving: Indices, steps: Array, recorded_steps: Indices
 ) -> ElementWork:
-    acting = [(effect, c[:, i : i + 1]) for effect, c in lanes.effects]
+    acting = [(effect, c[:, i : i + 1]) for effect, c in batch.effects]
     effects = tuple((effect, c) for effect, c in acting if c.any())
     forces = [(e, c) for e, c in effects if isinstance(e, Force | Friction | Contact)]
-    program = get_force_program(lanes, np.array([i]), [effect for effect, _ in forces])
-    numbers = [lanes.theta[i], *(value[i] for value in lanes.constants.values())]
+    program = get_force_program(batch, np.array([i]), [effect for effect, _ in forces])
+    numbers = [batch.theta[i], *(value[i] for value in batch.constants.values())]
     parameters = np.concatenate([*numbers, *(c[:, 0, 0] for _, c in forces)])
-    constants = {name: value[i : i + 1] for name, value in lanes.constants.items()}
+    constants = {name: value[i : i + 1] for name, value in batch.constants.items()}
     # An element without any step of positive length still has an input at its single time.
-    felt = moving if moving.size else slice(1)
-    inputs = {name: value[i, felt] for name, value in lanes.inputs.items()}
+    input_steps = moving if moving.size else slice(1)
+    inputs = {name: value[i, input_steps] for name, value in batch.inputs.items()}
     return ElementWork(
-        lanes.system,
-        lanes.theta[i : i + 1],
+        batch.system,
+        batch.theta[i : i + 1],
         constants,
-        lanes.x[i],
-        lanes.v[i],
+        batch.x[i],
+        batch.v[i],
         steps,
         inputs,
         effects,
         program,
         parameters,
-        kept,
+        recorded_steps,
     )
 
 
-def _given(lane: ElementWork) -> list[Array]:
+def _list_numbers(element: ElementWork) -> list[Array]:
     return [
-        lane.theta,
-        lane.x,
-        lane.v,
-        *lane.constants.values(),
-        *lane.inputs.values(),
-        *(c for _, c in lane.effects),
+        element.theta,
+        element.x,
+        element.v,
+        *element.constants.values(),
+        *element.inputs.values(),
+        *(c for _, c in element.effects),
     ]
 
 
@@ -247,35 +247,35 @@ def equalise_steps(steps: Array, every: int) -> Array:
         return steps
     # The error of the sample times is compared, not that of each step, because errors of rounded
     # time stamps do not add up.
-    even = math.fsum(steps) / steps.size
-    ends = even * np.arange(1, steps.size + 1)
-    missed = np.abs(np.cumsum(steps) - ends).max()
-    alike = missed <= TIME_TOLERANCE * even * every
-    return np.full(steps.size, even) if alike else steps
+    mean_step = math.fsum(steps) / steps.size
+    ends = mean_step * np.arange(1, steps.size + 1)
+    largest_deviation = np.abs(np.cumsum(steps) - ends).max()
+    are_equal = largest_deviation <= TIME_TOLERANCE * mean_step * every
+    return np.full(steps.size, mean_step) if are_equal else steps
 
 
-def split_into_legs(lane: ElementWork, *signals: Array) -> list[tuple[int, list[int]]]:
+def split_into_legs(element: ElementWork, *signals: Array) -> list[tuple[int, list[int]]]:
     """Split the steps into legs in which neither the step size nor any signal changes.
 
     Args:
-        lane: batch element.
+        element: batch element.
         *signals: (S,) signals.
 
     Returns:
         For each leg, the index of its first step, and the numbers of steps from one recorded state
         to the next, with the remainder to the end of the leg as the last number.
     """
-    size = lane.steps.size
-    new = np.zeros(size, dtype=bool)
-    new[:1] = True
-    for values in (lane.steps, *signals):
-        new[1:] |= values[1:size] != values[: size - 1]
+    size = element.steps.size
+    is_new_leg = np.zeros(size, dtype=bool)
+    is_new_leg[:1] = True
+    for values in (element.steps, *signals):
+        is_new_leg[1:] |= values[1:size] != values[: size - 1]
     # The engine is stopped at the beginning of each leg and where a state is recorded.
-    stops = new.copy()
-    stops[lane.recorded_steps[lane.recorded_steps < size]] = True
+    stops = is_new_leg.copy()
+    stops[element.recorded_steps[element.recorded_steps < size]] = True
     begins = np.flatnonzero(stops)
     counts = np.diff(begins, append=size).tolist()
-    firsts = new[begins].tolist()
+    firsts = is_new_leg[begins].tolist()
     result: list[tuple[int, list[int]]] = []
     for begin, count, first in zip(begins.tolist(), counts, firsts, strict=True):
         if first:

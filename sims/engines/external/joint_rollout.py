@@ -103,29 +103,29 @@ class JointBody(Protocol):
         ...
 
 
-def integrate_joint(joint: JointBody, lane: ElementWork) -> Trajectory:
+def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
     """Integrate one batch element.
 
     Args:
         joint: body in an engine.
-        lane: batch element to integrate.
+        element: batch element to integrate.
 
     Returns:
         The trajectory; NaN if the engine cannot represent the element.
     """
-    joint.reset_world(lane.plain_constants)
-    inertia = float(lane.system.mass(lane.theta, lane.constants)[0, 0])
-    damping = _find_equivalent_damping(lane) if joint.open_loop else None
+    joint.reset_world(element.plain_constants)
+    inertia = float(element.system.mass(element.theta, element.constants)[0, 0])
+    damping = _find_equivalent_damping(element) if joint.open_loop else None
     if damping is not None:
-        return _integrate_open_loop(joint, lane, inertia, damping)
-    return _integrate_stepwise(joint, lane, inertia)
+        return _integrate_open_loop(joint, element, inertia, damping)
+    return _integrate_stepwise(joint, element, inertia)
 
 
-def _find_equivalent_damping(lane: ElementWork) -> float | None:
+def _find_equivalent_damping(element: ElementWork) -> float | None:
     """Return the viscous damping that is equivalent to all effects; None if there is none."""
-    if not lane.effects:
+    if not element.effects:
         return 0.0
-    (effect, c), *others = lane.effects
+    (effect, c), *others = element.effects
     damping = float(c[0, 0, 0])
     # A plugin may replace an effect of this name with another law.
     is_drag = effect.name == "drag.linear" and type(effect).__module__ == "sims.effects.drag"
@@ -140,9 +140,9 @@ class LinearisedForces:
         limit: limit of dry friction.
     """
 
-    def __init__(self, joint: JointBody, lane: ElementWork, inertia: float) -> None:
+    def __init__(self, joint: JointBody, element: ElementWork, inertia: float) -> None:
         self._joint = joint
-        self._forces = ElementForces(lane, 2)
+        self._forces = ElementForces(element, 2)
         self._inertia = inertia
         self.set_inputs = self._forces.set_inputs
         self.weight = self.limit = self._velocity = self._force = self._slope = 0.0
@@ -224,36 +224,36 @@ def integrate_velocity(
     return velocity + subtract_dry_friction(velocity, force, limit) * inverse * duration
 
 
-def _compute_drive_forces(lane: ElementWork) -> Array:
+def _compute_drive_forces(element: ElementWork) -> Array:
     """Return the generalised force (S,) of the inputs over each step, at least one value."""
-    if not lane.inputs:
-        return np.zeros(max(lane.steps.size, 1))
-    signals = {name: values[:, None] for name, values in lane.inputs.items()}
+    if not element.inputs:
+        return np.zeros(max(element.steps.size, 1))
+    signals = {name: values[:, None] for name, values in element.inputs.items()}
     size = len(next(iter(signals.values())))
     nothing = np.zeros((size, 1))
-    moment = lane.make_snapshot(nothing, nothing, nothing, signals)
-    drive: Array = lane.system.drive(moment)[:, 0]
+    moment = element.make_snapshot(nothing, nothing, nothing, signals)
+    drive: Array = element.system.drive(moment)[:, 0]
     return drive
 
 
 def _integrate_open_loop(
-    joint: JointBody, lane: ElementWork, inertia: float, damping: float
+    joint: JointBody, element: ElementWork, inertia: float, damping: float
 ) -> Trajectory:
     """Integrate without feedback except viscous damping.
 
     The engine runs on its own while the input is constant.
     """
-    drive = _compute_drive_forces(lane)
+    drive = _compute_drive_forces(element)
     forces = drive.tolist()
-    steps = lane.steps.tolist()
-    kept = set(lane.recorded_steps.tolist())
-    x = float(lane.x[0])
+    steps = element.steps.tolist()
+    recorded_steps = set(element.recorded_steps.tolist())
+    x = float(element.x[0])
     w = math.nan
-    v = float(lane.v[0])
+    v = float(element.v[0])
     step = math.nan
-    felt = forces[0]
-    rows = [(x, w, step, felt)]
-    for begin, counts in split_into_legs(lane, drive):
+    drive_force = forces[0]
+    rows = [(x, w, step, drive_force)]
+    for begin, counts in split_into_legs(element, drive):
         h = steps[begin]
         u = forces[begin]
         end = begin + sum(counts)
@@ -261,7 +261,7 @@ def _integrate_open_loop(
             # The velocity half a step earlier depends on the step size.
             if begin:
                 v = _to_full_step_velocity(
-                    w, joint.compute_gravity_force(x) + felt, inertia, damping, step
+                    w, joint.compute_gravity_force(x) + drive_force, inertia, damping, step
                 )
             if not joint.set_step(h, inertia + 0.5 * h * damping, damping):  # (5)
                 break
@@ -269,29 +269,31 @@ def _integrate_open_loop(
                 x,
                 _to_half_step_velocity(v, joint.compute_gravity_force(x) + u, inertia, damping, h),
             )
-        elif u != felt:
-            joint.advance(_compute_transition_force(felt, u, inertia, damping, h))
+        elif u != drive_force:
+            joint.advance(_compute_transition_force(drive_force, u, inertia, damping, h))
             counts[0] -= 1
         states = joint.advance_freely(u, counts)
         x, w = states[-1]
         if not math.isfinite(x + w):
             break
         step = h
-        felt = u
+        drive_force = u
         # A leg may end between two samples, where the input changes and no state is recorded.
-        if end not in kept:
+        if end not in recorded_steps:
             states.pop()
         rows.extend((*state, h, u) for state in states)
-    if len(rows) < lane.recorded_steps.size:
-        return _make_failed_trajectory(lane)
-    return _read_trajectory(lane, np.array(rows), inertia, damping)
+    if len(rows) < element.recorded_steps.size:
+        return _make_failed_trajectory(element)
+    return _read_trajectory(element, np.array(rows), inertia, damping)
 
 
-def _read_trajectory(lane: ElementWork, rows: Array, inertia: float, damping: float) -> Trajectory:
+def _read_trajectory(
+    element: ElementWork, rows: Array, inertia: float, damping: float
+) -> Trajectory:
     """Convert the states of an uninterrupted run to a trajectory.
 
     Args:
-        lane: integrated batch element.
+        element: integrated batch element.
         rows: (N, 4) position, the engine's velocity, step size and force of the inputs at each
             recorded state.
         inertia: generalised inertia.
@@ -300,12 +302,12 @@ def _read_trajectory(lane: ElementWork, rows: Array, inertia: float, damping: fl
     Returns:
         Positions, velocities and accelerations (N, 1).
     """
-    positions, w_at, step_at, felt_at = rows.T
-    force = _weights(lane, positions) + felt_at
-    rates = _to_full_step_velocity(w_at, force, inertia, damping, step_at)
-    rates[0] = lane.v[0]
-    accelerations = (force - damping * rates) / inertia
-    return positions[:, None], rates[:, None], accelerations[:, None]
+    positions, engine_velocities, steps, drive_forces = rows.T
+    force = _compute_weights(element, positions) + drive_forces
+    velocities = _to_full_step_velocity(engine_velocities, force, inertia, damping, steps)
+    velocities[0] = element.v[0]
+    accelerations = (force - damping * velocities) / inertia
+    return positions[:, None], velocities[:, None], accelerations[:, None]
 
 
 def _to_full_step_velocity(w: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
@@ -338,32 +340,34 @@ def _to_half_step_velocity(v: Any, force: Any, inertia: Any, damping: Any, step:
     return (1.0 + half * damping) * v - half * force  # (7)
 
 
-def _compute_transition_force(felt: Any, u: Any, inertia: Any, damping: Any, step: Any) -> Any:
+def _compute_transition_force(
+    drive_force: Any, u: Any, inertia: Any, damping: Any, step: Any
+) -> Any:
     """Return the force over the step in which the input changes, equation (8).
 
     Args:
-        felt: force of the input before the change.
+        drive_force: force of the input before the change.
         u: force of the input after the change.
         inertia: generalised inertia.
         damping: viscous damping.
         step: step size in seconds.
     """
-    return u + (0.5 - 0.25 * step * damping / inertia) * (felt - u)  # (8)
+    return u + (0.5 - 0.25 * step * damping / inertia) * (drive_force - u)  # (8)
 
 
-def _integrate_stepwise(joint: JointBody, lane: ElementWork, inertia: float) -> Trajectory:
+def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) -> Trajectory:
     """Integrate with forces that are evaluated at each step."""
-    forces = LinearisedForces(joint, lane, inertia)
-    x = float(lane.x[0])
-    v = float(lane.v[0])
+    forces = LinearisedForces(joint, element, inertia)
+    x = float(element.x[0])
+    v = float(element.v[0])
     t = 0.0
     step = math.nan
     w = v
     inverse = 1.0 / inertia
     forces.linearise(t, x, v)
-    kept = set(lane.recorded_steps.tolist())
+    recorded_steps = set(element.recorded_steps.tolist())
     rows = [(x, v, forces.compute_acceleration(v))]
-    for i, h in enumerate(lane.steps.tolist()):
+    for i, h in enumerate(element.steps.tolist()):
         if i and forces.set_inputs(i):
             forces.linearise(t, x, v)
         start = integrate_velocity(
@@ -383,23 +387,23 @@ def _integrate_stepwise(joint: JointBody, lane: ElementWork, inertia: float) -> 
         # that velocity.
         forces.linearise(t, x, 2.0 * w - v)
         v = forces.compute_end_velocity(w, h)  # (3)
-        if i + 1 in kept:
+        if i + 1 in recorded_steps:
             rows.append((x, v, forces.compute_acceleration(v)))
-    if len(rows) < lane.recorded_steps.size:
-        return _make_failed_trajectory(lane)
+    if len(rows) < element.recorded_steps.size:
+        return _make_failed_trajectory(element)
     x_at, v_at, a_at = np.array(rows).T[:, :, None]
     return x_at, v_at, a_at
 
 
-def _weights(lane: ElementWork, x: Array) -> Array:
+def _compute_weights(element: ElementWork, x: Array) -> Array:
     """Return the force of gravity (n,) at positions (n,)."""
     nothing = np.zeros((x.size, 1))
-    moment = lane.make_snapshot(nothing, x[:, None], nothing, {})
-    weights: Array = lane.system.weight(moment)[:, 0]
+    moment = element.make_snapshot(nothing, x[:, None], nothing, {})
+    weights: Array = element.system.weight(moment)[:, 0]
     return weights
 
 
-def _make_failed_trajectory(lane: ElementWork) -> Trajectory:
+def _make_failed_trajectory(element: ElementWork) -> Trajectory:
     """Return a trajectory of NaN for a failed element."""
-    nothing = np.full((lane.recorded_steps.size, 1), np.nan)
+    nothing = np.full((element.recorded_steps.size, 1), np.nan)
     return nothing, nothing, nothing

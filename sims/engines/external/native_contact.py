@@ -44,20 +44,20 @@ class NativeContactBall(BallBody, Protocol):
         ...
 
 
-def integrate_native_ball(ball: NativeContactBall, lane: ElementWork) -> Trajectory:
+def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Trajectory:
     """Integrate one batch element.
 
     Args:
         ball: ball in an engine.
-        lane: batch element to integrate.
+        element: batch element to integrate.
 
     Returns:
         Positions, velocities and accelerations (N, 3); NaN if the integration failed.
     """
     # Unlike in `ball_rollout`, velocity and contact of the engine are used without correction.
-    forces = ElementForces(lane, 1)
-    changes_impacts = any(isinstance(effect, Contact) for effect, _ in lane.effects)
-    gx, gy, gz = get_gravity(lane)
+    forces = ElementForces(element, 1)
+    changes_impacts = any(isinstance(effect, Contact) for effect, _ in element.effects)
+    gx, gy, gz = get_gravity(element)
 
     def compute_force(t: float, x: Vector, v: Vector) -> Vector:
         if not forces.acts:
@@ -65,18 +65,18 @@ def integrate_native_ball(ball: NativeContactBall, lane: ElementWork) -> Traject
         fx, fy, fz = forces.evaluate(t, x, v)
         return fx - gx, fy - gy, fz - gz
 
-    floor = float(lane.system.floor(lane.constants)[0, 0])
-    ball.reset_world(lane.plain_constants)
-    x: Vector = lane.x.tolist()
-    w: Vector = lane.v.tolist()
+    floor = float(element.system.floor(element.constants)[0, 0])
+    ball.reset_world(element.plain_constants)
+    x: Vector = element.x.tolist()
+    w: Vector = element.v.tolist()
     ball.set_contact_parameters(*forces.compute_impact(max(-w[2], 0.0)))
     ball.set_state(x, w)
-    kept = set(lane.recorded_steps.tolist())
-    steps = lane.steps.tolist()
+    recorded_steps = set(element.recorded_steps.tolist())
+    steps = element.steps.tolist()
     t = 0.0
     step = math.nan
     rows = [(*x, *w, *compute_force(t, x, w))]
-    for begin, counts in split_into_legs(lane):
+    for begin, counts in split_into_legs(element):
         if steps[begin] != step:
             step = steps[begin]
             ball.set_step(step)
@@ -97,13 +97,13 @@ def integrate_native_ball(ball: NativeContactBall, lane: ElementWork) -> Traject
         else:
             # No force must be evaluated: the engine runs from sample to sample.
             states = [(*x, *w, 0.0, 0.0, 0.0) for x, w in ball.advance_freely(counts)]
-        rows.extend(states if begin + sum(counts) in kept else states[:-1])
+        rows.extend(states if begin + sum(counts) in recorded_steps else states[:-1])
         if not math.isfinite(sum(rows[-1])):
             break
-    at, v, pulled = make_trajectory(lane, rows)
+    positions, v, effect_forces = make_trajectory(element, rows)
     speed = np.sqrt((v * v).sum(axis=1, keepdims=True))
-    a: Array = np.array([gx, gy, gz]) + pulled - ball.damping * v * (1.0 + speed)  # (1)
+    a: Array = np.array([gx, gy, gz]) + effect_forces - ball.damping * v * (1.0 + speed)  # (1)
     for i in np.flatnonzero(np.abs(v[:, 2]) < _SLOW):
-        if ball.is_near_contact(at[i, 2] - floor):
+        if ball.is_near_contact(positions[i, 2] - floor):
             a[i, 2] = 0.0
-    return at, v, a
+    return positions, v, a

@@ -108,14 +108,14 @@ class MujocoJointWorldModule(MujocoWorldModule, JointWorldModule, Protocol):
 
 
 def find_world_module(
-    system: type[System], name: str, asked: type
+    system: type[System], name: str, protocol: type
 ) -> tuple[ModuleType | None, str]:
     """Find the world module of a system and check its interface.
 
     Args:
         system: system whose world is needed.
         name: name of the module in the package of the system's own module.
-        asked: protocol that the module must fulfil.
+        protocol: protocol that the module must fulfil.
 
     Returns:
         The module and an empty text, or None and the reason why there is no usable module.
@@ -128,12 +128,12 @@ def find_world_module(
     else:
         return None, f"no module {name} beside {system.__module__} builds it"
     module = import_module(path)
-    if reason := describe_missing_members(module, asked):
+    if reason := describe_missing_members(module, protocol):
         return None, f"module {path} {reason}"
     return module, ""
 
 
-def describe_missing_members(module: ModuleType, asked: type) -> str:
+def describe_missing_members(module: ModuleType, protocol: type) -> str:
     """Describe which member of the protocol `asked` a module does not have.
 
     A type checker covers the modules of this project; this function covers external modules as
@@ -141,38 +141,40 @@ def describe_missing_members(module: ModuleType, asked: type) -> str:
 
     Args:
         module: world module to check.
-        asked: protocol that the module must fulfil.
+        protocol: protocol that the module must fulfil.
 
     Returns:
         The end of a sentence; empty if the module is complete.
     """
     # The check begins with the most general protocol, so that members required of all worlds are
     # reported first.
-    for part in reversed(asked.__mro__):
+    for part in reversed(protocol.__mro__):
         if part in (object, Generic, Protocol):
             continue
         for name in inspect.get_annotations(part):
             if not isinstance(getattr(module, name, None), bool):
                 return f"has no {name} = True or False"
         for name, function in vars(part).items():
-            if not name.startswith("_") and not _answers(getattr(module, name, None), function):
-                return f"has no function {name}({_arguments(function)})"
+            if not name.startswith("_") and not _accepts_arguments(
+                getattr(module, name, None), function
+            ):
+                return f"has no function {name}({_list_arguments(function)})"
     return ""
 
 
-def _answers(found: Any, asked: Callable[..., Any]) -> bool:
+def _accepts_arguments(member: Any, protocol: Callable[..., Any]) -> bool:
     """Return whether `found` can be called with the arguments of the protocol's function."""
-    if not callable(found):
+    if not callable(member):
         return False
-    parameters = list(inspect.signature(asked).parameters.values())[1:]  # the first is self
+    parameters = list(inspect.signature(protocol).parameters.values())[1:]  # the first is self
     by_place = [p for p in parameters if p.kind is p.POSITIONAL_ONLY]
     by_name = {p.name: p for p in parameters if p.kind is not p.POSITIONAL_ONLY}
     try:
-        inspect.signature(found).bind(*by_place, **by_name)
+        inspect.signature(member).bind(*by_place, **by_name)
     except TypeError:
         return False
     return True
 
 
-def _arguments(function: Callable[..., Any]) -> str:
+def _list_arguments(function: Callable[..., Any]) -> str:
     return ", ".join(list(inspect.signature(function).parameters)[1:])
