@@ -112,9 +112,9 @@ class Columns:
         Returns:
             Forces and controls (R, T - 1, E + nu), and ψ (R, T, C).
         """
-        own = self.places[list(chosen)]
+        columns = self.places[list(chosen)]
         weights = coefficients / self.sizes[list(chosen)]
-        return self.pushed[..., own] @ weights, self.readings[..., own] @ weights
+        return self.pushed[..., columns] @ weights, self.readings[..., columns] @ weights
 
 
 @dataclass
@@ -172,18 +172,18 @@ class FollowedRuns:
         linear: list[MeasuredLinear] = []
         for number in range(max_linearisations if trajectories is None else 1):
             # Near the data, Jacobians change little from one motion to another.
-            nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
+            neighbours: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
             motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
             linear = [
-                _linearised(world, theta, noise, run, motion[run], near)
-                for run, near in enumerate(nearby)
+                _linearised(world, theta, noise, run, motion[run], neighbour)
+                for run, neighbour in enumerate(neighbours)
             ]
-            begin = FIRST_FORCE * typical if force is None else force
-            found = cls._of_linear(world, theta, noise, linear, begin, typical)
-            force, noise, trajectories = found.force, found.noise, found.trajectories
-            gain = np.inf if best is None else found.log_likelihood - best.log_likelihood
+            initial_force = FIRST_FORCE * typical if force is None else force
+            followed = cls._of_linear(world, theta, noise, linear, initial_force, typical)
+            force, noise, trajectories = followed.force, followed.noise, followed.trajectories
+            gain = np.inf if best is None else followed.log_likelihood - best.log_likelihood
             # The first linearisation is about the readings alone, which are not a possible motion.
-            best = found if number < 2 or gain > 0.0 else best
+            best = followed if number < 2 or gain > 0.0 else best
             if not gain > LINEARISED_GAIN:
                 break
         assert best is not None
@@ -203,8 +203,10 @@ class FollowedRuns:
             is_alike: whether the Jacobians of this filter are reused.
         """
         linear = [
-            _linearised(self.world, theta, self.noise, run, motion, near, simulator, is_alike)
-            for run, (motion, near) in enumerate(zip(self.trajectories, self.linear, strict=True))
+            _linearised(self.world, theta, self.noise, run, motion, neighbour, simulator, is_alike)
+            for run, (motion, neighbour) in enumerate(
+                zip(self.trajectories, self.linear, strict=True)
+            )
         ]
         given = self.noise, linear, self.force, self.typical
         return self._of_linear(self.world, theta, *given)
@@ -222,7 +224,7 @@ class FollowedRuns:
         """Filter the linearised models of all runs; other arguments as those of `_fit_noise`."""
         # A model that diverges between two samples overflows; `is_sound` is then false.
         with np.errstate(all="ignore"):
-            maps = [one.interval_maps() for one in linear]
+            maps = [run_model.interval_maps() for run_model in linear]
             # An effect may have its own states.
             prior = _prior(world, linear, maps[0].states.shape[1])
             runs = LinearRuns.stacked(maps, world.observed, prior)
@@ -246,8 +248,8 @@ class FollowedRuns:
         world.watch.stage("following the runs with the model", 1)
         assert isinstance(world.simulator, RobotSimulator)
         # With another step size, the motion at the ends of the steps is not known.
-        alike = known is not None and known.step == world.simulator.time_step
-        motion = known.trajectories if known is not None and alike else None
+        has_same_step = known is not None and known.step == world.simulator.time_step
+        motion = known.trajectories if known is not None and has_same_step else None
         followed = world.followed = cls.follow(world, theta, noise, motion)
         return followed
 
@@ -266,8 +268,10 @@ class FollowedRuns:
         The model is linearised about the same motion and filtered with the same process noise.
         """
         maps = [
-            _linearised(self.world, theta, self.noise, run, near.trajectory, near).interval_maps()
-            for run, near in enumerate(self.linear)
+            _linearised(
+                self.world, theta, self.noise, run, neighbour.trajectory, neighbour
+            ).interval_maps()
+            for run, neighbour in enumerate(self.linear)
         ]
         runs = LinearRuns.stacked(maps, self.world.observed, self.runs.prior)
         coloured, white = with_coloured_noise(runs, self.noise)
@@ -282,13 +286,13 @@ class FollowedRuns:
     def losses_without_force(self) -> Array:
         """Loss in twice the log-likelihood (E,) without each missing force."""
         coloured, white = with_coloured_noise(self.runs, self.noise)
-        best = self.log_likelihood
+        log_likelihood = self.log_likelihood
         losses = []
         for j in range(self.force.size):
             force = self.force.copy()
             force[j] = SMALLEST_FORCE * self.typical[j]
-            found = filter_runs(coloured, force, white)
-            losses.append(2.0 * (best - float(found.log_likelihood.sum())))
+            filtered = filter_runs(coloured, force, white)
+            losses.append(2.0 * (log_likelihood - float(filtered.log_likelihood.sum())))
         return np.array(losses)
 
     @property
@@ -318,13 +322,13 @@ class FollowedRuns:
     def trajectories(self) -> list[Trajectory]:
         """Smoothed motion of each run."""
         size = self.runs.prior.size
-        found = []
+        trajectories = []
         for run, linear in enumerate(self.linear):
             count = linear.knots.size
             states = self.smoothed.states[run, :count, :size]
             forces = self.smoothed.forces[run, : count - 1, : self.force.size]
-            found.append(linear.moved(linear.propagated(states, forces)))
-        return found
+            trajectories.append(linear.moved(linear.propagated(states, forces)))
+        return trajectories
 
     def columns(self, probes: Sequence[CandidateDirection]) -> Columns:
         """Compute the inputs that candidates add to states and readings, once per effect and place.
@@ -333,7 +337,7 @@ class FollowedRuns:
             probes: the candidates.
         """
         effects: list[tuple[Effect, Array]] = []
-        known: dict[tuple[str, bytes], int] = {}
+        numbers: dict[tuple[str, bytes], int] = {}
         places = []
         for probe in probes:
             effect, c = self.world.available_effects[probe.effect], probe.coefficients
@@ -342,30 +346,32 @@ class FollowedRuns:
             if len(parts) == 1:
                 effect, c = parts[0][0], parts[0][1][:, 0, 0]
             key = effect.name, c.tobytes()
-            if key not in known:
-                known[key] = len(effects)
+            if key not in numbers:
+                numbers[key] = len(effects)
                 effects.append((effect, c))
-            places.append(known[key])
+            places.append(numbers[key])
         number, samples, channels = self.runs.residuals.shape
         inputs = self.runs.inputs.shape[3]
         pushed = np.zeros((number, samples - 1, inputs, len(effects)), dtype=np.float32)
         readings = np.zeros((number, samples, channels, len(effects)), dtype=np.float32)
         for run, linear in enumerate(self.linear):
             predicted = self.filtered.predicted[run, : linear.knots.size, : self.runs.prior.size]
-            own, read = linear.added(effects, np.nan_to_num(predicted))
-            pushed[run, : own.shape[0]] = own
-            readings[run, : read.shape[0]] = read
+            run_pushed, run_readings = linear.added(effects, np.nan_to_num(predicted))
+            pushed[run, : run_pushed.shape[0]] = run_pushed
+            readings[run, : run_readings.shape[0]] = run_readings
         readings[~self.runs.recorded] = 0.0
-        fine = np.isfinite(pushed).all(axis=(0, 1, 2)) & np.isfinite(readings).all(axis=(0, 1, 2))
-        pushed[..., ~fine], readings[..., ~fine] = 0.0, 0.0
+        is_finite = np.isfinite(pushed).all(axis=(0, 1, 2)) & np.isfinite(readings).all(
+            axis=(0, 1, 2)
+        )
+        pushed[..., ~is_finite], readings[..., ~is_finite] = 0.0, 0.0
         sizes = np.array([1.0 if p.fixed else p.coefficients[p.place] for p in probes])
         return Columns(tuple(probes), np.array(places, dtype=np.intp), sizes, pushed, readings)
 
     def step_error_response(self) -> Array:
         """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
-        missed = self.runs.step_errors[..., None].astype(np.float32)
-        nothing = np.zeros((*self.runs.residuals.shape, 1), dtype=np.float32)
-        response: Array = self._through_filter(missed, nothing)[..., 0].astype(np.float64)
+        step_errors = self.runs.step_errors[..., None].astype(np.float32)
+        no_readings = np.zeros((*self.runs.residuals.shape, 1), dtype=np.float32)
+        response: Array = self._through_filter(step_errors, no_readings)[..., 0].astype(np.float64)
         return response
 
     def responses(self, columns: Columns) -> SingleArray:
@@ -378,10 +384,10 @@ class FollowedRuns:
             Whitened responses (R, T, C, K), in units of the probes' coefficients.
         """
         inputs = self.runs.inputs.astype(np.float32)
-        found = self._through_filter(columns.pushed, columns.readings, inputs)
+        whitened = self._through_filter(columns.pushed, columns.readings, inputs)
         sizes: SingleArray = columns.sizes.astype(np.float32)
         with np.errstate(all="ignore"):
-            result: SingleArray = found[..., columns.places] / sizes
+            result: SingleArray = whitened[..., columns.places] / sizes
         # A candidate with a divergent motion gets a response of zero.
         result[~(np.abs(result) < LARGEST)] = 0.0
         return result
@@ -392,11 +398,13 @@ class FollowedRuns:
         The first states are positions and velocities; readings are not fed back.
         """
         joints = len(self.linear[0].trajectory.x[0])
-        own = np.concatenate([np.arange(joints), self.linear[0].positions + np.arange(joints)])
-        begin = np.zeros((len(self.linear), self.runs.prior.size, own.size))
-        begin[:, own, np.arange(own.size)] = 1.0
+        joint_states = np.concatenate(
+            [np.arange(joints), self.linear[0].positions + np.arange(joints)]
+        )
+        initial_changes = np.zeros((len(self.linear), self.runs.prior.size, joint_states.size))
+        initial_changes[:, joint_states, np.arange(joint_states.size)] = 1.0
         result = np.zeros((*self.runs.residuals.shape, len(self.world.states)))
-        result[..., : own.size] = self._without_gain(begin)
+        result[..., : joint_states.size] = self._without_gain(initial_changes)
         return result
 
     def sensitivities(self, columns: Columns) -> Array:
@@ -451,17 +459,17 @@ class FollowedRuns:
         joints = len(self.linear[0].trajectory.x[0])
         if len(self.world.states) != 2 * joints:
             return None
-        own = self.runs.prior
-        velocities = own[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
-        return np.concatenate([own[:joints], velocities])
+        prior = self.runs.prior
+        velocities = prior[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
+        return np.concatenate([prior[:joints], velocities])
 
     def first_positions(self) -> Array:
         """Return the smoothed positions of the joints at the first samples (R, D)."""
-        found = []
+        positions = []
         for run, linear in enumerate(self.linear):
             x = linear.trajectory.x[int(linear.knots[0])]
-            found.append(x + self.smoothed.states[run, 0, : x.size])
-        return np.array(found)
+            positions.append(x + self.smoothed.states[run, 0, : x.size])
+        return np.array(positions)
 
     def first_states(self) -> Array:
         """Return positions and velocities of the joints at the first samples (R, 2 D).
@@ -469,14 +477,14 @@ class FollowedRuns:
         For recorded joints they are estimated from the readings alone, because a stiff servo hides
         the first velocity from a linear model; for other joints they are smoothed states.
         """
-        found = []
+        first_states = []
         for run, trajectory in enumerate(self.trajectories):
-            first = int(self.linear[run].knots[0])
-            x, v = trajectory.x[first].copy(), trajectory.v[first].copy()
+            first_step = int(self.linear[run].knots[0])
+            x, v = trajectory.x[first_step].copy(), trajectory.v[first_step].copy()
             for joint, states in measured_states(self.world, self.noise.sigma, run).items():
                 x[joint], v[joint] = states[0, :2]
-            found.append(np.concatenate([x, v]))
-        return np.array(found)
+            first_states.append(np.concatenate([x, v]))
+        return np.array(first_states)
 
     def _through_filter(
         self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
@@ -497,19 +505,21 @@ class FollowedRuns:
         whiteners = self.filtered.whiteners.astype(np.float32)
         with np.errstate(all="ignore"):
             for run in range(number):
-                last = int(np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0))
-                for begin in range(0, count, SIDE_BY_SIDE):
-                    part = slice(begin, min(begin + SIDE_BY_SIDE, count))
+                last_sample = int(
+                    np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0)
+                )
+                for first_column in range(0, count, SIDE_BY_SIDE):
+                    part = slice(first_column, min(first_column + SIDE_BY_SIDE, count))
                     s = np.zeros((a.shape[2], part.stop - part.start), dtype=np.float32)
-                    for i in range(last + 1):
+                    for i in range(last_sample + 1):
                         u = h[run, i] @ s
                         u += readings[run, i, :, part]
                         np.matmul(whiteners[run, i], u, out=result[run, i, :, part])
-                        if i < last:
+                        if i < last_sample:
                             s -= gains[run, i] @ u
                             s = a[run, i] @ s
-                            more = pushed[run, i, :, part]
-                            s[:size] += more if inputs is None else inputs[run, i] @ more
+                            added = pushed[run, i, :, part]
+                            s[:size] += added if inputs is None else inputs[run, i] @ added
         result[~np.isfinite(result)] = 0.0
         return result
 
@@ -542,16 +552,18 @@ def _fit_noise(runs: LinearRuns, noise: NoiseModel, force: Array, typical: Array
     best: _NoiseFit | None = None
     lowest = float(noise.phi.max(initial=0.0))
     for phi in (None, *(phi for phi in CORRELATIONS if phi > lowest)):
-        tried = noise if phi is None else NoiseModel(noise.sigma, np.full_like(noise.phi, phi))
-        coloured, white = with_coloured_noise(runs, tried)
+        tried_noise = (
+            noise if phi is None else NoiseModel(noise.sigma, np.full_like(noise.phi, phi))
+        )
+        coloured, white = with_coloured_noise(runs, tried_noise)
         if best is not None:
-            found = filter_runs(coloured, best.force, white)
-            before, after = best.filtered.log_likelihood.sum(), found.log_likelihood.sum()
+            filtered = filter_runs(coloured, best.force, white)
+            before, after = best.filtered.log_likelihood.sum(), filtered.log_likelihood.sum()
             # Both are minus infinity if the model diverges.
             if not after > before + COLOURED:
                 break
             force = best.force
-        best = _NoiseFit(tried, *fit_process_noise(coloured, force, white, typical))
+        best = _NoiseFit(tried_noise, *fit_process_noise(coloured, force, white, typical))
     assert best is not None
     return best
 
@@ -562,7 +574,7 @@ def _linearised(
     noise: NoiseModel,
     run: int,
     trajectory: Trajectory | None,
-    nearby: MeasuredLinear | None,
+    neighbour: MeasuredLinear | None,
     simulator: RobotSimulator | None = None,
     is_alike: bool = True,
 ) -> MeasuredLinear:
@@ -577,7 +589,7 @@ def _linearised(
     if trajectory is None:
         states = measured_states(world, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
-    return MeasuredLinear(robot, theta, scenario, start, trajectory, None, nearby, is_alike)
+    return MeasuredLinear(robot, theta, scenario, start, trajectory, None, neighbour, is_alike)
 
 
 def _prior(world: RunEvaluator, linear: Sequence[MeasuredLinear], size: int) -> Array:

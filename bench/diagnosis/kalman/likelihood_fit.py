@@ -168,18 +168,19 @@ def gauss_newton_step(
         The change of all parameters (P,), and the predicted gain in log-likelihood for linear
         innovations.
     """
-    own, target = list(places), followed.filtered.whitened
+    innovations, target = list(places), followed.filtered.whitened
     rows = np.stack(
-        [_derivative(followed, target, i, one) for i, one in zip(own, bounds, strict=True)], axis=-1
-    ).reshape(-1, len(own))
+        [_derivative(followed, target, i, one) for i, one in zip(innovations, bounds, strict=True)],
+        axis=-1,
+    ).reshape(-1, len(innovations))
     gram, cross = rows.T @ rows, rows.T @ target.reshape(-1)
     scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)
-    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(own))
-    values = followed.theta[own]
+    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(innovations))
+    values = followed.theta[innovations]
     low, high = np.array(bounds).T
     change = np.clip(values + np.linalg.solve(normal, cross / scale) / scale, low, high) - values
     step = np.zeros_like(followed.theta)
-    step[own] = change
+    step[innovations] = change
     return step, float(change @ cross - 0.5 * change @ gram @ change)
 
 

@@ -58,43 +58,48 @@ class EffectProposals:
     columns: LibraryColumns
     _for_base: dict[int, tuple[Proposals, Proposals]] = field(default_factory=dict)
 
-    def of(self, current: FilteredSet, most: int = MAX_JOINT_PROPOSALS) -> list[FitStart]:
+    def of(
+        self, current: FilteredSet, max_joint_proposals: int = MAX_JOINT_PROPOSALS
+    ) -> list[FitStart]:
         """Return models with one more effect than a set.
 
         Args:
             current: the set.
-            most: maximum number of effects of the joint and servo models.
+            max_joint_proposals: maximum number of effects of the joint and servo models.
         """
         world, count = self.filters.world, len(self.columns.library.probes)
         proposed = self._propose(current) if current.names else self._for_base.get(count)
         if proposed is None:
             proposed = self._for_base[count] = self._propose(current)
-        first, joint_model = proposed
-        own = FitStart(current.names, current.followed.theta, world.guess)
-        return [with_effect(world, own, name, c) for name, c in first + joint_model[:most]]
+        by_regression, joint_model = proposed
+        present_model = FitStart(current.names, current.followed.theta, world.guess)
+        return [
+            with_effect(world, present_model, name, c)
+            for name, c in by_regression + joint_model[:max_joint_proposals]
+        ]
 
     def _propose(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
         """Return all proposals, with those of the joint and servo models in a separate list."""
-        found = self._by_regression(current)
-        others, joint = {*current.names, *dict(found)}, current.followed.joints_by_loss[0]
-        joint_model = self._joint_model(current.followed, joint, others)
-        return found + self._offset_and_friction(joint, others), joint_model
+        by_regression = self._by_regression(current)
+        excluded, joint = {*current.names, *dict(by_regression)}, current.followed.joints_by_loss[0]
+        joint_model = self._joint_model(current.followed, joint, excluded)
+        return by_regression + self._offset_and_friction(joint, excluded), joint_model
 
     def _by_regression(self, current: FilteredSet) -> Proposals:
         """Return the effects that gain most by regression, each with its coefficients."""
         regression, _ = regression_about(current, self.columns.library, current.followed)
         gains = regression.net_gains()
-        found: dict[str, Array] = {}
+        proposals: dict[str, Array] = {}
         for i in np.argsort(-gains, kind="stable").tolist():
             group = regression.groups[i]
-            if group.effect in (*current.names, *found):
+            if group.effect in (*current.names, *proposals):
                 continue
             too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
-            if len(found) == MAX_REGRESSION_PROPOSALS or too_little:
+            if len(proposals) == MAX_REGRESSION_PROPOSALS or too_little:
                 break
             solution = regression.solve([group])[1][0]
-            found[group.effect] = self.columns.coefficients(group, solution)
-        return list(found.items())
+            proposals[group.effect] = self.columns.coefficients(group, solution)
+        return list(proposals.items())
 
     def _offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
         """Return an encoder offset of a joint, and less dry friction than the model file specifies.
@@ -102,15 +107,17 @@ class EffectProposals:
         The derivative by more friction does not show the effect of less friction.
         """
         world, place = self.filters.world, joint_name(self.filters.world, joint)
-        found = {f"sensor.bias@q.{place}": offset_from_command(world, self.filters.noise, joint)}
+        coefficients = {
+            f"sensor.bias@q.{place}": offset_from_command(world, self.filters.noise, joint)
+        }
         friction = f"friction.coulomb@{place}"
         if friction in world.library:
-            found[friction] = FIRST_SHARE * min(
+            coefficients[friction] = FIRST_SHARE * min(
                 compute_coefficient_bounds(world, friction)[0][0], 0.0
             )
         return [
             (name, np.array([c]))
-            for name, c in found.items()
+            for name, c in coefficients.items()
             if c and name in world.library and name not in excluded
         ]
 
@@ -133,7 +140,7 @@ class EffectProposals:
         effects = [f"{effect}@{place}" for effect in JOINT_MODEL]
         servo = servo_input(world, joint).removeprefix("u.")
         effects += [f"{effect}@{servo}" for effect in SERVO_MODEL]
-        found = []
+        proposals = []
         for name in effects:
             if name in world.library and name not in excluded:
                 places, bounds = (
@@ -145,9 +152,9 @@ class EffectProposals:
                 # If much process noise hides an effect, its typical size is tried.
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
-                found.append((gain, name, np.array([change])))
-        found.sort(key=lambda one: -one[0])
-        return [(name, c) for _, name, c in found]
+                proposals.append((gain, name, np.array([change])))
+        proposals.sort(key=lambda one: -one[0])
+        return [(name, c) for _, name, c in proposals]
 
 
 @dataclass(frozen=True)

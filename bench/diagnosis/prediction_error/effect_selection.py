@@ -70,38 +70,38 @@ def identify(followed: FollowedRuns, columns: Columns) -> Selected:
         followed: the runs, without any effect.
         columns: inputs of the candidates.
     """
-    now, chosen = followed, list[DirectionGroup]()
+    refitted, selected_before = followed, list[DirectionGroup]()
     coefficients: list[Array] = []
     result: Selected | None = None
     numerics = 0.0
     for _ in range(PASSES):
-        regression = regress(now, columns, chosen, coefficients, numerics)
-        selected = regression.pruned(chosen) if chosen else []
+        regression = regress(refitted, columns, selected_before, coefficients, numerics)
+        selected = regression.pruned(selected_before) if selected_before else []
         selected = regression.select(MOST, selected)
-        _, found = regression.solve(selected)
+        _, new_coefficients = regression.solve(selected)
         numerics = regression.nuisance(selected)
-        now = with_effects(followed, columns, selected, found, numerics)
-        likelihood = now.log_likelihood
+        refitted = with_effects(followed, columns, selected, new_coefficients, numerics)
+        likelihood = refitted.log_likelihood
         done = result is not None and likelihood < result.log_likelihood + 1.0
         if result is None or likelihood > result.log_likelihood:
             result = Selected(
                 selected,
-                found,
+                new_coefficients,
                 regression,
                 likelihood,
-                now,
+                refitted,
                 numerics,
                 regression.shows_nuisance(selected),
             )
         if done:
             break
-        chosen, coefficients = selected, found
+        selected_before, coefficients = selected, new_coefficients
     assert result is not None
     return result
 
 
 def regress(
-    now: FollowedRuns,
+    followed: FollowedRuns,
     columns: Columns,
     chosen: Sequence[DirectionGroup] = (),
     coefficients: Sequence[Array] = (),
@@ -111,31 +111,31 @@ def regress(
     """Set up the regression of all that effects explain, including those in the linear model.
 
     Args:
-        now: the runs, filtered with the chosen effects in the linear model.
+        followed: the runs, filtered with the chosen effects in the linear model.
         columns: inputs of the candidates.
         chosen: the effects in the linear model.
         coefficients: coefficients of these effects.
         numerics: share of the integrator's errors that is in the linear model.
         always: indices of probes that are part of every set, and are not candidates.
     """
-    responses = now.responses(columns)
+    responses = followed.responses(columns)
     number, _, _, count = responses.shape
-    nuisance = now.step_error_response()
-    own = columns_of(chosen)
+    nuisance = followed.step_error_response()
+    own_columns = columns_of(chosen)
     weights = np.concatenate([*coefficients, np.zeros(0)])
     grams = np.zeros((number, count + 1, count + 1))
     crosses, totals = np.zeros((number, count + 1)), np.zeros(number)
     for run in range(number):
-        target = now.filtered.whitened[run].reshape(-1)
+        target = followed.filtered.whitened[run].reshape(-1)
         rows = responses[run].reshape(target.size, count).astype(np.float64)
         rows = np.concatenate([rows, nuisance[run].reshape(-1, 1)], axis=1)
-        target = target + rows[:, own] @ weights + numerics * rows[:, -1]
+        target = target + rows[:, own_columns] @ weights + numerics * rows[:, -1]
         grams[run] = rows.T @ rows
         crosses[run] = rows.T @ target
         totals[run] = target @ target
-    contains = {name: effect.contains for name, effect in now.world.available_effects.items()}
+    contains = {name: effect.contains for name, effect in followed.world.available_effects.items()}
     groups = [g for g in groups_of(columns.probes) if not set(g.column_indices) & set(always)]
-    samples = int(now.runs.recorded.sum())
+    samples = int(followed.runs.recorded.sum())
     return Regression(groups, grams, crosses, totals, samples, contains, (count, *always))
 
 
@@ -155,11 +155,11 @@ def with_effects(
         coefficients: coefficients of each group.
         numerics: share of the integrator's errors to put into the linear model.
     """
-    own = [c for group in chosen for c in group.column_indices]
+    own_columns = [c for group in chosen for c in group.column_indices]
     runs = followed.runs
     defects, residuals = runs.defects - numerics * runs.step_errors, runs.residuals
-    if own:
-        pushed, readings = columns.total(own, np.concatenate(list(coefficients)))
+    if own_columns:
+        pushed, readings = columns.total(own_columns, np.concatenate(list(coefficients)))
         defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, pushed)
         residuals = np.where(runs.recorded, residuals - readings, 0.0)
     return followed.refitted(replace(runs, defects=defects, residuals=residuals))

@@ -58,9 +58,9 @@ def add_to_model(context: SearchContext, model: FittedModel) -> FittedModel:
         context: context of the search.
         model: the fitted model.
     """
-    begin = FilteredSet(context.filters.of_model(model), model.effects)
-    larger = _grow(context, begin)
-    if larger is begin:
+    current = FilteredSet(context.filters.of_model(model), model.effects)
+    larger = _grow(context, current)
+    if larger is current:
         return model
     return without_idle_effects(context, fit_filtered(context, larger))
 
@@ -97,24 +97,24 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
     watch, filters, base = context.world.watch, context.filters, context.search.base_model
-    begin = filters.empty_set
+    current = filters.empty_set
     if friction is not None:
-        begin = filters.with_effects(friction.theta, friction.effects)
-    first = _larger_that_pay(context, begin)
-    if not first and friction is None:
-        check_filter(context, begin.followed.log_likelihood)
+        current = filters.with_effects(friction.theta, friction.effects)
+    larger_sets = _larger_that_pay(context, current)
+    if not larger_sets and friction is None:
+        check_filter(context, current.followed.log_likelihood)
         return base
-    best = base if first else fit_filtered(context, begin)
-    for trial in _nearly_as_likely(context, first):
+    best = base if larger_sets else fit_filtered(context, current)
+    for trial in _nearly_as_likely(context, larger_sets):
         best = higher_merit(best, fit_filtered(context, trial))
         if watch.has_abandoned_fits():
             break
     if friction is None and not is_explained(context, best) and not watch.has_abandoned_fits():
-        check_filter(context, first[0].followed.log_likelihood)
+        check_filter(context, larger_sets[0].followed.log_likelihood)
         best = higher_merit(best, _fit_all_servos(context))
     # Two effects together may explain what neither explains alone.
-    if first and not is_explained(context, best) and not watch.has_abandoned_fits():
-        best = higher_merit(best, fit_filtered(context, _grow(context, first[0])))
+    if larger_sets and not is_explained(context, best) and not watch.has_abandoned_fits():
+        best = higher_merit(best, fit_filtered(context, _grow(context, larger_sets[0])))
     if not np.isfinite(best.fit.cost) or not best.effects:
         return base
     if not is_explained(context, best):
@@ -136,12 +136,12 @@ def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[Filte
     """Return sets with one more effect whose likelihood pays for it, the likeliest first."""
     filters = context.filters
     base = filters.log_likelihood(filters.reference)
-    own = current.followed.log_likelihood if current.names else base
-    share = LEAST_SHARE * 2.0 * (own - base)
+    log_likelihood = current.followed.log_likelihood if current.names else base
+    share = LEAST_SHARE * 2.0 * (log_likelihood - base)
     return [
         larger
         for larger in try_one_more(context, current)
-        if 2.0 * (larger.followed.log_likelihood - own)
+        if 2.0 * (larger.followed.log_likelihood - log_likelihood)
         >= max(filters.penalty(larger.names[-1]), share)
     ]
 
@@ -158,40 +158,40 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
     """
     watch, filters = context.world.watch, context.filters
     watch.stage("testing effects in the model one by one", MAX_REGRESSION_PROPOSALS)
-    tried = []
+    larger_sets = []
     for start in context.proposals.of(current):
-        tried.append(filters.with_effects(start.theta, start.effects, 0))
+        larger_sets.append(filters.with_effects(start.theta, start.effects, 0))
         watch.advance()
         watch.check_not_stopped()
-    tried.sort(key=lambda one: _criterion(context, one))
+    larger_sets.sort(key=lambda one: _criterion(context, one))
     # The coefficients of the best are improved before they are compared.
-    found = list[FilteredSet]()
-    for one in tried[:MAX_IMPROVED_TRIALS]:
-        if found and _is_settled(context, found[0], one):
-            found.append(one)
+    compared = list[FilteredSet]()
+    for one in larger_sets[:MAX_IMPROVED_TRIALS]:
+        if compared and _is_settled(context, compared[0], one):
+            compared.append(one)
             continue
-        found.append(filters.with_effects(one.followed.theta, one.names))
-        found.sort(key=lambda one: _criterion(context, one))
-    return found
+        compared.append(filters.with_effects(one.followed.theta, one.names))
+        compared.sort(key=lambda one: _criterion(context, one))
+    return compared
 
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
     """Return whether a set explains the runs, and another one is far worse."""
     behind = _criterion(context, other) - _criterion(context, best)
-    far = behind > RIVAL_MARGIN + SETTLED_SHARE * _gain(context, best)
-    return far and not best.followed.lacks_force
+    is_far_behind = behind > RIVAL_MARGIN + SETTLED_SHARE * _gain(context, best)
+    return is_far_behind and not best.followed.lacks_force
 
 
 def _nearly_as_likely(
-    context: SearchContext, tried: Sequence[FilteredSet]
+    context: SearchContext, larger_sets: Sequence[FilteredSet]
 ) -> Sequence[FilteredSet]:
     """Return the sets between which simulation has to decide, the likeliest first."""
-    if not tried:
+    if not larger_sets:
         return ()
-    error = LINEARISATION_ERROR * _gain(context, tried[0])
-    limit = _criterion(context, tried[0]) + RIVAL_MARGIN + error
-    near = [one for one in tried if _criterion(context, one) <= limit]
-    return [*near, *tried[len(near) : MAX_FIRST_EFFECTS]]
+    error = LINEARISATION_ERROR * _gain(context, larger_sets[0])
+    limit = _criterion(context, larger_sets[0]) + RIVAL_MARGIN + error
+    near_sets = [one for one in larger_sets if _criterion(context, one) <= limit]
+    return [*near_sets, *larger_sets[len(near_sets) : MAX_FIRST_EFFECTS]]
 
 
 def _gain(context: SearchContext, current: FilteredSet) -> float:

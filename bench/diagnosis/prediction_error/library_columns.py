@@ -89,7 +89,7 @@ class LibraryColumns:
 
     def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
         """Return the probes of effects about the base model."""
-        base, world, found = (
+        base, world, probes = (
             self.filters.models.base_model,
             self.filters.world,
             list[CandidateDirection](),
@@ -99,8 +99,8 @@ class LibraryColumns:
             for probe in first_probes(world, base.fit, name):
                 # The value in the model file may be too large, so the correction may be negative.
                 signed = probe.signed or (bounds[probe.place][0] < 0 and not probe.fixed)
-                found.append(replace(probe, signed=signed))
-        return found
+                probes.append(replace(probe, signed=signed))
+        return probes
 
     def select(self) -> Selected:
         """Select effects of the library by regression."""
@@ -118,8 +118,8 @@ class LibraryColumns:
             coefficients: coefficients of each group.
         """
         theta, base = self.filters.reference.copy(), self.filters.models.base_model
-        for group, own in zip(groups, coefficients, strict=True):
-            theta[self.filters.world.slots[group.effect]] = self.coefficients(group, own)
+        for group, solution in zip(groups, coefficients, strict=True):
+            theta[self.filters.world.slots[group.effect]] = self.coefficients(group, solution)
         return FitStart(tuple(group.effect for group in groups), theta, base.fit.states)
 
     def coefficients(self, group: DirectionGroup, solution: Array) -> Array:
@@ -150,17 +150,17 @@ class LibraryColumns:
         """
         world, followed = self.filters.world, self.filters.base
         tangents = [_tangents(world, name, start.theta) for name in start.effects]
-        columns = followed.columns([probe for own in tangents for probe in own])
+        columns = followed.columns([probe for effect_probes in tangents for probe in effect_probes])
         responses = followed.sensitivities(columns)
-        places, derivatives, first = list[int](), [], 0
-        for name, (whole, *moved) in zip(start.effects, tangents, strict=True):
-            for k, probe in enumerate(moved):
+        places, derivatives, first_column = list[int](), [], 0
+        for name, (whole_change, *displaced) in zip(start.effects, tangents, strict=True):
+            for k, probe in enumerate(displaced):
                 # A coefficient without a range has no derivative.
-                step = float(probe.coefficients[k] - whole.coefficients[k]) or np.inf
-                change = responses[..., first + 1 + k] - responses[..., first]
+                step = float(probe.coefficients[k] - whole_change.coefficients[k]) or np.inf
+                change = responses[..., first_column + 1 + k] - responses[..., first_column]
                 derivatives.append(change / step)
             places += world.get_coefficient_indices(name)
-            first += 1 + len(moved)
+            first_column += 1 + len(displaced)
         return KnownJacobian(np.array(places, dtype=np.intp), np.stack(derivatives, axis=-1))
 
 
@@ -201,17 +201,17 @@ def regression_about(
         columns: inputs of the candidates.
         followed: filtered runs about whose motion the effects are linearised.
     """
-    own: dict[str, list[int]] = {}
+    own_columns: dict[str, list[int]] = {}
     probes: list[CandidateDirection] = []
     count = len(columns.probes)
     for name in current.names:
         tangents = _tangents(followed.world, name, current.followed.theta)
-        first = count + len(probes)
-        own[name] = list(range(first, first + len(tangents)))
+        first_column = count + len(probes)
+        own_columns[name] = list(range(first_column, first_column + len(tangents)))
         probes += tangents
     joined = columns.joined(followed.columns(probes)) if probes else columns
     always = range(count, len(joined.probes))
-    return ModelRegression(regress(current.followed, joined, always=always), own)
+    return ModelRegression(regress(current.followed, joined, always=always), own_columns)
 
 
 def _tangents(world: RunEvaluator, name: str, theta: Array) -> list[CandidateDirection]:
@@ -219,9 +219,11 @@ def _tangents(world: RunEvaluator, name: str, theta: Array) -> list[CandidateDir
     c = theta[world.slots[name]]
     probes = [CandidateDirection(name, 0, 0, c, signed=True, fixed=True)]
     for place, (low, high) in enumerate(compute_coefficient_bounds(world, name)):
-        moved = c.copy()
+        displaced = c.copy()
         size = max(abs(float(c[place])), RELATIVE_DIFFERENCE * (high - low))
         step = RELATIVE_DIFFERENCE * size
-        moved[place] += step if moved[place] + step <= high else -step
-        probes.append(CandidateDirection(name, 1 + place, place, moved, signed=True, fixed=True))
+        displaced[place] += step if displaced[place] + step <= high else -step
+        probes.append(
+            CandidateDirection(name, 1 + place, place, displaced, signed=True, fixed=True)
+        )
     return probes

@@ -79,8 +79,8 @@ class ModelFilters:
         theta: Array = self.models.base_model.fit.theta.copy()
         identified = self.world.identified
         if identified is not None:
-            kept = [i not in self.models.frozen for i in self.world.base.tolist()]
-            theta[self.world.base[kept]] = identified[kept]
+            is_free = [i not in self.models.frozen for i in self.world.base.tolist()]
+            theta[self.world.base[is_free]] = identified[is_free]
         return theta
 
     def theta_with(self, name: str, c: Array) -> Array:
@@ -111,15 +111,15 @@ class ModelFilters:
         key = model.fit.theta.tobytes()
         if key not in self._of_models:
             names = frozenset(model.effects)
-            known = self._of_sets.get(names)
-            found = (known or self.base).with_parameters(model.fit.theta)
-            if known is None:
-                found = found.with_parameters(model.fit.theta, is_alike=True)
-            self._of_sets[names] = found
+            same_effects = self._of_sets.get(names)
+            followed = (same_effects or self.base).with_parameters(model.fit.theta)
+            if same_effects is None:
+                followed = followed.with_parameters(model.fit.theta, is_alike=True)
+            self._of_sets[names] = followed
             if self.numerics:
-                defects = found.runs.defects - self.numerics * found.runs.step_errors
-                found = found.refitted(replace(found.runs, defects=defects))
-            self._of_models[key] = found
+                defects = followed.runs.defects - self.numerics * followed.runs.step_errors
+                followed = followed.refitted(replace(followed.runs, defects=defects))
+            self._of_models[key] = followed
         return self._of_models[key]
 
     def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
@@ -146,21 +146,21 @@ class ModelFilters:
             names: names of the effects.
             steps: maximum number of Gauss-Newton steps.
         """
-        begin = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
+        initial = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
         bounds = [b for name in names for b in compute_coefficient_bounds(self.world, name)]
         places = [place for name in names for place in self.world.get_coefficient_indices(name)]
-        best = maximise_likelihood(begin, places, bounds, steps, self._follow_near)
+        best = maximise_likelihood(initial, places, bounds, steps, self._follow_near)
         newest = list(self._of_tried.items())[:MAX_CACHED_FILTERS]
         self._of_tried = {best.theta.tobytes(): best, **dict(newest)}
         return FilteredSet(best, tuple(names))
 
-    def _follow_near(self, theta: Array, known: FollowedRuns) -> FollowedRuns:
+    def _follow_near(self, theta: Array, neighbour: FollowedRuns) -> FollowedRuns:
         """Follow the runs with other parameters, linearised about a known motion."""
-        followed = known.with_parameters(theta)
-        moved = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
+        followed = neighbour.with_parameters(theta)
+        deviations = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
         # With an encoder offset, the true motion is far from the readings.
-        far = moved.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
-        return followed.with_parameters(theta) if far else followed
+        is_far = deviations.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
+        return followed.with_parameters(theta) if is_far else followed
 
     def first_states(self, followed: FollowedRuns) -> Array:
         """Return states at the first samples (R, s), estimated from the readings.
@@ -169,11 +169,11 @@ class ModelFilters:
         used, because they are biased by what is missing.
         """
         states, positions = self.world.guess.copy(), followed.first_positions()
-        own = states[:, : positions.shape[1]]
+        measured_positions = states[:, : positions.shape[1]]
         noise = float(np.nanmax(self.noise.sigma))
-        moved = np.abs(positions - own) > OFFSET_THRESHOLD * noise
-        fine = np.isfinite(positions) & moved & ~self.world.known[:, : positions.shape[1]]
-        states[:, : positions.shape[1]] = np.where(fine, positions, own)
+        has_moved = np.abs(positions - measured_positions) > OFFSET_THRESHOLD * noise
+        is_offset = np.isfinite(positions) & has_moved & ~self.world.known[:, : positions.shape[1]]
+        states[:, : positions.shape[1]] = np.where(is_offset, positions, measured_positions)
         return states
 
     def penalty(self, name: str) -> float:

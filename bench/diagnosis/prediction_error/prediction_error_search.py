@@ -93,11 +93,11 @@ class PredictionErrorSearch(EffectSearch):
         if self.likely is not None:
             best = without_idle_effects(context, fit(context, self.likely))
         if best is None or not is_explained(context, best):
-            best = self._find()
+            best = self._search_effects()
         self.best_supported_model = best
         return best
 
-    def _find(self) -> FittedModel:
+    def _search_effects(self) -> FittedModel:
         """Select, fit and add effects until the residual of a set is only noise."""
         context = self._context
         selected = context.columns.select()
@@ -107,7 +107,7 @@ class PredictionErrorSearch(EffectSearch):
         best = friction
         if not is_explained(context, best):
             best = higher_merit(best, fit_quick_selection(context, selected))
-        if self._goes_on(best):
+        if self._should_continue(best):
             best = self._with_missing_effects(best, selected, friction)
         if not is_explained(context, best):
             selected = select_with_shapes(context, selected)
@@ -118,7 +118,7 @@ class PredictionErrorSearch(EffectSearch):
             best = fit_selection(context, selected)
         return fit_single_in_place(context, best)
 
-    def _goes_on(self, best: FittedModel) -> bool:
+    def _should_continue(self, best: FittedModel) -> bool:
         """Return whether to search effects that regression missed.
 
         This is the case if a force is missing, the best model does not explain the runs, and there
@@ -148,9 +148,9 @@ class PredictionErrorSearch(EffectSearch):
             if len(best.effects) > 1:
                 return higher_merit(best, add_to_model(context, best))
         best = higher_merit(best, fit_single_effects(context))
-        if self._goes_on(best):
+        if self._should_continue(best):
             best = higher_merit(best, add_to_dry_friction(context, selected, friction))
-        if self._goes_on(best):
+        if self._should_continue(best):
             best = higher_merit(best, select_in_model(context))
         return best
 
@@ -179,12 +179,12 @@ class PredictionErrorSearch(EffectSearch):
         start = with_effect(self.world, model.fit.make_start(), name, c)
         places, count = self.world.get_coefficient_indices(name), len(self.world.library)
         # A filter with the effect in the model is faster than a fit, and not linear in the effect.
-        own = filters.of_model(model).log_likelihood
+        log_likelihood = filters.of_model(model).log_likelihood
         gains = []
         for share in TRIED_SHARES:
             theta = start.theta.copy()
             theta[places] *= share
-            gains.append(2.0 * (filters.log_likelihood(theta) - own))
+            gains.append(2.0 * (filters.log_likelihood(theta) - log_likelihood))
         by_filter = p_value_of_gain(max(gains), len(places), count)
         if by_filter > EFFECT_P_VALUE_THRESHOLD:
             return by_filter
@@ -231,8 +231,8 @@ class PredictionErrorSearch(EffectSearch):
     def with_sensitivities(self, start: FitStart) -> FitStart:
         """Return a start with derivatives by its coefficients about the measured motion."""
         free = set(self.world.base.tolist()) - self.frozen
-        known = start.known is not None or not start.effects
-        if known or free or has_series(self.world, start.effects):
+        has_jacobian = start.known is not None or not start.effects
+        if has_jacobian or free or has_series(self.world, start.effects):
             return start
         return replace(start, known=self._context.columns.sensitivities(start))
 

@@ -88,14 +88,14 @@ class Regression:
         _, parts = self._solve([*chosen, self._nuisance])
         return float(parts[-1][0]) if self.always else 0.0
 
-    def instead_of(self, own: Sequence[int]) -> Regression:
+    def instead_of(self, own_columns: Sequence[int]) -> Regression:
         """Return the regression without an effect that is in the model.
 
         Args:
-            own: columns of the effect, which are part of every set; the first one is its whole
-                change.
+            own_columns: columns of the effect, which are part of every set; the first one is its
+                whole change.
         """
-        whole, always = own[0], tuple(c for c in self.always if c not in own)
+        whole, always = own_columns[0], tuple(c for c in self.always if c not in own_columns)
         # Innovations without the effect: e + w of its whole change.
         crosses = self.crosses + self.grams[:, :, whole]
         totals = self.totals + 2.0 * self.crosses[:, whole] + self.grams[:, whole, whole]
@@ -338,28 +338,30 @@ def null_scores(
             by_effect.setdefault(group.effect, []).append(i)
     names = list(by_effect)
     score = np.array([max(gains[i] for i in by_effect[name]) for name in names])
-    chance, drawn, p_values, peaks = [], [], [], []
-    for name, best in zip(names, score.tolist(), strict=True):
-        own = by_effect[name]
-        freedom = max(len(regression.groups[i].column_indices) for i in own)
-        shapes = len(own)
-        chance.append(float(chdtri(freedom, 1.0 - NULL_QUANTILE ** (1.0 / shapes))))
+    null_quantiles, null_draws, p_values, peaks = [], [], [], []
+    for name, largest_gain in zip(names, score.tolist(), strict=True):
+        group_indices = by_effect[name]
+        degrees_of_freedom = max(len(regression.groups[i].column_indices) for i in group_indices)
+        shapes = len(group_indices)
+        null_quantiles.append(
+            float(chdtri(degrees_of_freedom, 1.0 - NULL_QUANTILE ** (1.0 / shapes)))
+        )
         uniform = rng.random(DRAWS) ** (1.0 / shapes)
-        drawn.append(chdtri(freedom, 1.0 - uniform))
-        p_values.append(p_value_of_gain(best, freedom, shapes))
-        peak: DirectionGroup = regression.groups[max(own, key=lambda i: gains[i])]
+        null_draws.append(chdtri(degrees_of_freedom, 1.0 - uniform))
+        p_values.append(p_value_of_gain(largest_gain, degrees_of_freedom, shapes))
+        peak: DirectionGroup = regression.groups[max(group_indices, key=lambda i: gains[i])]
         peaks.append(((peak, regression.solve([peak])[1][0]),))
     order = np.argsort(-score, kind="stable")
-    luck = np.array(chance)
-    by_chance = np.array(drawn).reshape(len(names), DRAWS) - luck[:, None]
+    quantiles = np.array(null_quantiles)
+    null_excesses = np.array(null_draws).reshape(len(names), DRAWS) - quantiles[:, None]
     p_value = min(len(names) * min(p_values, default=1.0), 1.0)
     return CandidateScores(
         effects=tuple(names[i] for i in order),
         score=score[order],
-        null_quantiles=luck[order],
+        null_quantiles=quantiles[order],
         peaks=tuple(peaks[i] for i in order),
         p_value=p_value,
         phi=0.0,
-        null_scores=by_chance[order],
+        null_scores=null_excesses[order],
         white_noise_scores=score[order],
     )

@@ -75,15 +75,15 @@ def fit_single_in_place(context: SearchContext, best: FittedModel) -> FittedMode
     ):
         return best
     filters = context.filters
-    tried = try_one_more(context, filters.empty_set)
-    if not tried:
+    single_sets = try_one_more(context, filters.empty_set)
+    if not single_sets:
         return best
-    (name,) = tried[0].names
+    (name,) = single_sets[0].names
     penalty = sum(filters.penalty(one) for one in best.effects) - filters.penalty(name)
-    loss = filters.of_model(best).log_likelihood - tried[0].followed.log_likelihood
+    loss = filters.of_model(best).log_likelihood - single_sets[0].followed.log_likelihood
     if 2.0 * loss > penalty + RIVAL_MARGIN:
         return best
-    return higher_merit(fit_rivals(context, fit_filtered(context, tried[0])), best)
+    return higher_merit(fit_rivals(context, fit_filtered(context, single_sets[0])), best)
 
 
 def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
@@ -94,8 +94,8 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
         best: the best model so far.
     """
     search, world = context.search, context.world
-    lost = not best.effects or not np.isfinite(best.fit.cost)
-    if lost or has_series(world, best.effects):
+    has_no_fit = not best.effects or not np.isfinite(best.fit.cost)
+    if has_no_fit or has_series(world, best.effects):
         return best
     starts = []
     for name in best.effects:
@@ -103,16 +103,18 @@ def fit_rivals(context: SearchContext, best: FittedModel) -> FittedModel:
             start = in_place_of(world, best, [name], rival.effect, rival.c)
             if frozenset(start.effects) in search.models:
                 continue
-            near = _confirm_by_filter(context, best, rival, start)
-            starts += [near] if near is not None else []
+            confirmed = _confirm_by_filter(context, best, rival, start)
+            starts += [confirmed] if confirmed is not None else []
     if starts:
         search.refit_models(starts, race=False)
     size = len(best.effects)
     if size == 1 and context.filters.base.runs.jumps.any():
         # Fits at force limits may stop in local minima.
-        known = [m for m in search.models.values() if len(m.effects) == 1 and m is not best]
+        single_effects = [
+            m for m in search.models.values() if len(m.effects) == 1 and m is not best
+        ]
         laws = JOINT_MODEL + SERVO_MODEL
-        plain = [model for model in known if model.effects[0].partition("@")[0] in laws]
+        plain = [model for model in single_effects if model.effects[0].partition("@")[0] in laws]
         refine_single_effects(context, plain)
     _fit_at_coupled_joints(context, size)
     _refine_near(context, size)
@@ -124,26 +126,28 @@ def _find_rivals(context: SearchContext, model: FittedModel, name: str) -> list[
     """Return the effects that are nearly as good by the regression in place of the given one."""
     world = context.world
     regression, columns = context.columns.regression(model)
-    rest = regression.instead_of(columns[name])
+    remaining = regression.instead_of(columns[name])
     # Effects with more coefficients gain more under the null hypothesis.
-    gains = rest.net_gains()
-    own = rest.gain_of(columns[name]) - context.filters.penalty(name)
+    gains = remaining.net_gains()
+    own_gain = remaining.gain_of(columns[name]) - context.filters.penalty(name)
     same_joint = plain_effects_beside(world, name)
-    found, near_count = dict[str, _Rival](), 0
+    rivals, near_count = dict[str, _Rival](), 0
     for i in np.argsort(-gains, kind="stable").tolist():
-        group = rest.groups[i]
-        effect, behind = group.effect, own - float(gains[i])
-        if effect not in world.library or effect in (*model.effects, *found):
+        group = remaining.groups[i]
+        effect, behind = group.effect, own_gain - float(gains[i])
+        if effect not in world.library or effect in (*model.effects, *rivals):
             continue
-        is_near = behind <= RIVAL_MARGIN + LINEARISATION_ERROR * own and near_count < MAX_RIVALS
+        is_near = (
+            behind <= RIVAL_MARGIN + LINEARISATION_ERROR * own_gain and near_count < MAX_RIVALS
+        )
         # Regression is inaccurate for a large effect, so effects at the same joint are tried.
-        is_alike = effect in same_joint and gains[i] > ALIKE_SHARE * own
+        is_alike = effect in same_joint and gains[i] > ALIKE_SHARE * own_gain
         # A law that contains this one never replaces it.
         if (is_near or is_alike) and name not in world.available_effects[effect].contains:
             near_count += is_near
-            c = context.columns.coefficients(group, rest.solve([group])[1][0])
-            found[effect] = _Rival(effect, c, behind)
-    return list(found.values())
+            c = context.columns.coefficients(group, remaining.solve([group])[1][0])
+            rivals[effect] = _Rival(effect, c, behind)
+    return list(rivals.values())
 
 
 def _confirm_by_filter(
@@ -156,8 +160,10 @@ def _confirm_by_filter(
     if rival.behind <= RIVAL_MARGIN:
         return start
     filters = context.filters
-    few = len(context.world.get_coefficient_indices(rival.effect)) <= MAX_IMPROVED_SIZE
-    steps = GAUSS_NEWTON_STEPS if few else 0
+    has_few_coefficients = (
+        len(context.world.get_coefficient_indices(rival.effect)) <= MAX_IMPROVED_SIZE
+    )
+    steps = GAUSS_NEWTON_STEPS if has_few_coefficients else 0
     followed, names = filters.with_effects(start.theta, start.effects, steps)
     loss = filters.of_model(best).log_likelihood - followed.log_likelihood
     return None if 2.0 * loss > RIVAL_MARGIN else FitStart(names, followed.theta, start.states)
@@ -184,12 +190,12 @@ def _refine_near(context: SearchContext, size: int) -> None:
 
     Otherwise, incomplete fits would decide between them.
     """
-    search, near = context.search, _near_the_best(context, size)
-    if context.world.watch.has_abandoned_fits() or len(near) < 2:
+    search, near_models = context.search, _near_the_best(context, size)
+    if context.world.watch.has_abandoned_fits() or len(near_models) < 2:
         return
     fitter = TrajectoryFitter(context.world, search.noise, search.frozen, exact=True)
-    starts = [model.fit.make_start() for model in near]
-    for model, fit in zip(near, fitter.fit_models(starts, MAX_ITERATIONS), strict=True):
+    starts = [model.fit.make_start() for model in near_models]
+    for model, fit in zip(near_models, fitter.fit_models(starts, MAX_ITERATIONS), strict=True):
         if fit.cost < model.fit.cost:
             search.add_fit(fit)
 

@@ -67,11 +67,11 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> FittedMod
     Returns:
         The fitted model, or the base model if simulation is slow and a force is still missing.
     """
-    kept = without_surplus(context, selected)
-    slow = len(kept.groups) > MAX_SLOW_EFFECTS and _is_slow(context, kept)
-    if slow and selected.followed.lacks_force:
+    paying = without_surplus(context, selected)
+    is_slow = len(paying.groups) > MAX_SLOW_EFFECTS and _is_slow(context, paying)
+    if is_slow and selected.followed.lacks_force:
         return context.search.base_model
-    return fit_selection(context, kept)
+    return fit_selection(context, paying)
 
 
 def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
@@ -86,13 +86,13 @@ def fit_selection(context: SearchContext, selected: Selected) -> FittedModel:
         return base
     start = context.columns.start(selected.groups, selected.coefficients)
     states = context.filters.first_states(selected.followed)
-    found = fit(context, replace(start, states=states))
-    if not np.isfinite(found.fit.cost):
+    fitted = fit(context, replace(start, states=states))
+    if not np.isfinite(fitted.fit.cost):
         return base
-    found = without_idle_effects(context, found)
+    fitted = without_idle_effects(context, fitted)
     if selected.shows_steps:
-        found = context.search.without_step_errors(found)
-    return higher_merit(found, base)
+        fitted = context.search.without_step_errors(fitted)
+    return higher_merit(fitted, base)
 
 
 def without_surplus(context: SearchContext, selected: Selected) -> Selected:
@@ -105,21 +105,26 @@ def without_surplus(context: SearchContext, selected: Selected) -> Selected:
         selected: the selection.
     """
     filters = context.filters
-    own = filters.log_likelihood(filters.reference)
-    best, kept, gained = 0.0, 0, 0.0
-    found: list[Array] = []
+    base_log_likelihood = filters.log_likelihood(filters.reference)
+    best_net_gain, best_count, best_gain = 0.0, 0, 0.0
+    best_coefficients: list[Array] = []
     for count in range(1, len(selected.groups) + 1):
-        if count > kept + MAX_SURPLUS:
+        if count > best_count + MAX_SURPLUS:
             break
         groups = selected.groups[:count]
         coefficients = selected.regression.solve(groups)[1]
         theta = context.columns.start(groups, coefficients).theta
-        gain = 2.0 * (filters.log_likelihood(theta) - own)
+        gain = 2.0 * (filters.log_likelihood(theta) - base_log_likelihood)
         penalty = sum(filters.penalty(group.effect) for group in groups)
-        least = LEAST_SHARE * max(gained, 0.0) * (count - kept)
-        if gain - penalty > best and gain - gained > least:
-            best, kept, gained, found = gain - penalty, count, gain, coefficients
-    return replace(selected, groups=selected.groups[:kept], coefficients=found)
+        min_gain = LEAST_SHARE * max(best_gain, 0.0) * (count - best_count)
+        if gain - penalty > best_net_gain and gain - best_gain > min_gain:
+            best_net_gain, best_count, best_gain, best_coefficients = (
+                gain - penalty,
+                count,
+                gain,
+                coefficients,
+            )
+    return replace(selected, groups=selected.groups[:best_count], coefficients=best_coefficients)
 
 
 def _is_slow(context: SearchContext, selected: Selected) -> bool:
@@ -145,11 +150,11 @@ def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
         selected: the previous selection.
     """
     world, joints = context.world, np.flatnonzero(selected.followed.missing_forces).tolist()
-    rich = [n for n in world.library if has_many_shapes(n) and acts_at(world, n, joints)]
-    if not rich:
+    many_shaped = [n for n in world.library if has_many_shapes(n) and acts_at(world, n, joints)]
+    if not many_shaped:
         return selected
-    world.watch.stage(f"testing {len(rich)} effects with many shapes", 1)
-    context.columns.add(rich)
+    world.watch.stage(f"testing {len(many_shaped)} effects with many shapes", 1)
+    context.columns.add(many_shaped)
     return context.columns.select()
 
 
@@ -183,9 +188,11 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
     # Stiff friction that explains the runs needs no comparison.
     if friction.effects and is_explained(context, context.search.fit_one(friction)):
         return
-    kept = without_surplus(context, selected)
-    own = filters.log_likelihood(context.columns.start(kept.groups, kept.coefficients).theta)
-    check_filter(context, own, is_preliminary=True)
+    paying = without_surplus(context, selected)
+    log_likelihood = filters.log_likelihood(
+        context.columns.start(paying.groups, paying.coefficients).theta
+    )
+    check_filter(context, log_likelihood, is_preliminary=True)
 
 
 def check_filter(
@@ -237,11 +244,11 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> FittedModel:
     friction = dry_friction_of(context, selected)
     if not friction.effects or not selected.followed.lacks_force:
         return context.search.base_model
-    known = context.search.models.get(frozenset(friction.effects))
-    if known is not None and is_explained(context, known):
-        return without_idle_effects(context, known)
-    found = fit(context, friction)
-    return without_idle_effects(context, found) if is_explained(context, found) else found
+    fitted_before = context.search.models.get(frozenset(friction.effects))
+    if fitted_before is not None and is_explained(context, fitted_before):
+        return without_idle_effects(context, fitted_before)
+    fitted = fit(context, friction)
+    return without_idle_effects(context, fitted) if is_explained(context, fitted) else fitted
 
 
 def dry_friction_of(context: SearchContext, selected: Selected) -> FitStart:
@@ -255,14 +262,14 @@ def dry_friction_of(context: SearchContext, selected: Selected) -> FitStart:
     """
     world, filters = context.world, context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    plain, own = with_plain_friction(world, start.effects, start.theta)
-    native = [name for name in plain if name.partition("@")[0] in MODEL_FIELD_EFFECTS]
+    plain_names, plain_theta = with_plain_friction(world, start.effects, start.theta)
+    native = [name for name in plain_names if name.partition("@")[0] in MODEL_FIELD_EFFECTS]
     friction = [name for name in native if has_dry_friction(world, [name])]
     contained = {part for name in friction for part in world.available_effects[name].contains}
     names = tuple(name for name in friction if name not in contained)
     theta = filters.reference.copy()
     for name in names:
-        theta[world.slots[name]] = own[world.slots[name]]
+        theta[world.slots[name]] = plain_theta[world.slots[name]]
     return FitStart(names, theta, filters.first_states(filters.base))
 
 
@@ -279,13 +286,18 @@ def stands_alone(context: SearchContext, selected: Selected, friction: FittedMod
     """
     filters = context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
-    _, plain = with_plain_friction(context.world, start.effects, start.theta)
-    stiff = filters.log_likelihood(plain)
-    soft = -np.inf if filters.is_soft else filters.log_likelihood(plain, is_soft=True)
-    own = -np.inf if np.array_equal(plain, start.theta) else filters.log_likelihood(start.theta)
-    if not max(stiff, soft) > own - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+    _, plain_theta = with_plain_friction(context.world, start.effects, start.theta)
+    stiff = filters.log_likelihood(plain_theta)
+    soft = -np.inf if filters.is_soft else filters.log_likelihood(plain_theta, is_soft=True)
+    selected_log_likelihood = (
+        -np.inf if np.array_equal(plain_theta, start.theta) else filters.log_likelihood(start.theta)
+    )
+    if (
+        not max(stiff, soft)
+        > selected_log_likelihood - 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO
+    ):
         return False
-    if soft > max(stiff, own) + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
+    if soft > max(stiff, selected_log_likelihood) + 0.5 * INDISTINGUISHABLE_LOG_LIKELIHOOD_RATIO:
         check_fit(context, friction)
     return True
 
@@ -308,10 +320,10 @@ def fit_single_effects(context: SearchContext) -> FittedModel:
     search, filters = context.search, context.filters
     states = filters.first_states(filters.base)
     starts = context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
-    found = search.fit_all([replace(start, states=states) for start in starts])
-    best = max(found, key=lambda model: model.penalised_log_likelihood, default=search.base_model)
+    fitted = search.fit_all([replace(start, states=states) for start in starts])
+    best = max(fitted, key=lambda model: model.penalised_log_likelihood, default=search.base_model)
     if not is_explained(context, best):
-        best = higher_merit(best, refine_single_effects(context, found))
+        best = higher_merit(best, refine_single_effects(context, fitted))
     if is_explained(context, best):
         return without_idle_effects(context, best)
     check_filter(context, filters.of_model(best).log_likelihood)
@@ -337,10 +349,10 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[FittedModel])
             starts += [model.fit.make_start(), *starts_nearby(context, model, name)]
     best = context.search.base_model
     for _, start in lowest_of_each(context, starts)[:MAX_REFINED]:
-        found = fit(context, start)
-        if not is_at_noise(context, found) and is_nearly_explained(context, found):
-            found = fit_nearby(context, found, found.effects[0])
-        best = higher_merit(best, found)
+        refined = fit(context, start)
+        if not is_at_noise(context, refined) and is_nearly_explained(context, refined):
+            refined = fit_nearby(context, refined, refined.effects[0])
+        best = higher_merit(best, refined)
         if is_explained(context, best) or context.world.watch.has_abandoned_fits():
             break
     return best
@@ -366,7 +378,7 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> FittedMode
     for probe in probes:
         theta = context.filters.theta_with(probe.effect, probe.coefficients)
         starts.append(FitStart((probe.effect,), theta, world.guess))
-    found = search.fit_all([start for _, start in lowest_of_each(context, starts)])
+    fitted = search.fit_all([start for _, start in lowest_of_each(context, starts)])
     return fit(
-        context, max(found, key=lambda model: model.penalised_log_likelihood).fit.make_start()
+        context, max(fitted, key=lambda model: model.penalised_log_likelihood).fit.make_start()
     )

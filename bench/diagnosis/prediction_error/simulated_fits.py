@@ -43,19 +43,19 @@ def fit(context: SearchContext, start: FitStart) -> FittedModel:
         start: start of the fit.
     """
     search, world = context.search, context.world
-    found = search.fit_one(start)
-    if is_explained(context, found) or not np.isfinite(found.fit.cost):
-        return found
-    before = world.derivatives
-    compute_state_jacobian(world, found.fit.theta, found.fit.states, anew=True)
-    found = search.fit_one(found.fit.make_start())
-    if not is_explained(context, found):
+    fitted = search.fit_one(start)
+    if is_explained(context, fitted) or not np.isfinite(fitted.fit.cost):
+        return fitted
+    derivatives_before = world.derivatives
+    compute_state_jacobian(world, fitted.fit.theta, fitted.fit.states, anew=True)
+    fitted = search.fit_one(fitted.fit.make_start())
+    if not is_explained(context, fitted):
         # Derivatives about a wrong motion are not valid for other models.
-        world.derivatives = before
-    for name in found.effects:
-        if has_dry_friction(world, [name]) and not is_explained(context, found):
-            found = fit_nearby(context, found, name)
-    return found
+        world.derivatives = derivatives_before
+    for name in fitted.effects:
+        if has_dry_friction(world, [name]) and not is_explained(context, fitted):
+            fitted = fit_nearby(context, fitted, name)
+    return fitted
 
 
 def fit_filtered(context: SearchContext, current: FilteredSet) -> FittedModel:
@@ -97,7 +97,9 @@ def starts_nearby(context: SearchContext, model: FittedModel, name: str) -> list
         for factor in NEARBY:
             theta = model.fit.theta.copy()
             theta[place] *= factor
-            starts += [FitStart(model.effects, theta, own) for own in (model.fit.states, measured)]
+            starts += [
+                FitStart(model.effects, theta, states) for states in (model.fit.states, measured)
+            ]
     return starts
 
 
@@ -186,10 +188,10 @@ def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedMo
         members = [member.name for member in members_of(world.available_effects[family])]
         if len(members) < 2 or not set(members) <= set(model.effects):
             continue
-        own = np.concatenate([model.fit.theta[world.slots[name]] for name in members])
-        if own.size != len(world.get_coefficient_indices(family)):
+        coefficients = np.concatenate([model.fit.theta[world.slots[name]] for name in members])
+        if coefficients.size != len(world.get_coefficient_indices(family)):
             continue
-        fitted = context.search.fit_one(in_place_of(world, model, members, family, own))
+        fitted = context.search.fit_one(in_place_of(world, model, members, family, coefficients))
         model = (
             fitted
             if fitted.penalised_log_likelihood
@@ -215,5 +217,5 @@ def in_place_of(
     for name in names:
         theta[world.slots[name]] = 0.0
     theta[world.slots[other]] = c
-    rest = (name for name in model.effects if name not in names)
-    return FitStart((*rest, other), theta, model.fit.states)
+    remaining = (name for name in model.effects if name not in names)
+    return FitStart((*remaining, other), theta, model.fit.states)

@@ -65,25 +65,27 @@ class Confirmation(Inquiry):
             self._measure()
         watch.begin_question("structure")
         self._model = search.fit_to_convergence(self._model)
-        left = assess_lack_of_fit(search, self._model)
+        lack_of_fit = assess_lack_of_fit(search, self._model)
         watch.begin_question("alternatives")
-        causes = _RobotAlternatives(search, self._trial, left.has_structure).collect_evidence(
-            self._model
-        )
+        causes = _RobotAlternatives(
+            search, self._trial, lack_of_fit.has_structure
+        ).collect_evidence(self._model)
         watch.check_not_stopped()
         model, trial = self._model, self._trial
         state = DiagnosisState(
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),
-            closed=compute_gap_closed(search, model, left),
-            unexplained=is_unexplained(left.has_structure, search.p_value_of_missing_effect(model)),
-            missed=trial is not None and trial.has_unexplained_gap(model, left),
+            closed=compute_gap_closed(search, model, lack_of_fit),
+            unexplained=is_unexplained(
+                lack_of_fit.has_structure, search.p_value_of_missing_effect(model)
+            ),
+            missed=trial is not None and trial.has_unexplained_gap(model, lack_of_fit),
         )
         verdict = decide_verdict(state)
         if verdict == "unknown" and state.closed < MIMICRY:
             # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
-        return self._finding(verdict, base, model, causes, left)
+        return self._finding(verdict, base, model, causes, lack_of_fit)
 
     def _measure(self) -> None:
         """Evaluate the models on held-out runs, and remove effects that do not help there."""
@@ -95,14 +97,14 @@ class Confirmation(Inquiry):
         if len(names) > 1:
             for name in model.effects:
                 search.remove_effect(model, name)
-        parts = [m for m in search.models.values() if set(m.effects) < names and m.effects]
+        smaller_models = [m for m in search.models.values() if set(m.effects) < names and m.effects]
         size = len(names)
         rivals = [m for m in search.models.values() if len(m.effects) == size and m is not model]
         rivals = [
             m for m in rivals if m.penalised_log_likelihood > model.penalised_log_likelihood - NEAR
         ]
         trial = HeldOutValidation(self._held_out)
-        trial.evaluate_models([search.base_model, model, *parts, *rivals])
+        trial.evaluate_models([search.base_model, model, *smaller_models, *rivals])
         self._watch.check_not_stopped()
         self._trial = trial
         self._model = trial.drop_unhelpful_effects(search, model)
