@@ -46,17 +46,23 @@ _ALIKE = 0.7
 """Minimum similarity (0 to 1, `difflib`) of a name that a message proposes instead of another."""
 
 
+MAX_LISTED_NAMES = 10
+"""Maximum number of known names that a message lists although some are similar to the unknown."""
+
+
 def make_unknown_name_error(kind: str, name: str, known: Sequence[str]) -> InputError:
-    """Make the error for an unknown name, which lists the known and the most similar names.
+    """Make the error for an unknown name, which lists the most similar or all known names.
 
     Args:
         kind: Kind of the name in the message.
         name: Unknown name.
         known: Known names.
     """
-    listed = ", ".join(sorted(known))
     near = similar(str(name), known)
-    return InputError(f"unknown {kind} '{truncate_text(str(name))}'; there are: {listed}{near}")
+    listed = (
+        "" if near and len(known) > MAX_LISTED_NAMES else f"; there are: {', '.join(sorted(known))}"
+    )
+    return InputError(f"unknown {kind} '{truncate_text(str(name))}'{listed}{near}")
 
 
 def similar(name: str, known: Iterable[str]) -> str:

@@ -45,7 +45,7 @@ def test_published_setting_of_ball_drop():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"buget": 3}, r"unknown entry of .*'buget'; there are: .*budget"),
+        ({"buget": 3}, r"unknown entry of .*'buget'; did you mean budget"),
         ({"budget": 0}, "budget must be at least 1, found 0"),
         ({"budget": "ten"}, "budget: expected a whole number, found 'ten'"),
         ({"budget": True}, "budget: expected a whole number, found True"),
@@ -81,7 +81,7 @@ def test_faults_are_one_line_that_names_file_and_entry(change, message):
 def test_unknown_experiment_lists_those_there_are():
     with pytest.raises(
         InputError,
-        match=r"unknown experiment 'ball'; there are: arm-drive, .*pendulum-real",
+        match=r"unknown experiment 'ball'; did you mean .*ball-drop",
     ):
         load_experiment("ball")
 
@@ -185,7 +185,7 @@ def test_a_sweep_names_entries_whose_names_have_dots():
 @pytest.mark.parametrize(
     ("sweep", "message"),
     [
-        ({"budgte": [1]}, r"unknown entry of mine.toml 'budgte'; there are: .*budget"),
+        ({"budgte": [1]}, r"unknown entry of mine.toml 'budgte'; did you mean budget"),
         ({"budget": 3}, "mine.toml: sweep.budget: expected a list, found 3"),
         ({"budget": []}, "mine.toml: sweep.budget: expected at least one value"),
         ({"budget": [3, "x"]}, "mine.toml: budget: expected a whole number, found 'x'"),
