@@ -127,7 +127,8 @@ class SignalAssignment:
             if joint is not None:
                 placed.append((column, joint, Placement.NAME))
             else:
-                group = column.file, column.bare.rstrip("0123456789[]")
+                # Columns of one kind differ by the last number of their names.
+                group = column.file, re.sub(r"\d+(?=\D*$)", "", column.bare)
                 numbered.setdefault(group, []).append(column)
         for group_columns in numbered.values():
             joints = column_guessing.match_numbered_joints(group_columns, self.joints)

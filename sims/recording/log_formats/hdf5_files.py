@@ -105,8 +105,12 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (InputError, MemoryError, KeyboardInterrupt):
+    except (InputError, KeyboardInterrupt):
         raise
+    except MemoryError:  # A damaged file may claim any size.
+        raise InputError(
+            f"{path}: the file is damaged, or its content does not fit into the memory"
+        ) from None
     except Exception as error:  # with a damaged file, h5py raises many kinds of errors
         what = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not an HDF5 file that can be read: {what[:200]}") from None

@@ -99,8 +99,12 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with path.open("rb") as file:
             yield make_reader(file)
-    except (InputError, MemoryError, KeyboardInterrupt):
+    except (InputError, KeyboardInterrupt):
         raise
+    except MemoryError:  # A damaged file may claim any size.
+        raise InputError(
+            f"{path}: the file is damaged, or its content does not fit into the memory"
+        ) from None
     except Exception as error:  # a damaged file or message raises many kinds of errors
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not an MCAP file that can be read: {reason[:300]}") from None

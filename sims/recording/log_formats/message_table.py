@@ -27,6 +27,8 @@ STAMP_FIELDS = ("timestamp", "stamp")
 SECONDS_FIELDS = ("sec", "secs", "seconds")
 NANOSECONDS_FIELDS = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")
 """Names of the parts of a time stamp."""
+NANOSECONDS = 1_000_000_000
+"""Nanoseconds in a second."""
 _NANO = 1e-9
 
 
@@ -89,7 +91,13 @@ def _fields(value: Any) -> dict[str, Any] | None:
         return {str(name): entry for name, entry in value.items()}
     descriptor = getattr(value, "DESCRIPTOR", None)
     if descriptor is not None:
-        return {field.name: getattr(value, field.name) for field in descriptor.fields}
+        # An alternative that is not set has a default value, which nobody measured.
+        names = [
+            field.name
+            for field in descriptor.fields
+            if field.containing_oneof is None or value.HasField(field.name)
+        ]
+        return {name: getattr(value, name) for name in names}
     return None
 
 
@@ -101,8 +109,13 @@ def _stamp(message: Any) -> float:
             parts = _fields(holder.get(name)) or {}
             seconds = [parts[key] for key in SECONDS_FIELDS if key in parts]
             nanoseconds = [parts[key] for key in NANOSECONDS_FIELDS if key in parts]
-            if seconds and all(isinstance(part, int) for part in (*seconds, *nanoseconds)):
-                return _to_float(seconds[0]) + _NANO * sum(map(_to_float, nanoseconds[:1]))
+            if seconds and all(
+                isinstance(part, int | np.integer) for part in (*seconds, *nanoseconds)
+            ):
+                # Whole nanoseconds, so that equal stamps of two topics become equal numbers.
+                return _NANO * _to_float(
+                    NANOSECONDS * int(seconds[0]) + sum(map(int, nanoseconds[:1]))
+                )
     return 0.0
 
 

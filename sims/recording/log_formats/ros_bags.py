@@ -104,8 +104,12 @@ def _opened(bag: Path) -> Iterator[Any]:
         usual = get_typestore(Stores.ROS2_HUMBLE)
         with AnyReader([bag], default_typestore=usual) as reader:
             yield reader
-    except (InputError, MemoryError, KeyboardInterrupt):
+    except (InputError, KeyboardInterrupt):
         raise
+    except MemoryError:  # A damaged file may claim any size.
+        raise InputError(
+            f"{bag}: the file is damaged, or its content does not fit into the memory"
+        ) from None
     except Exception as error:  # the readers of the three formats raise many kinds of errors
         what = " ".join(str(error).split()) or type(error).__name__
         hint = mcap_messages.INSTALL_HINT if bag.suffix.lower() == ".mcap" else ""

@@ -83,8 +83,12 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
             f"{path}: expected a PyTorch file as a zip archive, found another format; save it "
             "again with torch.save of PyTorch 1.6 or newer"
         ) from None
-    except (InputError, MemoryError, KeyboardInterrupt):
+    except (InputError, KeyboardInterrupt):
         raise
+    except MemoryError:  # A damaged file may claim any size.
+        raise InputError(
+            f"{path}: the file is damaged, or its content does not fit into the memory"
+        ) from None
     except Exception as error:  # a damaged archive or program can fail in any step
         raise InputError(
             f"{path}: not a PyTorch file that can be read ({type(error).__name__})"

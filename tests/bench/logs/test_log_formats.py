@@ -1,0 +1,65 @@
+"""Tests of every log format: a raw folder gives a verdict in two commands, and a damaged folder one
+line.
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.cli.main import main
+from bench.logs.inspection import load_recording
+from tests.bench.logs.damaged_logs import answer_to_damage
+from tests.bench.logs.log_writers import JOINTS, NEEDED, OPTIONS, WRITERS, motion, write_folder
+
+QUICK = ("csv", "npz")
+"""Formats of the fast tests of whole commands."""
+DAMAGES = 12
+"""Number of damaged folders of each format; ``python -m tests.bench.logs.damaged_logs`` makes
+thousands.
+"""
+
+
+def skip_without(kind):
+    if kind in NEEDED:
+        pytest.importorskip(NEEDED[kind], reason=f"{kind} is written with it")
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_the_numbers_of_a_folder_are_those_that_were_logged(kind, tmp_path):
+    skip_without(kind)
+    logs, model = write_folder(tmp_path, kind)
+    out = tmp_path / "log.toml"
+    assert main(["import", str(logs), "--model", str(model), "--out", str(out),
+                 *OPTIONS.get(kind, ())]) == 0  # fmt: skip
+    recording, _ = load_recording(out, divide=False)
+    assert len(recording.runs) == 3
+    for number, run in enumerate(recording.runs):
+        times, q, u = motion(number)
+        for k, joint in enumerate(JOINTS):
+            seen = run.channels[f"q.{joint}"]
+            own = np.isfinite(seen)
+            np.testing.assert_allclose(seen[own], q[:, k], atol=1e-6)
+            np.testing.assert_allclose(run.inputs[f"u.m_{joint}"][own], u[:, k], atol=1e-6)
+        np.testing.assert_allclose(run.times[own] - run.times[own][0], times, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in WRITERS]
+)
+def test_two_commands_give_a_verdict(kind, tmp_path, capsys):
+    skip_without(kind)
+    logs, model = write_folder(tmp_path, kind)
+    out, answer = tmp_path / "log.toml", tmp_path / "answer"
+    assert main(["import", str(logs), "--model", str(model), "--out", str(out),
+                 *OPTIONS.get(kind, ())]) == 0  # fmt: skip
+    assert main(["explain", str(out), "--out", str(answer), "--jobs", "1"]) == 0
+    verdict = json.loads((answer / "verdict.json").read_text())
+    assert verdict["verdict"] == "adequate", capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_damaged_folder_is_one_line_and_nothing_is_written(kind, tmp_path):
+    skip_without(kind)
+    errors = [answer_to_damage(kind, seed, tmp_path / str(seed)) for seed in range(DAMAGES)]
+    assert [error for error in errors if error is not None] != [], "no folder was damaged"
