@@ -100,8 +100,10 @@ FIRST_OFFSET_STEP = 0.3
 """First step of the refinement of an offset, in rad."""
 OFFSET_ACCURACY = 1e-3
 """Accuracy of a refined offset, in rad."""
-GAIN_EFFECTS = frozenset({"input.gain", "sensor.gain"})
-"""Effects that contain reversed signs and wrong units, and therefore do not compete with them."""
+CONVENTION_EFFECTS = frozenset({"input.gain", "sensor.gain", "joint.zero"})
+"""Effects that contain reversed signs, wrong units and other zeros, and therefore do not compete
+with them. A joint zero of less than `MIN_OFFSET` is never a convention.
+"""
 
 
 @dataclass(frozen=True)
@@ -345,7 +347,7 @@ class ConventionComparison:
         if not followed.is_sound:
             world.close()
             return -np.inf
-        left_out = MANY_SHAPES | GAIN_EFFECTS
+        left_out = MANY_SHAPES | CONVENTION_EFFECTS
         names = [name for name in world.library if name.partition("@")[0] not in left_out]
         base = _unfitted(world)
         probes = [probe for name in names for probe in first_probes(world, base, name)]

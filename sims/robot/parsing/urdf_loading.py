@@ -76,7 +76,10 @@ def _no_macros(files: ModelFileReader, root: Element) -> None:
         macros = [value for value in element.attrib.values() if "${" in value or "$(" in value]
         if element.tag.startswith("xacro:") or macros:
             what = truncate_text(macros[0]) if macros else f"<{truncate_text(element.tag)}>"
-            raise files.make_error(element, f"{what} is a macro; run xacro, and give the result")
+            command = f"pip install xacro; xacro {files.path.name} > robot.urdf"
+            raise files.make_error(
+                element, f"{what} is a macro; run xacro, and give the result ({command})"
+            )
 
 
 def _unread(root: Element) -> list[str]:

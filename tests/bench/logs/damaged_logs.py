@@ -25,7 +25,20 @@ from tests.bench.logs.log_writers import OPTIONS, WRITERS, write_folder
 COUNT = 2000  # Damaged folders of each format.
 LIMIT_SECONDS = 60  # Longest time of an import.
 SAMPLES = 40
-PIECES = (b"\x00", b"\xff", b"nan", b",", b"\n", b'"', b"[", b"1e999", b"-", b"\xc3(", b";;", b"{")
+INSERTED = (
+    b"\x00",
+    b"\xff",
+    b"nan",
+    b",",
+    b"\n",
+    b'"',
+    b"[",
+    b"1e999",
+    b"-",
+    b"\xc3(",
+    b";;",
+    b"{",
+)
 
 
 def damage(data, rng):
@@ -42,7 +55,7 @@ def damage(data, rng):
         elif act == 2:
             data[first:first] = data[first : first + length]
         elif act == 3:
-            data[first:first] = PIECES[rng.integers(0, len(PIECES))]
+            data[first:first] = INSERTED[rng.integers(0, len(INSERTED))]
         elif act == 4:
             data[first : first + 8] = rng.integers(0, 256, 8, dtype=np.uint8).tobytes()
         elif act == 5:
