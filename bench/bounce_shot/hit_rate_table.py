@@ -7,6 +7,8 @@ import math
 import pandas as pd
 
 from bench.benchmark.storage.run_status import FAILED_STATUSES
+from bench.figures.style import get_mark_style
+from bench.pages.chart import Axis, Panel, Series
 
 ALL_BALLS = "all"
 """Value of the column ball for all kinds of balls together."""
@@ -108,3 +110,36 @@ def format_result_table(lines: pd.DataFrame) -> str:
             + f"   {share:18}   {by.prediction_error_mean[ALL_BALLS]:.3f} m"
         )
     return "\n".join(told)
+
+
+def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
+    """Make the panel of the hit rate of each method by ball, with its table.
+
+    Args:
+        lines: table of `build_result_table`.
+    """
+    balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
+    places = {ball: place for place, ball in enumerate(balls)}
+    methods = list(dict.fromkeys(lines["method"]))
+    series = tuple(
+        Series(
+            method,
+            "rate",
+            get_mark_style(i),
+            {"method": method},
+            "low",
+            "high",
+            "points",
+            (i - (len(methods) - 1) / 2) * 0.6 / len(methods),
+        )
+        for i, method in enumerate(methods)
+    )
+    counts = lines.groupby("ball")["shots"].agg(["min", "max"]).astype(int)
+    names = []
+    for ball in balls:
+        ends = dict.fromkeys(counts.loc[ball].tolist())
+        names.append(f"{ball}\nn={'–'.join(map(str, ends))}")
+    across = Axis("ball; n shots of each method", names=tuple(names))
+    up = Axis("share of shots through the hoop", scales=("linear",), ends=(-0.03, 1.03))
+    panel = Panel("Hits by ball", "success", "place", series, across, up)
+    return panel, lines.assign(place=lines["ball"].map(places))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from bench.benchmark.problem.experiment import Experiment
-from bench.bounce_shot.hit_rate_table import ALL_BALLS
+from bench.bounce_shot.hit_rate_table import make_success_panel
 from bench.bounce_shot.shot_config import ShotConfig
 from bench.bounce_shot.shot_execution import ShotResult, execute_shot
 from bench.bounce_shot.shot_geometry import ShotGeometry
@@ -33,6 +34,7 @@ from bench.figures.style import (
     make_panel_grid,
     render_all_formats,
 )
+from bench.pages.chart_figure import draw_chart
 from sims.core.simulator import Array
 
 if TYPE_CHECKING:
@@ -99,83 +101,25 @@ def get_method_label(method: str) -> str:
 
 
 def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
-    """Draw the hit rate over all balls (left) and hits with intervals by ball (right).
+    """Draw the hit rate of each method over all balls and by ball, as the chart of the page.
 
     Args:
         experiment: the experiment.
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
     """
-    methods = list(lines["method"].unique())
-    size = (11.5, 1.6 + 0.42 * len(methods))
-    figure, axes = make_panel_grid(1, 2, size, sharey=True, gridspec_kw={"width_ratios": [1, 1.9]})
-    _rates(axes[0, 0], lines, methods)
-    _by_ball(axes[0, 1], lines, methods)
-    _legend(figure, methods)
-    counts = sorted(set(lines.loc[lines["ball"] != ALL_BALLS, "shots"].tolist()))
-    shots = "–".join(str(n) for n in (counts if len(counts) == 1 else (counts[0], counts[-1])))
-    note = f"shots of each ball: {shots}, each with a ball and a recorded drop of its own"
-    title = experiment.title or experiment.name
-    figure.suptitle(f"{title}\n{note}; bars and ranges: 95 % (Wilson)", fontsize=10)
+    panel, table = make_success_panel(lines)
+    size = (2.0 + 1.5 * len(panel.across.names), 4.2)
+    figure, axes = draw_chart([replace(panel, title="")], {panel.table: table}, size=size)
+    entries = axes[0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside right upper", fontsize=8, frameon=False)
+    note = "each shot with a ball and a recorded drop of its own; bars: 95 % intervals (Wilson)"
+    figure.suptitle(f"{experiment.title or experiment.name}\n{note}", fontsize=10)
     return figure
-
-
-def _rates(axis: Axes, lines: pd.DataFrame, methods: Sequence[str]) -> None:
-    """Draw the hit rate of each method over all balls, with its interval."""
-    over = lines[lines["ball"] == ALL_BALLS].set_index("method")
-    for place, method in enumerate(methods):
-        colour, marker = _GROUPS[get_method_group(method)]
-        rate, low, high = (100 * float(over[c][method]) for c in ("rate", "low", "high"))
-        axis.plot([low, high], [place, place], color=colour, linewidth=2)
-        axis.plot(rate, place, marker=marker, color=colour, markersize=7)
-        # A decimal prevents rounding to 0 % or 100 %.
-        near = 0 < rate < 0.5 or 99.5 <= rate < 100
-        axis.annotate(
-            f"{rate:.{1 if near else 0}f}",
-            (rate, place),
-            xytext=(0, 6),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
-    axis.set(xlim=(-2, 104), xlabel="shots through the hoop, all balls [%]")
-    _methods_down(axis, methods)
-    axis.grid(visible=True, axis="x", linewidth=0.4, alpha=0.5)
-    axis.spines[["top", "right"]].set_visible(False)
-
-
-def _by_ball(axis: Axes, lines: pd.DataFrame, methods: Sequence[str]) -> None:
-    """Draw the hits as cells by method and ball; lighter cells have more hits."""
-    balls = [ball for ball in lines["ball"].unique() if ball != ALL_BALLS]
-    for line in lines[lines["ball"] != ALL_BALLS].to_dict("records"):
-        x, y, rate = balls.index(line["ball"]), methods.index(line["method"]), float(line["rate"])
-        axis.add_patch(_cell(x, y, rate))
-        interval = f"{100 * line['low']:.0f}–{100 * line['high']:.0f} %"
-        axis.text(
-            x,
-            y,
-            f"{line['hits']}/{line['shots']}   {interval}",
-            ha="center",
-            va="center",
-            fontsize=7.5,
-            color="white" if rate < 0.45 else "black",
-        )
-    axis.set(xlim=(-0.5, len(balls) - 0.5), ylim=(len(methods) - 0.5, -0.5))
-    axis.set_xticks(range(len(balls)), balls, fontsize=9)
-    axis.xaxis.tick_top()
-    axis.tick_params(length=0)
-    axis.spines[:].set_visible(False)
 
 
 def _methods_down(axis: Axes, methods: Sequence[str]) -> None:
     axis.set_yticks(range(len(methods)), [get_method_label(m) for m in methods])
     axis.invert_yaxis()
-
-
-def _cell(x: int, y: int, rate: float) -> Any:
-    from matplotlib.patches import Rectangle
-
-    shade = 0.25 + 0.72 * rate
-    return Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=(shade, shade, shade), linewidth=0)
 
 
 def _legend(figure: Figure, methods: Sequence[str]) -> None:

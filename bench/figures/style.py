@@ -15,7 +15,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.benchmark.problem.experiment import Experiment
 from bench.benchmark.statistics.error_floor import ERROR_FLOOR
 from bench.figures.figure_files import is_pdf_wanted
 from bench.figures.png_encoder import encoded_png
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+    from bench.benchmark.problem.experiment import Experiment
     from bench.benchmark.statistics.comparison_statistics import ComparisonStatistics
     from bench.benchmark.storage.reference_results import ReferenceResult
 

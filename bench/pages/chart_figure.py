@@ -192,7 +192,10 @@ def _format_axis(axis: Axes, spec: Axis, which: str, reverse: bool = False) -> N
     axis.set(**{f"{which}label": _escape_math(spec.label)})
     set_ticks = axis.set_xticks if which == "x" else axis.set_yticks
     if spec.names:
-        names = [_escape_math(break_name(name, _NAME_LINE)) for name in spec.names]
+        names = [
+            "\n".join(_escape_math(break_name(line, _NAME_LINE)) for line in name.split("\n"))
+            for name in spec.names
+        ]
         set_ticks(range(len(names)), names, fontsize=8)
         ends = (-0.5, len(spec.names) - 0.5)
         axis.set(**{f"{which}lim": ends[::-1] if reverse else ends})

@@ -19,7 +19,7 @@ from markupsafe import Markup, escape
 from bench.pages.chart import Chart, Panel, PrintedFigure
 from bench.pages.data_grid import INITIAL_ROWS, DataGrid, GridColumn, select_initial_rows
 from bench.pages.page_table import Table
-from bench.pages.page_template import TEMPLATES, load_template
+from bench.pages.page_template import load_template
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,7 +47,7 @@ class HtmlPage:
         self._frames: dict[str, pd.DataFrame | Table] = {}
         self._charts: list[dict[str, Any]] = []
         self._grids: list[dict[str, Any]] = []
-        self._parts: Any = load_template(TEMPLATES / "parts.html").module
+        self._parts: Any = load_template(Path("parts.html")).module
 
     def add_table(self, name: str, frame: pd.DataFrame | Table, digits: int | None = None) -> None:
         """Store a table in the page for charts and grids, to be saved as NAME.csv.
@@ -158,7 +158,7 @@ class HtmlPage:
         script = f'{library}\n(() => {{\n"use strict";\n{own}\n}})();\n'
         styles = (_LIBRARY / "uPlot.min.css").read_text(encoding="utf-8"), _read("page.css")
         data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
-        return load_template(TEMPLATES / "page.html").render(
+        return load_template(Path("page.html")).render(
             title=content.title,
             style=Markup("\n".join([*styles, self._own_style])),
             digest=b64encode(sha256(script.encode()).digest()).decode("ascii"),

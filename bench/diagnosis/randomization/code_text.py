@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 from bench.pages.text_format import sanitise
 from sims.extended_simulator import ExtendedSimulator
@@ -23,21 +26,22 @@ def number(value: float) -> str:
     return repr(float(f"{value:.9g}"))
 
 
-def comment(text: str, indent: str = "") -> Iterator[str]:
-    """Yield the lines of a comment; line breaks and control characters in names are escaped.
+def comment(texts: str | Sequence[str], indent: str = "") -> str:
+    """Format comments; line breaks and control characters in names are escaped.
 
     Args:
-        text: Text of the comment.
+        texts: Text of a comment, or of several.
         indent: Indentation of the lines.
     """
-    words = sanitise(text, 2000).split(" ")
-    line = f"{indent}#"
-    for word in words:
-        if len(line) + 1 + len(word) > WIDTH and line != f"{indent}#":
-            yield line
-            line = f"{indent}#"
-        line += f" {word}"
-    yield line
+    begin = f"{indent}# "
+    lines: list[str] = []
+    for text in [texts] if isinstance(texts, str) else texts:
+        plain = sanitise(text, 2000)
+        lines += textwrap.wrap(
+            plain, WIDTH, initial_indent=begin, subsequent_indent=begin, break_long_words=False,
+            break_on_hyphens=False,
+        )  # fmt: skip
+    return "\n".join(lines)
 
 
 def identifiers(names: Iterable[str]) -> Iterator[str]:
@@ -54,8 +58,8 @@ def identifiers(names: Iterable[str]) -> Iterator[str]:
         yield found
 
 
-def heading(extended: ExtendedSimulator, framework: str, left_out: Iterable[str]) -> Iterator[str]:
-    """Yield the first lines of a file: its origin, and the ranges that are left out.
+def list_heading(extended: ExtendedSimulator, framework: str, left_out: Iterable[str]) -> list[str]:
+    """List the comments at the beginning of a file: its origin, and ranges that are left out.
 
     Args:
         extended: Extended simulator with the numbers.
@@ -63,13 +67,36 @@ def heading(extended: ExtendedSimulator, framework: str, left_out: Iterable[str]
         left_out: Reasons for ranges that are left out.
     """
     model = extended.robot.path.name if extended.robot is not None else extended.system
-    yield from comment(
+    return [
         f"Domain randomisation for {framework}, written by simgap explain --ranges: robot "
-        f"{model}, recording {extended.title}."
-    )
-    yield from comment(
+        f"{model}, recording {extended.title}.",
         "Each range is the 95 % interval of a number of the model file with the causes that were "
-        "found: how well this recording determines it, not how robots of one kind differ."
+        "found: how well this recording determines it, not how robots of one kind differ.",
+        *(f"Left out: {line}." for line in left_out),
+    ]
+
+
+def render_code(name: str, **values: Any) -> str:
+    """Render a template of this folder as Python code.
+
+    Args:
+        name: File name of the code; the template has the suffix ``.jinja``.
+        **values: Values of the template.
+    """
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
     )
-    for line in left_out:
-        yield from comment(f"Left out: {line}.")
+    environment.filters |= {
+        "comment": comment,
+        "literal": literal,
+        "number": number,
+        "variable": lambda field: field.replace(".", "_"),
+    }
+    source = Path(__file__).with_name(f"{name}.jinja").read_text(encoding="utf-8")
+    return environment.from_string(source).render(**values).rstrip() + "\n"

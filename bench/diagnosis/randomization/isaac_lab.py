@@ -16,16 +16,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.diagnosis.randomization.code_text import comment, heading, identifiers, literal, number
+from bench.diagnosis.randomization.code_text import (
+    identifiers,
+    list_heading,
+    literal,
+    number,
+    render_code,
+)
 from bench.diagnosis.randomization.ranges import RandomizationRange, RandomizationRanges, texts
 from sims.extended_simulator import ExtendedSimulator
 
-IMPORTS = (
-    "import isaaclab.envs.mdp as mdp",
-    "from isaaclab.managers import EventTermCfg as EventTerm",
-    "from isaaclab.managers import SceneEntityCfg",
-    "from isaaclab.utils import configclass",
-)
 FRICTION_NOTE = (
     "On PhysX this term draws static, dynamic and viscous friction of the joint from one range; "
     "set the viscous friction of the joint again if you use it."
@@ -54,33 +54,14 @@ def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, rob
         extended: Extended simulator with the numbers.
         robot: Robot with its compiled model.
     """
-    said = dict(texts(ranges))
-    terms, missing = _terms(ranges, said, robot)
-    lines = [*heading(extended, "Isaac Lab", ranges.left_out)]
-    lines += comment(
-        "Let the events of your environment inherit from SimgapEventCfg; robot is the name of the "
-        "articulation in the scene. Centres of mass are moved relative to the original model."
+    sentences = dict(texts(ranges))
+    terms, missing = _terms(ranges, sentences, robot)
+    return render_code(
+        "ranges_isaac_lab.py",
+        heading=list_heading(extended, "Isaac Lab", ranges.left_out),
+        terms=list(zip(identifiers(term.name for term in terms), terms, strict=True)),
+        missing=[f"- {sentences[each]}" for each in missing],
     )
-    lines += ["", *IMPORTS, "", "", "@configclass", "class SimgapEventCfg:"]
-    lines += ['    """Event terms that randomise the numbers that simgap found."""', ""]
-    for name, term in zip(identifiers(term.name for term in terms), terms, strict=True):
-        lines += _written(name, term)
-    if missing:
-        lines += comment("Isaac Lab has no event term for:", "    ")
-        for one in missing:
-            lines += comment(f"- {said[one]}", "    ")
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _written(name: str, term: Term) -> Iterator[str]:
-    for text in term.comments:
-        yield from comment(text, "    ")
-    yield f"    {name} = EventTerm("
-    yield f"        func=mdp.{term.function},"
-    yield '        mode="startup",'
-    yield "        params={"
-    yield from (f'            "{key}": {value},' for key, value in term.params.items())
-    yield from ("        },", "    )", "")
 
 
 def _terms(
