@@ -64,8 +64,8 @@ class BallKind:
 
     def draw_ball(self, rng: np.random.Generator) -> BallKind:
         """Draw a ball of this kind with random restitution."""
-        own = self.restitution + self.spread * float(rng.uniform(-1.0, 1.0))
-        return replace(self, restitution=own)
+        restitution = self.restitution + self.spread * float(rng.uniform(-1.0, 1.0))
+        return replace(self, restitution=restitution)
 
 
 _BALLS = (

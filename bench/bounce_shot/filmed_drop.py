@@ -48,26 +48,26 @@ def film_and_track_drop(
     )
     # The codec halves the resolution of colour, so both dimensions must be even.
     size = (2 * round(ASPECT_RATIO * pixels / 2), pixels)
-    camera, look = (
+    camera, appearance = (
         PinholeCamera(azimuth, distance, height, (0.0, 0.0, CAMERA_TARGET_HEIGHT), size=size),
         SceneAppearance.draw(rng),
     )
     film = path.with_suffix(".mp4")
     # Recordings and films are never overwritten, and a killed process may have left some of them.
-    for left in (
+    for leftover in (
         film,
         get_camera_file_path(film),
         *(path.with_suffix(end) for end in (".csv", ".toml", ".png", ".pdf")),
     ):
-        left.unlink(missing_ok=True)
-    stage = BallScene(camera, look, radius, rng)
-    places = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
+        leftover.unlink(missing_ok=True)
+    scene = BallScene(camera, appearance, radius, rng)
+    positions = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
     write_video(
         film,
-        stage.render_frames(places),
+        scene.render_frames(positions),
         times,
-        look.crf,
+        appearance.crf,
         {get_camera_file_path(film): format_camera_file(FilmDescription(camera, radius))},
     )
-    stage.close()
+    scene.close()
     film_tracking.track_film(film, path, render_track_figure, scale="camera")

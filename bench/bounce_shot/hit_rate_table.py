@@ -69,11 +69,11 @@ def build_result_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
     shots, hits = len(part), int(part["hit"].sum())
-    off = part["off"].abs().fillna(math.inf)
+    miss_distances = part["off"].abs().fillna(math.inf)
     errors = part["prediction_error"]
     failures = int(part["status"].isin(NO_SHOT_STATUSES).sum())
     # Not interpolated, because values may be infinite.
-    near = off.quantile([0.5, 0.9], interpolation="higher").tolist()
+    miss_quantiles = miss_distances.quantile([0.5, 0.9], interpolation="higher").tolist()
     return [
         method,
         ball,
@@ -81,7 +81,7 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
         hits,
         hits / shots,
         *compute_wilson_interval(hits, shots),
-        *near,
+        *miss_quantiles,
         errors.median(),
         errors.mean(),
         part["simulations"].mean(),
@@ -99,17 +99,18 @@ def format_result_table(lines: pd.DataFrame) -> str:
         + "  ".join(f"{b:>12}" for b in balls)
         + "   all (95 %, Wilson)   path off by"
     )
-    told = [head]
+    text_lines = [head]
     for method, part in lines.groupby("method", sort=False):
-        by = part.set_index("ball")
-        cells = [f"{f'{by.hits[b]}/{by.shots[b]}':>12}" for b in balls]
-        share = f"{by.rate[ALL_BALLS]:6.1%} ({by.low[ALL_BALLS]:.0%}–{by.high[ALL_BALLS]:.0%})"
-        told.append(
+        by_ball = part.set_index("ball")
+        cells = [f"{f'{by_ball.hits[b]}/{by_ball.shots[b]}':>12}" for b in balls]
+        total = by_ball.loc[ALL_BALLS]
+        share = f"{total.rate:6.1%} ({total.low:.0%}–{total.high:.0%})"
+        text_lines.append(
             f"{method:{width}}  "
             + "  ".join(cells)
-            + f"   {share:18}   {by.prediction_error_mean[ALL_BALLS]:.3f} m"
+            + f"   {share:18}   {by_ball.prediction_error_mean[ALL_BALLS]:.3f} m"
         )
-    return "\n".join(told)
+    return "\n".join(text_lines)
 
 
 def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:

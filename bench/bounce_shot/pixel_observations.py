@@ -64,10 +64,10 @@ def build_pixel_runs(recording: Recording, experiment: Experiment, radius: float
     (run,) = recording.runs
     times: Array = np.arange(experiment.sampling.samples) / experiment.sampling.rate
     # The recording may begin later or skip samples; each row is assigned by its time.
-    at = np.rint(run.times * experiment.sampling.rate).astype(np.intp)
-    kept = at < times.size
+    indices = np.rint(run.times * experiment.sampling.rate).astype(np.intp)
+    is_inside = indices < times.size
     observed: Array = np.full((times.size, 2), np.nan)
-    observed[at[kept], 1] = run.extra[ROW_CHANNEL][kept]
+    observed[indices[is_inside], 1] = run.extra[ROW_CHANNEL][is_inside]
     z = run.channels["z"]
     first = int(np.flatnonzero(np.isfinite(z))[0])
     gravity = recording.constants["gravity"]

@@ -76,7 +76,7 @@ def write_animation(
     folder: Path,
     settings: ShotConfig,
     example: tuple[ShotSetup, list[str]],
-    kept: Mapping[str, Any],
+    stored: Mapping[str, Any],
     trusted: bool = False,
 ) -> Path:
     """Write figures/shot.gif: a drop at normal speed, if it was filmed, and shots at half speed.
@@ -85,7 +85,7 @@ def write_animation(
         folder: result folder.
         settings: the [shot] table.
         example: the shot and its methods.
-        kept: stored results by name of the shot.
+        stored: stored results by name of the shot.
         trusted: whether tuners ran without isolation, which the title then says.
 
     Returns:
@@ -93,31 +93,31 @@ def write_animation(
     """
     from matplotlib.animation import FuncAnimation, PillowWriter
 
-    dealt, methods = example
-    film = _film(folder / RECORDINGS_FOLDER / f"{dealt.name}.mp4")
-    beside = int(bool(film.pictures))
+    setup, methods = example
+    film = _film(folder / RECORDINGS_FOLDER / f"{setup.name}.mp4")
+    film_columns = int(bool(film.pictures))
     # Margins are set once, below: a layout engine would move the panels from frame to frame.
     figure, axes = make_panel_grid(
         1,
-        len(methods) + beside,
-        (2.9 * len(methods) + 1.5 * beside, 3.2),
+        len(methods) + film_columns,
+        (2.9 * len(methods) + 1.5 * film_columns, 3.2),
         layout=None,
-        gridspec_kw={"width_ratios": [0.5] * beside + [1] * len(methods)},
+        gridspec_kw={"width_ratios": [0.5] * film_columns + [1] * len(methods)},
     )
-    shot = execute_example(settings, dealt, methods, kept)
-    panels = zip(axes[0, beside:], methods, strict=True)
-    moving = [_shot_panel(axis, dealt, method, shot) for axis, method in panels]
-    filmed = _film_panel(axes[0, 0], film) if beside else None
+    shot = execute_example(settings, setup, methods, stored)
+    panels = zip(axes[0, film_columns:], methods, strict=True)
+    moving = [_shot_panel(axis, setup, method, shot) for axis, method in panels]
+    filmed = _film_panel(axes[0, 0], film) if film_columns else None
     step = SAMPLING_RATE_HZ / _FRAMES_PER_SECOND / _SLOW_MOTION_FACTOR
-    shots = int(np.ceil(max(one.end for one in moving) / step)) + 1
+    shots = int(np.ceil(max(panel.end for panel in moving) / step)) + 1
 
     def show(frame: int) -> list[Any]:
         later = frame - len(film.pictures)
         if filmed is not None and later < 0:
             filmed.show(film.pictures[frame], film.tracks[frame])
         else:
-            for one in moving:
-                one.show(round(later * step))
+            for panel in moving:
+                panel.show(round(later * step))
         return []
 
     if trusted:
@@ -130,14 +130,14 @@ def write_animation(
     return path
 
 
-def _shot_panel(axis: Any, dealt: ShotSetup, method: str, shot: ExampleShot) -> _Moving:
+def _shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> _Moving:
     """Draw the panel of one method in the initial state."""
-    draw_shot_panel(axis, dealt, method, shot)
+    draw_shot_panel(axis, setup, method, shot)
     line = axis.lines[-1]
     line.set_data([], [])
     (ball,) = axis.plot([], [], marker="o", color=VERMILION, markeredgecolor="black", markersize=7)
     path = shot.throws[method].flown
-    return _Moving(path, find_path_end(path, dealt.scene), line, ball)
+    return _Moving(path, find_path_end(path, setup.scene), line, ball)
 
 
 def _film_panel(axis: Any, film: FilmFrames) -> _Filmed:
@@ -158,7 +158,7 @@ def _film(path: Path) -> FilmFrames:
     except InputError:
         return FilmFrames([], [])
     times = np.array([time for time, _ in frames]) - frames[0][0]
-    wanted = np.arange(0.0, times[-1], 1.0 / _FRAMES_PER_SECOND)
+    frame_times = np.arange(0.0, times[-1], 1.0 / _FRAMES_PER_SECOND)
     track = np.stack([run.extra["u"], run.extra["v"]], axis=1)
-    pictures = [frames[int(np.searchsorted(times, time - 1e-6))][1] for time in wanted]
-    return FilmFrames(pictures, [track[run.times <= time + 1e-6] for time in wanted])
+    pictures = [frames[int(np.searchsorted(times, time - 1e-6))][1] for time in frame_times]
+    return FilmFrames(pictures, [track[run.times <= time + 1e-6] for time in frame_times])

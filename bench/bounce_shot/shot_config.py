@@ -78,8 +78,8 @@ def read_shot_config(experiment: Experiment) -> ShotConfig:
     if settings.rows and not settings.filmed:
         raise InputError(f"{source}: shot.rows: only a film has pixel rows; set shot.filmed too")
     # Tuners in shot.rows need not be in the experiment: the command line may add them.
-    there = {*(entry.label for entry in experiment.tuners), *tuners.names()}
-    check_known_names(f"tuner in shot.rows of {source}", settings.rows, there)
+    known_tuners = {*(entry.label for entry in experiment.tuners), *tuners.names()}
+    check_known_names(f"tuner in shot.rows of {source}", settings.rows, known_tuners)
     return settings
 
 
@@ -96,8 +96,8 @@ def _value(source: str, where: str, value: Any, declared: Any) -> Any:
         if not 0 <= low <= high:  # equal ends define a constant
             raise make_error(source, where, "0 <= low <= high", value)
         return low, high
-    wanted = "a number of at least 0"
-    size = check_number(source, where, value, wanted)
+    expected = "a number of at least 0"
+    size = check_number(source, where, value, expected)
     if size < 0:
-        raise make_error(source, where, wanted, value)
+        raise make_error(source, where, expected, value)
     return size

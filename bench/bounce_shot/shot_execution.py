@@ -51,11 +51,11 @@ class ShotResult:
     flown: Array
 
 
-def execute_shot(dealt: ShotSetup, settings: ShotConfig, model: TunedModel) -> ShotResult:
+def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> ShotResult:
     """Execute a planned shot, with the shot's release error.
 
     Args:
-        dealt: the shot.
+        setup: the shot.
         settings: the [shot] table.
         model: tuned model with the plan.
     """
@@ -65,30 +65,30 @@ def execute_shot(dealt: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
         nothing = np.full((times.size, 3), np.nan)
         return ShotResult(False, float("nan"), float("nan"), times, nothing, nothing)
     heights = np.array([model.height])
-    known = get_planning_constants(settings, dealt.ball.radius)
+    constants = get_planning_constants(settings, setup.ball.radius)
     planned = simulate_flights(
         make_planning_simulator(model),
         get_planning_theta(model),
-        dealt.scene,
-        known,
+        setup.scene,
+        constants,
         heights,
         times,
     )[0]
     # The true ball, friction and release, which the planner does not know.
-    ground = InclinedGround(dealt.scene.angle, settings.friction)
+    ground = InclinedGround(setup.scene.angle, settings.friction)
     start = (
-        dealt.release[0],
+        setup.release[0],
         0.0,
-        dealt.scene.compute_contact_height(dealt.ball.radius) + model.height + dealt.release[1],
+        setup.scene.compute_contact_height(setup.ball.radius) + model.height + setup.release[1],
     )
-    flown = simulate_shot(dealt.ball, ground, start, times)
-    x, y = compute_hoop_crossings(flown[None], dealt.scene)[0].tolist()
-    off = x - dealt.scene.hoop_x
-    hit = math.hypot(off, y) < dealt.scene.hoop_radius
+    flown = simulate_shot(setup.ball, ground, start, times)
+    x, y = compute_hoop_crossings(flown[None], setup.scene)[0].tolist()
+    miss_distance = x - setup.scene.hoop_x
+    is_hit = math.hypot(miss_distance, y) < setup.scene.hoop_radius
     # Beyond the hoop's plane, nothing was planned.
-    last = min(_through(planned, dealt.scene.hoop_z), _through(flown, dealt.scene.hoop_z))
+    last = min(_through(planned, setup.scene.hoop_z), _through(flown, setup.scene.hoop_z))
     error = float(np.linalg.norm(planned - flown, axis=1)[: last + 1].mean())
-    return ShotResult(hit, off, error, times, planned, flown)
+    return ShotResult(is_hit, miss_distance, error, times, planned, flown)
 
 
 def _through(path: Array, height: float) -> int:
@@ -104,35 +104,35 @@ def _through(path: Array, height: float) -> int:
 
 
 def build_shot_rows(
-    dealt: ShotSetup, settings: ShotConfig, made: list[dict[str, Any]]
+    setup: ShotSetup, settings: ShotConfig, models: list[dict[str, Any]]
 ) -> list[dict[str, Any]]:
     """Execute the shot of each method, and build the result rows.
 
     Args:
-        dealt: the shot.
+        setup: the shot.
         settings: the [shot] table.
-        made: fields of the tuned model of each method.
+        models: fields of the tuned model of each method.
     """
     return [
-        _row(dealt, model, execute_shot(dealt, settings, model))
-        for model in (TunedModel(**row) for row in made)
+        _row(setup, model, execute_shot(setup, settings, model))
+        for model in (TunedModel(**row) for row in models)
     ]
 
 
-def _row(dealt: ShotSetup, model: TunedModel, made: ShotResult) -> dict[str, Any]:
+def _row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> dict[str, Any]:
     effects: Mapping[str, Any] = model.effects
     return {
-        "shot": dealt.name,
-        "ball": dealt.name.rpartition("-")[0],
+        "shot": setup.name,
+        "ball": setup.name.rpartition("-")[0],
         "method": model.method,
-        "hit": made.is_hit,
-        "off": made.miss_distance,
-        "margin": dealt.scene.hoop_radius - abs(made.miss_distance),
+        "hit": result.is_hit,
+        "off": result.miss_distance,
+        "margin": setup.scene.hoop_radius - abs(result.miss_distance),
         "planned_margin": model.margin,
-        "prediction_error": made.prediction_error,
+        "prediction_error": result.prediction_error,
         "drop_height": model.height,
         "restitution": model.restitution,
-        "true_restitution": dealt.ball.restitution,
+        "true_restitution": setup.ball.restitution,
         "effects": "; ".join(
             f"{name} {', '.join(f'{v:.4g}' for v in values)}" for name, values in effects.items()
         ),

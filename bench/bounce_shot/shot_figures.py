@@ -57,8 +57,8 @@ _BELOW = 0.12
 def draw_figures(
     experiment: Experiment,
     settings: ShotConfig,
-    dealt: Sequence[ShotSetup],
-    kept: Mapping[str, Any],
+    setups: Sequence[ShotSetup],
+    stored: Mapping[str, Any],
     rows: pd.DataFrame,
     lines: pd.DataFrame,
 ) -> dict[str, FigureFiles]:
@@ -67,8 +67,8 @@ def draw_figures(
     Args:
         experiment: the experiment.
         settings: the [shot] table.
-        dealt: all shots.
-        kept: stored results by name of the shot.
+        setups: all shots.
+        stored: stored results by name of the shot.
         rows: rows of shots.csv.
         lines: table of `bench.bounce_shot.hit_rate_table.build_result_table`.
 
@@ -79,9 +79,9 @@ def draw_figures(
         "success": draw_success_figure(experiment, lines),
         "off": draw_miss_figure(settings, rows),
     }
-    chosen = select_example_shots(dealt, kept, rows)
+    chosen = select_example_shots(setups, stored, rows)
     if chosen:
-        figures["shots"] = draw_shots_figure(settings, chosen, kept)
+        figures["shots"] = draw_shots_figure(settings, chosen, stored)
     return {
         name: render_all_formats(add_trust_note(figure, experiment.trusted))
         for name, figure in figures.items()
@@ -195,36 +195,42 @@ def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
 
 
 def select_example_shots(
-    dealt: Sequence[ShotSetup], kept: Mapping[str, Any], rows: pd.DataFrame
+    setups: Sequence[ShotSetup], stored: Mapping[str, Any], rows: pd.DataFrame
 ) -> list[tuple[ShotSetup, list[str]]]:
     """Select example shots: a typical one and the worst one of a tuned method.
 
     The typical one is a shot that the untuned simulator missed, if there is one.
 
     Args:
-        dealt: all shots.
-        kept: stored results by name of the shot.
+        setups: all shots.
+        stored: stored results by name of the shot.
         rows: rows of shots.csv.
 
     Returns:
         The shots, each with the methods to show.
     """
-    by_name = {one.name: one for one in dealt}
+    by_name = {setup.name: setup for setup in setups}
     tuned = [m for m in rows["method"].unique() if get_method_group(m) == "tuned"]
     if not tuned:
         return []
-    first = next((m for m in ("tunenet-vision", "tunenet") if m in tuned), tuned[0])
-    shown = [m for m in (UNTUNED_METHOD, first, EXPLAIN_METHOD) if (rows["method"] == m).any()]
+    reference_method = next((m for m in ("tunenet-vision", "tunenet") if m in tuned), tuned[0])
+    methods_shown = [
+        m for m in (UNTUNED_METHOD, reference_method, EXPLAIN_METHOD) if (rows["method"] == m).any()
+    ]
     # Only shots with a result of all shown methods can be compared.
-    wide = rows.pivot(index="shot", columns="method", values="off")[shown].abs().dropna()
+    wide = rows.pivot(index="shot", columns="method", values="off")[methods_shown].abs().dropna()
     if wide.empty:
         return []
     missed = rows[(rows["method"] == UNTUNED_METHOD) & (rows["hit"].astype(float) == 0)]["shot"]
-    telling = wide[wide.index.isin(missed)]
-    telling = wide if telling.empty else telling
-    typical = (telling[first] - wide[first].median()).abs().idxmin()
-    worst = wide[first].idxmax()
-    return [(by_name[str(name)], shown) for name in dict.fromkeys((typical, worst)) if name in kept]
+    missed_by_untuned = wide[wide.index.isin(missed)]
+    missed_by_untuned = wide if missed_by_untuned.empty else missed_by_untuned
+    typical = (missed_by_untuned[reference_method] - wide[reference_method].median()).abs().idxmin()
+    worst = wide[reference_method].idxmax()
+    return [
+        (by_name[str(name)], methods_shown)
+        for name in dict.fromkeys((typical, worst))
+        if name in stored
+    ]
 
 
 class ExampleShot(NamedTuple):
@@ -242,40 +248,40 @@ class ExampleShot(NamedTuple):
 
 
 def execute_example(
-    settings: ShotConfig, dealt: ShotSetup, methods: Sequence[str], kept: Mapping[str, Any]
+    settings: ShotConfig, setup: ShotSetup, methods: Sequence[str], stored: Mapping[str, Any]
 ) -> ExampleShot:
     """Execute one shot again with each of some methods.
 
     Args:
         settings: the [shot] table.
-        dealt: the shot.
+        setup: the shot.
         methods: names of the methods.
-        kept: stored results by name of the shot.
+        stored: stored results by name of the shot.
     """
-    models = {model["method"]: TunedModel(**model) for model in kept[dealt.name]["models"]}
-    throws = {method: execute_shot(dealt, settings, models[method]) for method in methods}
+    models = {model["method"]: TunedModel(**model) for model in stored[setup.name]["models"]}
+    throws = {method: execute_shot(setup, settings, models[method]) for method in methods}
     top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
     return ExampleShot(models, throws, top)
 
 
 def draw_shots_figure(
-    settings: ShotConfig, chosen: Sequence[tuple[ShotSetup, list[str]]], kept: Mapping[str, Any]
+    settings: ShotConfig, chosen: Sequence[tuple[ShotSetup, list[str]]], stored: Mapping[str, Any]
 ) -> Figure:
     """Draw example shots as planned and as flown.
 
     Args:
         settings: the [shot] table.
         chosen: examples as returned by `select_example_shots`, one per row.
-        kept: stored results by name of the shot.
+        stored: stored results by name of the shot.
     """
     columns = max(len(methods) for _, methods in chosen)
     size = (4.1 * columns, 0.9 + 3.1 * len(chosen))
     figure, axes = make_panel_grid(len(chosen), columns, size)
-    for row, (dealt, methods) in zip(axes, chosen, strict=True):
-        shot = execute_example(settings, dealt, methods, kept)
+    for row, (setup, methods) in zip(axes, chosen, strict=True):
+        shot = execute_example(settings, setup, methods, stored)
         for axis, method in zip(row, methods, strict=False):
-            draw_shot_panel(axis, dealt, method, shot)
-        row[0].set_ylabel(f"{dealt.name}\nheight [m]")
+            draw_shot_panel(axis, setup, method, shot)
+        row[0].set_ylabel(f"{setup.name}\nheight [m]")
     for axis in axes[-1]:
         axis.set_xlabel("distance [m]")
     axes[0, 0].legend(loc="upper right", fontsize=8, frameon=False)
@@ -288,16 +294,16 @@ def draw_shots_figure(
     return figure
 
 
-def draw_shot_panel(axis: Axes, dealt: ShotSetup, method: str, shot: ExampleShot) -> None:
+def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot) -> None:
     """Draw incline, hoop, planned and flown path of one shot; the flown path is the last line.
 
     Args:
         axis: axes to draw on.
-        dealt: the shot.
+        setup: the shot.
         method: name of the method.
         shot: the executed example.
     """
-    scene, flight = dealt.scene, shot.throws[method]
+    scene, flight = setup.scene, shot.throws[method]
     slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
     axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color=INCLINE_GREY, linewidth=0)
     rim = [scene.hoop_x - scene.hoop_radius, scene.hoop_x + scene.hoop_radius]

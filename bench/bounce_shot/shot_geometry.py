@@ -66,21 +66,21 @@ def compute_hoop_crossings(path: Array, scene: ShotGeometry) -> Array:
         falls = z[:, 1:] < z[:, :-1]
         risen = np.logical_or.accumulate(rises, axis=1)
         fallen = np.logical_or.accumulate(risen & falls, axis=1)
-        again = np.logical_or.accumulate(fallen & rises, axis=1)
+        rises_again = np.logical_or.accumulate(fallen & rises, axis=1)
         # Downward only: a ball that crosses upwards has not scored.
         above = z[:, :-1] > scene.hoop_z
         below = z[:, 1:] <= scene.hoop_z
-        down = risen & ~again & above & below
+        down = risen & ~rises_again & above & below
     first = np.argmax(down, axis=1)
     rows = np.arange(len(z))
     high = z[rows, first]
     low = z[rows, first + 1]
-    comes = down.any(axis=1)  # for paths without a crossing, `first` is 0 and unused
-    share = (high - scene.hoop_z) / np.where(comes, high - low, 1.0)  # (1)
+    is_crossed = down.any(axis=1)  # for paths without a crossing, `first` is 0 and unused
+    share = (high - scene.hoop_z) / np.where(is_crossed, high - low, 1.0)  # (1)
     at_x = x[rows, first] + share * (x[rows, first + 1] - x[rows, first])
     at_y = y[rows, first] + share * (y[rows, first + 1] - y[rows, first])
-    place = np.stack([at_x, at_y], axis=1)
-    result: Array = np.where(comes[:, None], place, np.nan)
+    crossing_points = np.stack([at_x, at_y], axis=1)
+    result: Array = np.where(is_crossed[:, None], crossing_points, np.nan)
     return result
 
 
@@ -94,6 +94,8 @@ def compute_rim_margins(path: Array, scene: ShotGeometry) -> Array:
     Returns:
         Distances (n,) in m, > 0 inside the hoop; NaN for paths that do not cross its plane.
     """
-    place = compute_hoop_crossings(path, scene)
-    result: Array = scene.hoop_radius - np.hypot(place[:, 0] - scene.hoop_x, place[:, 1])
+    crossing_points = compute_hoop_crossings(path, scene)
+    result: Array = scene.hoop_radius - np.hypot(
+        crossing_points[:, 0] - scene.hoop_x, crossing_points[:, 1]
+    )
     return result

@@ -74,12 +74,12 @@ def plan_shot(
     grid = np.linspace(low, high, _GRID)
     best = float("nan")
     for _ in range(_ROUNDS):
-        room = compute_rim_margins(
+        margins = compute_rim_margins(
             simulate_flights(simulator, theta, scene, constants, grid, times), scene
         )
-        if not np.isfinite(room).any():
+        if not np.isfinite(margins).any():
             break
-        best = float(grid[np.nanargmax(room)])
+        best = float(grid[np.nanargmax(margins)])
         reach = float(grid[1] - grid[0])
         # Up to the neighbours of the best height: the maximum is between them.
         grid = np.linspace(max(low, best - reach), min(high, best + reach), _ZOOM)
@@ -110,9 +110,11 @@ def simulate_flights(
     Returns:
         Centres (n, T, 3), m.
     """
-    known = {**constants, "incline_angle": scene.angle}
+    scenario_constants = {**constants, "incline_angle": scene.angle}
     scenarios = []
     for height in heights:
-        scenarios.append(Scenario(times, constants={**known, "drop_height": float(height)}))
+        scenarios.append(
+            Scenario(times, constants={**scenario_constants, "drop_height": float(height)})
+        )
     rows = np.repeat(np.atleast_2d(theta), len(heights), axis=0)
     return simulator.simulate_batch(rows, scenarios)

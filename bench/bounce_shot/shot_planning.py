@@ -93,45 +93,45 @@ class ShotInputs:
         described = self.recording.with_suffix(".toml")
         return self.recording, described, *self.weights.values(), *sorted(plugins)
 
-    def relocate(self, places: Mapping[Path, Path]) -> ShotInputs:
+    def relocate(self, paths: Mapping[Path, Path]) -> ShotInputs:
         """Return a copy for another machine, where the files have other paths."""
-        weights = {label: places[path] for label, path in self.weights.items()}
-        tuned = {label: relocate(one, places) for label, one in self.tuned.items()}
-        return replace(self, recording=places[self.recording], weights=weights, tuned=tuned)
+        weights = {label: paths[path] for label, path in self.weights.items()}
+        tuned = {label: relocate(tuner_spec, paths) for label, tuner_spec in self.tuned.items()}
+        return replace(self, recording=paths[self.recording], weights=weights, tuned=tuned)
 
 
 def tune_and_plan(
-    experiment: Experiment, settings: ShotConfig, known: ShotInputs
+    experiment: Experiment, settings: ShotConfig, inputs: ShotInputs
 ) -> list[dict[str, Any]]:
     """Tune all methods to a recording, and plan a shot with each.
 
     Args:
         experiment: the experiment.
         settings: its [shot] table.
-        known: input of the methods.
+        inputs: input of the methods.
 
     Returns:
         Fields of a `TunedModel` for each method.
     """
-    recording = read_recording(known.recording, BallSimulator, whole=True)
-    made = [TunedModel(UNTUNED_METHOD, _nominal(), {}, 0, 0.0, "done")]
-    made += [
-        _tuned(experiment, settings, entry, known, recording, {}) for entry in experiment.tuners
+    recording = read_recording(inputs.recording, BallSimulator, whole=True)
+    models = [TunedModel(UNTUNED_METHOD, _nominal(), {}, 0, 0.0, "done")]
+    models += [
+        _tuned(experiment, settings, entry, inputs, recording, {}) for entry in experiment.tuners
     ]
-    explained, acting = _explained(known.recording)
-    made.append(explained)
+    explained, acting = _explained(inputs.recording)
+    models.append(explained)
     # If explain failed, there is no extended simulator to tune.
     if explained.status == "done":
-        again = [
-            _tuned(experiment, settings, entry, known, recording, acting)
+        extended_models = [
+            _tuned(experiment, settings, entry, inputs, recording, acting)
             for entry in experiment.tuners
         ]
-        made += [
+        models += [
             replace(model, method=model.method + EXPLAIN_SUFFIX, effects=explained.effects)
-            for model in again
+            for model in extended_models
         ]
     radius = _constants(recording)["radius"]
-    return [asdict(_planned(model, settings, known.scene, radius)) for model in made]
+    return [asdict(_planned(model, settings, inputs.scene, radius)) for model in models]
 
 
 def _nominal() -> float:
@@ -142,7 +142,7 @@ def _tuned(
     experiment: Experiment,
     settings: ShotConfig,
     entry: TunerEntry,
-    known: ShotInputs,
+    inputs: ShotInputs,
     recording: Recording,
     effects: EffectCoefficients,
 ) -> TunedModel:
@@ -155,30 +155,30 @@ def _tuned(
     try:
         problem = get_problem(experiment)
         start = problem.cube.to_unit_cube(np.array([p.nominal for p in problem.cube.parameters]))
-        seen = (
+        observed_runs = (
             build_pixel_runs(recording, experiment, radius)
             if label in settings.rows
             else _side(recording, experiment)
         )
-        nothing = ObservedRuns((), np.empty((0, seen.observed.shape[1])))
-        target = BlindedTarget(known.name, "real", start, seen, nothing)
-        order = RunRequest(
+        nothing = ObservedRuns((), np.empty((0, observed_runs.observed.shape[1])))
+        target = BlindedTarget(inputs.name, "real", start, observed_runs, nothing)
+        request = RunRequest(
             label,
             entry,
             0,
             target,
             entry.budget or experiment.budget,
-            known.weights.get(entry.label),
-            known.tuned.get(entry.label),
-            known.hidden,
+            inputs.weights.get(entry.label),
+            inputs.tuned.get(entry.label),
+            inputs.hidden,
         )
-        outcome = execute_run(experiment, order)
+        outcome = execute_run(experiment, request)
     except InputError as error:
         return TunedModel(label, _nominal(), {}, 0, 0.0, "crashed", str(error))
     trace = outcome.trace
-    found = float(problem.cube.to_physical(trace.recommendations[-1])[0])
+    tuned_value = float(problem.cube.to_physical(trace.recommendations[-1])[0])
     return TunedModel(
-        label, found, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
+        label, tuned_value, {}, len(trace.losses), outcome.seconds, trace.status, trace.reason
     )
 
 
@@ -208,12 +208,12 @@ def _side(recording: Recording, experiment: Experiment) -> ObservedRuns:
     radius = experiment.fixed["radius"]
     shift = radius - _constants(recording)["radius"]
     z = run.channels["z"] + shift
-    seen = run.channels["z"][np.isfinite(run.channels["z"])]
+    visible_heights = run.channels["z"][np.isfinite(run.channels["z"])]
     # Released at rest at t = 0, the ball has the speed g t when it is first seen.
-    fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(
+    speed = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(
         run.times[0]
     )
-    first = {"z": float(seen[0]), "vz": -fallen, **scenario.initial}
+    first = {"z": float(visible_heights[0]), "vz": -speed, **scenario.initial}
     initial = {**first, "z": first["z"] + shift}
     moved = Scenario(scenario.times, initial, {}, {**scenario.constants, "radius": radius})
     return ObservedRuns((moved,), z[:, None])
@@ -234,23 +234,27 @@ def _explained(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
 
     started = perf_counter()
     try:
-        found = explain(recording)
+        explanation = explain(recording)
     except Exception:  # the failure of one method is a row of the table
         last = traceback.format_exc()
         return TunedModel(
             EXPLAIN_METHOD, _nominal(), {}, 0, perf_counter() - started, "crashed", last
         ), {}
-    acting = {
+    all_effects = {
         name: tuple(number.value for number in numbers.values())
-        for name, numbers in found.extended.effects.items()
+        for name, numbers in explanation.extended.effects.items()
     }
-    carried = select_transferable_effects(acting, found.extended.constants.get("gravity", 9.81))
-    reason = f"{found.verdict}: {', '.join(acting) or 'nothing'}"
-    restitution = found.extended.parameters["restitution"].value
+    acting_effects = select_transferable_effects(
+        all_effects, explanation.extended.constants.get("gravity", 9.81)
+    )
+    reason = f"{explanation.verdict}: {', '.join(all_effects) or 'nothing'}"
+    restitution = explanation.extended.parameters["restitution"].value
     seconds = perf_counter() - started
-    simulations = found.answer.simulations
-    model = TunedModel(EXPLAIN_METHOD, restitution, carried, simulations, seconds, "done", reason)
-    return model, acting
+    simulations = explanation.answer.simulations
+    model = TunedModel(
+        EXPLAIN_METHOD, restitution, acting_effects, simulations, seconds, "done", reason
+    )
+    return model, all_effects
 
 
 def select_transferable_effects(
@@ -313,9 +317,13 @@ def plan_shot_in_model(
         scene: incline and hoop.
         radius: radius of the ball, m.
     """
-    known = get_planning_constants(settings, radius)
+    constants = get_planning_constants(settings, radius)
     return plan_shot(
-        make_planning_simulator(model), get_planning_theta(model), scene, known, settings.heights
+        make_planning_simulator(model),
+        get_planning_theta(model),
+        scene,
+        constants,
+        settings.heights,
     )
 
 
@@ -324,9 +332,9 @@ def _planned(
 ) -> TunedModel:
     if model.status == "crashed":
         return model
-    made = plan_shot_in_model(model, settings, scene, radius)
-    if not made.is_found and model.status in ("done", "converged"):
+    plan = plan_shot_in_model(model, settings, scene, radius)
+    if not plan.is_found and model.status in ("done", "converged"):
         return replace(
             model, status="no plan", reason="the model reaches the hoop's plane from no height"
         )
-    return replace(model, height=made.height, margin=made.rim_margin)
+    return replace(model, height=plan.height, margin=plan.rim_margin)

@@ -80,14 +80,14 @@ def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
         Number of methods and shots that crashed or exceeded their time.
     """
     folder = study.folder
-    kept = {}
-    for one in study.shots:
-        if (shot := read_shot(folder, one)) is not None:
-            kept[one.name] = shot
-    if not kept:
+    stored = {}
+    for setup in study.shots:
+        if (shot := read_shot(folder, setup)) is not None:
+            stored[setup.name] = shot
+    if not stored:
         say("no shot was made")
         return 0
-    rows = pd.DataFrame([row for shot in kept.values() for row in shot["rows"]])
+    rows = pd.DataFrame([row for shot in stored.values() for row in shot["rows"]])
     for name in _NUMBERS:
         # A column that is empty has no numeric type.
         rows[name] = pd.to_numeric(rows[name])
@@ -96,7 +96,7 @@ def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
     statuses = add_trust_column(_statuses(rows, study.skipped_tuners), study.experiment)
     for name, frame in (("table", lines), ("shots", rows), ("status", statuses)):
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
-    pictures = draw_figures(study.experiment, study.config, study.shots, kept, rows, lines)
+    pictures = draw_figures(study.experiment, study.config, study.shots, stored, rows, lines)
     figures = [
         style.write_figure_files(folder / "figures" / name, picture.png, picture.pdf)[0]
         for name, picture in pictures.items()
@@ -104,9 +104,9 @@ def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
     write_atomically(
         folder / REPORT_FILE, render_page(study.experiment, str(folder), lines, rows, pictures)
     )
-    for example in select_example_shots(study.shots, kept, rows)[:1]:
+    for example in select_example_shots(study.shots, stored, rows)[:1]:
         figures.append(
-            write_animation(folder, study.config, example, kept, study.experiment.trusted)
+            write_animation(folder, study.config, example, stored, study.experiment.trusted)
         )
     # Every new folder has an empty journal folder, which a bounce-shot study does not use.
     journal = folder / SEGMENTS_FOLDER
@@ -133,7 +133,7 @@ def _say_faults(
 
 def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
     """Build the rows of status.csv: one per method and shot, and one per tuner that was skipped."""
-    made = pd.DataFrame(
+    statuses = pd.DataFrame(
         {
             "run": rows["method"] + "/" + rows["shot"],
             "tuner": rows["method"],
@@ -148,9 +148,9 @@ def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
     )
     # Concatenating an empty frame would change the types of the columns.
     if not skipped:
-        return made
-    left = [
+        return statuses
+    skipped_rows = [
         (label, label, SIMULATOR_NAME, "", 0, "skipped", reason, 0, 0.0, False)
         for label, reason in skipped.items()
     ]
-    return pd.concat([made, pd.DataFrame(left, columns=STATUS_COLUMN_NAMES)])
+    return pd.concat([statuses, pd.DataFrame(skipped_rows, columns=STATUS_COLUMN_NAMES)])

@@ -105,35 +105,35 @@ def compute_visible_share(path: Path, experiment: Experiment) -> float:
     return float(np.isfinite(z).sum() / experiment.sampling.samples)
 
 
-def record_drop(experiment: Experiment, dealt: ShotSetup, settings: ShotConfig, path: Path) -> None:
+def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, path: Path) -> None:
     """Record a drop of the ball on level ground, unless the recording exists already.
 
     Args:
         experiment: the experiment.
-        dealt: the shot.
+        setup: the shot.
         settings: the [shot] table.
         path: CSV file of the recording.
     """
     if path.exists() and path.with_suffix(".toml").exists():
         return
     # If only one of the two files exists, the process was killed while writing.
-    for left in (path, path.with_suffix(".toml")):
-        left.unlink(missing_ok=True)
-    rng = make_rng(*_of(dealt.salt), experiment.name, "drop", dealt.name)
+    for leftover in (path, path.with_suffix(".toml")):
+        leftover.unlink(missing_ok=True)
+    rng = make_rng(*_of(setup.salt), experiment.name, "drop", setup.name)
     height = experiment.initial.get("z", 1.5)
-    clear = float(rng.uniform(*height)) if isinstance(height, tuple) else height
-    radius, sampling = dealt.ball.radius, experiment.sampling
+    drop_height = float(rng.uniform(*height)) if isinstance(height, tuple) else height
+    radius, sampling = setup.ball.radius, experiment.sampling
     times = np.arange(sampling.samples) / sampling.rate
     z = simulate_shot(
-        dealt.ball, InclinedGround(0.0, settings.friction), (0.0, 0.0, radius + clear), times
+        setup.ball, InclinedGround(0.0, settings.friction), (0.0, 0.0, radius + drop_height), times
     )[:, 2]
     if settings.filmed:
         film_and_track_drop(path, z, times, radius, round(settings.filmed), rng)
         return
     noise = experiment.noise.get("z", 0.0)
-    seen = z + noise * rng.standard_normal(z.shape)
+    noisy_heights = z + noise * rng.standard_normal(z.shape)
     # Rounded to 0.01 mm, far below any noise, to keep the file short.
-    run = Run("1", times, {"z": np.round(seen, 5)}, {}, {}, {}, False)
-    known = {"radius": radius, "mass": dealt.ball.mass, "gravity": GRAVITY}
-    recording = Recording(path, "ball", f"a drop of {dealt.name}", known, {"z": noise}, (run,))
+    run = Run("1", times, {"z": np.round(noisy_heights, 5)}, {}, {}, {}, False)
+    constants = {"radius": radius, "mass": setup.ball.mass, "gravity": GRAVITY}
+    recording = Recording(path, "ball", f"a drop of {setup.name}", constants, {"z": noise}, (run,))
     write_recording(path, recording, BallSimulator)

@@ -33,92 +33,96 @@ _NUMBERS = ("height", "margin", "restitution", "seconds")
 """Numbers of a model that may be missing."""
 
 
-def get_shot_path(folder: Path, dealt: ShotSetup) -> Path:
+def get_shot_path(folder: Path, setup: ShotSetup) -> Path:
     """Return the file of a shot; it exists once the shot has been executed.
 
     Args:
         folder: result folder of the study.
-        dealt: the shot.
+        setup: the shot.
     """
-    return folder / SHOTS_FOLDER / f"{dealt.name}.json"
+    return folder / SHOTS_FOLDER / f"{setup.name}.json"
 
 
-def list_missing_shots(folder: Path, dealt: Sequence[ShotSetup]) -> list[ShotSetup]:
+def list_missing_shots(folder: Path, setups: Sequence[ShotSetup]) -> list[ShotSetup]:
     """List the shots that have not been executed.
 
     Args:
         folder: result folder of the study.
-        dealt: all shots.
+        setups: all shots.
     """
-    return [one for one in dealt if not get_shot_path(folder, one).exists()]
+    return [setup for setup in setups if not get_shot_path(folder, setup).exists()]
 
 
 def store_shot(
-    folder: Path, dealt: ShotSetup, settings: ShotConfig, models: list[dict[str, Any]], seen: float
+    folder: Path,
+    setup: ShotSetup,
+    settings: ShotConfig,
+    models: list[dict[str, Any]],
+    visible_share: float,
 ) -> None:
     """Execute a shot with the model of every method, and store the result atomically.
 
     Args:
         folder: result folder of the study.
-        dealt: ball, scene and release error.
+        setup: ball, scene and release error.
         settings: the [shot] table of the study.
         models: models as returned by `bench.bounce_shot.shot_planning.tune_and_plan`.
-        seen: fraction of the drop's sample times at which its recording has a height.
+        visible_share: fraction of the drop's sample times at which its recording has a height.
     """
-    rows = [{**row, "seen": seen} for row in build_shot_rows(dealt, settings, models)]
+    rows = [{**row, "seen": visible_share} for row in build_shot_rows(setup, settings, models)]
     document = _plain({"models": models, "rows": rows})
     write_atomically(
-        get_shot_path(folder, dealt), json.dumps(document, indent=1, allow_nan=False) + "\n"
+        get_shot_path(folder, setup), json.dumps(document, indent=1, allow_nan=False) + "\n"
     )
 
 
-def read_shot(folder: Path, dealt: ShotSetup) -> dict[str, Any] | None:
+def read_shot(folder: Path, setup: ShotSetup) -> dict[str, Any] | None:
     """Read the stored result of a shot; return None if the shot has not been executed.
 
     Args:
         folder: result folder of the study.
-        dealt: the shot.
+        setup: the shot.
 
     Raises:
         InputError: the file is damaged.
     """
-    path = get_shot_path(folder, dealt)
+    path = get_shot_path(folder, setup)
     if not path.exists():
         return None
     try:
-        kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        _check(kept, "models", SHOT_MODEL_COLUMNS)
-        _check(kept, "rows", tuple(c for c in SHOT_COLUMNS if c.required))
+        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        _check(document, "models", SHOT_MODEL_COLUMNS)
+        _check(document, "rows", tuple(c for c in SHOT_COLUMNS if c.required))
     except CellError as error:
         raise InputError(f"{path}, {error.says}; {_REMEDY}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise InputError(f"{path}: {_REMEDY}") from None
-    wanted = (dealt.name, [model["method"] for model in kept["models"]])
-    found = {row["shot"] for row in kept["rows"]}, [row["method"] for row in kept["rows"]]
-    if found != ({wanted[0]}, wanted[1]):
-        says = f"expected a row of {wanted[0]} for each model, found others"
-        raise InputError(f"{path}: {says}; {_REMEDY}")
-    for model in kept["models"]:
+    expected = (setup.name, [model["method"] for model in document["models"]])
+    names = {row["shot"] for row in document["rows"]}, [row["method"] for row in document["rows"]]
+    if names != ({expected[0]}, expected[1]):
+        message = f"expected a row of {expected[0]} for each model, found others"
+        raise InputError(f"{path}: {message}; {_REMEDY}")
+    for model in document["models"]:
         # JSON has no NaN, so missing numbers are stored as null.
         model.update({name: math.nan for name in _NUMBERS if model[name] is None})
-    return kept
+    return document
 
 
-def check_shots(folder: Path, dealt: Sequence[ShotSetup]) -> None:
+def check_shots(folder: Path, setups: Sequence[ShotSetup]) -> None:
     """Validate the stored results of shots.
 
     Args:
         folder: result folder of the study.
-        dealt: the shots.
+        setups: the shots.
 
     Raises:
         InputError: a file is damaged.
     """
-    for one in dealt:
-        read_shot(folder, one)
+    for setup in setups:
+        read_shot(folder, setup)
 
 
-def _check(kept: dict[str, Any], name: str, columns: Columns) -> None:
+def _check(document: dict[str, Any], name: str, columns: Columns) -> None:
     """Validate the models or the rows of a shot.
 
     Raises:
@@ -126,7 +130,7 @@ def _check(kept: dict[str, Any], name: str, columns: Columns) -> None:
         KeyError: the part is missing.
         TypeError: the part is not a list of tables.
     """
-    tables = kept[name]
+    tables = document[name]
     try:
         for row, table in enumerate(tables):
             select_declared_columns(list(table), columns, row)

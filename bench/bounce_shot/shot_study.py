@@ -118,10 +118,14 @@ class BounceShotStudy:
     @cached_property
     def experiment(self) -> Experiment:
         """The experiment, with the tuners that can be used."""
-        whole = self.configuration.experiment
+        complete_experiment = self.configuration.experiment
         # Skipped tuners would have empty lines; `finish` reports why they are missing.
-        labels = [entry.label for entry in whole.tuners if entry.label not in self.skipped_tuners]
-        return whole.with_tuners(labels)
+        labels = [
+            entry.label
+            for entry in complete_experiment.tuners
+            if entry.label not in self.skipped_tuners
+        ]
+        return complete_experiment.with_tuners(labels)
 
     @cached_property
     def config(self) -> ShotConfig:
@@ -177,13 +181,15 @@ class BounceShotStudy:
             InputError: the file of a shot is damaged.
         """
         check_shots(self.folder, self.shots)
-        left = {one.name for one in list_missing_shots(self.folder, self.shots)}
+        missing = {setup.name for setup in list_missing_shots(self.folder, self.shots)}
         ends = tuple(
-            RunEnd(one.name, one.ball.name, MISSING_STATUS if one.name in left else "made")
-            for one in self.shots
+            RunEnd(setup.name, setup.ball.name, MISSING_STATUS if setup.name in missing else "made")
+            for setup in self.shots
         )
-        held = self.configuration
-        return StudyProgress(held.experiment.name, "shots made", held.fingerprint, ends)
+        configuration = self.configuration
+        return StudyProgress(
+            configuration.experiment.name, "shots made", configuration.fingerprint, ends
+        )
 
     def report(self, say: PrintLine) -> int:
         """Write tables, figures and HTML report, and print a summary.
@@ -247,14 +253,14 @@ class _ShotStages:
             Errors by index of the shot.
         """
         calls: list[Call] = [
-            (record_drop, (self._experiment, one, self._settings, path))
-            for one, path in zip(self._left, self._paths, strict=True)
+            (record_drop, (self._experiment, setup, self._settings, path))
+            for setup, path in zip(self._left, self._paths, strict=True)
         ]
         step = self._progress("dropping", len(calls))
         faults: dict[int, BaseException] = {}
-        for place, fault in workers.iterate_results(calls, self._experiment.timeout):
-            if isinstance(fault, BaseException):
-                faults[place] = fault
+        for index, error in workers.iterate_results(calls, self._experiment.timeout):
+            if isinstance(error, BaseException):
+                faults[index] = error
             step()
         return faults
 
@@ -268,23 +274,23 @@ class _ShotStages:
             Exception: a training failed; an untrained tuner must not be used as a trained one.
         """
         learned = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
-        grounds = [
+        experiments = [
             shot_planning.make_tuning_experiment(self._experiment, self._settings, entry)
             for entry in learned
         ]
         calls: list[Call] = [
             (
                 train_or_load,
-                (ground, TrainingRequest(entry, 0, self._tuned.get(entry.label), self._hidden)),
+                (experiment, TrainingRequest(entry, 0, self._tuned.get(entry.label), self._hidden)),
             )
-            for ground, entry in zip(grounds, learned, strict=True)
+            for experiment, entry in zip(experiments, learned, strict=True)
         ]
         step = self._progress("training", len(calls))
         weights = {}
-        for place, training in workers.iterate_results(calls, math.inf):
+        for index, training in workers.iterate_results(calls, math.inf):
             if not isinstance(training, TrainingResult):
                 raise training
-            weights[learned[place].label] = training.path
+            weights[learned[index].label] = training.path
             step()
         return weights
 
@@ -292,28 +298,28 @@ class _ShotStages:
         self, workers: Pool, faults: dict[int, BaseException], weights: dict[str, Path]
     ) -> None:
         """Tune and plan with every method, and execute the shots."""
-        seen = [place for place in range(len(self._left)) if place not in faults]
+        recorded = [index for index in range(len(self._left)) if index not in faults]
         calls: list[Call] = []
-        for place in seen:
-            one = self._left[place]
-            known = shot_planning.ShotInputs(
-                one.name, self._paths[place], one.scene, weights, self._tuned, self._hidden
+        for index in recorded:
+            setup = self._left[index]
+            inputs = shot_planning.ShotInputs(
+                setup.name, self._paths[index], setup.scene, weights, self._tuned, self._hidden
             )
-            calls.append((shot_planning.tune_and_plan, (self._experiment, self._settings, known)))
+            calls.append((shot_planning.tune_and_plan, (self._experiment, self._settings, inputs)))
         step = self._progress("shooting", len(self._left))
-        for place, fault in faults.items():
-            status = "no recording" if isinstance(fault, InputError) else "crashed"
-            self._keep(place, _failed(self._experiment, fault, status), 0.0)
+        for index, error in faults.items():
+            status = "no recording" if isinstance(error, InputError) else "crashed"
+            self._keep(index, _failed(self._experiment, error, status), 0.0)
             step()
-        for at, models in workers.iterate_results(calls, self._experiment.timeout):
-            place = seen[at]
+        for position, models in workers.iterate_results(calls, self._experiment.timeout):
+            index = recorded[position]
             if isinstance(models, BaseException):
                 models = _failed(self._experiment, models)
-            self._keep(place, models, compute_visible_share(self._paths[place], self._experiment))
+            self._keep(index, models, compute_visible_share(self._paths[index], self._experiment))
             step()
 
-    def _keep(self, place: int, models: list[dict[str, Any]], seen: float) -> None:
-        store_shot(self._study.folder, self._left[place], self._settings, models, seen)
+    def _keep(self, index: int, models: list[dict[str, Any]], visible_share: float) -> None:
+        store_shot(self._study.folder, self._left[index], self._settings, models, visible_share)
 
 
 def _failed(

@@ -142,16 +142,20 @@ class DiagnosisReportDataBuilder:
             return ()
         best = max(others, key=lambda model: model.penalised_log_likelihood)
         (name,) = best.effects
-        own = [one for one in assess_consistency(self.search, best) if one.number.startswith(name)]
-        return tuple(own)
+        group_estimates = [
+            consistency
+            for consistency in assess_consistency(self.search, best)
+            if consistency.number.startswith(name)
+        ]
+        return tuple(group_estimates)
 
     def _fixable(self) -> tuple[ParameterIdentifiability, ...]:
         """Assess identifiability from the directions that the search has simulated."""
         key: frozenset[str] = frozenset()
         scanned = self.search.cached_scans.get(key) or self.search.superseded_scans.get(key)
-        known = self.search.directions_known()
-        if known is not None:
-            return assess_identifiability(self.search.world, self.search.noise, *known)
+        directions = self.search.directions_known()
+        if directions is not None:
+            return assess_identifiability(self.search.world, self.search.noise, *directions)
         if scanned is None:
             return ()
         return assess_identifiability(
@@ -241,17 +245,18 @@ class DiagnosisReportDataBuilder:
 
     def _bordering(self) -> Iterator[str]:
         """Yield sentences on parameters that a fit leaves at a bound of their range."""
-        for one in self._parameters():
-            values = one.before[0], one.after[0]
+        for parameter in self._parameters():
+            values = parameter.before[0], parameter.after[0]
             for when, value, bound in zip(
-                ("in the base fit ", ""), values, one.bounds, strict=True
+                ("in the base fit ", ""), values, parameter.bounds, strict=True
             ):
                 if bound is None:
                     continue
                 yield (
-                    f"{when}{one.name} lies at the {END[bound]} bound of its range, {value:g}"
-                    f" {one.unit}: larger ranges were not searched, and a cause may compensate for"
-                    " a value beyond the bound. Check the units and constants of the recording"
+                    f"{when}{parameter.name} lies at the {END[bound]} bound of its range, "
+                    f"{value:g} {parameter.unit}: larger ranges were not searched, and a "
+                    "cause may compensate for a value beyond the bound. Check the "
+                    "units and constants of the recording"
                 )
                 break
 
@@ -276,11 +281,11 @@ class DiagnosisReportDataBuilder:
                 )
 
     def _structure(self) -> str:
-        chance = self.finding.lack_of_fit.p_value
+        p_value = self.finding.lack_of_fit.p_value
         # Lack of fit is either a residual with a pattern, or one that is only too large.
-        if chance < STRUCTURE_P_VALUE_THRESHOLD:
+        if p_value < STRUCTURE_P_VALUE_THRESHOLD:
             return (
-                f"the residual has structure (p-value {chance:.2g}) "
+                f"the residual has structure (p-value {p_value:.2g}) "
                 "that the sensor's noise does not have"
             )
         return "the residual exceeds the stated noise of the sensors"

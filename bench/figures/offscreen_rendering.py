@@ -78,10 +78,10 @@ def _asked(backend: str, model: Any, positions: Array, view: Projection) -> Imag
     with TemporaryDirectory(prefix="simgap-picture-") as name:
         folder = Path(name)
         mujoco.mj_saveModel(model, str(folder / "model.mjb"), None)
-        shown = (view.azimuth, view.elevation, view.width, view.height)
-        np.savez(folder / "view.npz", qpos=positions, centre=view.centre, shown=shown)
+        view_numbers = (view.azimuth, view.elevation, view.width, view.height)
+        np.savez(folder / "view.npz", qpos=positions, centre=view.centre, shown=view_numbers)
         try:
-            done = subprocess.run(
+            process = subprocess.run(
                 [sys.executable, "-c", _START.format(path=sys.path), str(folder)],
                 env=environment,
                 capture_output=True,
@@ -92,32 +92,32 @@ def _asked(backend: str, model: Any, positions: Array, view: Projection) -> Imag
             image: Image = np.load(folder / "image.npy")
         except (OSError, ValueError, subprocess.TimeoutExpired):
             return None
-    return image if done.returncode == 0 else None
+    return image if process.returncode == 0 else None
 
 
 def render_requested(folder: str) -> None:
     """Render the request that `_asked` has stored in a folder; any error ends the process."""
     import mujoco
 
-    place = Path(folder)
-    model = mujoco.MjModel.from_binary_path(str(place / "model.mjb"))
-    asked = np.load(place / "view.npz")
-    azimuth, elevation, width, height = asked["shown"].tolist()
-    view = Projection(azimuth, elevation, asked["centre"], width, height)
+    folder_path = Path(folder)
+    model = mujoco.MjModel.from_binary_path(str(folder_path / "model.mjb"))
+    request = np.load(folder_path / "view.npz")
+    azimuth, elevation, width, height = request["shown"].tolist()
+    view = Projection(azimuth, elevation, request["centre"], width, height)
     data = mujoco.MjData(model)
-    data.qpos[:] = asked["qpos"]
+    data.qpos[:] = request["qpos"]
     mujoco.mj_forward(model, data)
-    np.save(place / "image.npy", _drawn(mujoco, model, data, view))
+    np.save(folder_path / "image.npy", _drawn(mujoco, model, data, view))
 
 
 def _drawn(mujoco: Any, model: Any, data: Any, view: Projection) -> Image:
     """Render the robot in grey on a white background."""
     scale = MAX_IMAGE_PIXELS / max(view.width, view.height)
     rows, columns = (max(2, round(scale * size)) for size in (view.height, view.width))
-    whole = model.vis.global_
-    whole.offwidth, whole.offheight = columns, rows
+    global_options = model.vis.global_
+    global_options.offwidth, global_options.offheight = columns, rows
     # In an orthographic projection, fovy is the visible height.
-    whole.orthographic, whole.fovy = 1, view.height
+    global_options.orthographic, global_options.fovy = 1, view.height
     size = float(np.hypot(view.width, view.height))
     model.stat.extent = size
     model.vis.map.znear, model.vis.map.zfar = 0.01, 3 * CAMERA_DISTANCE_FACTOR
@@ -151,8 +151,8 @@ def convert_to_grey(colours: Array, shape: NDArray[np.bool_]) -> Image:
     """
     # Luma of ITU-R BT.601.
     luma = colours @ (0.299, 0.587, 0.114)
-    seen = luma[shape]
-    low, high = np.quantile(seen, [0.02, 0.98]) if seen.size else (0.0, 1.0)
+    robot_luma = luma[shape]
+    low, high = np.quantile(robot_luma, [0.02, 0.98]) if robot_luma.size else (0.0, 1.0)
     # The robot's own range of luma is mapped to medium to light grey.
     share = np.clip((luma - low) / max(high - low, 1.0), 0.0, 1.0)
     grey = np.where(shape, 120 + 112 * share, 255)

@@ -178,8 +178,8 @@ def _named(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
 
 def _titled(axis: Axes, recording: Recording, placed: Sequence[_PlacedRun]) -> None:
     total = len(recording.runs)
-    some = f", {len(placed)} of {total} runs" if len(placed) < total else ""
-    axis.set_title(f"{recording.title}{some}", fontsize=11, pad=16)
+    selection = f", {len(placed)} of {total} runs" if len(placed) < total else ""
+    axis.set_title(f"{recording.title}{selection}", fontsize=11, pad=16)
 
 
 def _marks(recording: Recording, placed: Sequence[_PlacedRun]) -> list[Line2D]:

@@ -101,13 +101,13 @@ def draw_robot_figure(
         least: Minimum width of the figure in inches.
     """
     data = make_posed_data(robot, dict(positions))
-    seen_from = choose_projection(robot, data)
-    labels = _labels(robot, data, seen_from, marks)
+    projection = choose_projection(robot, data)
+    labels = _labels(robot, data, projection, marks)
     sides = _sides(labels)
     columns = [_breadth(side) for side in sides]
-    scale = MAX_SIDE_INCHES / max(seen_from.width, seen_from.height)
+    scale = MAX_SIDE_INCHES / max(projection.width, projection.height)
     needed = max(_height(side) for side in sides)
-    width, height = scale * seen_from.width, scale * seen_from.height
+    width, height = scale * projection.width, scale * projection.height
     tall = max(height, needed)
     spare = max(0.0, least - sum(columns) - width) / 2
     columns = [column + spare for column in columns]
@@ -117,30 +117,30 @@ def draw_robot_figure(
     below = (SCALE_BAR_HEIGHT_INCHES + (tall - height) / 2) / size[1]
     axis.set_position((columns[0] / size[0], below, width / size[0], height / size[1]))
     axis.set_axis_off()
-    across, up = seen_from.width / 2, seen_from.height / 2
+    across, up = projection.width / 2, projection.height / 2
     axis.set(xlim=(-across, across), ylim=(-up, up))
     axis.set_autoscale_on(False)
 
     image = (
-        render_robot(robot.compiled, data.qpos.copy(), seen_from) if _has_shapes(robot) else None
+        render_robot(robot.compiled, data.qpos.copy(), projection) if _has_shapes(robot) else None
     )
     if image is None:
-        draw_skeleton(axis, robot, data, seen_from)
+        draw_skeleton(axis, robot, data, projection)
     else:
         axis.imshow(image, extent=(-across, across, -up, up), zorder=0, aspect="auto")
         # Shapes may be missing between joints, if their meshes are absent or were never drawn.
         for ends in compute_link_segments(robot, data):
             axis.plot(
-                *seen_from.project(np.stack(ends)).T, color=CAPTION_GREY, linewidth=0.7, zorder=3
+                *projection.project(np.stack(ends)).T, color=CAPTION_GREY, linewidth=0.7, zorder=3
             )
-        dots = seen_from.project(np.array([data.xanchor[j.id] for j in robot.joints]))
+        dots = projection.project(np.array([data.xanchor[j.id] for j in robot.joints]))
         axis.plot(*dots.T, "o", color=NEUTRAL_MARK, markersize=3.5, zorder=4)
-    _draw_place_rings(axis, robot, data, seen_from, marks)
+    _draw_place_rings(axis, robot, data, projection, marks)
     for side, ((left, right), begin) in enumerate(
         zip(((1, 0), (0, 1)), (-0.12, 0.12), strict=True)
     ):
         _write(axis, sides[side], left * -across + right * across + begin / scale, scale, tall)
-    _draw_scale_bar(axis, seen_from, scale, tall)
+    _draw_scale_bar(axis, projection, scale, tall)
     return figure
 
 
@@ -158,15 +158,15 @@ def compute_joint_positions(
         Name of each joint, and its position as fractions of width and height from the top left.
     """
     data = make_posed_data(robot, dict(positions))
-    seen_from = choose_projection(robot, data)
+    projection = choose_projection(robot, data)
     axis = figure.axes[0]
-    found = []
+    joint_positions = []
     for joint in robot.joints:
-        point = seen_from.project(data.xanchor[joint.id][None])[0]
+        point = projection.project(data.xanchor[joint.id][None])[0]
         pixels = axis.transData.transform(point)
         across, up = (pixels / figure.bbox.size).tolist()
-        found.append((joint.name, across, 1.0 - up))
-    return found
+        joint_positions.append((joint.name, across, 1.0 - up))
+    return joint_positions
 
 
 def _has_shapes(robot: RobotModel) -> bool:
@@ -176,19 +176,19 @@ def _has_shapes(robot: RobotModel) -> bool:
 
 
 def _labels(
-    robot: RobotModel, data: Any, seen_from: Projection, marks: Sequence[PlaceMark]
+    robot: RobotModel, data: Any, projection: Projection, marks: Sequence[PlaceMark]
 ) -> list[_Label]:
     """Make one label for each marked place, and for the other joints if there are few."""
-    said: dict[tuple[str, str], list[str]] = {}
+    lines_by_place: dict[tuple[str, str], list[str]] = {}
     for mark in marks:
-        lines = said.setdefault((mark.kind, mark.name), [])
+        lines = lines_by_place.setdefault((mark.kind, mark.name), [])
         lines += [mark.says] if mark.says and mark.says not in lines else []
     if len(robot.joints) <= MAX_NAMED_JOINTS:
         for joint in robot.joints:
-            said.setdefault(("joint", joint.name), [])
+            lines_by_place.setdefault(("joint", joint.name), [])
     marked = {(mark.kind, mark.name) for mark in marks}
     labels = []
-    for (kind, name), lines in said.items():
+    for (kind, name), lines in lines_by_place.items():
         place = locate_place(robot, data, kind, name)
         if place is None:
             continue
@@ -198,7 +198,7 @@ def _labels(
         lines = [
             line for text in texts for line in break_name(text, MAX_LABEL_LINE_LENGTH).split("\n")
         ]
-        point = seen_from.project(place[None])[0]
+        point = projection.project(place[None])[0]
         labels.append(_Label(tuple(lines), point, (kind, name) in marked))
     return labels
 
@@ -294,19 +294,19 @@ def _write(axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: f
 
 
 def _draw_place_rings(
-    axis: Axes, robot: RobotModel, data: Any, seen_from: Projection, marks: Sequence[PlaceMark]
+    axis: Axes, robot: RobotModel, data: Any, projection: Projection, marks: Sequence[PlaceMark]
 ) -> None:
     """Draw rings around places: solid if the place is certain, dashed otherwise."""
-    sure: dict[tuple[str, str], bool] = {}
+    certainty: dict[tuple[str, str], bool] = {}
     for mark in marks:
         key = mark.kind, mark.name
-        sure[key] = sure.get(key, False) or mark.is_certain
-    for (kind, name), whole in sure.items():
+        certainty[key] = certainty.get(key, False) or mark.is_certain
+    for (kind, name), is_certain in certainty.items():
         place = locate_place(robot, data, kind, name)
         if place is None:
             continue
         shape, size = _SIZES.get(kind, _SIZES["joint"])
-        across, up = seen_from.project(place[None])[0].tolist()
+        across, up = projection.project(place[None])[0].tolist()
         # Markers cannot be dashed, so a ring is a scatter plot of one point.
         axis.scatter(
             across,
@@ -316,16 +316,16 @@ def _draw_place_rings(
             facecolors="none",
             edgecolors=BLUE,
             linewidths=2.4,
-            linestyles="-" if whole else (0, (1.6, 1.0)),
+            linestyles="-" if is_certain else (0, (1.6, 1.0)),
             zorder=5,
             clip_on=False,
         )
 
 
-def _draw_scale_bar(axis: Axes, seen_from: Projection, scale: float, tall: float) -> None:
+def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: float) -> None:
     """Draw a scale bar below the drawing, at the left."""
-    length = round_down_length(0.3 * seen_from.width)
-    left = -seen_from.width / 2
+    length = round_down_length(0.3 * projection.width)
+    left = -projection.width / 2
     y = -tall / scale / 2 - 0.2 / scale
     axis.plot(
         [left, left + length],

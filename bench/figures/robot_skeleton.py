@@ -58,22 +58,22 @@ def compute_link_segments(robot: RobotModel, data: Any) -> list[tuple[Array, Arr
         data: MuJoCo data at the pose.
     """
     model = robot.compiled
-    found = []
-    carried = set()
+    segments = []
+    parents = set()
     for body in range(1, model.nbody):
         if not int(model.body_weldid[body]):
             continue
         parent = int(model.body_parentid[body])
-        carried.add(parent)
+        parents.add(parent)
         if parent:
-            found.append(
+            segments.append(
                 (_find_link_start(model, data, parent), _find_link_start(model, data, body))
             )
     for body in range(1, model.nbody):
-        if int(model.body_weldid[body]) and body not in carried:
+        if int(model.body_weldid[body]) and body not in parents:
             begin = _find_link_start(model, data, body)
-            found.append((begin, _find_link_end(model, data, body, begin)))
-    return found
+            segments.append((begin, _find_link_end(model, data, body, begin)))
+    return segments
 
 
 def _find_link_start(model: Any, data: Any, body: int) -> Array:
@@ -103,16 +103,18 @@ def _find_link_end(model: Any, data: Any, body: int, begin: Array) -> Array:
 def _find_base_points(robot: RobotModel, data: Any) -> list[Array]:
     """Return the (3,) points where moving bodies are fixed to static ones, without free bodies."""
     model = robot.compiled
-    afloat = {int(model.jnt_bodyid[joint.id]) for joint in robot.joints if joint.kind == "free"}
-    found = []
+    free_bodies = {
+        int(model.jnt_bodyid[joint.id]) for joint in robot.joints if joint.kind == "free"
+    }
+    points = []
     for body in range(1, model.nbody):
         parent = int(model.body_parentid[body])
-        still = not int(model.body_weldid[parent])
-        if int(model.body_weldid[body]) and still and body not in afloat:
-            found.append(
+        has_fixed_parent = not int(model.body_weldid[parent])
+        if int(model.body_weldid[body]) and has_fixed_parent and body not in free_bodies:
+            points.append(
                 np.array(data.xpos[parent]) if parent else _find_link_start(model, data, body)
             )
-    return found
+    return points
 
 
 def _draw_joint(axis: Axes, joint: Joint, data: Any, view: Projection) -> None:

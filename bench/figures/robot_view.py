@@ -60,8 +60,8 @@ class Projection:
 
     def project(self, points: Array) -> Array:
         """Project points (N, 3) to (N, 2) metres to the right and up from the middle."""
-        seen: Array = (np.asarray(points) - self.centre) @ self.axes[:2].T  # Equation (1).
-        return seen
+        projected: Array = (np.asarray(points) - self.centre) @ self.axes[:2].T  # Equation (1).
+        return projected
 
 
 def _axes(azimuth: float, elevation: float) -> Array:
@@ -105,8 +105,8 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
     low, high = points.min(axis=0), points.max(axis=0)
     if len(still):
         # A floor or a long rail would make the robot too small.
-        around = STATIC_CONTEXT_SHARE * float(np.linalg.norm(high - low))
-        clipped = np.clip(still @ axes.T, low - around, high + around)
+        margin = STATIC_CONTEXT_SHARE * float(np.linalg.norm(high - low))
+        clipped = np.clip(still @ axes.T, low - margin, high + margin)
         low = np.minimum(low, clipped.min(axis=0))
         high = np.maximum(high, clipped.max(axis=0))
     width, height = np.maximum((high - low)[:2], MIN_VIEW_METRES) * (1 + 2 * MARGIN_SHARE)
@@ -141,8 +141,8 @@ def _direction(robot: RobotModel, data: Any) -> tuple[float, float]:
     points = np.concatenate([data.xanchor, moving.mean(axis=0, keepdims=True)])
 
     def spread(azimuth: float) -> float:
-        seen = points @ _axes(azimuth, ELEVATION_DEG)[:2].T
-        sizes = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+        projected = points @ _axes(azimuth, ELEVATION_DEG)[:2].T
+        sizes = np.linalg.svd(projected - projected.mean(axis=0), compute_uv=False)
         return float(np.prod(sizes))
 
     # Without rounding, numerical errors would decide for a robot that looks the same from two
@@ -238,11 +238,15 @@ def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
     if row is None:
         return None
     sensor = int(np.searchsorted(model.sensor_adr, row.address, side="right")) - 1
-    on, of = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
-    places = {
+    object_id, object_type = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
+    positions_by_type = {
         int(mujoco.mjtObj.mjOBJ_SITE): data.site_xpos,
         int(mujoco.mjtObj.mjOBJ_JOINT): data.xanchor,
         int(mujoco.mjtObj.mjOBJ_BODY): data.xipos,
         int(mujoco.mjtObj.mjOBJ_XBODY): data.xpos,
     }
-    return np.array(places[of][on]) if of in places else None
+    return (
+        np.array(positions_by_type[object_type][object_id])
+        if object_type in positions_by_type
+        else None
+    )

@@ -375,22 +375,22 @@ def _behind_entries(
     """Make the legend entries of a reference: a heading, and its tuners that are drawn."""
     from matplotlib.lines import Line2D
 
-    drawn = {line.get_gid() for axis in axes for line in axis.get_lines()}
+    line_ids = {line.get_gid() for axis in axes for line in axis.get_lines()}
     heading = f"thin, grey: {reference.name},\nsimgap {reference.simgap}"
     return [
         (Line2D([], [], linestyle="none"), heading),
         *(
             (Line2D([], [], **style.get_reference_style(reference, tuner)), tuner)
             for tuner in reference.tuners
-            if make_reference_id(reference, tuner) in drawn
+            if make_reference_id(reference, tuner) in line_ids
         ),
     ]
 
 
 def _behind_caption(reference: ReferenceResult, experiment: Experiment) -> str:
-    differs = reference.find_mismatches(experiment)
-    told = f"; differs in {'; '.join(differs)}" if differs else ""
-    return f" Grey: medians of the reference {reference.provenance_text}{told}."
+    mismatches = reference.find_mismatches(experiment)
+    difference_text = f"; differs in {'; '.join(mismatches)}" if mismatches else ""
+    return f" Grey: medians of the reference {reference.provenance_text}{difference_text}."
 
 
 def make_reference_id(reference: ReferenceResult, tuner: str) -> str:

@@ -55,9 +55,9 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
     above.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
     above.set_title("dotted: ball on the ground", fontsize=9)
     below.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
-    found, frames = int(np.isfinite(track.u).sum()), len(track.times)
+    visible_count, frames = int(np.isfinite(track.u).sum()), len(track.times)
     # A film's name must not be read as mathematics.
-    figure.suptitle(f"{title}\n{found} of {frames} frames", parse_math=False, fontsize=10)
+    figure.suptitle(f"{title}\n{visible_count} of {frames} frames", parse_math=False, fontsize=10)
     return figure
 
 
@@ -89,12 +89,14 @@ def _over_time(axis: Axes, track: BallTrack, part: slice, values: Array, label: 
 
 def _some(track: BallTrack) -> list[int]:
     """Return the indices of a few frames with the ball, evenly spaced along its path."""
-    seen = track.visible_frames.tolist()
-    steps = np.hypot(np.diff(track.u[seen]), np.diff(track.v[seen]))
-    way = np.concatenate([[0.0], np.cumsum(steps)])
+    visible = track.visible_frames.tolist()
+    steps = np.hypot(np.diff(track.u[visible]), np.diff(track.v[visible]))
+    path_length = np.concatenate([[0.0], np.cumsum(steps)])
     # Evenly along the path, not in time: outlines of a slow ball would cover each other.
-    places = np.searchsorted(way, np.linspace(0, way[-1], _SHOWN)).clip(0, len(seen) - 1)
-    return [seen[i] for i in np.unique(places)]
+    indices = np.searchsorted(path_length, np.linspace(0, path_length[-1], _SHOWN)).clip(
+        0, len(visible) - 1
+    )
+    return [visible[i] for i in np.unique(indices)]
 
 
 def _overlaid(track: BallTrack) -> RgbImage:

@@ -45,22 +45,26 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
         True parameters, (p,).
     """
     problem = TuningProblem(experiment, salt)
-    wanted = experiment.calibration or CalibrationConfig()
+    calibration = experiment.calibration or CalibrationConfig()
     streams = TargetStreams(salt, experiment.name, "calibration", 0)
-    inside = problem.cube.training
-    point = streams.get_stream("truth").uniform(inside[0], inside[1], size=problem.cube.dim)
+    training_box = problem.cube.training
+    point = streams.get_stream("truth").uniform(
+        training_box[0], training_box[1], size=problem.cube.dim
+    )
     theta = problem.cube.to_physical(point[None])[:, : len(problem.world.parameters)]
-    initial = {**experiment.initial, **wanted.initial}
-    inputs = {**experiment.inputs, **wanted.inputs}
+    initial = {**experiment.initial, **calibration.initial}
+    inputs = {**experiment.inputs, **calibration.inputs}
     runs = []
-    for number in range(wanted.runs):
+    for number in range(calibration.runs):
         scene = targets.draw_scenario(
             experiment, streams.get_held_out_stream(number), initial, inputs
         )
         clean = problem.world.simulate(theta, scene)[0]
         rng = TargetStreams(salt, experiment.name, "calibration", 1 + number).get_stream("noise")
-        seen = clean + problem.noise * rng.standard_normal(clean.shape)
-        runs.append(_run(problem, number, scene, seen, number >= wanted.runs - wanted.held_out))
+        noisy = clean + problem.noise * rng.standard_normal(clean.shape)
+        runs.append(
+            _run(problem, number, scene, noisy, number >= calibration.runs - calibration.held_out)
+        )
     kind = type(problem.simulator)
     model = None
     if experiment.model:
@@ -80,13 +84,15 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
         digits=9,
     )
     problem.close()
-    made: Array = theta[0]
-    return made
+    parameters: Array = theta[0]
+    return parameters
 
 
-def _run(problem: TuningProblem, number: int, scene: Scenario, seen: Array, held_out: bool) -> Run:
+def _run(
+    problem: TuningProblem, number: int, scene: Scenario, observed: Array, held_out: bool
+) -> Run:
     names = [channel.name for channel in problem.channels]
-    channels = dict(zip(names, np.ascontiguousarray(seen.T), strict=True))
+    channels = dict(zip(names, np.ascontiguousarray(observed.T), strict=True))
     return Run(str(number + 1), scene.times, channels, scene.inputs, scene.constants, {}, held_out)
 
 
@@ -100,9 +106,9 @@ def run_explain(recording: Path, experiment: Experiment, jobs: int) -> ExtendedS
     """
     from bench.diagnosis.explain import explain  # a local import, because it imports all of explain
 
-    found = explain([recording], free=experiment.free, jobs=max(jobs, 1))
-    found.write(recording.parent / "explain")
-    return found.extended
+    explanation = explain([recording], free=experiment.free, jobs=max(jobs, 1))
+    explanation.write(recording.parent / "explain")
+    return explanation.extended
 
 
 def load_extended(file: Path) -> ExtendedSimulator:
@@ -126,11 +132,11 @@ def list_coefficients(extended: ExtendedSimulator, kind: type[Simulator]) -> dic
     """
     if not issubclass(kind, SystemSimulator):
         raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
-    found = {}
+    coefficients = {}
     for name, numbers in extended.effects.items():
-        there = library.find_effect(name, kind.system).on(kind.system)
-        found[name] = [numbers[c.name].value if c.name in numbers else 0.0 for c in there]
-    return found
+        declared = library.find_effect(name, kind.system).on(kind.system)
+        coefficients[name] = [numbers[c.name].value if c.name in numbers else 0.0 for c in declared]
+    return coefficients
 
 
 def make_base_experiment(experiment: Experiment) -> Experiment:

@@ -73,12 +73,12 @@ def draw_bias_figure(systems: Sequence[StudyResult], table: pd.DataFrame) -> Fig
         table: Rows of their error tables.
     """
     figure, panels = _panels(len(systems))
-    for panel, one in zip(panels, systems, strict=False):
-        lines = table[(table["experiment"] == one.experiment.name) & (table["metric"] == "bias")]
+    for panel, study in zip(panels, systems, strict=False):
+        lines = table[(table["experiment"] == study.experiment.name) & (table["metric"] == "bias")]
         parameter = _most_biased(lines)
-        _compared(panel, one, lines[lines["parameter"] == parameter])
+        _compared(panel, study, lines[lines["parameter"] == parameter])
         panel.axvline(0.0, color=ZERO_LINE_GREY, linewidth=0.8)
-        panel.set_title(f"{one.name}: {parameter}\n{_lacks(one)}", fontsize=9)
+        panel.set_title(f"{study.name}: {parameter}\n{_lacks(study)}", fontsize=9)
         panel.set_xlabel("mean signed error [training widths]", fontsize=8)
     caption = (
         "The parameter that least squares gets most wrong in the simulator as it is. Point: mean "
@@ -96,12 +96,12 @@ def draw_prediction_figure(systems: Sequence[StudyResult], table: pd.DataFrame) 
         table: Rows of their error tables.
     """
     figure, panels = _panels(len(systems))
-    for panel, one in zip(panels, systems, strict=False):
-        mine = table["experiment"] == one.experiment.name
-        _compared(panel, one, table[mine & (table["metric"] == "heldout_error")])
+    for panel, study in zip(panels, systems, strict=False):
+        is_of_study = table["experiment"] == study.experiment.name
+        _compared(panel, study, table[is_of_study & (table["metric"] == "heldout_error")])
         panel.set_xscale("log")
-        panel.set_title(f"{one.name}\n{_lacks(one)}", fontsize=9)
-        panel.set_xlabel(f"RMSE of {one.channel} in unseen runs [{one.unit}]", fontsize=8)
+        panel.set_title(f"{study.name}\n{_lacks(study)}", fontsize=9)
+        panel.set_xlabel(f"RMSE of {study.channel} in unseen runs [{study.unit}]", fontsize=8)
     caption = (
         f"Point: mean over {_targets(systems)} of the error of the tuned simulator in runs that no "
         "tuner saw, without sensor noise. Bar: 95 % bootstrap interval."
@@ -123,14 +123,16 @@ def draw_rank_slope_figure(
     metrics = {"param_error": "error of the parameters", "heldout_error": "prediction"}
     width = max(6.0, 2.6 + 1.75 * len(systems))
     figure, axes = make_panel_grid(len(metrics), len(systems), (width, 6.6), sharey=True)
-    for row, (metric, what) in zip(axes, metrics.items(), strict=True):
-        for panel, one in zip(row, systems, strict=True):
-            mine = ranks[(ranks["experiment"] == one.experiment.name) & (ranks["metric"] == metric)]
-            _slope(panel, one, mine)
-            said = ranking[ranking["experiment"] == one.experiment.name].set_index("metric")
-            tau, p = (float(said[column].loc[metric]) for column in ("tau", "p_value"))
-            panel.set_title(f"{one.name}\nτ = {tau:.2f}, p = {p:.2g}", fontsize=8)
-        row[0].set_ylabel(f"mean rank by {what}\n(1 is best)", fontsize=9)
+    for row, (metric, label) in zip(axes, metrics.items(), strict=True):
+        for panel, study in zip(row, systems, strict=True):
+            study_ranks = ranks[
+                (ranks["experiment"] == study.experiment.name) & (ranks["metric"] == metric)
+            ]
+            _slope(panel, study, study_ranks)
+            agreement = ranking[ranking["experiment"] == study.experiment.name].set_index("metric")
+            tau, p = (float(agreement[column].loc[metric]) for column in ("tau", "p_value"))
+            panel.set_title(f"{study.name}\nτ = {tau:.2f}, p = {p:.2g}", fontsize=8)
+        row[0].set_ylabel(f"mean rank by {label}\n(1 is best)", fontsize=9)
     axes[0][0].invert_yaxis()
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False)
@@ -156,9 +158,9 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def _compared(panel: Axes, one: StudyResult, lines: pd.DataFrame) -> None:
+def _compared(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
     """Draw one row per tuner with both simulators and their intervals."""
-    tuners = one.tuners()
+    tuners = study.tuners()
     for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
         part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
         mean = part["mean"].to_numpy(dtype=np.float64)
@@ -192,22 +194,22 @@ def _most_biased(lines: pd.DataFrame) -> str:
     return [str(name) for name in largest.index][int(largest.to_numpy().argmax())]
 
 
-def _slope(panel: Axes, one: StudyResult, ranks: pd.DataFrame) -> None:
+def _slope(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
     style_axis(panel)
-    style = TunerStyles(one.experiment, list(ranks.sort_values("plain", kind="stable")["tuner"]))
+    style = TunerStyles(study.experiment, list(ranks.sort_values("plain", kind="stable")["tuner"]))
     for tuner, before, after in zip(ranks["tuner"], ranks["plain"], ranks["extended"], strict=True):
         panel.plot([0, 1], [before, after], markersize=5, **style.get_plot_style(str(tuner)))
     panel.set_xticks([0, 1], ["as it is", "extended"], fontsize=8)
     panel.set_xlim(-0.25, 1.25)
 
 
-def _lacks(one: StudyResult) -> str:
-    names = list(one.experiment.world.get("fixed", {}))
-    return f"lacks {', '.join(names) or 'nothing'}; {len(one.targets())} targets"
+def _lacks(study: StudyResult) -> str:
+    names = list(study.experiment.world.get("fixed", {}))
+    return f"lacks {', '.join(names) or 'nothing'}; {len(study.targets())} targets"
 
 
 def _targets(systems: Sequence[StudyResult]) -> str:
-    counts = sorted({len(one.targets()) for one in systems})
+    counts = sorted({len(study.targets()) for study in systems})
     many = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     return f"{many} targets"
 

@@ -48,15 +48,15 @@ def write_report(study: ReportableMisspecificationStudy, say: PrintLine) -> int:
     """
     folder, experiment = study.folder, study.configuration.experiment
     failed = _comparisons(folder, say)
-    one = (
+    scores = (
         misspecification_scores.load_scores(folder, experiment)
         if has_both_comparisons(folder)
         else None
     )
-    if one is None or not one.targets():
+    if scores is None or not scores.targets():
         say(f"{experiment.name}: no target has been met in both simulators yet")
         return failed
-    _written(folder, [one], say, whole=False)
+    _written(folder, [scores], say, is_joint=False)
     return failed
 
 
@@ -77,7 +77,7 @@ def write_joint_report(folder: Path, parts: Sequence[Path], say: PrintLine) -> N
     if len(outcomes) < 2:
         return
     say(f"\ntogether, {len(outcomes)} systems")
-    _written(folder, outcomes, say, whole=True)
+    _written(folder, outcomes, say, is_joint=True)
 
 
 def has_both_comparisons(folder: Path) -> bool:
@@ -98,10 +98,10 @@ def _comparisons(folder: Path, say: PrintLine) -> int:
         stored = read_comparison(folder / model)
         for name, frame in build_tables(stored).items():
             write_atomically(folder / model / f"{name}.csv", frame.to_csv(index=False))
-        bad = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
-        for text in format_failures(bad):
+        failures = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
+        for text in format_failures(failures):
             say(text)
-        failed += int((bad["status"] != "skipped").sum())
+        failed += int((failures["status"] != "skipped").sum())
     return failed
 
 
@@ -109,7 +109,7 @@ def _written(
     folder: Path,
     outcomes: Sequence[misspecification_scores.StudyScores],
     say: PrintLine,
-    whole: bool,
+    is_joint: bool,
 ) -> None:
     """Write tables and figures of one study, or of all together, and print a summary."""
     experiment: Experiment = outcomes[0].experiment
@@ -124,14 +124,14 @@ def _written(
         write_atomically(
             folder / f"{name}.csv", add_trust_column(frame, experiment).to_csv(index=False)
         )
-    for text in _said(folder, outcomes, frames, whole):
+    for text in _said(folder, outcomes, frames, is_joint):
         say(text)
-    drawn = {
+    drawn_figures = {
         "bias": figures.draw_bias_figure(outcomes, frames["table"]),
         "prediction": figures.draw_prediction_figure(outcomes, frames["table"]),
         "ranks": figures.draw_rank_slope_figure(outcomes, frames["ranks"], frames["ranking"]),
     }
-    for name, figure in drawn.items():
+    for name, figure in drawn_figures.items():
         path = write_figure(add_trust_note(figure, experiment.trusted), folder / "figures" / name)[
             0
         ]
@@ -142,47 +142,49 @@ def _said(
     folder: Path,
     outcomes: Sequence[misspecification_scores.StudyScores],
     frames: dict[str, pd.DataFrame],
-    whole: bool,
+    is_joint: bool,
 ) -> list[str]:
     texts = []
-    for one in outcomes:
-        place = folder / one.experiment.name if whole else folder
-        texts += ["", _explained(one, place), _table(one, frames["table"])]
-        rows = frames["ranking"][frames["ranking"]["experiment"] == one.experiment.name]
+    for scores in outcomes:
+        study_folder = folder / scores.experiment.name if is_joint else folder
+        texts += ["", _explained(scores, study_folder), _table(scores, frames["table"])]
+        rows = frames["ranking"][frames["ranking"]["experiment"] == scores.experiment.name]
         texts += [_tau(row) for _, row in rows.iterrows()]
-    if whole:
+    if is_joint:
         for metric in misspecification_scores.RANKED_METRICS:
             texts += ["", _together(frames["ranks"], metric)]
     return texts
 
 
-def _explained(one: misspecification_scores.StudyScores, folder: Path) -> str:
+def _explained(scores: misspecification_scores.StudyScores, folder: Path) -> str:
     """Format the effects of the true system and the causes that explain named."""
-    hidden = one.experiment.world.get("fixed", {})
+    hidden = scores.experiment.world.get("fixed", {})
     world = ", ".join(f"{name} {value}" for name, value in hidden.items()) or "nothing more"
     path = folder / VERDICT_FILE
     answer = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     causes = ", ".join(str(c["effect"]) for c in answer.get("causes", ())) or "nothing"
-    return f"{one.name}: the world has {world}; explain says {answer.get('verdict')}: {causes}"
+    return f"{scores.name}: the world has {world}; explain says {answer.get('verdict')}: {causes}"
 
 
-def _table(one: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
+def _table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
     """Format the errors of parameters and of prediction by tuner, in both simulators."""
-    mine = lines[
-        (lines["experiment"] == one.experiment.name)
+    study_lines = lines[
+        (lines["experiment"] == scores.experiment.name)
         & lines["metric"].isin(misspecification_scores.RANKED_METRICS)
     ]
     heads = {
         misspecification_scores.PARAMETERS: "parameters",
-        misspecification_scores.PREDICTION: f"unseen {one.channel}",
+        misspecification_scores.PREDICTION: f"unseen {scores.channel}",
     }
-    mine = mine.assign(column=mine["metric"].map(heads) + " " + mine["model"])
-    wide = mine.pivot(index="tuner", columns="column", values="mean")
+    study_lines = study_lines.assign(
+        column=study_lines["metric"].map(heads) + " " + study_lines["model"]
+    )
+    wide = study_lines.pivot(index="tuner", columns="column", values="mean")
     order = [f"{head} {model}" for head in heads.values() for model in MODEL_LABELS]
     wide = wide[order].sort_values(order[-1]).rename_axis(index=None, columns=None)
     title = (
         f"mean error of the parameters [{misspecification_scores.TRAINING_WIDTHS_UNIT}] "
-        f"and RMSE of unseen runs [{one.unit}]"
+        f"and RMSE of unseen runs [{scores.unit}]"
     )
     return f"{title}\n{wide.to_string(float_format=lambda value: f'{value:.2g}')}"
 
@@ -201,8 +203,8 @@ def _together(ranked: pd.DataFrame, metric: str) -> str:
     joint = misspecification_scores.compute_joint_ranks(ranked, metric)
     means = pd.DataFrame({model: joint.ranked[model].mean() for model in MODEL_LABELS})
     means = means.sort_values(EXTENDED).rename_axis(index=None)
-    what = "parameters" if metric == misspecification_scores.PARAMETERS else "prediction"
-    head = f"mean rank over {len(joint.ranked[PLAIN])} systems by {what}, tau {joint.tau:.2f}"
+    quantity = "parameters" if metric == misspecification_scores.PARAMETERS else "prediction"
+    head = f"mean rank over {len(joint.ranked[PLAIN])} systems by {quantity}, tau {joint.tau:.2f}"
     tests = "; ".join(
         f"{model}: Friedman p {joint.friedman[model]:.2g}, "
         f"{joint.distinct_tuner_pairs[model]} pairs apart (Nemenyi)"

@@ -146,13 +146,13 @@ def _whole(errors: pd.DataFrame) -> pd.DataFrame:
 
     In an interrupted study, other targets would compare different sets of targets.
     """
-    asked = errors.groupby(["model", "tuner"])["runs"].transform("max")
+    seed_counts = errors.groupby(["model", "tuner"])["runs"].transform("max")
     # A tuner that was skipped in one simulator is excluded from both.
     used = set.intersection(*(set(part["tuner"]) for _, part in errors.groupby("model")))
-    there = errors[(errors["runs"] == asked) & errors["tuner"].isin(used)]
-    met = there.groupby("target").size()
-    whole = set(met[met == len(MODEL_LABELS) * len(used)].index)
-    return there[there["target"].isin(whole)].reset_index(drop=True)
+    complete = errors[(errors["runs"] == seed_counts) & errors["tuner"].isin(used)]
+    met = complete.groupby("target").size()
+    complete_targets = set(met[met == len(MODEL_LABELS) * len(used)].index)
+    return complete[complete["target"].isin(complete_targets)].reset_index(drop=True)
 
 
 def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Array) -> pd.DataFrame:
@@ -179,58 +179,68 @@ def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Arr
     return grouped
 
 
-def build_score_table(one: StudyScores) -> pd.DataFrame:
+def build_score_table(scores: StudyScores) -> pd.DataFrame:
     """Build the table of means with intervals; columns as in `SCORE_COLUMNS`."""
     lines = []
-    for (model, tuner), part in one.errors.groupby(["model", "tuner"], sort=False):
-        wanted = [
+    for (model, tuner), part in scores.errors.groupby(["model", "tuner"], sort=False):
+        metrics = [
             (metric, p.name, TRAINING_WIDTHS_UNIT, column)
-            for p in one.parameters
+            for p in scores.parameters
             for metric, column in ((BIAS, p.name), (ABSOLUTE, f"|{p.name}|"))
         ]
-        wanted += [
+        metrics += [
             (PARAMETERS, "", TRAINING_WIDTHS_UNIT, PARAMETERS),
-            (PREDICTION, "", one.unit, PREDICTION),
+            (PREDICTION, "", scores.unit, PREDICTION),
         ]
         counts = len(part), int(part["runs"].sum()), int(part["failures"].sum())
-        for metric, parameter, unit, column in wanted:
+        for metric, parameter, unit, column in metrics:
             values = part[column].to_numpy(dtype=np.float64)
             values = values[np.isfinite(values)][:, None]
-            names = (one.experiment.name, str(model), str(tuner))
+            names = (scores.experiment.name, str(model), str(tuner))
             low, high = compute_bootstrap_interval(
                 values, compute_resampled_means, *names, metric, parameter
             )
             mean = float(values.mean()) if len(values) else np.nan
-            key = (one.experiment.name, model, tuner, metric, parameter, unit)
+            key = (scores.experiment.name, model, tuner, metric, parameter, unit)
             lines.append((*key, mean, low[0], high[0], *counts))
     return pd.DataFrame(lines, columns=SCORE_COLUMNS)
 
 
-def build_rank_table(one: StudyScores) -> pd.DataFrame:
+def build_rank_table(scores: StudyScores) -> pd.DataFrame:
     """Build the table of each tuner's mean rank in both simulators; columns as `RANK_COLUMNS`."""
-    tuners, targets = one.tuners(), one.targets()
+    tuners, targets = scores.tuners(), scores.targets()
     lines = []
     for metric in RANKED_METRICS:
-        both = [
-            compute_mean_ranks(one.build_metric_matrix(model, metric, tuners, targets))
+        mean_ranks = [
+            compute_mean_ranks(scores.build_metric_matrix(model, metric, tuners, targets))
             for model in MODEL_LABELS
         ]
-        lines += [(one.experiment.name, metric, t, *r) for t, *r in zip(tuners, *both, strict=True)]
+        lines += [
+            (scores.experiment.name, metric, t, *r)
+            for t, *r in zip(tuners, *mean_ranks, strict=True)
+        ]
     return pd.DataFrame(lines, columns=RANK_COLUMNS)
 
 
-def build_rank_agreement_table(one: StudyScores) -> pd.DataFrame:
+def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
     """Build the table of rank agreement between simulators; columns as `RANK_AGREEMENT_COLUMNS`."""
-    tuners, targets = one.tuners(), one.targets()
+    tuners, targets = scores.tuners(), scores.targets()
     lines = []
     for metric in RANKED_METRICS:
         plain, extended = (
-            one.build_metric_matrix(model, metric, tuners, targets) for model in MODEL_LABELS
+            scores.build_metric_matrix(model, metric, tuners, targets) for model in MODEL_LABELS
         )
-        alike = compute_rank_agreement(plain, extended, one.experiment.name, metric)
+        agreement = compute_rank_agreement(plain, extended, scores.experiment.name, metric)
         friedman = [_friedman(errors) for errors in (plain, extended)]
-        numbers = (alike.tau, alike.low, alike.high, alike.halves, alike.p_value, *friedman)
-        lines.append((one.experiment.name, metric, len(tuners), len(targets), *numbers))
+        numbers = (
+            agreement.tau,
+            agreement.low,
+            agreement.high,
+            agreement.halves,
+            agreement.p_value,
+            *friedman,
+        )
+        lines.append((scores.experiment.name, metric, len(tuners), len(targets), *numbers))
     return pd.DataFrame(lines, columns=RANK_AGREEMENT_COLUMNS)
 
 

@@ -122,13 +122,17 @@ class MisspecificationStudy:
             return StudyOutcome(0, 2 * count, interrupted=True)
         for model in MODEL_LABELS:
             comparison = self._comparison(model, jobs)
-            made = comparison.run(jobs, progress, pool)
-            finished, planned = finished + made.finished, planned + made.planned
-            if not made.is_complete:
+            outcome = comparison.run(jobs, progress, pool)
+            finished, planned = finished + outcome.finished, planned + outcome.planned
+            if not outcome.is_complete:
                 # The comparison that has not started has the same number of runs.
-                left = made.planned if model == PLAIN else 0
+                not_started = outcome.planned if model == PLAIN else 0
                 return StudyOutcome(
-                    finished, planned + left, made.interrupted, made.stopped, made.skipped
+                    finished,
+                    planned + not_started,
+                    outcome.interrupted,
+                    outcome.stopped,
+                    outcome.skipped,
                 )
         reveal_salt(self.folder, read_salt(self.folder, self.configuration.experiment))
         self.configuration = read_configuration(self.folder)
@@ -165,16 +169,16 @@ class MisspecificationStudy:
 
     def _comparison(self, model: str, jobs: int) -> Comparison:
         """Create or resume the comparison in one of the simulators."""
-        place, experiment = self.folder / model, self.configuration.experiment
-        if (place / CONFIGURATION_FILE).is_file():
-            comparison = Comparison.resume(place, self.plugins)
+        folder, experiment = self.folder / model, self.configuration.experiment
+        if (folder / CONFIGURATION_FILE).is_file():
+            comparison = Comparison.resume(folder, self.plugins)
         else:
             # A public salt is already part of the experiment.
             secret = read_salt(self.folder, experiment)
             plan = replace(self.get_experiment(model), salt_sha256="")
             from bench.benchmark.runner.study_setup import prepare_study
 
-            comparison = Comparison.begin(prepare_study(plan, self.plugins, place, jobs, secret))
+            comparison = Comparison.begin(prepare_study(plan, self.plugins, folder, jobs, secret))
         if comparison.results is not None:
             # The folder of the other simulator contains the same truths, so it must be inaccessible
             # too.
@@ -193,8 +197,8 @@ class MisspecificationStudy:
         if model == PLAIN:
             return make_base_experiment(experiment)
         kind = get_simulator_class(experiment)
-        found = load_extended(self.folder / EXTENDED_MODEL_FILE)
-        return make_extended_experiment(experiment, list_coefficients(found, kind))
+        extended = load_extended(self.folder / EXTENDED_MODEL_FILE)
+        return make_extended_experiment(experiment, list_coefficients(extended, kind))
 
     def close(self) -> None:
         """Close the study; its comparisons are opened when they run."""
@@ -205,7 +209,7 @@ class MisspecificationStudy:
         Raises:
             InputError: the study is damaged.
         """
-        held = self.configuration
+        configuration = self.configuration
         ends: list[RunEnd] = []
         under_way = (self.folder / SEGMENTS_FOLDER).exists()
         for model in MODEL_LABELS:
@@ -214,14 +218,16 @@ class MisspecificationStudy:
                     RunEnd(f"{model} {i}", model, MISSING_STATUS) for i in range(self._planned())
                 ]
                 continue
-            standing = Comparison(self.folder / model).status()
-            under_way = under_way or standing.under_way
+            progress = Comparison(self.folder / model).status()
+            under_way = under_way or progress.under_way
             ends += [
                 RunEnd(f"{model} {e.name}", f"{model} {e.group}", e.status, e.reason)
-                for e in standing.ends
+                for e in progress.ends
             ]
-        name = held.experiment.name
-        return StudyProgress(name, "runs finished", held.fingerprint, tuple(ends), under_way)
+        name = configuration.experiment.name
+        return StudyProgress(
+            name, "runs finished", configuration.fingerprint, tuple(ends), under_way
+        )
 
     def report(self, say: PrintLine) -> int:
         """Write tables and figures, and print a summary.

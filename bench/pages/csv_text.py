@@ -7,18 +7,18 @@ import io
 from collections.abc import Iterable, Sequence
 
 
-def csv_text(head: Sequence[str], found: Iterable[Sequence[object]]) -> str:
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """Format a table as CSV.
 
     Args:
         head: Names of the columns.
-        found: Rows.
+        rows: Rows.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
     # A spreadsheet would run text that begins like a formula, and names come from files.
-    writer.writerows([_plain(cell) for cell in row] for row in found)
+    writer.writerows([_plain(cell) for cell in row] for row in rows)
     return text.getvalue()
 
 

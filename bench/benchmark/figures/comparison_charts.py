@@ -74,9 +74,9 @@ def make_misfit_chart(view: ComparisonView) -> ComparisonChart:
     panels = []
     for panel, kind in zip(chart.panels, view.ranges, strict=False):
         runs = view.statistics.select_range(kind)
-        least = float(runs.groupby("target")["obs_error"].min().median())
-        text = f"smallest that any tuner reached: {format_number(least, 2)} (median)"
-        panels.append(replace(panel, rules=(ReferenceLine(least, text), *panel.rules)))
+        smallest = float(runs.groupby("target")["obs_error"].min().median())
+        text = f"smallest that any tuner reached: {format_number(smallest, 2)} (median)"
+        panels.append(replace(panel, rules=(ReferenceLine(smallest, text), *panel.rules)))
     return replace(chart, panels=panels)
 
 

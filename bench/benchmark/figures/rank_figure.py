@@ -30,10 +30,10 @@ def draw_critical_difference_figure(
     # Each tuner has its colour of every other figure; text stays dark, since light colours are hard
     # to read.
     colours = {str(name): get_colour(place) for place, name in enumerate(ranked.columns)}
-    drawn = critical_difference_diagram(
+    artists = critical_difference_diagram(
         ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
     )
-    for label in drawn["labels"]:
+    for label in artists["labels"]:
         label.set_color(NEUTRAL_MARK)
     tests = f"Friedman p = {friedman:.2g}; bars: Nemenyi p > 0.05"
     axis.set_title(f"Mean rank over {len(ranked)} problems, 1 is best ({tests})", fontsize=10)

@@ -107,11 +107,11 @@ def targets_text(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    count, ranked = statistics.target_counts[kind], _in_range(statistics, kind)["targets"]
-    deciding = int(ranked.max()) if len(ranked) else 0
-    things = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
+    count, deciding_counts = statistics.target_counts[kind], _in_range(statistics, kind)["targets"]
+    deciding = int(deciding_counts.max()) if len(deciding_counts) else 0
+    unit = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
     # Targets whose data identify no direction have no deciding error.
-    return f"{count} {things}" if deciding == count else f"{deciding} of {count} {things} decide"
+    return f"{count} {unit}" if deciding == count else f"{deciding} of {count} {unit} decide"
 
 
 def floor_text(statistics: ComparisonStatistics) -> str:
@@ -126,13 +126,13 @@ def how_decided(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    others = _others(statistics, kind)
-    if not others:
+    comparison_count = _others(statistics, kind)
+    if not comparison_count:
         return ""
     return (
         f"5.8x (8/10): median error 5.8 times the best one's, larger on 8 of 10 targets. Worse: "
         f"p < {SIGNIFICANCE:g} in Wilcoxon's signed-rank test against the best, Holm-corrected for "
-        f"{others} comparison{'s' * (others > 1)}."
+        f"{comparison_count} comparison{'s' * (comparison_count > 1)}."
     )
 
 
@@ -149,13 +149,13 @@ def too_few(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    ranked, others = _in_range(statistics, kind)["targets"], _others(statistics, kind)
-    if not others or int(ranked.max()) >= (needed := targets_needed(others)):
+    ranked, comparison_count = _in_range(statistics, kind)["targets"], _others(statistics, kind)
+    if not comparison_count or int(ranked.max()) >= (needed := targets_needed(comparison_count)):
         return ""
     targets = int(ranked.max())
     return (
-        f"{targets} target{'s' * (targets != 1)} cannot decide between {others + 1} tuners: "
-        f"it takes at least {needed} (--targets {needed})."
+        f"{targets} target{'s' * (targets != 1)} cannot decide between {comparison_count + 1} "
+        f"tuners: it takes at least {needed} (--targets {needed})."
     )
 
 
@@ -167,9 +167,9 @@ def failed_runs(statistics: ComparisonStatistics, kind: str) -> str:
         kind: Range of the targets.
     """
     part = _in_range(statistics, kind).drop_duplicates("tuner")
-    each = [
+    texts = [
         f"{row['tuner']} {row['failures']} of {row['runs']}"
         for row in part.to_dict("records")
         if row["failures"]
     ]
-    return f"failed runs, which count as infinite errors: {', '.join(each)}" if each else ""
+    return f"failed runs, which count as infinite errors: {', '.join(texts)}" if texts else ""

@@ -51,10 +51,12 @@ def format_log_table(rows: Sequence[LogResult]) -> str:
         cells: list[tuple[object, ...]] = []
         for cause in row.causes:
             for name, number in cause["coefficients"].items():
-                what = cause["effect"], " or ".join(cause["alternatives"]), name
-                cells.append((*what, *(number[key] for key in ("value", "low", "high", "unit"))))
-        last = row.gap_closed, row.seconds, row.error
-        lines += [(row.log, row.verdict, *cell, *last) for cell in cells or [("",) * 7]]
+                cause_cells = cause["effect"], " or ".join(cause["alternatives"]), name
+                cells.append(
+                    (*cause_cells, *(number[key] for key in ("value", "low", "high", "unit")))
+                )
+        common_cells = row.gap_closed, row.seconds, row.error
+        lines += [(row.log, row.verdict, *cell, *common_cells) for cell in cells or [("",) * 7]]
     return csv_text(LOG_COLUMNS, lines)
 
 
@@ -63,19 +65,21 @@ def summarise_causes(rows: Sequence[LogResult]) -> list[str]:
 
     The most frequent cause comes first.
     """
-    places: dict[str, list[Mapping[str, Any]]] = {}
+    by_cause: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
         for cause in row.causes:
-            places.setdefault(format_cause(cause), []).append(cause["coefficients"])
+            by_cause.setdefault(format_cause(cause), []).append(cause["coefficients"])
     lines = []
-    for effects, found in sorted(places.items(), key=lambda entry: (-len(entry[1]), entry[0])):
+    for effects, coefficients in sorted(
+        by_cause.items(), key=lambda entry: (-len(entry[1]), entry[0])
+    ):
         numbers = []
-        for name, first in found[0].items():
-            values = [c[name]["value"] for c in found if name in c]
+        for name, first in coefficients[0].items():
+            values = [c[name]["value"] for c in coefficients if name in c]
             label = "" if name == "coefficient" else f"{name} "
             unit = "" if first["unit"] == "1" else f" {first['unit']}"
             low, high = min(values), max(values)
             span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
             numbers.append(f"{label}{span}{unit}")
-        lines.append(f"{effects}: in {len(found)} of {len(rows)} logs, {', '.join(numbers)}")
+        lines.append(f"{effects}: in {len(coefficients)} of {len(rows)} logs, {', '.join(numbers)}")
     return lines

@@ -55,15 +55,15 @@ def list_logs(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> 
     Raises:
         InputError: A file does not exist.
     """
-    told = repr(sorted((key, str(value)) for key, value in settings.items()))
+    settings_text = repr(sorted((key, str(value)) for key, value in settings.items()))
     if settings.get("model") is not None:
-        told += read_content(Path(settings["model"])).hex()
+        settings_text += read_content(Path(settings["model"])).hex()
     return [
         BatchLog(
             name,
             path.absolute(),
             out.absolute() / name.replace("/", "_"),
-            compute_recording_digest(path, told),
+            compute_recording_digest(path, settings_text),
         )
         for name, path in zip(make_log_names(paths), paths, strict=True)
     ]
@@ -94,18 +94,18 @@ def explain_batch(
     rows = _load_previous_results(out, logs)
     for row in rows.values():
         done(row)
-    left = [log for log in logs if log.name not in rows]
+    remaining = [log for log in logs if log.name not in rows]
     # A worker process does not know the figure settings of this process.
-    calls = [(explain_log, (log, dict(settings), is_pdf_wanted())) for log in left]
-    for place, result in pool.iterate_results(calls, np.inf):
-        log = left[place]
+    calls = [(explain_log, (log, dict(settings), is_pdf_wanted())) for log in remaining]
+    for index, result in pool.iterate_results(calls, np.inf):
+        log = remaining[index]
         row = (
             result
             if isinstance(result, LogResult)
             else LogResult(log.name, log.digest, error=_said(result))
         )
         rows[log.name] = row
-        ordered = [rows[one.name] for one in logs if one.name in rows]
+        ordered = [rows[each.name] for each in logs if each.name in rows]
         _write(out, ordered)
         done(row)
         if stop():
@@ -128,17 +128,17 @@ def explain_log(log: BatchLog, settings: Mapping[str, Any], pdf: bool = False) -
         explanation.write(log.folder, pdf=pdf)
     except InputError as error:
         return LogResult(log.name, log.digest, error=get_first_line(error))
-    found = explanation.answer.to_document()
-    held_out = found["heldout"]
+    document = explanation.answer.to_document()
+    held_out = document["heldout"]
     closed = held_out["gap_closed"] if held_out else None
-    causes = tuple(found["causes"])
-    return LogResult(log.name, log.digest, found["verdict"], causes, closed, found["seconds"])
+    causes = tuple(document["causes"])
+    return LogResult(log.name, log.digest, document["verdict"], causes, closed, document["seconds"])
 
 
 def _said(error: object) -> str:
     """Format the error that ended a call in one line."""
-    said = get_first_line(error) if isinstance(error, BaseException) else "no result"
-    return said if isinstance(error, InputError) else f"{type(error).__name__}: {said}"
+    message = get_first_line(error) if isinstance(error, BaseException) else "no result"
+    return message if isinstance(error, InputError) else f"{type(error).__name__}: {message}"
 
 
 def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, LogResult]:
@@ -152,10 +152,12 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
     except (OSError, ValueError, TypeError):
         raise InputError(f"{path}: is none of simgap's; name another folder") from None
     by_name = {row.log: row for row in stored}
-    same = {log.name: by_name[log.name] for log in logs if log.name in by_name}
+    unchanged = {log.name: by_name[log.name] for log in logs if log.name in by_name}
     digests = {log.name: log.digest for log in logs}
     return {
-        name: row for name, row in same.items() if row.digest == digests[name] and not row.error
+        name: row
+        for name, row in unchanged.items()
+        if row.digest == digests[name] and not row.error
     }
 
 

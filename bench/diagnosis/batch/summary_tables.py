@@ -32,12 +32,12 @@ def build_log_table(rows: Sequence[LogResult], folders: Mapping[str, Path]) -> p
         folders: Folder of each log's explanation, by log.
     """
     lines = []
-    for place, row in enumerate(rows, start=1):
+    for log_number, row in enumerate(rows, start=1):
         folder = folders[row.log]
         error = _held_out_of(folder) if not row.error else {}
         report = "" if row.error else quote(f"{folder.name}/{REPORT_FILE}")
         lines.append({
-            "number": place, "log": row.log, "verdict": row.verdict or "not explained",
+            "number": log_number, "log": row.log, "verdict": row.verdict or "not explained",
             "causes": "; ".join(format_cause(cause) for cause in row.causes),
             "gap_closed": row.gap_closed,
             "low": error.get("low"), "high": error.get("high"),
@@ -61,8 +61,8 @@ def read_log_table(rows: Sequence[LogResult]) -> pd.DataFrame:
 def _held_out_of(folder: Path) -> dict[str, float]:
     """Read the held-out errors from a log's verdict.json; empty if it cannot be read."""
     try:
-        said = json.loads((folder / "verdict.json").read_text(encoding="utf-8"))["heldout"]
-        return {key: value for key, value in said.items() if isinstance(value, (int, float))}
+        held_out = json.loads((folder / "verdict.json").read_text(encoding="utf-8"))["heldout"]
+        return {key: value for key, value in held_out.items() if isinstance(value, (int, float))}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
@@ -75,20 +75,20 @@ def _convert_to_noise_floors(error: Mapping[str, float], key: str) -> float | No
 
 def place_of(name: str) -> str:
     """Format the place of a coefficient: ``at elbow`` for ``coefficient@elbow``."""
-    coefficient, at, place = name.partition("@")
-    return f"at {place}" if at and coefficient == "coefficient" else name
+    coefficient, separator, place = name.partition("@")
+    return f"at {place}" if separator and coefficient == "coefficient" else name
 
 
 def build_number_table(rows: Sequence[LogResult]) -> pd.DataFrame:
     """Build a table with one row per number of each cause, those of the commonest cause first."""
     lines = []
-    for place, row in enumerate(rows, start=1):
+    for log_number, row in enumerate(rows, start=1):
         for cause in row.causes:
-            for name, known in cause["coefficients"].items():
-                label = format_label(place_of(name), known["unit"], LONGEST_NAME)
+            for name, number in cause["coefficients"].items():
+                label = format_label(place_of(name), number["unit"], LONGEST_NAME)
                 what = f"{format_cause(cause)}: {label}"
-                about = {"cause": format_cause(cause), "name": name, "what": what, **known}
-                lines.append({"number": place, "log": row.log, **about})
+                cells = {"cause": format_cause(cause), "name": name, "what": what, **number}
+                lines.append({"number": log_number, "log": row.log, **cells})
     columns = ["number", "log", "cause", "name", "what", "value", "low", "high", "unit"]
     frame = pd.DataFrame(lines, columns=columns)
     frame = frame.astype(dict.fromkeys(["value", "low", "high"], float))

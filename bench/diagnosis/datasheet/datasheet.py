@@ -51,13 +51,13 @@ class DataSheet(SheetContent):
         import tomli_w
 
         folder = Path(folder)
-        made = build_mjcf(self, folder)
-        drawn = render_diagram(self.diagram) if self.diagram is not None else None
+        mjcf = build_mjcf(self, folder)
+        diagram = render_diagram(self.diagram) if self.diagram is not None else None
         contents: dict[Path, Content] = {
             folder / "sheet.toml": tomli_w.dumps(self.document()),
-            folder / "sheet.html": render_page(self, drawn, made),
+            folder / "sheet.html": render_page(self, diagram, mjcf),
             folder / "sheet.pdf": render_pdf(self),
-            **{folder / name: text for name, text in made.contents.items()},
+            **{folder / name: text for name, text in mjcf.contents.items()},
         }
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -90,14 +90,14 @@ def build_datasheet(
     assert kind is not None
     subject = make_subject(kind, joint)
     for channel in extended.observe:
-        there = list(recording.runs[0].channels)
-        if channel not in there:
-            raise make_unknown_name_error(f"channel of {recording.path}", channel, there)
+        visible_effects = list(recording.runs[0].channels)
+        if channel not in visible_effects:
+            raise make_unknown_name_error(f"channel of {recording.path}", channel, visible_effects)
     recording = replace(recording, constants={**extended.constants, **recording.constants})
     recording, _ = leave_out_settling(recording, kind)
     recording, _ = segment_recording(recording, kind)
     is_driven = subject.is_driven(recording)
-    asked = tuple(
+    absent_effects = tuple(
         name
         for name, effect in (
             (name, library.find_effect(name, kind.system))
@@ -105,18 +105,21 @@ def build_datasheet(
         )
         if (is_driven or not _needs_drive(name, effect)) and not _is_stop(effect)
     )
-    candidates = [*extended.effects, *asked]
+    candidates = [*extended.effects, *absent_effects]
     engine = None if kind.own_engine else extended.engine
-    world = RunEvaluator(kind, recording, recording.training(), engine, candidates=candidates)
-    with closing(world):
+    evaluator = RunEvaluator(kind, recording, recording.training(), engine, candidates=candidates)
+    with closing(evaluator):
         # An effect on a channel that is not recorded has no visible influence.
-        there = [
+        visible_effects = [
             effect
-            for effect in asked
-            if not world.available_effects[effect].signal or _seen(world, effect)
+            for effect in absent_effects
+            if not evaluator.available_effects[effect].signal or _seen(evaluator, effect)
         ]
         rows = build_sheet_rows(
-            subject, extended, verdict, compute_detection_limits(world, extended, there)
+            subject,
+            extended,
+            verdict,
+            compute_detection_limits(evaluator, extended, visible_effects),
         )
     return DataSheet(
         name or subject.joint or kind.name, subject, recording, verdict, extended, rows
@@ -132,17 +135,19 @@ def list_absent_effects(subject: SheetSubject, extended: ExtendedSimulator) -> I
         subject: Joint or system of the sheet.
         extended: Extended simulator.
     """
-    own = [
+    local_effects = [
         effect
         for name, numbers in extended.effects.items()
         for effect, _, number in subject.localise_effect(name, numbers)
         if number.value != 0
     ]
-    has = {*own, *extended.effects}
+    modelled = {*local_effects, *extended.effects}
     effects = {effect.name: effect for effect in subject.list_effects()}
-    simpler = {other for name in own for other in getattr(effects.get(name), "contains", ())}
+    simpler = {
+        other for name in local_effects for other in getattr(effects.get(name), "contains", ())
+    }
     for name in effects:
-        if name not in has | simpler and name.partition("@")[2] != ALL_PLACES:
+        if name not in modelled | simpler and name.partition("@")[2] != ALL_PLACES:
             yield name
 
 

@@ -113,80 +113,99 @@ class DetectionLimits:
 
 
 def compute_detection_limits(
-    world: RunEvaluator, extended: ExtendedSimulator, names: Sequence[str]
+    evaluator: RunEvaluator, extended: ExtendedSimulator, names: Sequence[str]
 ) -> DetectionLimits:
     """Compute the detection limits of effects that an extended simulator does not contain.
 
     Args:
-        world: Run evaluator of the runs, with the effects of the simulator and the absent ones.
+        evaluator: Run evaluator of the runs, with the effects of the simulator and the absent ones.
         extended: Extended simulator.
         names: Absent effects.
 
     Raises:
         InputError: The simulation fails on the runs.
     """
-    floor = compute_noise_floor(world, world.recording)
+    floor = compute_noise_floor(evaluator, evaluator.recording)
     white = NoiseModel(floor.sigma, np.zeros(len(floor.sigma)))
-    fit = _fitted(world, extended, white)
-    if not np.isfinite(fit.simulated[np.isfinite(world.observed)]).all():
-        raise InputError(f"{world.recording.path}: the simulation of it fails")
+    fit = _fitted(evaluator, extended, white)
+    if not np.isfinite(fit.simulated[np.isfinite(evaluator.observed)]).all():
+        raise InputError(f"{evaluator.recording.path}: the simulation of it fails")
     # The random stream is not used, because there is no search.
-    models = ModelSet(world, white, frozenset(), make_rng("sheet"), floor.is_stated)
+    models = ModelSet(evaluator, white, frozenset(), make_rng("sheet"), floor.is_stated)
     model = models.add_fit(fit)
-    left = model.likelihood
+    likelihood = model.likelihood
     # The residual of the model is taken as the noise, whatever the recording specifies.
-    noise = NoiseModel(np.maximum(left.sigma, 1e-300), left.phi)
-    found = _with_small_gaps(world, fit, compute_directions(world, fit, names))
-    about = _Shown(
-        world, noise, get_central_jacobian(models, fit), found, models.compute_residual(fit)
+    noise = NoiseModel(np.maximum(likelihood.sigma, 1e-300), likelihood.phi)
+    directions = _with_small_gaps(evaluator, fit, compute_directions(evaluator, fit, names))
+    information = _Shown(
+        evaluator,
+        noise,
+        get_central_jacobian(models, fit),
+        directions,
+        models.compute_residual(fit),
     )
-    return about.shown(_another(assess_consistency(models, model)))
+    return information.shown(_another(assess_consistency(models, model)))
 
 
-def _another(found: Sequence[ParameterConsistency]) -> dict[str, float]:
+def _another(consistencies: Sequence[ParameterConsistency]) -> dict[str, float]:
     """Return half the prediction interval of each parameter for a new log, or else a new run."""
-    by_run = {one.number: Z95 * one.prediction_sigma for one in found if one.by == "run"}
-    return by_run | {one.number: Z95 * one.prediction_sigma for one in found if one.by == "log"}
+    by_run = {
+        consistency.number: Z95 * consistency.prediction_sigma
+        for consistency in consistencies
+        if consistency.by == "run"
+    }
+    return by_run | {
+        consistency.number: Z95 * consistency.prediction_sigma
+        for consistency in consistencies
+        if consistency.by == "log"
+    }
 
 
-def _with_small_gaps(world: RunEvaluator, fit: TrajectoryFit, found: DirectionSet) -> DirectionSet:
+def _with_small_gaps(
+    evaluator: RunEvaluator, fit: TrajectoryFit, directions: DirectionSet
+) -> DirectionSet:
     """Add directions with smaller backlash than a search tries, to find the detection limit."""
-    least: dict[str, CandidateDirection] = {}
-    for probe in found.candidates:
-        gap = (
+    smallest: dict[str, CandidateDirection] = {}
+    for probe in directions.candidates:
+        is_backlash = (
             probe.fixed
-            and world.available_effects[probe.effect].coefficients[0].of
+            and evaluator.available_effects[probe.effect].coefficients[0].of
             not in NONLINEAR_COEFFICIENT_KINDS
         )
-        if gap and (
-            probe.effect not in least or probe.coefficients[0] < least[probe.effect].coefficients[0]
+        if is_backlash and (
+            probe.effect not in smallest
+            or probe.coefficients[0] < smallest[probe.effect].coefficients[0]
         ):
-            least[probe.effect] = probe
-    more = [
+            smallest[probe.effect] = probe
+    smaller = [
         replace(p, coefficients=p.coefficients * 0.5**n)
-        for p in least.values()
+        for p in smallest.values()
         for n in range(1, GAP_HALVINGS + 1)
     ]
-    if not more:
-        return found
+    if not smaller:
+        return directions
     values = np.nan_to_num(
-        compute_responses(world, fit, [(probe.effect, probe.coefficients) for probe in more])
+        compute_responses(evaluator, fit, [(probe.effect, probe.coefficients) for probe in smaller])
     )
     return DirectionSet(
-        (*found.candidates, *more),
-        np.concatenate([found.responses, np.moveaxis(values, 0, -1)], axis=3),
+        (*directions.candidates, *smaller),
+        np.concatenate([directions.responses, np.moveaxis(values, 0, -1)], axis=3),
     )
 
 
-def _fitted(world: RunEvaluator, extended: ExtendedSimulator, noise: NoiseModel) -> TrajectoryFit:
+def _fitted(
+    evaluator: RunEvaluator, extended: ExtendedSimulator, noise: NoiseModel
+) -> TrajectoryFit:
     """Evaluate the simulator on the runs with derivatives; only initial states are fitted."""
-    theta = build_theta(world, extended)
-    (measured,) = HeldOutRuns(world, noise).fit_initial_states([theta])
-    own = [extended.parameters.get(p.name) for p in world.parameters[: world.own]]
+    theta = build_theta(evaluator, extended)
+    (measured,) = HeldOutRuns(evaluator, noise).fit_initial_states([theta])
+    known_values = [extended.parameters.get(p.name) for p in evaluator.parameters[: evaluator.own]]
     # A parameter without an interval was not fitted.
-    frozen = {i for i, number in enumerate(own) if number is None or number.low is None}
+    frozen = {i for i, number in enumerate(known_values) if number is None or number.low is None}
     start = FitStart(tuple(extended.effects), theta, measured.states)
-    return TrajectoryFitter(world, noise, frozenset(frozen)).fit_models([start], iterations=0)[0]
+    return TrajectoryFitter(evaluator, noise, frozenset(frozen)).fit_models([start], iterations=0)[
+        0
+    ]
 
 
 class _Shown:
@@ -218,24 +237,24 @@ class _Shown:
         pull = self.left[self.q : -1, -1] - along @ self.left[: self.q, -1]
         self.leaning = pull / np.maximum(self.powers, 1e-300)  # (2)
 
-    def shown(self, another: Mapping[str, float]) -> DetectionLimits:
+    def shown(self, prediction_half_widths: Mapping[str, float]) -> DetectionLimits:
         """Compute the detection limit of each coefficient, at the shape that is detected best."""
         shapes: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():
             probe = self.found.candidates[k]
             if not probe.fixed:
                 shapes.setdefault((probe.effect, probe.place), []).append(k)
-        best = {key: places[0] for key, places in shapes.items()}
+        best = {key: probe_indices[0] for key, probe_indices in shapes.items()}
         limits = dict.fromkeys(probe.effect for probe in self.found.candidates if probe.fixed)
         reaches = {}
-        for (name, place), places in shapes.items():
+        for (name, place), probe_indices in shapes.items():
             # At that shape a richer law may be equivalent to a simpler one that it contains.
-            own = [k for k in places if not self._told_already(name, k, best)]
-            if name not in limits and own:
-                reaches[name, self._coefficient(name, place)] = self._proportional(own[0])
+            new_shapes = [k for k in probe_indices if not self._told_already(name, k, best)]
+            if name not in limits and new_shapes:
+                reaches[name, self._coefficient(name, place)] = self._proportional(new_shapes[0])
         for name in limits:
             reaches[name, self._coefficient(name, 0)] = self._limit(name)
-        return DetectionLimits(self.free, self.covariance, reaches, another)
+        return DetectionLimits(self.free, self.covariance, reaches, prediction_half_widths)
 
     def _coefficient(self, effect: str, place: int) -> str:
         return self.world.available_effects[effect].on(self.world.simulator.system)[place].name

@@ -129,45 +129,45 @@ def compute_drive_diagram(
         extended: Extended simulator.
         strongest: Force limit of the drive; None if it has none.
     """
-    found = _Joint(subject, extended)
+    joint = _Joint(subject, extended)
     zero = np.zeros(1)
-    alone = float(found.friction(zero, zero)[0])
+    alone = float(joint.friction(zero, zero)[0])
     reach = strongest or DEFAULT_LOAD_FACTOR * alone or 1.0
     load = np.linspace(-reach, reach, LOAD_POINT_COUNT)
-    far = MAX_FORCE_FACTOR * reach
+    search_range = MAX_FORCE_FACTOR * reach
 
     def ahead(u: Array, p: Array) -> Array:
-        return u - p + found.pull(u, p) - found.friction(u, p)  # (1)
+        return u - p + joint.pull(u, p) - joint.friction(u, p)  # (1)
 
     def behind(u: Array, p: Array) -> Array:
-        return u - p + found.pull(u, p) + found.friction(u, p)  # (2)
+        return u - p + joint.pull(u, p) + joint.friction(u, p)  # (2)
 
     def unpowered(p: Array) -> Array:
         return -behind(np.zeros_like(p), p)
 
     return DriveDiagram(
-        "N" if found.system.kind == "linear" else "N*m",
+        "N" if joint.system.kind == "linear" else "N*m",
         load,
-        _root(lambda u: ahead(u, load), far, LOAD_POINT_COUNT),
-        _root(lambda u: behind(u, load), far, LOAD_POINT_COUNT),
-        float(_root(lambda u: ahead(u, zero), far, 1)[0]),
-        float(_root(unpowered, far, 1)[0]),
-        found.names,
+        _root(lambda u: ahead(u, load), search_range, LOAD_POINT_COUNT),
+        _root(lambda u: behind(u, load), search_range, LOAD_POINT_COUNT),
+        float(_root(lambda u: ahead(u, zero), search_range, 1)[0]),
+        float(_root(unpowered, search_range, 1)[0]),
+        joint.names,
         reach,
-        found.without,
+        joint.without,
     )
 
 
-def _root(growing: Callable[[Array], Array], far: float, count: int) -> Array:
+def _root(growing: Callable[[Array], Array], search_range: float, count: int) -> Array:
     """Find zeros (N,) of increasing functions by bisection; infinite outside the range."""
-    low, high = np.full(count, -far), np.full(count, far)
+    low, high = np.full(count, -search_range), np.full(count, search_range)
     never, always = growing(high) <= 0, growing(low) > 0
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         above = growing(middle) > 0
         low, high = np.where(above, low, middle), np.where(above, middle, high)
     # A zero is only found up to the rounding error of the bisection.
-    middle = np.where(np.abs(high) < ROUNDING_SHARE * far, 0.0, 0.5 * (low + high))
+    middle = np.where(np.abs(high) < ROUNDING_SHARE * search_range, 0.0, 0.5 * (low + high))
     root: Array = np.where(never, np.inf, np.where(always, -np.inf, middle))
     return root
 
@@ -206,8 +206,8 @@ class _Joint:
         for law, c in self.laws:
             if isinstance(law, Friction):
                 limits.append(law.limit(_each(c, drive), moment)[:, 0])
-        held: Array = np.maximum(np.sum(limits, axis=0), 0.0)
-        return held
+        holding_force: Array = np.maximum(np.sum(limits, axis=0), 0.0)
+        return holding_force
 
     def pull(self, drive: Array, load: Array) -> Array:
         """Compute the sum of the other forces at rest (N,)."""
@@ -221,9 +221,9 @@ class _Joint:
 
     def _moment(self, drive: Array, load: Array) -> StateSnapshot:
         nothing = np.zeros((len(drive), 1))
-        given = {"drive": drive[:, None], "load": load[:, None]}
+        inputs = {"drive": drive[:, None], "load": load[:, None]}
         return StateSnapshot(
-            self.system, np.zeros((len(drive), 0)), {}, nothing, nothing, nothing, given
+            self.system, np.zeros((len(drive), 0)), {}, nothing, nothing, nothing, inputs
         )
 
 

@@ -94,21 +94,23 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     axes.plot(load, load, color=style.CONNECTOR_GREY, linewidth=0.8, linestyle=":")
     axes.axhline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
     axes.axvline(0.0, color=style.ZERO_LINE_GREY, linewidth=0.6)
-    for force, at, marker in (
+    for force, position, marker in (
         (diagram.breakaway, (0.0, diagram.breakaway), "o"),
         (diagram.backdrive, (diagram.backdrive, 0.0), "s"),
     ):
         if 0 < force <= reach:
-            axes.plot(*at, marker=marker, color=style.NEUTRAL_MARK, markersize=5, linestyle="none")
+            axes.plot(
+                *position, marker=marker, color=style.NEUTRAL_MARK, markersize=5, linestyle="none"
+            )
             text = f" {format_number(force)} {unit}"
-            axes.annotate(text, at, xytext=(4, 4), textcoords="offset points")
-    said: dict[str, Any] = {"ha": "center", "va": "center", "color": style.CAPTION_GREY}
-    axes.text(-0.55 * reach, 0.75 * reach, "moves forward", **said)
-    axes.text(0.55 * reach, -0.75 * reach, "moves back", **said)
-    axes.text(0.72 * reach, 0.25 * reach, "back-driven:\nthe load slips", **said)
+            axes.annotate(text, position, xytext=(4, 4), textcoords="offset points")
+    text_style: dict[str, Any] = {"ha": "center", "va": "center", "color": style.CAPTION_GREY}
+    axes.text(-0.55 * reach, 0.75 * reach, "moves forward", **text_style)
+    axes.text(0.55 * reach, -0.75 * reach, "moves back", **text_style)
+    axes.text(0.72 * reach, 0.25 * reach, "back-driven:\nthe load slips", **text_style)
     middle = 0.62 * reach
     if np.interp(middle, load, ahead - back) > 0.15 * reach:
-        axes.text(middle, middle, "holds", **said)
+        axes.text(middle, middle, "holds", **text_style)
     axes.set(
         xlim=(-reach, reach),
         ylim=(-reach, reach),
@@ -118,27 +120,27 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     axes.set_title("Drive and back-drive, at rest", fontsize=9, loc="left")
 
 
-def render_pdf(facts: SheetContent) -> bytes:
+def render_pdf(content: SheetContent) -> bytes:
     """Render the sheet as a PDF of one page."""
     with _styled():
-        return style.render_pdf(draw_sheet(facts))
+        return style.render_pdf(draw_sheet(content))
 
 
-def draw_sheet(facts: SheetContent) -> Figure:
+def draw_sheet(content: SheetContent) -> Figure:
     """Draw the sheet as a figure of one page."""
     from bench.figures.notebook_figure import NotebookFigure
 
     figure = NotebookFigure(figsize=A4_INCHES, layout=None)
-    top = _heading(figure, facts)
-    top = _shown(figure, facts, top)
-    diagram = facts.diagram
+    top = _heading(figure, content)
+    top = _shown(figure, content, top)
+    diagram = content.diagram
     if diagram is None:
-        said = "\n".join(textwrap.wrap(facts.without_drive(), _LETTERS))
-        figure.text(_MARGIN, top - 0.01, said, va="top", linespacing=1.4)
+        text = "\n".join(textwrap.wrap(content.without_drive(), _LETTERS))
+        figure.text(_MARGIN, top - 0.01, text, va="top", linespacing=1.4)
         # Without a diagram there is space for a table with a larger font.
-        _not_shown(figure, facts, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
+        _not_shown(figure, content, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
         return figure
-    below = _not_shown(figure, facts, size=_SMALL_SIZE)
+    below = _not_shown(figure, content, size=_SMALL_SIZE)
     height = min(_MAX_DIAGRAM_HEIGHT, top - below - 0.09)
     if height > 0.1:
         width = height * A4_INCHES[1] / A4_INCHES[0]
@@ -147,37 +149,37 @@ def draw_sheet(facts: SheetContent) -> Figure:
     return figure
 
 
-def _heading(figure: Figure, facts: SheetContent) -> float:
+def _heading(figure: Figure, content: SheetContent) -> float:
     """Draw name, title and verdict; return the height of the space below, as a share."""
-    figure.text(_MARGIN, 0.965, sanitise(facts.name, 60), fontsize=17, weight="bold", va="top")
-    title = facts.recording.title or facts.recording.path.stem
-    said = f"Data sheet from {sanitise(title, 90)}. {format_sentence(facts.verdict.meaning)}"
-    lines = textwrap.wrap(sanitise(said, 300), _LETTERS)[:3]
+    figure.text(_MARGIN, 0.965, sanitise(content.name, 60), fontsize=17, weight="bold", va="top")
+    title = content.recording.title or content.recording.path.stem
+    text = f"Data sheet from {sanitise(title, 90)}. {format_sentence(content.verdict.meaning)}"
+    lines = textwrap.wrap(sanitise(text, 300), _LETTERS)[:3]
     figure.text(
         _MARGIN, 0.938, "\n".join(lines), color=style.CAPTION_GREY, va="top", linespacing=1.3
     )
     return 0.938 - 0.014 * len(lines) - 0.012
 
 
-def _shown(figure: Figure, facts: SheetContent, top: float) -> float:
+def _shown(figure: Figure, content: SheetContent, top: float) -> float:
     """Draw the table of identified numbers; return the height of the space below, as a share."""
     heads = ("", "quantity", "value (95 %)", "another run", "evidence")
     rows = [
         (
-            title(row, facts.is_driven),
+            title(row, content.is_driven),
             sanitise(format_name(row), 60),
             sanitise(format_fitted_value(row.number), 70),
             format_prediction_interval(row),
             sanitise(format_evidence(row, short=True), 60),
         )
-        for row in facts.rows
+        for row in content.rows
         if row.number is not None
     ]
-    found = [row.state == "found" for row in facts.rows if row.number is not None]
+    is_cause = [row.state == "found" for row in content.rows if row.number is not None]
     size, columns = _columns([heads, *rows])
     for x, text in zip(columns, heads, strict=True):
         figure.text(x, top, text, weight="bold", va="top", fontsize=size)
-    for cells, is_found in zip(rows, found, strict=True):
+    for cells, is_found in zip(rows, is_cause, strict=True):
         top -= _LINE * 1.25
         for i, (x, text) in enumerate(zip(columns, cells, strict=True)):
             weight = "bold" if is_found and i == 1 else "normal"
@@ -201,12 +203,12 @@ def _columns(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
     return size, (_MARGIN + begins / A4_INCHES[0]).tolist()
 
 
-def _not_shown(figure: Figure, facts: SheetContent, size: float, begins: float = 0.0) -> float:
+def _not_shown(figure: Figure, content: SheetContent, size: float, begins: float = 0.0) -> float:
     """Draw the effects that are not shown in two columns.
 
     Args:
         figure: Page to draw on.
-        facts: Content of the data sheet.
+        content: Content of the data sheet.
         size: Font size in points.
         begins: Height of the first line, as a share of the page; 0 for a table that ends at the
             foot of the page.
@@ -215,12 +217,12 @@ def _not_shown(figure: Figure, facts: SheetContent, size: float, begins: float =
         Height of the top of the table, as a share of the page.
     """
     rows = []
-    names = [format_short_name(row) for row in facts.rows if row.number is None]
+    names = [format_short_name(row) for row in content.rows if row.number is None]
     longest = min(max(map(len, names), default=0), _NAME_LETTERS)
     # A character of the monospaced font is 0.602 of its size wide.
     beside_name = (0.602 * size / POINTS * longest + 0.12) / A4_INCHES[0]
     letters = int((0.45 - beside_name) * A4_INCHES[0] * POINTS / (_LETTER * size))
-    for row in facts.rows:
+    for row in content.rows:
         if row.number is None:
             mixed = format_confounding(row)
             said = format_detection_limit(row) + (

@@ -28,18 +28,18 @@ _NAMED_RUNS = 8
 
 
 def render_page(
-    sheet: SheetContent, drawn: tuple[bytes, bytes | None] | None, made: MjcfFiles
+    sheet: SheetContent, diagram_files: tuple[bytes, bytes | None] | None, mjcf: MjcfFiles
 ) -> str:
     """Render the page as HTML.
 
     Args:
         sheet: Content of the data sheet.
-        drawn: Diagram as SVG, and as PDF if requested; None without a drive.
-        made: MJCF files with their notes.
+        diagram_files: Diagram as SVG, and as PDF if requested; None without a drive.
+        mjcf: MJCF files with their notes.
     """
     page, still = HtmlPage(), None
-    if sheet.diagram is not None and drawn is not None:
-        still = PrintedFigure(*drawn, _describe(sheet.diagram), DIAGRAM_NAME)
+    if sheet.diagram is not None and diagram_files is not None:
+        still = PrintedFigure(*diagram_files, _describe(sheet.diagram), DIAGRAM_NAME)
         columns = {
             "load": sheet.diagram.load.tolist(),
             "moves_forward": sheet.diagram.forward.tolist(),
@@ -53,8 +53,8 @@ def render_page(
         runs=_format_runs([run.name for run in sheet.recording.training()]),
         elsewhere=joined(list(sheet.elsewhere())),
         class_file=CLASS_FILE,
-        class_text=made.contents.get(CLASS_FILE, ""),
-        notes=made.notes,
+        class_text=mjcf.contents.get(CLASS_FILE, ""),
+        notes=mjcf.notes,
         format_confounding=wording.format_confounding,
         format_detection_limit=wording.format_detection_limit,
         format_evidence=wording.format_evidence,

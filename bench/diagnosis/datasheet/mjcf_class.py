@@ -68,20 +68,20 @@ def _of_robot(facts: SheetContent) -> MjcfFiles:
     kind: Any = facts.subject.kind
     causes = collect_causes(facts.extended)
     actuator = next(iter(facts.subject.actuators), None)
-    made = _class(
+    rendered = _class(
         kind.robot, causes, facts.subject.joint, actuator, make_class_name(facts.name), facts
     )
-    files = {CLASS_FILE: _file(facts, [made])}
-    if made.model:
-        files["model.xml"] = made.model
-    return MjcfFiles(files, tuple(made.said))
+    files = {CLASS_FILE: _file(facts, [rendered])}
+    if rendered.model:
+        files["model.xml"] = rendered.model
+    return MjcfFiles(files, tuple(rendered.said))
 
 
 def _of_system(facts: SheetContent, folder: Path) -> MjcfFiles:
     """Build a class, a model and a log description for each group of runs with equal constants."""
     from sims.robot.parsing.read_model_file import read_robot
 
-    made: list[_Class] = []
+    classes: list[_Class] = []
     files: dict[str, str] = {}
     for setting in group_runs_by_constants(facts):
         model = _model_file(facts, setting)
@@ -92,15 +92,17 @@ def _of_system(facts: SheetContent, folder: Path) -> MjcfFiles:
             path = Path(place) / f"{facts.subject.kind.name}.xml"
             path.write_text(model.text)
             robot = read_robot(path)
-        causes, said = _placed(facts, setting, model)
-        one = _class(robot, causes, model.joint, model.actuator, name, facts, (*model.said, *said))
-        made.append(one)
+        causes, notes = _placed(facts, setting, model)
+        rendered = _class(
+            robot, causes, model.joint, model.actuator, name, facts, (*model.said, *notes)
+        )
+        classes.append(rendered)
         stem = f"model_{setting.name}" if setting.name else "model"
-        if one.model:
-            files[f"{stem}.xml"] = one.model
+        if rendered.model:
+            files[f"{stem}.xml"] = rendered.model
             files |= _described(facts, setting, model, stem, folder)
-    lines = dict.fromkeys(line for one in made for line in one.said)
-    return MjcfFiles({CLASS_FILE: _file(facts, made), **files}, tuple(lines))
+    lines = dict.fromkeys(line for rendered in classes for line in rendered.said)
+    return MjcfFiles({CLASS_FILE: _file(facts, classes), **files}, tuple(lines))
 
 
 def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
@@ -126,13 +128,15 @@ def _class(
     from sims.robot.export.xml_editing import NotEditableError
 
     applied = apply_causes(robot, causes, facts.extended.title)
-    own = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
-    said = [*notes, *applied.notes]
-    text = render_default_class(applied, *own, name, said)
+    places = robot.joint(joint).id, robot.actuator(actuator).id if actuator else None
+    class_notes = [*notes, *applied.notes]
+    text = render_default_class(applied, *places, name, class_notes)
     try:
-        return _Class(text, said, render_model_using_class(robot, applied, *own, name, text))
+        return _Class(
+            text, class_notes, render_model_using_class(robot, applied, *places, name, text)
+        )
     except NotEditableError as unfit:
-        return _Class(text, [*said, f"no model that uses the class is written: {unfit}"])
+        return _Class(text, [*class_notes, f"no model that uses the class is written: {unfit}"])
 
 
 def make_class_name(name: str) -> str:
@@ -141,12 +145,12 @@ def make_class_name(name: str) -> str:
     return plain or "drive"
 
 
-def _file(facts: SheetContent, made: Sequence[_Class]) -> str:
+def _file(facts: SheetContent, classes: Sequence[_Class]) -> str:
     """Format the classes as a file that MuJoCo loads and that others can include."""
     title = facts.recording.title or facts.recording.path.stem
     heading = f"{make_class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
     safe = re.sub(r"-(?=-)", "- ", heading)
-    inner = "\n".join(one.text for one in made).replace("\n", "\n    ")
+    inner = "\n".join(rendered.text for rendered in classes).replace("\n", "\n    ")
     return f"<mujoco>\n  <!-- {safe} -->\n  <default>\n    {inner}\n  </default>\n</mujoco>\n"
 
 
@@ -170,14 +174,14 @@ def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
     by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
     for run in facts.recording.runs:
         by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
-    usual = {c.name: c.value for c in facts.subject.kind.constants}
-    usual |= {p.name: p.nominal for p in facts.subject.kind.parameters}
+    defaults = {c.name: c.value for c in facts.subject.kind.constants}
+    defaults |= {p.name: p.nominal for p in facts.subject.kind.parameters}
     fitted = {name: number.value for name, number in facts.extended.parameters.items()}
-    known = {**usual, **facts.recording.constants, **facts.extended.constants, **fitted}
+    numbers = {**defaults, **facts.recording.constants, **facts.extended.constants, **fitted}
     return [
         ConstantsGroup(
             "_".join(f"{name}{value:g}" for name, value in constants) if by_constants else "",
-            {**known, **dict(constants)},
+            {**numbers, **dict(constants)},
             tuple(runs),
         )
         for constants, runs in by_constants.items()
@@ -192,27 +196,29 @@ def _placed(
 
     places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}
     causes: dict[str, Mapping[str, FittedValue]] = {}
-    dry, said = 0.0, []
+    dry_friction, notes = 0.0, []
     for name, numbers in facts.extended.effects.items():
         effect = library.get_effect(name)
         if issubclass(effect, Friction) and name not in MODEL_FIELD_EFFECTS:
-            held = _held(facts, setting, effect, numbers)
-            dry += held
-            said.append(
+            mean_limit = _held(facts, setting, effect, numbers)
+            dry_friction += mean_limit
+            notes.append(
                 f"{name}: MuJoCo has no such law; frictionloss holds its mean over these runs, "
-                f"{held:.4g} N m"
+                f"{mean_limit:.4g} N m"
             )
             continue
         place = places.get(effect.at, "")
         off = FittedValue(0.0, "1", None, None)
-        whole = {c.name: numbers.get(c.name, off) for c in effect.on(facts.subject.kind.system)}
-        causes[f"{name}@{place}" if place else name] = whole
-    if dry:
+        coefficients = {
+            c.name: numbers.get(c.name, off) for c in effect.on(facts.subject.kind.system)
+        }
+        causes[f"{name}@{place}" if place else name] = coefficients
+    if dry_friction:
         key = f"friction.coulomb@{model.joint}"
-        own = causes.get(key, {}).get("coefficient")
-        total = dry + (own.value if own else 0.0)
+        fitted = causes.get(key, {}).get("coefficient")
+        total = dry_friction + (fitted.value if fitted else 0.0)
         causes[key] = {"coefficient": FittedValue(total, "N*m", None, None)}
-    return causes, said
+    return causes, notes
 
 
 def _held(
@@ -223,8 +229,8 @@ def _held(
 ) -> float:
     """Compute the mean limit of a friction law over the samples of some runs."""
     limits = [_limits(facts, setting, run, effect, numbers) for run in setting.runs]
-    seen = np.concatenate(limits)
-    return float(seen[np.isfinite(seen)].mean())
+    values = np.concatenate(limits)
+    return float(values[np.isfinite(values)].mean())
 
 
 def _limits(
@@ -240,21 +246,23 @@ def _limits(
     (coordinate,) = system.coordinates
     position = run.channels[coordinate]
     rate = np.gradient(position, run.times)
-    each = (len(position), 1)
+    shape = (len(position), 1)
     theta = np.array([[setting.numbers[p.name] for p in kind.parameters]])
-    there = effect.on(system)
-    coefficients = [numbers[c.name].value if c.name in numbers else 0.0 for c in there]
+    effect_coefficients = effect.on(system)
+    coefficients = [
+        numbers[c.name].value if c.name in numbers else 0.0 for c in effect_coefficients
+    ]
     moment = StateSnapshot(
         system,
         np.repeat(theta, len(position), axis=0),
-        {c.name: np.full(each, setting.numbers[c.name]) for c in kind.constants},
+        {c.name: np.full(shape, setting.numbers[c.name]) for c in kind.constants},
         (run.times - run.times[0])[:, None],
         position[:, None],
         rate[:, None],
         {name: values[:, None] for name, values in run.inputs.items()},
     )
     c = np.array(coefficients)[:, None, None]
-    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *each)), moment)[:, 0]
+    limit: Array = effect().limit(np.broadcast_to(c, (len(c), *shape)), moment)[:, 0]
     return limit
 
 
@@ -280,9 +288,9 @@ def _described(
         "runs": {run.name: {"held_out": True} for run in setting.runs if _driven(run, model)},
     }
     for kind in ("channels", "inputs"):
-        for name, own in stated.get(kind, {}).items():
+        for name, description in stated.get(kind, {}).items():
             if name in model.signals:
-                document[kind][model.signals[name]] = {"file": file, "column": name, **own}
+                document[kind][model.signals[name]] = {"file": file, "column": name, **description}
     yield f"{stem}.toml", tomli_w.dumps(document)
 
 

@@ -84,20 +84,23 @@ class SheetContent:
 
     def without_drive(self) -> str:
         """Return why there is no diagram, and what is known of the joint at rest instead."""
-        why = "the log has no input"
+        reason = "the log has no input"
         if self.subject.joint:
-            why = (
+            reason = (
                 f"joint {self.subject.joint} has no actuator in the model, and no force in the log"
             )
         rest = self.rest
         if rest.laws and rest.breakaway > 0:
             force = append_unit(format_number(rest.breakaway), rest.unit)
-            held = f"At rest, dry friction holds against up to {force} ({joined(rest.laws)})"
+            friction_text = (
+                f"At rest, dry friction holds against up to {force} ({joined(rest.laws)})"
+            )
         else:
-            held = "No law of friction was found that holds it at rest"
+            friction_text = "No law of friction was found that holds it at rest"
         return (
-            f"There is no drive: {why}. So this sheet has no drive and back-drive diagram, and no "
-            f"numbers of a drive; the table shows what else acts on the joint. {held}."
+            f"There is no drive: {reason}. So this sheet has no drive and back-drive diagram, and "
+            "no numbers of a drive; the table shows the other effects on the joint. "
+            f"{friction_text}."
         )
 
     @cached_property
@@ -115,13 +118,15 @@ class SheetContent:
     def lines(self) -> list[str]:
         """Format the sheet as text: numbers first, then the effects that are not shown."""
         lines = [f"{sanitise(self.name, 80)}: {self.verdict.verdict}"]
-        shown = [row for row in self.rows if row.number is not None]
+        identified = [row for row in self.rows if row.number is not None]
         lines += [
-            f"  {sanitise(r.name, 60)} = {format_fitted_value(r.number)}" for r in shown if r.number
+            f"  {sanitise(r.name, 60)} = {format_fitted_value(r.number)}"
+            for r in identified
+            if r.number
         ]
-        rest = [row.name for row in self.rows if row.number is None]
-        few, more = rest[:NAMES_IN_TERMINAL], len(rest) - NAMES_IN_TERMINAL
-        if more > 0:
-            few = [*few, f"{more} more (the sheet says how small each could be)"]
-        lines.append(f"not shown by these data: {sanitise(joined(few), 2000) or 'nothing'}")
+        absent = [row.name for row in self.rows if row.number is None]
+        named, unnamed_count = absent[:NAMES_IN_TERMINAL], len(absent) - NAMES_IN_TERMINAL
+        if unnamed_count > 0:
+            named = [*named, f"{unnamed_count} more (the sheet says how small each could be)"]
+        lines.append(f"not shown by these data: {sanitise(joined(named), 2000) or 'nothing'}")
         return lines

@@ -95,7 +95,7 @@ def _reached(reach: DetectionLimit) -> dict[str, Any]:
 
 
 def build_sheet_rows(
-    subject: SheetSubject, extended: ExtendedSimulator, verdict: Verdict, shown: DetectionLimits
+    subject: SheetSubject, extended: ExtendedSimulator, verdict: Verdict, limits: DetectionLimits
 ) -> tuple[SheetRow, ...]:
     """Build the rows of a sheet.
 
@@ -103,12 +103,12 @@ def build_sheet_rows(
         subject: Joint or system.
         extended: Extended simulator.
         verdict: Verdict with the evidence.
-        shown: Covariance and detection limits.
+        limits: Covariance and detection limits.
 
     Returns:
         Derived quantities, parameters, causes, then effects that are not shown.
     """
-    rows = _Rows(subject, extended, verdict, shown)
+    rows = _Rows(subject, extended, verdict, limits)
     return (*rows.derived(), *rows.parameters(), *rows.causes(), *rows.absent())
 
 
@@ -123,20 +123,23 @@ class _Rows:
         """Yield quantities derived from the system's parameters, by error propagation."""
         parameters = self.extended.parameters
         values = {name: number.value for name, number in parameters.items()}
-        known = {**self.extended.constants, **values}
+        values_by_name = {**self.extended.constants, **values}
         free = [name for name in self.shown.free if name in values]
-        places = [self.shown.free.index(name) for name in free]
-        covariance = self.shown.covariance[np.ix_(places, places)]
+        indices = [self.shown.free.index(name) for name in free]
+        covariance = self.shown.covariance[np.ix_(indices, indices)]
         for derived in self.subject.kind.system.derived:
             try:
-                value = derived.of(known)
+                value = derived.of(values_by_name)
             except (KeyError, ZeroDivisionError):
                 # A constant that differs between runs has no single value.
                 continue
             slopes = []
             for name in free:
-                step = DERIVATIVE_STEP_SHARE * (abs(known[name]) or 1.0)
-                slopes.append((derived.of({**known, name: known[name] + step}) - value) / step)
+                step = DERIVATIVE_STEP_SHARE * (abs(values_by_name[name]) or 1.0)
+                slopes.append(
+                    (derived.of({**values_by_name, name: values_by_name[name] + step}) - value)
+                    / step
+                )
             spread = np.array(slopes)
             half = Z95 * float(np.sqrt(max(spread @ covariance @ spread, 0.0)))
             number = FittedValue(value, derived.unit, value - half, value + half)
@@ -159,24 +162,24 @@ class _Rows:
         for name, number in self.extended.parameters.items():
             # The coefficient of an effect with several has its name after a point.
             effect, _, place = name.partition("@")
-            there = next(
+            local_place = next(
                 (p for p in self.subject.places if place in (p, f"{p}.{_tail(place)}")), ""
             )
-            if there:
-                row = self._of_effect(f"{effect}@{there}", name, number, "fitted")
-                yield self._apart(row, f"{effect}@{there}", name)
+            if local_place:
+                row = self._of_effect(f"{effect}@{local_place}", name, number, "fitted")
+                yield self._apart(row, f"{effect}@{local_place}", name)
 
     def causes(self) -> Iterator[SheetRow]:
         """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
         for name, numbers in self.extended.effects.items():
-            own = list(self.subject.localise_effect(name, numbers))
-            for effect, coefficient, number in own:
+            local_coefficients = list(self.subject.localise_effect(name, numbers))
+            for effect, coefficient, number in local_coefficients:
                 if number.value == 0:
                     # A coefficient of zero means that the effect is absent; its detection limit is
                     # computed.
                     continue
-                several = sum(other == effect for other, _, _ in own) > 1
-                label = f"{effect} {coefficient}" if several else effect
+                has_several = sum(other == effect for other, _, _ in local_coefficients) > 1
+                label = f"{effect} {coefficient}" if has_several else effect
                 row = self._of_effect(effect, label, number, "found", self._cause(name))
                 if _is_nothing(number):
                     yield self._nothing(row, effect, number)
@@ -184,8 +187,8 @@ class _Rows:
                 place = (
                     "" if name.partition("@")[2] != ALL_PLACES else f"@{effect.partition('@')[2]}"
                 )
-                alone = name if len(numbers) == 1 else f"{name}.{coefficient}{place}"
-                yield self._apart(row, effect, alone)
+                parameter = name if len(numbers) == 1 else f"{name}.{coefficient}{place}"
+                yield self._apart(row, effect, parameter)
 
     def _apart(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
         """Add the prediction interval from the consistency of the runs."""

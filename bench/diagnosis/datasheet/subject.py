@@ -116,14 +116,16 @@ class SheetSubject:
             if self.acts_here(library.find_effect(name, self.kind.system)):
                 yield from ((name, key, number) for key, number in numbers.items())
             return
-        there = [one.place for one in self.list_effects() if one.of == base]
+        local_places = [
+            local_place.place for local_place in self.list_effects() if local_place.of == base
+        ]
         for key, number in numbers.items():
-            coefficient, _, at = key.partition("@")
+            coefficient, _, named_place = key.partition("@")
             # A family with one coefficient for all places, such as a delay, has the same value
             # here.
-            for one in [at] if at else there:
-                if one in self.places:
-                    yield f"{base}@{one}", coefficient, number
+            for local_place in [named_place] if named_place else local_places:
+                if local_place in self.places:
+                    yield f"{base}@{local_place}", coefficient, number
 
     def get_model_file_value(self, effect: str) -> ModelFileValue | None:
         """Return the value in the model file that an effect changes; None if there is none."""

@@ -73,17 +73,17 @@ def format_evidence(row: SheetRow, short: bool = False) -> str:
             if row.number and row.number.low is not None
             else "not identified by these data"
         )
-    judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
-    cut = "not judged" if short else "the search ended before it was judged"
-    said = [format_p_value(row.p_value) if judged else cut]
+    is_judged = row.p_value is None or row.p_value <= UNJUDGED_P_VALUE
+    unjudged_text = "not judged" if short else "the search ended before it was judged"
+    parts = [format_p_value(row.p_value) if is_judged else unjudged_text]
     if row.share is not None:
         closed = format_percent(row.share)
-        said.append(
+        parts.append(
             f"{closed} held out" if short else f"alone it closes {closed} of the held-out gap"
         )
     if row.alternatives:
-        said.append(f"{joined(row.alternatives, 'or')} explains the data equally well")
-    return "; ".join(said)
+        parts.append(f"{joined(row.alternatives, 'or')} explains the data equally well")
+    return "; ".join(parts)
 
 
 def format_detection_limit(row: SheetRow) -> str:
@@ -106,7 +106,7 @@ def format_detection_limit(row: SheetRow) -> str:
 
 def format_confounding(row: SheetRow) -> str:
     """Format confounded parameters, and causes that the effect might replace."""
-    said = list(row.detection_limit.confounded_with) if row.detection_limit else []
+    parts = list(row.detection_limit.confounded_with) if row.detection_limit else []
     if row.alternatives:
-        said.append(f"possible alternative to {joined(row.alternatives, 'or')}")
-    return ", ".join(said)
+        parts.append(f"possible alternative to {joined(row.alternatives, 'or')}")
+    return ", ".join(parts)

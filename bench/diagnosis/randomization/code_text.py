@@ -50,12 +50,12 @@ def identifiers(names: Iterable[str]) -> Iterator[str]:
     for name in names:
         base = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "range"
         base = base if base[0].isalpha() else f"n_{base}"
-        found, count = base, 1
-        while found in used:
+        identifier, count = base, 1
+        while identifier in used:
             count += 1
-            found = f"{base}_{count}"
-        used.add(found)
-        yield found
+            identifier = f"{base}_{count}"
+        used.add(identifier)
+        yield identifier
 
 
 def list_heading(extended: ExtendedSimulator, framework: str, left_out: Iterable[str]) -> list[str]:

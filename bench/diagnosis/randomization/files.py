@@ -37,7 +37,7 @@ def range_files(
         return {}
     import tomli_w
 
-    rows = [one.document() for one in ranges.ranges]
+    rows = [each.document() for each in ranges.ranges]
     assert extended.robot is not None
     document: dict[str, Any] = {
         "format": FORMAT,
@@ -48,7 +48,7 @@ def range_files(
     }
     table = [[_cell(row.get(column)) for column in COLUMNS] for row in rows]
     tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": csv_text(COLUMNS, table)}
-    if not any(one.fields for one in ranges.ranges):
+    if not any(each.fields for each in ranges.ranges):
         return tables
     robot = getattr(extended.kind, "robot", None)
     return {

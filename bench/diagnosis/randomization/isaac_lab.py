@@ -65,52 +65,57 @@ def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, rob
 
 
 def _terms(
-    ranges: RandomizationRanges, said: Mapping[RandomizationRange, str], robot: Any
+    ranges: RandomizationRanges, sentences: Mapping[RandomizationRange, str], robot: Any
 ) -> tuple[list[Term], list[RandomizationRange]]:
     """Build the terms, and list the ranges for which there is no term."""
     by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
-    for one in ranges.ranges:
-        by_effect.setdefault(one.effect, {}).setdefault(one.name, []).append(one)
+    for each in ranges.ranges:
+        by_effect.setdefault(each.effect, {}).setdefault(each.name, []).append(each)
     terms: list[Term] = []
     for effect, function, key in (
         ("friction.coulomb", "randomize_joint_parameters", "friction_distribution_params"),
         ("inertia.armature", "randomize_joint_parameters", "armature_distribution_params"),
     ):
-        for name, (one,) in by_effect.pop(effect, {}).items():
+        for name, (each,) in by_effect.pop(effect, {}).items():
             notes = [FRICTION_NOTE] if effect == "friction.coulomb" else []
             terms.append(
-                _joint_term(one.field, name, function, key, _ends(one), [said[one], *notes])
+                _joint_term(each.field, name, function, key, _ends(each), [sentences[each], *notes])
             )
-    terms += _gains(by_effect, said, robot)
-    for name, (one,) in by_effect.pop("mass.scale", {}).items():
-        params = {"mass_distribution_params": _pair(*_ends(one)), "operation": '"abs"'}
+    terms += _gains(by_effect, sentences, robot)
+    for name, (each,) in by_effect.pop("mass.scale", {}).items():
+        params = {"mass_distribution_params": _pair(*_ends(each)), "operation": '"abs"'}
         if name in by_effect.get("inertia.scale", {}):
             # The range of the inertia already includes the scaling by the mass.
             params["recompute_inertia"] = "False"
         terms.append(
-            _body_term("body_mass", name, "randomize_rigid_body_mass", params, [said[one]])
+            _body_term("body_mass", name, "randomize_rigid_body_mass", params, [sentences[each]])
         )
     for name, offsets in by_effect.pop("mass.offset", {}).items():
-        pairs = [f'"{one.coefficient}": {_pair(one.minimum, one.maximum)}' for one in offsets]
+        pairs = [f'"{each.coefficient}": {_pair(each.minimum, each.maximum)}' for each in offsets]
         params = {"com_range": "{" + ", ".join(pairs) + "}"}
-        notes = [said[one] for one in offsets]
+        notes = [sentences[each] for each in offsets]
         terms.append(_body_term("body_ipos", name, "randomize_rigid_body_com", params, notes))
-    for name, (one,) in by_effect.pop("inertia.scale", {}).items():
+    for name, (each,) in by_effect.pop("inertia.scale", {}).items():
         params = {
-            "inertia_distribution_params": _pair(one.minimum, one.maximum),
+            "inertia_distribution_params": _pair(each.minimum, each.maximum),
             "operation": '"scale"',
             "diagonal_only": "False",
         }
-        notes = [said[one], "This term exists since Isaac Lab 3."]
+        notes = [sentences[each], "This term exists since Isaac Lab 3."]
         function = "randomize_rigid_body_inertia"
         terms.append(_body_term("body_inertia", name, function, params, notes))
-    terms += _gravity(by_effect, said, robot)
-    return terms, [one for places in by_effect.values() for own in places.values() for one in own]
+    terms += _gravity(by_effect, sentences, robot)
+    return terms, [
+        each
+        for ranges_by_place in by_effect.values()
+        for by_place in ranges_by_place.values()
+        for each in by_place
+    ]
 
 
 def _gains(
     by_effect: dict[str, dict[str, list[RandomizationRange]]],
-    said: Mapping[RandomizationRange, str],
+    sentences: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
     """Yield the terms of stiffness and damping at joints."""
@@ -120,69 +125,76 @@ def _gains(
     function = "randomize_actuator_gains"
     for joint, actuators in _by_joint(robot, stiffness).items():
         ends = _sum([_at_joint(robot, stiffness, name, 1) for name in actuators])
-        notes = [said[one] for name in actuators for one in stiffness.get(name, ())]
+        notes = [sentences[each] for name in actuators for each in stiffness.get(name, ())]
         key = "stiffness_distribution_params"
         yield _joint_term("stiffness", joint, function, key, ends, notes)
     for joint in dict.fromkeys([*passive, *_by_joint(robot, damping)]):
-        names = [one.name for one in robot.actuators if one.joint == joint]
+        names = [each.name for each in robot.actuators if each.joint == joint]
         parts = [_at_joint(robot, damping, name, 2) for name in names]
         stated = float(robot.compiled.dof_damping[robot.joint(joint).velocity])
-        own = passive.get(joint)
-        parts.append(_ends(own[0]) if own else (stated, stated))
-        found = [*(own or ()), *(one for name in names for one in damping.get(name, ()))]
-        notes = [*(said[one] for one in found), DAMPING_NOTE]
+        damping_ranges = passive.get(joint)
+        parts.append(_ends(damping_ranges[0]) if damping_ranges else (stated, stated))
+        joint_ranges = [
+            *(damping_ranges or ()),
+            *(each for name in names for each in damping.get(name, ())),
+        ]
+        notes = [*(sentences[each] for each in joint_ranges), DAMPING_NOTE]
         key = "damping_distribution_params"
         yield _joint_term("damping", joint, function, key, _sum(parts), notes)
 
 
-def _by_joint(robot: Any, found: Mapping[str, Any]) -> dict[str, list[str]]:
+def _by_joint(robot: Any, ranges: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return all actuators of each joint at which one of the given actuators acts."""
-    joints = dict.fromkeys(robot.actuator(name).joint for name in found)
-    return {j: [one.name for one in robot.actuators if one.joint == j] for j in joints if j}
+    joints = dict.fromkeys(robot.actuator(name).joint for name in ranges)
+    return {
+        j: [actuator.name for actuator in robot.actuators if actuator.joint == j]
+        for j in joints
+        if j
+    }
 
 
 def _at_joint(
-    robot: Any, found: Mapping[str, Sequence[RandomizationRange]], name: str, term: int
+    robot: Any, ranges: Mapping[str, Sequence[RandomizationRange]], name: str, term: int
 ) -> tuple[float, float]:
     """Return the interval of an actuator's gain, converted to its joint."""
-    number_ = robot.actuator(name).id
-    share = float(robot.compiled.actuator_gear[number_, 0]) ** 2
-    if name in found:
-        low, high = _ends(found[name][0])
+    actuator_id = robot.actuator(name).id
+    share = float(robot.compiled.actuator_gear[actuator_id, 0]) ** 2
+    if name in ranges:
+        low, high = _ends(ranges[name][0])
         return share * low, share * high
-    stated = -share * float(robot.compiled.actuator_biasprm[number_, term])
+    stated = -share * float(robot.compiled.actuator_biasprm[actuator_id, term])
     return stated, stated
 
 
 def _gravity(
     by_effect: dict[str, dict[str, list[RandomizationRange]]],
-    said: Mapping[RandomizationRange, str],
+    sentences: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
     """Yield the term of gravity, which sets all components."""
-    scale = [one for own in by_effect.pop("gravity.scale", {}).values() for one in own]
-    tilt = [one for own in by_effect.pop("gravity.tilt", {}).values() for one in own]
+    scale = [each for ranges in by_effect.pop("gravity.scale", {}).values() for each in ranges]
+    tilt = [each for ranges in by_effect.pop("gravity.tilt", {}).values() for each in ranges]
     if not scale and not tilt:
         return
     stated = np.asarray(robot.compiled.opt.gravity, dtype=float)
     low, high = stated.copy(), stated.copy()
-    for one in scale:
-        ends = np.stack([one.minimum * stated, one.maximum * stated])
+    for each in scale:
+        ends = np.stack([each.minimum * stated, each.maximum * stated])
         low, high = ends.min(axis=0), ends.max(axis=0)
-    for one in tilt:
-        axis = AXES.index(one.coefficient)
-        low[axis], high[axis] = one.low, one.high
+    for each in tilt:
+        axis = AXES.index(each.coefficient)
+        low[axis], high[axis] = each.low, each.high
     vectors = [f"[{', '.join(number(value) for value in end)}]" for end in (low, high)]
     params = {
         "gravity_distribution_params": f"({', '.join(vectors)})",
         "operation": '"abs"',
     }
-    notes = [said[one] for one in (*scale, *tilt)]
+    notes = [sentences[each] for each in (*scale, *tilt)]
     yield Term("gravity", "randomize_physics_scene_gravity", params, notes)
 
 
 def _joint_term(
-    what: str,
+    prefix: str,
     joint: str,
     function: str,
     key: str,
@@ -195,14 +207,14 @@ def _joint_term(
         "operation": '"abs"',
         "distribution": '"uniform"',
     }
-    return Term(f"{what}_{joint}", function, params, notes)
+    return Term(f"{prefix}_{joint}", function, params, notes)
 
 
 def _body_term(
-    what: str, body: str, function: str, params: Mapping[str, str], notes: Sequence[str]
+    prefix: str, body: str, function: str, params: Mapping[str, str], notes: Sequence[str]
 ) -> Term:
     return Term(
-        f"{what}_{body}", function, {"asset_cfg": _asset("body_names", body), **params}, notes
+        f"{prefix}_{body}", function, {"asset_cfg": _asset("body_names", body), **params}, notes
     )
 
 
@@ -211,8 +223,8 @@ def _asset(key: str, name: str) -> str:
     return f'SceneEntityCfg("robot", {key}=[{literal(re.escape(name))}])'
 
 
-def _ends(one: RandomizationRange) -> tuple[float, float]:
-    return one.low, one.high
+def _ends(each: RandomizationRange) -> tuple[float, float]:
+    return each.low, each.high
 
 
 def _sum(parts: Sequence[tuple[float, float]]) -> tuple[float, float]:

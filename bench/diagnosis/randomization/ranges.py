@@ -78,7 +78,7 @@ class RandomizationRange:
 
     def document(self) -> dict[str, Any]:
         """Return the range as in ranges.toml and in the command's JSON; TOML has no null."""
-        found: dict[str, Any] = {
+        document: dict[str, Any] = {
             "cause": self.cause,
             "coefficient": self.coefficient,
             "source": "free number" if self.is_free else "cause",
@@ -87,12 +87,12 @@ class RandomizationRange:
             "field": self.field,
         }
         if self.fields:
-            found |= {"address": list(self.fields[0].address), "sign": self.fields[0].sign}
-        found |= {"unit": self.unit}
+            document |= {"address": list(self.fields[0].address), "sign": self.fields[0].sign}
+        document |= {"unit": self.unit}
         if self.nominal is not None:
-            found["nominal"] = self.nominal
-        found |= {key: getattr(self, key) for key in ("value", "low", "high", "operation")}
-        return found | {"minimum": self.minimum, "maximum": self.maximum}
+            document["nominal"] = self.nominal
+        document |= {key: getattr(self, key) for key in ("value", "low", "high", "operation")}
+        return document | {"minimum": self.minimum, "maximum": self.maximum}
 
 
 class RandomizationRanges(NamedTuple):
@@ -136,14 +136,14 @@ def randomization_ranges(answer: Verdict, extended: ExtendedSimulator) -> Random
         if cause.alternatives
     ]
     freed = {effect.name for effect in kind.system.freed_effects}
-    found = {
+    causes_by_name = {
         name: numbers
         for name, numbers in collect_causes(extended).items()
         if not name.startswith("numerics.")
     }
     causes = [
         (cause, name in freed, name in freed or name in named)
-        for name, numbers in found.items()
+        for name, numbers in causes_by_name.items()
         for cause in expand_families(kind.robot, {name: numbers})
     ]
     ranges = []
@@ -204,17 +204,18 @@ class _Totals:
         """
         from sims.robot.export.model_file_totals import totals
 
-        values = [dict(own) for own in self.values]
+        values = [dict(coefficients) for coefficients in self.values]
         values[number][coefficient] = value
         fitted = [
-            (effect, list(own.values())) for effect, own in zip(self.effects, values, strict=True)
+            (effect, list(coefficients.values()))
+            for effect, coefficients in zip(self.effects, values, strict=True)
         ]
         effect = self.effects[number]
-        place = [c.name for c in effect.coefficients].index(coefficient)
-        found = totals(self.robot, fitted)[number][place]
-        if found is not None:
-            return found.stated, found.total, found.unit
-        return None, value, effect.coefficients[place].units[0] or "1"
+        index = [c.name for c in effect.coefficients].index(coefficient)
+        reading = totals(self.robot, fitted)[number][index]
+        if reading is not None:
+            return reading.stated, reading.total, reading.unit
+        return None, value, effect.coefficients[index].units[0] or "1"
 
 
 def _value(numbers: Mapping[str, FittedValue], coefficient: str) -> float:
@@ -231,7 +232,7 @@ def _range(robot: RobotModel, totals: _Totals, number: int, entry: _Entry) -> Ra
     effect = totals.effects[number]
     names = [c.name for c in effect.coefficients]
     fields = model_fields(robot, cause.effect, cause.place)
-    own = tuple(fields[names.index(entry.coefficient)]) if fields else ()
+    own_fields = tuple(fields[names.index(entry.coefficient)]) if fields else ()
     nominal, value, unit = totals.at(number, entry.coefficient, fitted.value)
     ends = (totals.at(number, entry.coefficient, end)[1] for end in (fitted.low, fitted.high))
     low, high = sorted(ends)
@@ -247,7 +248,7 @@ def _range(robot: RobotModel, totals: _Totals, number: int, entry: _Entry) -> Ra
         entry.is_free,
         effect.at,
         cause.place,
-        own,
+        own_fields,
         unit,
         nominal,
         value,

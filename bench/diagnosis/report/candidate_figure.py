@@ -76,44 +76,44 @@ _BAR = 0.16
 _NAME_SIZE = 9
 
 
-def candidates_figure(story: DiagnosisReportData) -> Figure:
+def candidates_figure(report: DiagnosisReportData) -> Figure:
     """Draw the candidates, the highest score first.
 
     The left panel shows the share of the held-out gap that each closes alone, with its 95 %
     interval, if any candidate was simulated on held-out runs. The right panel shows the score on
     the fitted runs.
     """
-    shown = select_shown_candidates(story)
-    names = [_name(story, candidate) for candidate in shown]
-    has_shares = any(candidate.heldout_gain is not None for candidate in shown)
+    candidates = select_shown_candidates(report)
+    names = [_name(report, candidate) for candidate in candidates]
+    has_shares = any(candidate.heldout_gain is not None for candidate in candidates)
 
     # Names of causes are bold, which is a little wider.
     left = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
-    between = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
-    width = max(left + between + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
+    shares_width = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
+    width = max(left + shares_width + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
     # All rows have the height of the longest name, so that bars are evenly spaced.
     row = _ROW + _LINE * most_lines(names)
-    handles, labels = _legend(story)
+    handles, labels = _legend(report)
     top = _TOP if handles else _TOP_WITHOUT_LEGEND
-    height = top + _BOTTOM + row * len(shown)
+    height = top + _BOTTOM + row * len(candidates)
 
     figure, axes = make_panel_grid(
         1, 2 if has_shares else 1, (width, height), layout=None, sharey=True
     )
-    bottom, size = _BOTTOM / height, row * len(shown) / height
+    bottom, size = _BOTTOM / height, row * len(candidates) / height
     scores = axes[0, -1]
-    scores.set_position(((left + between) / width, bottom, _SCORES_WIDTH / width, size))
-    _scores_panel(scores, story, shown, thickness=_BAR / row)
+    scores.set_position(((left + shares_width) / width, bottom, _SCORES_WIDTH / width, size))
+    _scores_panel(scores, report, candidates, thickness=_BAR / row)
     if has_shares:
         shares = axes[0, 0]
         shares.set_position((left / width, bottom, _SHARES_WIDTH / width, size))
-        _shares_panel(shares, story, shown)
+        _shares_panel(shares, report, candidates)
         scores.tick_params(axis="y", left=False, labelleft=False)
-    _label_rows(axes[0, 0], story, shown, names)
+    _label_rows(axes[0, 0], report, candidates, names)
 
-    total = len(rank_candidates(story))
-    some = f", the best {len(shown)} of {total}" if len(shown) < total else ""
-    title = f"Candidate causes, each by itself{some}"
+    total = len(rank_candidates(report))
+    selection = f", the best {len(candidates)} of {total}" if len(candidates) < total else ""
+    title = f"Candidate causes, each by itself{selection}"
     figure.text(_EDGE / width, 1 - 0.2 / height, title, fontsize=11, va="center")
     figure.legend(
         handles,
@@ -126,54 +126,56 @@ def candidates_figure(story: DiagnosisReportData) -> Figure:
         handletextpad=0.5,
         columnspacing=1.4,
     )
-    note = "\n".join(_notes(story, shown))
+    note = "\n".join(_notes(report, candidates))
     figure.text(_EDGE / width, 0.1 / height, note, fontsize=8, color=CAPTION_GREY, va="bottom")
     return figure
 
 
-def _name(story: DiagnosisReportData, candidate: Candidate) -> str:
+def _name(report: DiagnosisReportData, candidate: Candidate) -> str:
     """Format a candidate's name in as many lines as needed; its place is never cut off."""
     text = sanitise(shorten_effect_name(candidate.effect), 160)
-    if get_candidate_status(story, candidate.effect) != NOT_NEEDED:
+    if get_candidate_status(report, candidate.effect) != NOT_NEEDED:
         text = POINTER + text
     if len(text) <= LINE_LENGTH:
         return text
     # The place has its own lines.
-    effect, at, place = text.rpartition(" at ")
-    lines = textwrap.wrap(effect if at else text, LINE_LENGTH)
-    return "\n".join([*lines, break_name(f"at {place}", LONGEST_LINE)] if at else lines)
+    effect, separator, place = text.rpartition(" at ")
+    lines = textwrap.wrap(effect if separator else text, LINE_LENGTH)
+    return "\n".join([*lines, break_name(f"at {place}", LONGEST_LINE)] if separator else lines)
 
 
 def _label_rows(
-    axis: Axes, story: DiagnosisReportData, shown: Sequence[Candidate], names: Sequence[str]
+    axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate], names: Sequence[str]
 ) -> None:
-    axis.set_yticks(np.arange(len(shown)), names, fontsize=_NAME_SIZE, linespacing=1.15)
-    axis.set_ylim(len(shown) - 0.5, -0.5)
+    axis.set_yticks(np.arange(len(candidates)), names, fontsize=_NAME_SIZE, linespacing=1.15)
+    axis.set_ylim(len(candidates) - 0.5, -0.5)
     axis.tick_params(axis="y", length=0)
-    for label, candidate in zip(axis.get_yticklabels(), shown, strict=True):
-        if get_candidate_status(story, candidate.effect) != NOT_NEEDED:
+    for label, candidate in zip(axis.get_yticklabels(), candidates, strict=True):
+        if get_candidate_status(report, candidate.effect) != NOT_NEEDED:
             label.set_fontweight("bold")
 
 
-def _shares_panel(axis: Axes, story: DiagnosisReportData, shown: Sequence[Candidate]) -> None:
+def _shares_panel(axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate]) -> None:
     """Draw the share of the held-out gap that each candidate closes, with its 95 % interval."""
     lowest = 0.0
-    for row, candidate in enumerate(shown):
+    for row, candidate in enumerate(candidates):
         axis.axhline(row, color=NOISE_BAND_GREY, linewidth=0.5, zorder=0)
         share = candidate.heldout_gain
         if share is None:
             continue
-        at = max(share, LOWEST_SHARE)
+        position = max(share, LOWEST_SHARE)
         text = format_percent(share)
-        interval = story.share_intervals.get(candidate.effect)
+        interval = report.share_intervals.get(candidate.effect)
         if interval is not None:
             low, high = (max(end, LOWEST_SHARE) for end in interval)
             axis.plot([low, high], [row, row], color=NEUTRAL_MARK, linewidth=1.4, zorder=2)
             lowest = min(lowest, low)
             text += f" ({' to '.join(format_percent(end)[:-2] for end in interval)})"
-        lowest = min(lowest, at)
-        look = _DOTS[get_candidate_status(story, candidate.effect)]
-        axis.plot(at, row, markeredgecolor=NEUTRAL_MARK, linestyle="", zorder=3, **look)
+        lowest = min(lowest, position)
+        marker_style = _DOTS[get_candidate_status(report, candidate.effect)]
+        axis.plot(
+            position, row, markeredgecolor=NEUTRAL_MARK, linestyle="", zorder=3, **marker_style
+        )
         axis.annotate(
             text,
             (1.0, row),
@@ -193,28 +195,33 @@ def _shares_panel(axis: Axes, story: DiagnosisReportData, shown: Sequence[Candid
 
 
 def _scores_panel(
-    axis: Axes, story: DiagnosisReportData, shown: Sequence[Candidate], thickness: float
+    axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate], thickness: float
 ) -> None:
     """Draw the candidates' scores; ticks are the scores of the same effect at other places."""
-    elsewhere = {entry.best.effect: entry.elsewhere for entry in rank_candidates(story)}
+    elsewhere = {entry.best.effect: entry.elsewhere for entry in rank_candidates(report)}
     longest = 1e-9
-    for row, candidate in enumerate(shown):
+    for row, candidate in enumerate(candidates):
         size = max(candidate.score, 0.0)
-        look = dict(_BARS[get_candidate_status(story, candidate.effect)])
-        if _is_chance(story, candidate):
-            look["facecolor"] = "white"
-        axis.barh(row, size, height=thickness, edgecolor=NEUTRAL_MARK, linewidth=0.6, **look)
-        others = [max(other.score, 0.0) for other in elsewhere.get(candidate.effect, ())]
+        bar_style = dict(_BARS[get_candidate_status(report, candidate.effect)])
+        if _is_chance(report, candidate):
+            bar_style["facecolor"] = "white"
+        axis.barh(row, size, height=thickness, edgecolor=NEUTRAL_MARK, linewidth=0.6, **bar_style)
+        other_scores = [max(other.score, 0.0) for other in elsewhere.get(candidate.effect, ())]
         axis.plot(
-            others, [row] * len(others), "|", color=NEUTRAL_MARK, markersize=8, markeredgewidth=1.0
+            other_scores,
+            [row] * len(other_scores),
+            "|",
+            color=NEUTRAL_MARK,
+            markersize=8,
+            markeredgewidth=1.0,
         )
-        longest = max(longest, size, *others)
+        longest = max(longest, size, *other_scores)
         text = format_number(candidate.score)
         if CERTAIN < candidate.p_value <= CHANCE:
             text += f"  ({_printed(candidate.p_value)})"
         axis.annotate(
             text,
-            (max([size, *others]), row),
+            (max([size, *other_scores]), row),
             (5, 0),
             textcoords="offset points",
             va="center",
@@ -227,10 +234,10 @@ def _scores_panel(
     axis.set_title("Evidence on the fitted runs", fontsize=9.5, loc="left")
 
 
-def _is_chance(story: DiagnosisReportData, candidate: Candidate) -> bool:
+def _is_chance(report: DiagnosisReportData, candidate: Candidate) -> bool:
     """Return whether the score of a candidate that is not a cause is insignificant."""
     return (
-        candidate.p_value > CHANCE and get_candidate_status(story, candidate.effect) == NOT_NEEDED
+        candidate.p_value > CHANCE and get_candidate_status(report, candidate.effect) == NOT_NEEDED
     )
 
 
@@ -239,53 +246,53 @@ def _printed(p_value: float) -> str:
     return format_p_value(p_value).replace(" 1×10", " 10")
 
 
-def _notes(story: DiagnosisReportData, shown: Sequence[Candidate]) -> list[str]:
+def _notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list[str]:
     """Format the number of runs and samples, and p-values that are not printed next to bars."""
-    counts = f"Fitted: {_counted(story.fitting)}"
-    if story.held_out is not None and story.cross_validated:
+    counts = f"Fitted: {_counted(report.fitting)}"
+    if report.held_out is not None and report.cross_validated:
         counts += "; each run left out in turn"
-    elif story.held_out is not None:
-        counts += f"; held out: {_counted(story.held_out)}"
+    elif report.held_out is not None:
+        counts += f"; held out: {_counted(report.held_out)}"
     notes = [f"{counts}."]
-    what = "p: probability of such a score by chance"
-    certain = [c.p_value for c in shown if c.p_value <= CERTAIN]
-    by_chance = [c.p_value for c in shown if _is_chance(story, c)]
+    p_value_note = "p: probability of such a score by chance"
+    certain = [c.p_value for c in candidates if c.p_value <= CERTAIN]
+    by_chance = [c.p_value for c in candidates if _is_chance(report, c)]
     if certain:
-        which = "for all shown" if len(certain) == len(shown) else "for grey or coloured bars"
-        what += f"; {_printed(max(certain)).replace('=', '≤')} {which}"
+        bars = "for all shown" if len(certain) == len(candidates) else "for grey or coloured bars"
+        p_value_note += f"; {_printed(max(certain)).replace('=', '≤')} {bars}"
     if by_chance:
-        which = "for all shown" if len(by_chance) == len(shown) else "for white bars"
-        what += f"; {_printed(min(by_chance)).replace('=', '≥')} {which}"
-    notes.append(f"{what}.")
-    missing = sum(candidate.heldout_gain is None for candidate in shown)
-    if 0 < missing < len(shown):
-        notes[1] += f" Without a mark: not simulated on {story.validation_runs}."
+        bars = "for all shown" if len(by_chance) == len(candidates) else "for white bars"
+        p_value_note += f"; {_printed(min(by_chance)).replace('=', '≥')} {bars}"
+    notes.append(f"{p_value_note}.")
+    missing = sum(candidate.heldout_gain is None for candidate in candidates)
+    if 0 < missing < len(candidates):
+        notes[1] += f" Without a mark: not simulated on {report.validation_runs}."
     return notes
 
 
-def _counted(side: DataSplit) -> str:
+def _counted(split: DataSplit) -> str:
     """Format the size of a data split, such as ``3 runs, 1200 samples of 2 channels``."""
-    runs, channels = len(side.times), side.observed.shape[2]
-    samples = int(np.isfinite(side.observed).any(axis=2).sum())
-    one = "1 run" if runs == 1 else f"{runs} runs"
-    of = f" of {channels} channels" if channels > 1 else ""
-    return f"{one}, {samples} samples{of}"
+    runs, channels = len(split.times), split.observed.shape[2]
+    samples = int(np.isfinite(split.observed).any(axis=2).sum())
+    run_count = "1 run" if runs == 1 else f"{runs} runs"
+    channel_text = f" of {channels} channels" if channels > 1 else ""
+    return f"{run_count}, {samples} samples{channel_text}"
 
 
-def _legend(story: DiagnosisReportData) -> tuple[list[Any], list[str]]:
+def _legend(report: DiagnosisReportData) -> tuple[list[Any], list[str]]:
     """Return handles and labels of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    there = {
-        get_candidate_status(story, candidate.effect) for candidate in story.verdict.candidates
+    statuses = {
+        get_candidate_status(report, candidate.effect) for candidate in report.verdict.candidates
     }
     # If all bars have the same style, no legend is needed.
-    names = [name for name in _BARS if name in there] if there != {NOT_NEEDED} else []
+    names = [name for name in _BARS if name in statuses] if statuses != {NOT_NEEDED} else []
     handles: list[Any] = [
         Patch(edgecolor=NEUTRAL_MARK, linewidth=0.6, **_BARS[name]) for name in names
     ]
-    if any(entry.elsewhere for entry in rank_candidates(story)) and has_placed_causes(story):
+    if any(entry.elsewhere for entry in rank_candidates(report)) and has_placed_causes(report):
         handles.append(Line2D([], [], color=NEUTRAL_MARK, marker="|", linestyle="", markersize=8))
         names = [*names, "the same effect at other places"]
     return handles, names

@@ -31,53 +31,57 @@ class RankedCandidate(NamedTuple):
     elsewhere: tuple[Candidate, ...] = ()
 
 
-def get_candidate_status(story: DiagnosisReportData, effect: str) -> str:
+def get_candidate_status(report: DiagnosisReportData, effect: str) -> str:
     """Return the status of an effect: found, found but indistinguishable, or not needed.
 
     Args:
-        story: Report data.
+        report: Report data.
         effect: Name of the effect.
     """
-    for cause in story.verdict.causes:
+    for cause in report.verdict.causes:
         if effect in (cause.effect, *cause.alternatives):
             return "found, but cannot be told apart" if cause.alternatives else "found"
     return "not needed"
 
 
-def rank_candidates(story: DiagnosisReportData) -> list[RankedCandidate]:
+def rank_candidates(report: DiagnosisReportData) -> list[RankedCandidate]:
     """List all candidates as entries, the highest score first.
 
     Without places each candidate is an entry. Otherwise each effect and each cause is one entry.
     """
-    ordered = sorted(story.verdict.candidates, key=lambda c: c.score, reverse=True)
-    if not has_placed_causes(story):
+    ordered = sorted(report.verdict.candidates, key=lambda c: c.score, reverse=True)
+    if not has_placed_causes(report):
         return [RankedCandidate(candidate) for candidate in ordered]
-    causes = {cause.effect for cause in story.verdict.causes}
+    causes = {cause.effect for cause in report.verdict.causes}
     groups: dict[str, list[Candidate]] = {}
     for candidate in ordered:
         groups.setdefault(split_effect_name(candidate.effect)[0], []).append(candidate)
-    found = []
+    entries = []
     for group in groups.values():
         # A diagnosed cause represents its effect even if another place has a higher score.
         heads = [c for c in group if c.effect in causes] or [_head(group)]
         rest = tuple(c for c in group if c not in heads)
-        found += [RankedCandidate(heads[0], rest), *(RankedCandidate(head) for head in heads[1:])]
-    return sorted(found, key=lambda entry: entry.best.score, reverse=True)
+        entries += [RankedCandidate(heads[0], rest), *(RankedCandidate(head) for head in heads[1:])]
+    return sorted(entries, key=lambda entry: entry.best.score, reverse=True)
 
 
 def _head(group: list[Candidate]) -> Candidate:
     """Return the best place, unless the family explains much more; it explains at least as much."""
-    one = next((c for c in group if split_effect_name(c.effect)[1] != ALL_PLACES), group[0])
-    return one if group[0].score < MIN_FAMILY_SCORE_RATIO * max(one.score, 1.0) else group[0]
+    best_place = next((c for c in group if split_effect_name(c.effect)[1] != ALL_PLACES), group[0])
+    return (
+        best_place
+        if group[0].score < MIN_FAMILY_SCORE_RATIO * max(best_place.score, 1.0)
+        else group[0]
+    )
 
 
-def select_shown_candidates(story: DiagnosisReportData) -> list[Candidate]:
+def select_shown_candidates(report: DiagnosisReportData) -> list[Candidate]:
     """Select the candidates to show, the highest score first; diagnosed causes are included."""
-    ordered = [entry.best for entry in rank_candidates(story)]
+    ordered = [entry.best for entry in rank_candidates(report)]
     # A diagnosed cause is shown even with a low score.
-    others = [c for c in ordered if get_candidate_status(story, c.effect) == "not needed"]
-    beyond = others[max(0, MAX_SHOWN_CANDIDATES - len(ordered) + len(others)) :]
-    return [c for c in ordered if c not in beyond]
+    unneeded = [c for c in ordered if get_candidate_status(report, c.effect) == "not needed"]
+    hidden = unneeded[max(0, MAX_SHOWN_CANDIDATES - len(ordered) + len(unneeded)) :]
+    return [c for c in ordered if c not in hidden]
 
 
 LONGEST_PLACE = 64

@@ -84,14 +84,14 @@ def _together(group: Sequence[str], last: str) -> str:
     bases = list(dict.fromkeys(split_effect_name(name)[0] for name in group))
     places = list(dict.fromkeys(split_effect_name(name)[1] for name in group))
     nouns = [format_effect(base) for base in bases]
-    wrong = all(is_parameter_error(base) for base in bases)
+    is_parameter = all(is_parameter_error(base) for base in bases)
     kind = get_place_kind(group[0])
-    spots = [place for place in places if place != ALL_PLACES]
-    text = joined(nouns, last) + format_places(kind, spots, last, wrong)
+    named_places = [place for place in places if place != ALL_PLACES]
+    text = joined(nouns, last) + format_places(kind, named_places, last, is_parameter)
     return (
         text
-        if spots == places
-        else f"{text} {last}{format_places(kind, [ALL_PLACES], last, wrong)}"
+        if named_places == places
+        else f"{text} {last}{format_places(kind, [ALL_PLACES], last, is_parameter)}"
     )
 
 
@@ -101,25 +101,26 @@ def format_lacking(causes: Sequence[Cause]) -> str:
     For example ``lacks wind, and linear drag or Coulomb friction``.
     """
     lacking: list[str] = []
-    wrong: list[str] = []
+    wrong_values: list[str] = []
     either: list[str] = []
     certain = [cause.effect for cause in causes if not cause.alternatives]
     # Causes without alternatives share one list; each other cause has its own "or" list.
-    for part, into in ((False, lacking), (True, wrong)):
-        if names := [name for name in certain if is_parameter_error(name) == part]:
-            into.append(joined([format_effect(name) for name in names]))
+    for is_wrong, parts_list in ((False, lacking), (True, wrong_values)):
+        if names := [name for name in certain if is_parameter_error(name) == is_wrong]:
+            parts_list.append(joined([format_effect(name) for name in names]))
     for cause in causes:
         if not cause.alternatives:
             continue
         names = [cause.effect, *cause.alternatives]
-        bad = [name for name in names if is_parameter_error(name)]
-        good = [name for name in names if name not in bad]
-        if bad and good:
-            either.append(f"either lacks {format_effect_set(good)} or has {format_effect_set(bad)}")
+        wrong_names = [name for name in names if is_parameter_error(name)]
+        missing_names = [name for name in names if name not in wrong_names]
+        if wrong_names and missing_names:
+            missing = format_effect_set(missing_names)
+            either.append(f"either lacks {missing} or has {format_effect_set(wrong_names)}")
         else:
-            (wrong if bad else lacking).append(format_effect_set(names))
+            (wrong_values if wrong_names else lacking).append(format_effect_set(names))
     parts = [f"lacks {', and '.join(lacking)}"] if lacking else []
-    parts += [f"has {', and '.join(wrong)}"] if wrong else []
+    parts += [f"has {', and '.join(wrong_values)}"] if wrong_values else []
     return ", and ".join([*parts, *either])
 
 
@@ -148,7 +149,9 @@ def format_number_error(cause: Cause) -> str:
     values = list(cause.coefficients.values())
     if say is None or not place or place == ALL_PLACES or not values:
         return ""
-    return say(format_places(get_place_kind(cause.effect), [place], wrong=True).strip(), values)
+    return say(
+        format_places(get_place_kind(cause.effect), [place], is_parameter=True).strip(), values
+    )
 
 
 def is_overstated(cause: Cause) -> bool:
@@ -158,28 +161,29 @@ def is_overstated(cause: Cause) -> bool:
     return bool(place) and base in DIFFERENCE_EFFECTS and bool(values) and max(values) < 0
 
 
-def _share(what: str) -> Callable[[str, Sequence[FittedValue]], str]:
+def _share(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
     def say(where: str, values: Sequence[FittedValue]) -> str:
         c = values[0].value
         percent = format_percent(abs(c))
-        return f"the {what} {where} is {percent} {_MORE[c > 0]} than the model file says"
+        return f"the {quantity} {where} is {percent} {_MORE[c > 0]} than the model file says"
 
     return say
 
 
-def _difference(what: str) -> Callable[[str, Sequence[FittedValue]], str]:
+def _difference(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
     def say(where: str, values: Sequence[FittedValue]) -> str:
         size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
-        return f"the {what} {where} is {size} {_MORE[values[0].value > 0]} than the model file says"
+        comparison = _MORE[values[0].value > 0]
+        return f"the {quantity} {where} is {size} {comparison} than the model file says"
 
     return say
 
 
 def _moved(where: str, values: Sequence[FittedValue]) -> str:
-    far = append_unit(
+    distance = append_unit(
         format_number(float(np.linalg.norm([n.value for n in values])), 2), values[0].unit
     )
-    return f"the centre of mass {where} is {far} from where the model file has it"
+    return f"the centre of mass {where} is {distance} from where the model file has it"
 
 
 def _zero(where: str, values: Sequence[FittedValue]) -> str:
@@ -239,48 +243,50 @@ def format_values(cause: Cause) -> str:
     """Format the coefficients of a cause in one line; those of a family with their places."""
     texts = []
     for name, text in list_values(cause):
-        own, place = split_effect_name(name)
+        coefficient, place = split_effect_name(name)
         # If each member of a family has one coefficient, its place identifies it.
-        front = "" if place and own == "coefficient" else f"{own} "
-        texts.append(f"{front}{text}" + (f" at {place}" if place else ""))
+        prefix = "" if place and coefficient == "coefficient" else f"{coefficient} "
+        texts.append(f"{prefix}{text}" + (f" at {place}" if place else ""))
     return joined(texts)
 
 
-def strip_place(says: str) -> str:
+def strip_place(description: str) -> str:
     """Remove the place in brackets from a description, because its noun names the place already."""
-    return re.sub(r" \(at [^()]*\)$", "", says)
+    return re.sub(r" \(at [^()]*\)$", "", description)
 
 
-def has_placed_causes(story: DiagnosisReportData) -> bool:
+def has_placed_causes(report: DiagnosisReportData) -> bool:
     """Return whether any candidate acts at a place."""
-    return any("@" in candidate.effect for candidate in story.verdict.candidates)
+    return any("@" in candidate.effect for candidate in report.verdict.candidates)
 
 
-def list_place_marks(story: DiagnosisReportData) -> list[PlaceMark]:
+def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
     """List the diagnosed places, to be marked on the robot."""
-    found: dict[tuple[str, str, str], PlaceMark] = {}
-    for cause in story.verdict.causes:
-        alone = not cause.alternatives
+    marks: dict[tuple[str, str, str], PlaceMark] = {}
+    for cause in report.verdict.causes:
+        is_certain = not cause.alternatives
         for name in (cause.effect, *cause.alternatives):
-            said, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
-            for place in _places(story, name, cause):
+            noun, kind = format_effect_name(split_effect_name(name)[0]), get_place_kind(name)
+            for place in _places(report, name, cause):
                 size = _size(cause, name, place) if name == cause.effect else ""
                 # A family and one of its places give the same mark, which is kept once.
-                found.setdefault(
-                    (kind, place, said), PlaceMark(kind, place, f"{said}{size}", alone)
+                marks.setdefault(
+                    (kind, place, noun), PlaceMark(kind, place, f"{noun}{size}", is_certain)
                 )
-    return list(found.values())
+    return list(marks.values())
 
 
-def _places(story: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
+def _places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
     """List the places of an effect: those of a family's coefficients, else all of its kind."""
     _, place = split_effect_name(effect)
     if place != ALL_PLACES:
         return [place] if place else []
-    own = [split_effect_name(name)[1] for name in cause.coefficients if effect == cause.effect]
-    robot = story.robot
-    if any(own) or robot is None:
-        return list(dict.fromkeys(name for name in own if name))
+    coefficient_places = [
+        split_effect_name(name)[1] for name in cause.coefficients if effect == cause.effect
+    ]
+    robot = report.robot
+    if any(coefficient_places) or robot is None:
+        return list(dict.fromkeys(name for name in coefficient_places if name))
     tables = {
         "joint": [joint.name for joint in robot.joints],
         "actuator": [actuator.name for actuator in robot.actuators],
@@ -291,12 +297,12 @@ def _places(story: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
 
 def _size(cause: Cause, effect: str, place: str) -> str:
     """Format the coefficient of a cause at a place for a label; empty for several coefficients."""
-    there = [
+    at_place = [
         n for name, n in cause.coefficients.items() if split_effect_name(name)[1] in ("", place)
     ]
-    if len(there) != 1:
+    if len(at_place) != 1:
         return ""
-    fitted = there[0]
+    fitted = at_place[0]
     if split_effect_name(effect)[0] in _SIZED and fitted.unit == "1":
         sign = "+" if fitted.value > 0 else ""
         return f": {sign}{format_percent(fitted.value)}"

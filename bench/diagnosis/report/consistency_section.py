@@ -31,18 +31,18 @@ AGREEMENT_COLUMNS = ("model", "number", "unit", "by", "group", "value", "low", "
 """Columns of the file apart.csv."""
 
 
-def format_consistency(story: DiagnosisReportData) -> list[str]:
+def format_consistency(report: DiagnosisReportData) -> list[str]:
     """Format sentences about the consistency of the parameters.
 
     They report which parameters differ between groups, which are consistent with the causes only,
     and which drift.
 
     Args:
-        story: Report data.
+        report: Report data.
     """
-    before = {(spread.number, spread.by): spread for spread in story.consistency.before}
-    after = story.consistency.after
-    effects = [cause.effect for cause in story.verdict.causes]
+    before = {(spread.number, spread.by): spread for spread in report.consistency.before}
+    after = report.consistency.after
+    effects = [cause.effect for cause in report.verdict.causes]
     causes = joined([sanitise(effect, 60) for effect in effects])
     sentences = []
     reconciled = [
@@ -58,7 +58,7 @@ def format_consistency(story: DiagnosisReportData) -> list[str]:
             f"without {causes}, {joined(names[:MAX_NAMED_PARAMETERS])} differed between "
             f"{_plural(reconciled[0].by)} by more than the intervals"
         )
-    rivals = [s for s in story.consistency.alternative_effect if not s.is_consistent]
+    rivals = [s for s in report.consistency.alternative_effect if not s.is_consistent]
     for rival in _select_clearest(rivals)[:1]:
         trend = ""
         if _has_trend(rival):
@@ -85,7 +85,7 @@ def _select_clearest(spreads: Sequence[ParameterConsistency]) -> list[ParameterC
     by_number: dict[str, list[ParameterConsistency]] = {}
     for spread in spreads:
         by_number.setdefault(spread.number, []).append(spread)
-    return [min(each, key=_rank) for each in by_number.values()]
+    return [min(same_number, key=_rank) for same_number in by_number.values()]
 
 
 def _rank(spread: ParameterConsistency) -> tuple[bool, int, float]:
@@ -179,10 +179,10 @@ class AgreementRow(NamedTuple):
     drawing: IntervalDrawing | None
 
 
-def build_agreement_rows(story: DiagnosisReportData) -> list[AgreementRow]:
+def build_agreement_rows(report: DiagnosisReportData) -> list[AgreementRow]:
     """Build the rows of the table, the least consistent number first."""
     rows = []
-    for spread in sorted(story.consistency.after, key=lambda spread: spread.p_value):
+    for spread in sorted(report.consistency.after, key=lambda spread: spread.p_value):
         halves = [(part.value, Z95 * part.error) for part in spread.group_estimates]
         rows.append(
             AgreementRow(
@@ -208,11 +208,11 @@ def _format_interval(spread: ParameterConsistency, error: float) -> str:
     return append_unit(text, spread.unit)
 
 
-def build_consistency_rows(story: DiagnosisReportData) -> list[tuple[object, ...]]:
+def build_consistency_rows(report: DiagnosisReportData) -> list[tuple[object, ...]]:
     """Build the rows of `AGREEMENT_COLUMNS`: joint fit and groups, with 95 % intervals."""
-    models = [("base", story.consistency.before)]
-    if story.verdict.causes:
-        models.append(("extended", story.consistency.after))
+    models = [("base", report.consistency.before)]
+    if report.verdict.causes:
+        models.append(("extended", report.consistency.after))
     rows: list[tuple[object, ...]] = []
     for model, spreads in models:
         for spread in spreads:

@@ -36,13 +36,13 @@ BEST, ELSEWHERE = "the best of each effect", "the same at other places"
 """Labels of the rows of a robot's candidates, for the filter."""
 
 
-def build_candidate_table(story: DiagnosisReportData) -> Table:
+def build_candidate_table(report: DiagnosisReportData) -> Table:
     """Build a table with one row per candidate, the highest score first."""
-    sets = _sets(story)
-    heads = {entry.best.effect for entry in rank_candidates(story)}
-    found = bool(story.verdict.causes)
+    sets = _sets(report)
+    heads = {entry.best.effect for entry in rank_candidates(report)}
+    has_causes = bool(report.verdict.causes)
     rows = []
-    for c in sorted(story.verdict.candidates, key=lambda one: -one.score):
+    for c in sorted(report.verdict.candidates, key=lambda one: -one.score):
         _, place = split_effect_name(c.effect)
         rows.append(
             {
@@ -53,37 +53,39 @@ def build_candidate_table(story: DiagnosisReportData) -> Table:
                 "p_value": c.p_value,
                 "heldout_gain": c.heldout_gain,
                 # Without a diagnosed cause, "not needed" would be wrong.
-                "standing": get_candidate_status(story, c.effect) if found else "not convincing",
+                "standing": get_candidate_status(report, c.effect)
+                if has_causes
+                else "not convincing",
                 "set": sets.get(c.effect, ""),
                 "kind": get_place_kind(c.effect),
                 "place": "all" if place == ALL_PLACES else sanitise(place, 80),
-                "joint": find_joint(story, get_place_kind(c.effect), place),
+                "joint": find_joint(report, get_place_kind(c.effect), place),
                 "shown": BEST if c.effect in heads else ELSEWHERE,
-                "says": _says(story, c.effect),
+                "says": _says(report, c.effect),
             }
         )
-    return Table.from_rows(rows).without(_needless(story))
+    return Table.from_rows(rows).without(_needless(report))
 
 
-def _needless(story: DiagnosisReportData) -> list[str]:
+def _needless(report: DiagnosisReportData) -> list[str]:
     """List the columns that would be empty."""
-    columns = [] if _sets(story) else ["set"]
-    return columns + ([] if has_placed_causes(story) else ["kind", "place", "joint", "shown"])
+    columns = [] if _sets(report) else ["set"]
+    return columns + ([] if has_placed_causes(report) else ["kind", "place", "joint", "shown"])
 
 
-def _sets(story: DiagnosisReportData) -> dict[str, str]:
+def _sets(report: DiagnosisReportData) -> dict[str, str]:
     """Return, by effect, the set of effects that it is indistinguishable from."""
-    found: dict[str, str] = {}
-    for cause in story.verdict.causes:
+    sets: dict[str, str] = {}
+    for cause in report.verdict.causes:
         if cause.alternatives:
             members = [cause.effect, *cause.alternatives]
-            found |= dict.fromkeys(members, sanitise(format_effect_set(members), 160))
-    return found
+            sets |= dict.fromkeys(members, sanitise(format_effect_set(members), 160))
+    return sets
 
 
-def _says(story: DiagnosisReportData, name: str) -> str:
+def _says(report: DiagnosisReportData, name: str) -> str:
     """Return the description of an effect; for a cause, the one in the verdict."""
-    for cause in story.verdict.causes:
+    for cause in report.verdict.causes:
         if cause.effect == name:
             return format_sentence(strip_place(sanitise(cause.says, 400)))
     try:
@@ -93,55 +95,55 @@ def _says(story: DiagnosisReportData, name: str) -> str:
         return ""
 
 
-def build_gap_location_table(story: DiagnosisReportData) -> Table:
+def build_gap_location_table(report: DiagnosisReportData) -> Table:
     """Build a table with one row per part of the data: its RMS residual in units of the noise."""
     rows = []
-    for p in story.places:
+    for p in report.places:
         row = {
             "kind": p.kind,
             "part": sanitise(p.label, 80),
             "samples": p.samples,
             "before": p.before,
         }
-        if has_extended_model(story):
+        if has_extended_model(report):
             row["after"] = p.after
-        if is_robot(story):
+        if is_robot(report):
             name = p.label if p.kind == "channel" else ""
-            row["joint"] = find_joint(story, "channel", name)
+            row["joint"] = find_joint(report, "channel", name)
         rows.append(row)
     return Table.from_rows(rows)
 
 
-def build_residual_profile_table(story: DiagnosisReportData) -> Table:
+def build_residual_profile_table(report: DiagnosisReportData) -> Table:
     """Build the table of residual profiles, with one row per bin."""
     rows = []
-    for p in story.profiles:
-        about = {"channel": sanitise(p.channel, 80), "variable": sanitise(p.variable, 80)}
-        whens = {"before": p.before} | ({"after": p.after} if has_extended_model(story) else {})
+    for p in report.profiles:
+        key = {"channel": sanitise(p.channel, 80), "variable": sanitise(p.variable, 80)}
+        whens = {"before": p.before} | ({"after": p.after} if has_extended_model(report) else {})
         for when, means in whens.items():
             for centre, mean, error in zip(p.centres, means, p.error, strict=True):
-                bars = {"mean": mean, "low": mean - 2 * error, "high": mean + 2 * error}
-                rows.append({**about, "when": when, "at": centre, **bars})
+                values = {"mean": mean, "low": mean - 2 * error, "high": mean + 2 * error}
+                rows.append({**key, "when": when, "at": centre, **values})
     return Table.from_rows(rows)
 
 
-def list_less_informative_profiles(story: DiagnosisReportData) -> tuple[str, ...]:
+def list_less_informative_profiles(report: DiagnosisReportData) -> tuple[str, ...]:
     """List the names of the profiles that are not shown at first."""
-    shown = {id(profile) for profile in select_informative_profiles(story.profiles)}
-    return tuple(_name(profile) for profile in story.profiles if id(profile) not in shown)
+    shown = {id(profile) for profile in select_informative_profiles(report.profiles)}
+    return tuple(_name(profile) for profile in report.profiles if id(profile) not in shown)
 
 
-def make_residual_profile_panels(story: DiagnosisReportData) -> list[Panel]:
+def make_residual_profile_panels(report: DiagnosisReportData) -> list[Panel]:
     """Make the panels of the residual profiles, the most informative ones first."""
-    units = {channel.name: channel.unit for channel in story.channels}
+    units = {channel.name: channel.unit for channel in report.channels}
     styles = {
         "after": EXTENDED_MODEL_STYLE._replace(marker="o"),
         "before": BASE_MODEL_STYLE._replace(marker="s"),
     }
-    whens = ("after", "before") if has_extended_model(story) else ("before",)
-    shown = {id(profile) for profile in select_informative_profiles(story.profiles)}
+    whens = ("after", "before") if has_extended_model(report) else ("before",)
+    shown = {id(profile) for profile in select_informative_profiles(report.profiles)}
     panels = []
-    for profile in sorted(story.profiles, key=lambda profile: id(profile) not in shown):
+    for profile in sorted(report.profiles, key=lambda profile: id(profile) not in shown):
         channel, variable = sanitise(profile.channel, 80), sanitise(profile.variable, 80)
         series = []
         for when in whens:

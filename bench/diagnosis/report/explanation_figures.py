@@ -73,35 +73,35 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def list_figure_names(story: DiagnosisReportData) -> tuple[str, ...]:
+def list_figure_names(report: DiagnosisReportData) -> tuple[str, ...]:
     """List the names of the figures for which there are data."""
-    there = {
-        "robot": story.robot is not None,
+    is_available = {
+        "robot": report.robot is not None,
         "overview": True,
-        "where": bool(select_gap_locations(story.places)),
-        "candidates": bool(select_shown_candidates(story)),
+        "where": bool(select_gap_locations(report.places)),
+        "candidates": bool(select_shown_candidates(report)),
     }
-    return tuple(name for name, drawn in there.items() if drawn)
+    return tuple(name for name, available in is_available.items() if available)
 
 
-def draw_figure(story: DiagnosisReportData, name: str) -> Figure:
+def draw_figure(report: DiagnosisReportData, name: str) -> Figure:
     """Draw one figure.
 
     Args:
-        story: Report data.
+        report: Report data.
         name: One of `list_figure_names`.
 
     Raises:
         InputError: There is no figure of that name.
     """
-    known = list_figure_names(story)
+    known = list_figure_names(report)
     if name not in known:
         raise make_unknown_name_error("figure", name, known)
     with _styled():
-        drawn = _MAKERS[name](story)
+        figure = _MAKERS[name](report)
         # Ticks take their style from the settings that are active when they are first drawn.
-        drawn.draw_without_rendering()
-    return drawn
+        figure.draw_without_rendering()
+    return figure
 
 
 class RenderedFigure(NamedTuple):
@@ -121,25 +121,27 @@ class RenderedFigure(NamedTuple):
     joint_positions: tuple[tuple[str, float, float], ...] = ()
 
 
-def render_figures(story: DiagnosisReportData) -> dict[str, RenderedFigure]:
+def render_figures(report: DiagnosisReportData) -> dict[str, RenderedFigure]:
     """Draw all figures and render their files, by name."""
     with _styled():
         # The settings must stay active, because text is laid out again when a figure is written.
-        figures = {name: _MAKERS[name](story) for name in list_figure_names(story)}
-        made = {}
-        for name, drawn in figures.items():
-            png, pdf = style.render_png_and_pdf(drawn, DPI)
-            made[name] = RenderedFigure(
-                png, pdf, style.render_svg(drawn) if is_pdf_wanted() else None
+        figures = {name: _MAKERS[name](report) for name in list_figure_names(report)}
+        rendered = {}
+        for name, figure in figures.items():
+            png, pdf = style.render_png_and_pdf(figure, DPI)
+            rendered[name] = RenderedFigure(
+                png, pdf, style.render_svg(figure) if is_pdf_wanted() else None
             )
-        if story.robot is not None and "robot" in made:
-            where = tuple(
+        if report.robot is not None and "robot" in rendered:
+            positions = tuple(
                 compute_joint_positions(
-                    figures["robot"], story.robot, get_extreme_pose(story, select_worst_run(story))
+                    figures["robot"],
+                    report.robot,
+                    get_extreme_pose(report, select_worst_run(report)),
                 )
             )
-            made["robot"] = made["robot"]._replace(joint_positions=where)
-        return made
+            rendered["robot"] = rendered["robot"]._replace(joint_positions=positions)
+        return rendered
 
 
 @contextmanager
@@ -153,53 +155,54 @@ def _styled() -> Iterator[None]:
         yield
 
 
-def get_extreme_pose(story: DiagnosisReportData, shot: RunView) -> dict[str, float]:
+def get_extreme_pose(report: DiagnosisReportData, view: RunView) -> dict[str, float]:
     """Return recorded joint positions at the sample of a run that is farthest from its start.
 
     Args:
-        story: Report data.
-        shot: Run to use.
+        report: Report data.
+        view: Run to use.
     """
     joints, columns = [], []
-    for c, channel in enumerate(story.channels):
+    for c, channel in enumerate(report.channels):
         kind, _, joint = channel.name.partition(".")
-        values = shot.side.observed[shot.row, :, c]
+        values = view.side.observed[view.row, :, c]
         if kind == "q" and np.isfinite(values).any():
             joints.append(joint)
             columns.append(np.nan_to_num(values, nan=float(values[np.isfinite(values)][0])))
     if not joints:
         return {}
     motion = np.stack(columns)
-    far = np.square(motion - motion[:, :1]).sum(axis=0)
-    return dict(zip(joints, motion[:, int(np.argmax(far))].tolist(), strict=True))
+    distances = np.square(motion - motion[:, :1]).sum(axis=0)
+    return dict(zip(joints, motion[:, int(np.argmax(distances))].tolist(), strict=True))
 
 
-def _robot(story: DiagnosisReportData) -> Figure:
+def _robot(report: DiagnosisReportData) -> Figure:
     """Draw the robot in the extreme pose of the run that is shown."""
-    if story.robot is None:
-        raise InputError(f"{story.path}: no robot was recorded")
+    if report.robot is None:
+        raise InputError(f"{report.path}: no robot was recorded")
     return draw_robot_figure(
-        story.robot, get_extreme_pose(story, select_worst_run(story)), list_place_marks(story)
+        report.robot, get_extreme_pose(report, select_worst_run(report)), list_place_marks(report)
     )
 
 
-def _overview(story: DiagnosisReportData) -> Figure:
-    shot = select_worst_run(story)
-    if is_robot(story):
-        return draw_joint_figure(story, shot)
-    count = len(shot.channels)
+def _overview(report: DiagnosisReportData) -> Figure:
+    view = select_worst_run(report)
+    if is_robot(report):
+        return draw_joint_figure(report, view)
+    count = len(view.channels)
     size = (_WIDTHS[count], 5.2)
     figure, axes = make_panel_grid(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
-    for column, c in enumerate(shot.channels):
-        _signal(axes[0][column], axes[1][column], story, shot, c)
+    for column, c in enumerate(view.channels):
+        _signal(axes[0][column], axes[1][column], report, view, c)
     # A sample time counts once, however many channels were recorded.
-    samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
-    kind = f"{story.validation_run} run" if shot.held_out else "run"
-    how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
-    some = f"; {count} of {len(story.channels)} channels" if count < len(story.channels) else ""
-    title = (
-        f"The {kind} {how}: {shorten_label(shot.side.names[shot.row])} ({samples} samples{some})"
+    samples = int(np.isfinite(view.side.observed[view.row]).any(axis=1).sum())
+    kind = f"{report.validation_run} run" if view.held_out else "run"
+    reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
+    selection = (
+        f"; {count} of {len(report.channels)} channels" if count < len(report.channels) else ""
     )
+    name = shorten_label(view.side.names[view.row])
+    title = f"The {kind} {reason}: {name} ({samples} samples{selection})"
     figure.suptitle(title, fontsize=11, y=0.985)
     # The columns differ only in the channel, so they share one legend.
     handles, labels = axes[0][0].get_legend_handles_labels()
@@ -210,12 +213,14 @@ def _overview(story: DiagnosisReportData) -> Figure:
     return figure
 
 
-def _signal(above: Axes, below: Axes, story: DiagnosisReportData, shot: RunView, c: int) -> None:
+def _signal(
+    signal_axis: Axes, residual_axis: Axes, report: DiagnosisReportData, view: RunView, c: int
+) -> None:
     """Draw the measured and simulated signal of a channel, and the residual below it."""
-    channel, side = story.channels[c], shot.side
-    times = side.times[shot.row]
+    channel, split = report.channels[c], view.side
+    times = split.times[view.row]
     # Arrays are padded after the end of a shorter run.
-    signals = [a[shot.row, : len(times), c] for a in (side.observed, side.before, side.after)]
+    signals = [a[view.row, : len(times), c] for a in (split.observed, split.before, split.after)]
     rows = decimate(signals[0])
     t = times[rows]
     measured, before, after = (signal[rows] for signal in signals)
@@ -224,28 +229,30 @@ def _signal(above: Axes, below: Axes, story: DiagnosisReportData, shot: RunView,
     marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
     # Thousands of vector outlines would dominate the file size.
     marks["rasterized"] = rows.size > MAX_OUTLINED_DOTS
-    above.plot(t, measured, "o", label="measured", zorder=4, **marks)
-    tuned = "simulated before (tuned)" if has_extended_model(story) else "simulated (tuned)"
-    above.plot(t, before, label=tuned, zorder=3, **BASE_MODEL_LINE)
+    signal_axis.plot(t, measured, "o", label="measured", zorder=4, **marks)
+    base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
+    signal_axis.plot(t, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
     noise, band = 2 * channel.sigma, "±2σ: 95 % of the noise"
-    below.axhspan(-noise, noise, color=NOISE_BAND_GREY, linewidth=0, label=band, zorder=0)
-    below.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
-    below.plot(t, measured - before, zorder=3, **{**BASE_MODEL_LINE, "linewidth": 1.0})
-    if has_extended_model(story):
+    residual_axis.axhspan(-noise, noise, color=NOISE_BAND_GREY, linewidth=0, label=band, zorder=0)
+    residual_axis.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
+    residual_axis.plot(t, measured - before, zorder=3, **{**BASE_MODEL_LINE, "linewidth": 1.0})
+    if has_extended_model(report):
         # The wide curve is behind: where both agree, "before" is visible as dashes on it.
-        above.plot(
+        signal_axis.plot(
             t, after, label="simulated after", zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 3.2}
         )
-        below.plot(t, measured - after, zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 0.8})
+        residual_axis.plot(
+            t, measured - after, zorder=2, **{**EXTENDED_MODEL_LINE, "linewidth": 0.8}
+        )
 
-    above.set_ylabel(shorten_label(channel.name, channel.unit, 14))
-    below.set_ylabel(shorten_label("residual", channel.unit))
-    below.set_xlabel("time [s]; residual: measured − simulated")
-    above.margins(x=0.01)
-    for axis in (above, below):
+    signal_axis.set_ylabel(shorten_label(channel.name, channel.unit, 14))
+    residual_axis.set_ylabel(shorten_label("residual", channel.unit))
+    residual_axis.set_xlabel("time [s]; residual: measured − simulated")
+    signal_axis.margins(x=0.01)
+    for axis in (signal_axis, residual_axis):
         axis.locator_params(nbins=6)
     # Noise must not fill the panel: its band should look narrow.
-    _at_least(below, 3 * channel.sigma)
+    _at_least(residual_axis, 3 * channel.sigma)
 
 
 def _at_least(axis: Axes, size: float) -> None:
@@ -294,11 +301,11 @@ _PROFILES_AFTER = 4.1
 """Distance from the end of the names of places to the profiles, in inches."""
 
 
-def _where(story: DiagnosisReportData) -> Figure:
+def _where(report: DiagnosisReportData) -> Figure:
     """Draw the gap locations on the left, and the most informative profiles on the right."""
     places, profiles = (
-        select_gap_locations(story.places),
-        select_informative_profiles(story.profiles),
+        select_gap_locations(report.places),
+        select_informative_profiles(report.profiles),
     )
     rows = min(2, len(profiles))
     columns = -(-len(profiles) // 2)
@@ -309,13 +316,13 @@ def _where(story: DiagnosisReportData) -> Figure:
     width = left + 3.3 + (3.1 * columns if columns != 1 else 4.4)
     row = 0.27 + 0.13 * (most_lines(names) - 1)
     # Variables of robots have long names, which need several lines below the panels.
-    more = 0.15 * (most_lines([profile_label(profile) for profile in profiles]) - 1)
-    height = max(2.6 + row * len(places), 1.5 + (1.9 + more) * rows)
+    label_height = 0.15 * (most_lines([profile_label(profile) for profile in profiles]) - 1)
+    height = max(2.6 + row * len(places), 1.5 + (1.9 + label_height) * rows)
     figure, axes = make_panel_grid(1, 1, (width, height), layout=None)
-    sheet, axis = _FigureLayout(figure, width, height), axes[0, 0]
+    layout, axis = _FigureLayout(figure, width, height), axes[0, 0]
     axis.set_position((left / width, 1.0 / height, 3.1 / width, 1 - 1.4 / height))
-    draw_gap_location_panel(axis, places, story)
-    sheet.heading(0.15, "Where the gap is")
+    draw_gap_location_panel(axis, places, report)
+    layout.heading(0.15, "Where the gap is")
     figure.legend(
         *get_legend_entries(axis), loc="lower left", ncols=2, fontsize=8.5, columnspacing=1.0
     )
@@ -323,26 +330,28 @@ def _where(story: DiagnosisReportData) -> Figure:
         return figure
 
     channels = {profile.channel for profile in profiles}
-    of = f" of {sanitise(profiles[0].channel, LONGEST_NAME)}" if len(channels) == 1 else ""
-    sheet.heading(profiles_from, f"What the residual{of} follows: means in bins")
+    channel_text = (
+        f" of {sanitise(profiles[0].channel, LONGEST_NAME)}" if len(channels) == 1 else ""
+    )
+    layout.heading(profiles_from, f"What the residual{channel_text} follows: means in bins")
     note = "residual: measured − simulated; bars: ±2 standard errors"
-    figure.text(sheet.across(profiles_from), sheet.up(0.2), note, fontsize=8.5, va="center")
+    figure.text(layout.across(profiles_from), layout.up(0.2), note, fontsize=8.5, va="center")
     grid = figure.add_gridspec(
         rows,
         columns,
-        left=sheet.across(profiles_from),
-        right=1 - sheet.across(0.12),
-        bottom=sheet.up(0.85 + more),
-        top=1 - sheet.up(0.5),
-        hspace=0.45 + 0.6 * more,
+        left=layout.across(profiles_from),
+        right=1 - layout.across(0.12),
+        bottom=layout.up(0.85 + label_height),
+        top=1 - layout.up(0.5),
+        hspace=0.45 + 0.6 * label_height,
         wspace=0.42,
     )
-    units = {c.name: c.unit for c in story.channels}
+    units = {c.name: c.unit for c in report.channels}
     for i, profile in enumerate(profiles):
         axis = figure.add_subplot(grid[i // columns, i % columns])
         unit = units.get(profile.channel, "1")
         draw_profile_panel(
-            axis, profile, unit, has_extended_model(story), one_channel=len(channels) == 1
+            axis, profile, unit, has_extended_model(report), one_channel=len(channels) == 1
         )
     return figure
 

@@ -97,72 +97,72 @@ _FEW = 5
 
 
 def render_report(
-    story: DiagnosisReportData, drawn: Mapping[str, RenderedFigure], folder: Path | None = None
+    report: DiagnosisReportData, drawn: Mapping[str, RenderedFigure], folder: Path | None = None
 ) -> str:
     """Render the report as HTML.
 
     Args:
-        story: Report data.
+        report: Report data.
         drawn: Figures by name; missing ones are left out.
         folder: Folder in which the report is written with the other files; None for a page alone.
     """
     page = HtmlPage(_STYLE.read_text(encoding="utf-8"))
     tables = {
-        CANDIDATES: build_candidate_table(story),
-        PLACES: build_gap_location_table(story),
-        FOLLOWS: build_residual_profile_table(story),
+        CANDIDATES: build_candidate_table(report),
+        PLACES: build_gap_location_table(report),
+        FOLLOWS: build_residual_profile_table(report),
     }
     for name, table in tables.items():
         if len(table):
             page.add_table(name, table)
-    motion = make_motion_chart(story)
+    motion = make_motion_chart(report)
     page.add_table(MOTION_TABLE_NAME, motion.table.frame)
-    verdict, held_out = story.verdict, story.verdict.heldout
+    verdict, held_out = report.verdict, report.verdict.heldout
     has_share = held_out is not None and bool(verdict.causes) and has_gap_closed(held_out)
-    residual_split, residual_runs = story.fitting, "fitted"
+    residual_split, residual_runs = report.fitting, "fitted"
     # Nothing was fitted to the residual of held-out runs, except initial states.
-    if story.held_out:
-        residual_split, residual_runs = story.held_out, story.validation_run
+    if report.held_out:
+        residual_split, residual_runs = report.held_out, report.validation_run
     open_verdict = verdict.verdict if verdict.cut is None else "unidentifiable"
-    splits = _list_splits(story)
+    splits = _list_splits(report)
     return page.render(
         _TEMPLATE,
         # Report data.
-        story=story,
+        story=report,
         verdict=verdict,
         folder=folder,
-        is_robot=is_robot(story),
-        has_places=has_placed_causes(story),
+        is_robot=is_robot(report),
+        has_places=has_placed_causes(report),
         has_shares=any(c.heldout_gain is not None for c in verdict.candidates),
         # Texts.
-        badge=_format_badge(story),
-        headline=format_headline(story),
-        gain_and_caveats=list(format_gain_and_caveats(story)),
-        next_run=format_next_run(story),
+        badge=_format_badge(report),
+        headline=format_headline(report),
+        gain_and_caveats=list(format_gain_and_caveats(report)),
+        next_run=format_next_run(report),
         values_of_causes=[_format_cause(cause) for cause in verdict.causes],
-        consistency=format_consistency(story),
-        alternative_sets=[_format_set(story, c) for c in verdict.causes if c.alternatives],
+        consistency=format_consistency(report),
+        alternative_sets=[_format_set(report, c) for c in verdict.causes if c.alternatives],
         residual_description=_RESIDUALS.get(open_verdict, "Nothing significant"),
         residual_runs=residual_runs,
-        residual_rms=format_number(compute_normalised_rms(story, residual_split, "after"), 2),
-        units=_format_units(story),
-        simulation_count=format_simulation_count(story),
+        residual_rms=format_number(compute_normalised_rms(report, residual_split, "after"), 2),
+        units=_format_units(report),
+        simulation_count=format_simulation_count(report),
         # Tables, charts and figures.
         closed=format_percent(held_out.gap_closed) if held_out and has_share else "",
         closed_interval=format_interval(held_out) if held_out else "",
-        bars=list(_make_bars(story)),
+        bars=list(_make_bars(report)),
         motion=motion,
-        stills={name: _make_still(story, drawn, name) for name in _FIGURES},
+        stills={name: _make_still(report, drawn, name) for name in _FIGURES},
         joint_positions=drawn["robot"].joint_positions if "robot" in drawn else (),
-        marks=_list_marks(story),
-        identifiability=build_identifiability_section(story),
-        profile_panels=make_residual_profile_panels(story),
-        less_informative=list_less_informative_profiles(story),
+        marks=_list_marks(report),
+        identifiability=build_identifiability_section(report),
+        profile_panels=make_residual_profile_panels(report),
+        less_informative=list_less_informative_profiles(report),
         channel_headings=[f"-RMSE{when}, {name} runs" for name, _, when in splits],
-        channels=_list_channels(story),
-        has_absorbed=any(p.is_sensitive and has_absorbed_gap(p) for p in story.parameters),
-        parameters=[_make_parameter_row(p) for p in story.parameters],
-        agreement=build_agreement_rows(story),
+        channels=_list_channels(report),
+        has_absorbed=any(p.is_sensitive and has_absorbed_gap(p) for p in report.parameters),
+        parameters=[_make_parameter_row(p) for p in report.parameters],
+        agreement=build_agreement_rows(report),
         # Constants and functions.
         BEST=BEST,
         MAX_OPEN_CHANGES=MAX_OPEN_CHANGES,
@@ -175,8 +175,8 @@ def render_report(
     )
 
 
-def _format_badge(story: DiagnosisReportData) -> str:
-    verdict = story.verdict
+def _format_badge(report: DiagnosisReportData) -> str:
+    verdict = report.verdict
     if verdict.recording_faults:
         return "unknown: a unit or a sign of the recording is wrong"
     if verdict.cut is not None:
@@ -193,13 +193,13 @@ def _format_cause(cause: Cause) -> str:
     return f"{sanitise(name, 200)}: {format_coefficients(cause)}"
 
 
-def _format_set(story: DiagnosisReportData, cause: Cause) -> str:
+def _format_set(report: DiagnosisReportData, cause: Cause) -> str:
     """Format the members of a set of indistinguishable causes, with scores and held-out gains."""
     names = [cause.effect, *cause.alternatives]
     # The members of a large set have their scores in the table of candidates.
     if any("@" in name for name in names):
         return f"{format_effect_set(names, 'and')}. Each of them explains these runs equally well."
-    by_effect = {c.effect: c for c in story.verdict.candidates}
+    by_effect = {c.effect: c for c in report.verdict.candidates}
     members = []
     for name in names:
         text = format_effect(name)
@@ -210,10 +210,10 @@ def _format_set(story: DiagnosisReportData, cause: Cause) -> str:
     return f"{joined(members)}. Either of them explains these runs equally well."
 
 
-def _format_units(story: DiagnosisReportData) -> str:
-    units = [format_unit(channel.unit) or "1" for channel in story.channels]
+def _format_units(report: DiagnosisReportData) -> str:
+    units = [format_unit(channel.unit) or "1" for channel in report.channels]
     # A robot has many channels, so each unit is listed once.
-    return sanitise(joined(list(dict.fromkeys(units)) if is_robot(story) else units), 100)
+    return sanitise(joined(list(dict.fromkeys(units)) if is_robot(report) else units), 100)
 
 
 class Bar(NamedTuple):
@@ -225,60 +225,60 @@ class Bar(NamedTuple):
     value: str
 
 
-def _make_bars(story: DiagnosisReportData) -> Iterator[Bar]:
+def _make_bars(report: DiagnosisReportData) -> Iterator[Bar]:
     """Yield bars of the held-out error before and after, and of the noise floor."""
-    held_out = story.verdict.heldout
+    held_out = report.verdict.heldout
     if held_out is None:
         return
     # Without a cause both errors are equal, so a second bar would be misleading.
     bars = [("before", "tuned simulation", held_out.rmse_base)]
-    if story.verdict.causes:
+    if report.verdict.causes:
         bars = [
             ("before", "before: tuned simulation", held_out.rmse_base),
             ("after", "after: with the causes found", held_out.rmse_extended),
         ]
     bars.append(("floor", "noise floor", held_out.noise_floor))
     # Bars are relative to the longest one; a failed simulation has no error and no bar.
-    known = [value for _, _, value in bars if value is not None and isfinite(value)]
-    longest = max(known, default=0.0)
+    finite_values = [value for _, _, value in bars if value is not None and isfinite(value)]
+    longest = max(finite_values, default=0.0)
     for kind, name, value in bars:
         width = 100.0 * value / longest if value is not None and longest > 0 else 0.0
-        yield Bar(kind, name, width, append_unit(format_number(value), get_held_out_unit(story)))
+        yield Bar(kind, name, width, append_unit(format_number(value), get_held_out_unit(report)))
 
 
 _FIGURES = ("robot", "overview", "where", "candidates")
 
 
 def _make_still(
-    story: DiagnosisReportData, drawn: Mapping[str, RenderedFigure], name: str
+    report: DiagnosisReportData, drawn: Mapping[str, RenderedFigure], name: str
 ) -> PrintedFigure | None:
     figure = drawn.get(name)
     if figure is None:
         return None
-    return PrintedFigure(figure.svg or figure.png, figure.pdf, _describe(story, name), name)
+    return PrintedFigure(figure.svg or figure.png, figure.pdf, _describe(report, name), name)
 
 
-def _describe(story: DiagnosisReportData, name: str) -> str:
+def _describe(report: DiagnosisReportData, name: str) -> str:
     """Return the alternative text of a figure."""
     if name == "robot":
         named = [
             f"{mark.kind} {sanitise(mark.name, 30)} ({sanitise(mark.says, 60)})"
-            for mark in list_place_marks(story)
+            for mark in list_place_marks(report)
         ]
         return f"The robot; marked: {joined(named) or 'nothing'}."
     if name == "overview":
-        names = joined([sanitise(channel.name, 30) for channel in story.channels])
-        what = f"Measured and simulated {names} of the run that fits worst, with the residual."
-        return f"{what} {format_headline(story)}"
+        names = joined([sanitise(channel.name, 30) for channel in report.channels])
+        sentence = f"Measured and simulated {names} of the run that fits worst, with the residual."
+        return f"{sentence} {format_headline(report)}"
     # A few of the largest values suffice, because the tables contain all of them.
     if name == "where":
-        finite = [place for place in story.places if isfinite(place.before)]
+        finite = [place for place in report.places if isfinite(place.before)]
         sizes = [
             f"{place.kind} {sanitise(place.label, 30)} {format_number(place.before, 2)}"
             for place in sorted(finite, key=lambda place: -place.before)[:_FEW]
         ]
         return f"RMS of the residual in units of the noise, the largest before: {'; '.join(sizes)}."
-    best = story.verdict.candidates[:_FEW]
+    best = report.verdict.candidates[:_FEW]
     scores = [f"{format_effect_name(c.effect)} {format_number(c.score)}" for c in best]
     return f"Scores of the best candidates: {'; '.join(scores)}."
 
@@ -290,13 +290,13 @@ class MarkedPlace(NamedTuple):
     text: str
 
 
-def _list_marks(story: DiagnosisReportData) -> list[MarkedPlace]:
+def _list_marks(report: DiagnosisReportData) -> list[MarkedPlace]:
     return [
         MarkedPlace(
-            find_joint(story, mark.kind, mark.name),
+            find_joint(report, mark.kind, mark.name),
             f"{mark.kind} {sanitise(mark.name, 40)}: {sanitise(mark.says, 80)}",
         )
-        for mark in list_place_marks(story)
+        for mark in list_place_marks(report)
     ]
 
 
@@ -309,10 +309,10 @@ class ChannelRow(NamedTuple):
     errors: list[str]
 
 
-def _list_splits(story: DiagnosisReportData) -> list[tuple[str, DataSplit, str]]:
+def _list_splits(report: DiagnosisReportData) -> list[tuple[str, DataSplit, str]]:
     """List name, runs, and `` before`` or `` after``, of each error of a channel."""
-    whens = (" before", " after") if story.verdict.causes else ("",)
-    splits = [("fitted", story.fitting), (story.validation_run, story.held_out)]
+    whens = (" before", " after") if report.verdict.causes else ("",)
+    splits = [("fitted", report.fitting), (report.validation_run, report.held_out)]
     return [
         (name, split, when)
         for name, split in splits
@@ -321,13 +321,13 @@ def _list_splits(story: DiagnosisReportData) -> list[tuple[str, DataSplit, str]]
     ]
 
 
-def _list_channels(story: DiagnosisReportData) -> list[ChannelRow]:
+def _list_channels(report: DiagnosisReportData) -> list[ChannelRow]:
     columns = [
         compute_channel_errors(split)[:, int(when == " after")]
-        for _, split, when in _list_splits(story)
+        for _, split, when in _list_splits(report)
     ]
     rows = []
-    for i, channel in enumerate(story.channels):
+    for i, channel in enumerate(report.channels):
         source = "stated" if channel.stated else "estimated"
         source += f", steps of {format_number(channel.step)}" if channel.step else ""
         noise = append_unit(format_number(channel.sigma), channel.unit)

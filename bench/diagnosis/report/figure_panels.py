@@ -77,56 +77,56 @@ def shorten_label(name: object, unit: str = "1", most: int = 30) -> str:
     return format_label(sanitise(name, most), sanitise(unit, 12))
 
 
-def has_extended_model(story: DiagnosisReportData) -> bool:
+def has_extended_model(report: DiagnosisReportData) -> bool:
     """Return whether there is an extended model to show next to the base model."""
-    return bool(story.verdict.causes)
+    return bool(report.verdict.causes)
 
 
 def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
     """Select the runs, channels and phases with the largest gaps, in their original order."""
     result: list[GapLocation] = []
     # A part without samples has no RMS.
-    usable = [p for p in places if np.isfinite(p.before) and p.samples > 0]
+    measured = [p for p in places if np.isfinite(p.before) and p.samples > 0]
     for kind, most in (
         ("run", MAX_RUNS),
         ("channel", MAX_GAP_LOCATIONS),
         ("phase", MAX_GAP_LOCATIONS),
     ):
-        there = [p for p in usable if p.kind == kind]
-        worst = sorted(there, key=lambda p: -p.before)[:most]
+        of_kind = [p for p in measured if p.kind == kind]
+        worst = sorted(of_kind, key=lambda p: -p.before)[:most]
         # The original order is kept, because readers look for run 3 after run 2.
-        result += [p for p in there if p in worst]
+        result += [p for p in of_kind if p in worst]
     return result
 
 
 def draw_gap_location_panel(
-    axis: Axes, places: Sequence[GapLocation], story: DiagnosisReportData
+    axis: Axes, places: Sequence[GapLocation], report: DiagnosisReportData
 ) -> None:
     """Draw the RMS by run, channel and phase, with the range that noise alone would give.
 
     Args:
         axis: Axes to draw on.
         places: Gap locations to draw.
-        story: Report data.
+        report: Report data.
     """
     rows = _rows_of(axis, places)
     # The RMS of n noise samples has a standard deviation of 1 / sqrt(2 n); two of them are drawn.
     noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
-    ones = np.ones(len(rows))
+    floor = np.ones(len(rows))
     axis.errorbar(
-        ones, rows, xerr=noise, fmt="none", ecolor=CHANCE_LEVEL_GREY, elinewidth=7, label=_ALONE
+        floor, rows, xerr=noise, fmt="none", ecolor=CHANCE_LEVEL_GREY, elinewidth=7, label=_ALONE
     )
     axis.axvline(1.0, color=NEUTRAL_MARK, linewidth=1.0, linestyle=":", label=_FLOOR)
-    squares = [p.before for p in places]
-    dots = [p.after for p in places]
-    if has_extended_model(story):
-        axis.hlines(rows, dots, squares, color=CONNECTOR_GREY, linewidth=0.9)
-        axis.plot(dots, rows, linestyle="", label="after", **EXTENDED_MODEL_MARKER)
-    name = "before" if has_extended_model(story) else "simulated (tuned)"
-    axis.plot(squares, rows, linestyle="", label=name, **BASE_MODEL_MARKER)
-    drawn = [*squares, *dots] if has_extended_model(story) else squares
+    before_values = [p.before for p in places]
+    after_values = [p.after for p in places]
+    if has_extended_model(report):
+        axis.hlines(rows, after_values, before_values, color=CONNECTOR_GREY, linewidth=0.9)
+        axis.plot(after_values, rows, linestyle="", label="after", **EXTENDED_MODEL_MARKER)
+    name = "before" if has_extended_model(report) else "simulated (tuned)"
+    axis.plot(before_values, rows, linestyle="", label=name, **BASE_MODEL_MARKER)
+    shown_values = [*before_values, *after_values] if has_extended_model(report) else before_values
     # The noise floor must be visible, whatever the sizes.
-    _decades(axis, [*drawn, 1.0])
+    _decades(axis, [*shown_values, 1.0])
     axis.set_yticks(rows, place_names(places), linespacing=1.05)
     axis.set_ylim(rows[-1] + 0.7, -0.1)
     axis.set_xlabel("RMS of the residual, in units of the noise")
@@ -172,13 +172,13 @@ def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:
 
 def _decades(axis: Axes, values: Sequence[float]) -> None:
     """Use a logarithmic axis with plain numbers if the values have a large range."""
-    there = np.array([v for v in values if np.isfinite(v) and v > 0])
-    if not there.size or there.max() / there.min() < _SPAN_FOR_LOG:
+    positive = np.array([v for v in values if np.isfinite(v) and v > 0])
+    if not positive.size or positive.max() / positive.min() < _SPAN_FOR_LOG:
         axis.set_xlim(left=0)
         return
     axis.set_xscale("log")
-    low = there.min() / 1.4
-    high = there.max() * 1.4
+    low = positive.min() / 1.4
+    high = positive.max() * 1.4
     ticks = _ticks(low, high)
     axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     # Minor ticks of a short axis would be labelled too, in powers of ten.
@@ -208,21 +208,21 @@ def select_informative_profiles(profiles: Sequence[ResidualProfile]) -> list[Res
 
     Each variable comes once before any comes a second time.
     """
-    usable = [p for p in profiles if np.isfinite(_standing(p))]
-    strongest_first = sorted(usable, key=lambda p: -_standing(p))
+    measured = [p for p in profiles if np.isfinite(_standing(p))]
+    strongest_first = sorted(measured, key=lambda p: -_standing(p))
     variables = [p.variable for p in strongest_first]
-    again = [name in variables[:i] for i, name in enumerate(variables)]
+    is_repeated = [name in variables[:i] for i, name in enumerate(variables)]
     # The sort is stable: first profiles of each variable come first, each group by significance.
-    order = np.argsort(again, kind="stable")
+    order = np.argsort(is_repeated, kind="stable")
     return [strongest_first[i] for i in order[:MAX_PROFILES]]
 
 
 def _standing(profile: ResidualProfile) -> float:
     """Compute the mean squared residual in standard errors; 1 for noise, NaN for too few bins."""
-    there = np.isfinite(profile.before) & (profile.error > 0)
-    if there.sum() < 2:
+    is_measured = np.isfinite(profile.before) & (profile.error > 0)
+    if is_measured.sum() < 2:
         return float("nan")
-    return float(np.mean((profile.before[there] / profile.error[there]) ** 2))
+    return float(np.mean((profile.before[is_measured] / profile.error[is_measured]) ** 2))
 
 
 def profile_label(profile: ResidualProfile) -> str:
@@ -246,18 +246,18 @@ def draw_profile_panel(
         one_channel: Whether all panels show the same channel, which their heading names.
     """
     # Bins without samples have no mean.
-    there = np.isfinite(profile.before)
-    centres = profile.centres[there]
-    bars = 2 * profile.error[there]
+    is_measured = np.isfinite(profile.before)
+    centres = profile.centres[is_measured]
+    bars = 2 * profile.error[is_measured]
     axis.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6)
-    looks = [
+    curves = [
         (
             profile.before,
             {**BASE_MODEL_LINE, **BASE_MODEL_MARKER, "markersize": 4.5, "linewidth": 1.0},
         )
     ]
     if extended:
-        looks.append(
+        curves.append(
             (
                 profile.after,
                 {
@@ -268,13 +268,13 @@ def draw_profile_panel(
                 },
             )
         )
-    for values, look in looks:
-        axis.errorbar(centres, values[there], yerr=bars, elinewidth=1.0, **look)
+    for values, curve_style in curves:
+        axis.errorbar(centres, values[is_measured], yerr=bars, elinewidth=1.0, **curve_style)
     axis.set_xlabel(profile_label(profile))
-    what = (
+    label = (
         "residual" if one_channel else f"residual of {sanitise(profile.channel, MAX_LABEL_LENGTH)}"
     )
     axis.set_ylabel(
-        break_name(format_label(what, sanitise(unit, SHORT_LABEL_LENGTH)), MAX_LABEL_LENGTH)
+        break_name(format_label(label, sanitise(unit, SHORT_LABEL_LENGTH)), MAX_LABEL_LENGTH)
     )
     axis.locator_params(nbins=5)

@@ -126,11 +126,11 @@ class IdentifiabilitySection(NamedTuple):
     all: list[IdentifiabilityRow]
 
 
-def build_identifiability_section(story: DiagnosisReportData) -> IdentifiabilitySection | None:
+def build_identifiability_section(report: DiagnosisReportData) -> IdentifiabilitySection | None:
     """Build the section on free parameters and causes; None if identifiability is unknown."""
-    if not story.identifiability:
+    if not report.identifiability:
         return None
-    rows = _rows(story)
+    rows = _rows(report)
     present = [status for status in _STANDINGS if any(row.standing == status for row in rows)]
     unclear, clear = _told_apart([row for row in rows if _place(row)])
     count = len({split_effect_name(row.effect)[0] for row in clear})
@@ -138,8 +138,8 @@ def build_identifiability_section(story: DiagnosisReportData) -> Identifiability
     without_place = [row for row in rows if not _place(row)]
     columns = [s for s in _STANDINGS if any(row.standing == s for row in without_place)]
     return IdentifiabilitySection(
-        counts=format_counts(story),
-        free=[_table_row(one, one.word) for one in story.identifiability if one.free],
+        counts=format_counts(report),
+        free=[_table_row(one, one.word) for one in report.identifiability if one.free],
         legend="; ".join(f"{_SIGNS[status]} {_LEGEND[status]}" for status in present),
         matrices=_matrices(unclear),
         family_headings=[f"{_SIGNS[status]} {_LEGEND[status]}" for status in columns],
@@ -171,9 +171,9 @@ def _matrices(rows: Sequence[_Row]) -> list[Matrix]:
     ]
 
 
-def format_counts(story: DiagnosisReportData) -> str:
+def format_counts(report: DiagnosisReportData) -> str:
     """Format how many causes are identifiable, and which were found."""
-    rows = _rows(story)
+    rows = _rows(report)
     words = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
     counts = {s: words.count(s) for s in _STANDINGS[2:]}
     sentence = (
@@ -181,32 +181,34 @@ def format_counts(story: DiagnosisReportData) -> str:
         f"{counts['identifiable']} well, {counts['weak']} roughly and "
         f"{counts['not identifiable']} not at all."
     )
-    found = [f"{format_effect(c.effect)} ({sanitise(c.effect, 60)})" for c in _causes(story)]
-    return f"{sentence} Found: {joined(found)}." if found else sentence
+    named_causes = [
+        f"{format_effect(c.effect)} ({sanitise(c.effect, 60)})" for c in _causes(report)
+    ]
+    return f"{sentence} Found: {joined(named_causes)}." if named_causes else sentence
 
 
-def _causes(story: DiagnosisReportData) -> list[Cause]:
+def _causes(report: DiagnosisReportData) -> list[Cause]:
     """Return the causes that the verdict supports."""
-    vouched = story.verdict.verdict in ("named", "ambiguous", "partial")
-    return list(story.verdict.causes) if vouched else []
+    vouched = report.verdict.verdict in ("named", "ambiguous", "partial")
+    return list(report.verdict.causes) if vouched else []
 
 
-def _rows(story: DiagnosisReportData) -> list[_Row]:
+def _rows(report: DiagnosisReportData) -> list[_Row]:
     """List the causes in the order of the numbers, with those of the verdict marked."""
-    found: dict[str, str] = {}
-    for cause in _causes(story):
+    status_by_effect: dict[str, str] = {}
+    for cause in _causes(report):
         for name in (cause.effect, *cause.alternatives):
             standing = "set" if cause.alternatives else "found"
-            found.setdefault(name, standing)
+            status_by_effect.setdefault(name, standing)
             # For a family, members with a coefficient of their own are marked.
             for key in cause.coefficients if name == cause.effect else ():
                 if place := split_effect_name(key)[1]:
-                    found.setdefault(f"{split_effect_name(name)[0]}@{place}", standing)
+                    status_by_effect.setdefault(f"{split_effect_name(name)[0]}@{place}", standing)
     rows = []
-    for one in story.identifiability:
+    for one in report.identifiability:
         if not one.free:
             effect = one.name.partition(" ")[0]
-            rows.append(_Row(one, effect, found.get(effect, one.word)))
+            rows.append(_Row(one, effect, status_by_effect.get(effect, one.word)))
     return rows
 
 

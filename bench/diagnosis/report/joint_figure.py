@@ -80,21 +80,21 @@ class JointRow(NamedTuple):
     channels: Mapping[str, int]
 
 
-def is_robot(story: DiagnosisReportData) -> bool:
+def is_robot(report: DiagnosisReportData) -> bool:
     """Return whether the channels are those of a robot."""
-    return story.robot is not None and len(list_joint_rows(story)) > 0
+    return report.robot is not None and len(list_joint_rows(report)) > 0
 
 
-def list_joint_rows(story: DiagnosisReportData) -> list[JointRow]:
+def list_joint_rows(report: DiagnosisReportData) -> list[JointRow]:
     """List a row for each joint, in the order of the channels, then one for each sensor."""
     joints: dict[str, dict[str, int]] = {}
     sensors = []
-    for c, channel in enumerate(story.channels):
+    for c, channel in enumerate(report.channels):
         quantity, _, name = channel.name.partition(".")
         if quantity in QUANTITY_LABELS and name:
             joints.setdefault(name, {})[quantity] = c
         else:
-            sensors.append(JointRow(channel.name, c, {_first(story): c}))
+            sensors.append(JointRow(channel.name, c, {_first(report): c}))
     rows = []
     for name, channels in joints.items():
         # The position is shown if it was recorded, otherwise the velocity or the torque.
@@ -103,89 +103,91 @@ def list_joint_rows(story: DiagnosisReportData) -> list[JointRow]:
     return rows + sensors
 
 
-def _first(story: DiagnosisReportData) -> str:
+def _first(report: DiagnosisReportData) -> str:
     """Return the quantity of the first residual column, which also holds those of sensors."""
-    return next(iter(_quantities(story)), "q")
+    return next(iter(_quantities(report)), "q")
 
 
-def _quantities(story: DiagnosisReportData) -> list[str]:
-    there = {channel.name.partition(".")[0] for channel in story.channels}
-    return [quantity for quantity in QUANTITY_LABELS if quantity in there]
+def _quantities(report: DiagnosisReportData) -> list[str]:
+    recorded = {channel.name.partition(".")[0] for channel in report.channels}
+    return [quantity for quantity in QUANTITY_LABELS if quantity in recorded]
 
 
-def draw_joint_figure(story: DiagnosisReportData, shot: RunView) -> Figure:
+def draw_joint_figure(report: DiagnosisReportData, view: RunView) -> Figure:
     """Draw a run joint by joint.
 
     Args:
-        story: Report data.
-        shot: Run to draw.
+        report: Report data.
+        view: Run to draw.
     """
-    rows = _worst(story, shot)
-    quantities = _quantities(story) or ["q"]
+    rows = _worst(report, view)
+    quantities = _quantities(report) or ["q"]
     height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
-    found = {mark.name for mark in list_place_marks(story)} | _joints_of_marks(story)
-    names = [_row_name(row, row.name in found) for row in rows]
-    left = max(1.95, 0.12 + text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
-    width = left + 5.15 + 2.6 * len(quantities)
+    named_joints = {mark.name for mark in list_place_marks(report)} | _joints_of_marks(report)
+    names = [_row_name(row, row.name in named_joints) for row in rows]
+    names_width = max(1.95, 0.12 + text_width(names, _NAME_SIZE, "bold") + _BESIDE_NAME)
+    width = names_width + 5.15 + 2.6 * len(quantities)
     size = (width, _HEAD + _FOOT + height * len(rows))
     ratios = (4.2, *[3.0] * len(quantities))
     figure, axes = make_panel_grid(
         len(rows), len(ratios), size, layout=None, sharex=True, width_ratios=ratios
     )
     for row, panels in zip(rows, axes, strict=True):
-        _motion(panels[0], story, shot, row, row.name in found)
+        _motion(panels[0], report, view, row, row.name in named_joints)
         for panel, quantity in zip(panels[1:], quantities, strict=True):
             if quantity in row.channels:
-                _residual(panel, story, shot, row.channels[quantity])
+                _residual(panel, report, view, row.channels[quantity])
             else:
                 panel.set_axis_off()
     for column, quantity in enumerate(quantities, start=1):
-        _one_scale(axes[:, column], story, shot, rows, quantity)
-        what = QUANTITY_LABELS[quantity]
-        axes[0, column].set_title(f"residual of {what} [σ]", fontsize=9.5, loc="left")
+        _one_scale(axes[:, column], report, view, rows, quantity)
+        label = QUANTITY_LABELS[quantity]
+        axes[0, column].set_title(f"residual of {label} [σ]", fontsize=9.5, loc="left")
     axes[0, 0].set_title("measured and simulated", fontsize=9.5, loc="left")
     for panel in axes[-1]:
         panel.set_xlabel("time [s]")
         # The narrow columns have little space for tick labels, which may be long.
         panel.locator_params(axis="x", nbins=4)
-    _finish(figure, axes, story, shot, rows, left)
+    _finish(figure, axes, report, view, rows, names_width)
     return figure
 
 
-def _worst(story: DiagnosisReportData, shot: RunView) -> list[JointRow]:
+def _worst(report: DiagnosisReportData, view: RunView) -> list[JointRow]:
     """Select the rows with the largest residuals, in their original order."""
-    rows = list_joint_rows(story)
+    rows = list_joint_rows(report)
 
     def gap(row: JointRow) -> float:
-        return max(_size(story, shot, c, "before") for c in row.channels.values())
+        return max(_size(report, view, c, "before") for c in row.channels.values())
 
     worst = sorted(rows, key=gap, reverse=True)[:MAX_JOINTS]
     return [row for row in rows if row in worst]
 
 
-def _size(story: DiagnosisReportData, shot: RunView, c: int, which: str) -> float:
+def _size(report: DiagnosisReportData, view: RunView, c: int, model: str) -> float:
     """Return the RMS residual of a channel in this run in noise units; 0 without samples."""
-    left = _left(story, shot, c, which)
-    there = left[np.isfinite(left)]
-    return float(np.sqrt(np.mean(there**2))) if there.size else 0.0
+    residual = _left(report, view, c, model)
+    finite = residual[np.isfinite(residual)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
 
 
-def _left(story: DiagnosisReportData, shot: RunView, c: int, which: str) -> Array:
+def _left(report: DiagnosisReportData, view: RunView, c: int, model: str) -> Array:
     """Return the residual (T,) of a channel in units of its noise."""
-    count = len(shot.side.times[shot.row])
-    simulated = getattr(shot.side, which)
-    left: Array = (shot.side.observed - simulated)[shot.row, :count, c] / story.channels[c].sigma
-    return left
+    count = len(view.side.times[view.row])
+    simulated = getattr(view.side, model)
+    residual: Array = (view.side.observed - simulated)[view.row, :count, c] / report.channels[
+        c
+    ].sigma
+    return residual
 
 
 def _motion(
-    panel: Axes, story: DiagnosisReportData, shot: RunView, row: JointRow, found: bool
+    panel: Axes, report: DiagnosisReportData, view: RunView, row: JointRow, is_named: bool
 ) -> None:
     """Draw the measured and simulated motion, with the name of the joint next to it."""
-    channel, side = story.channels[row.shown], shot.side
-    times = side.times[shot.row]
+    channel, split = report.channels[row.shown], view.side
+    times = split.times[view.row]
     signals = [
-        a[shot.row, : len(times), row.shown] for a in (side.observed, side.before, side.after)
+        a[view.row, : len(times), row.shown] for a in (split.observed, split.before, split.after)
     ]
     rows = decimate(signals[0])
     measured, before, after = (signal[rows] for signal in signals)
@@ -202,16 +204,16 @@ def _motion(
         zorder=1,
         rasterized=rows.size > MAX_OUTLINED_DOTS,
     )
-    tuned = "simulated before (tuned)" if has_extended_model(story) else "simulated (tuned)"
-    panel.plot(t, before, label=tuned, zorder=3, **BASE_MODEL_LINE)
-    if has_extended_model(story):
+    base_label = "simulated before (tuned)" if has_extended_model(report) else "simulated (tuned)"
+    panel.plot(t, before, label=base_label, zorder=3, **BASE_MODEL_LINE)
+    if has_extended_model(report):
         # Where the curves agree, "before" is visible as dashes on "after", and "after" on the dots.
         panel.plot(t, after, label="simulated after", zorder=2, **EXTENDED_MODEL_LINE)
     quantity = channel.name.partition(".")[0]
     symbol = quantity if quantity in QUANTITY_LABELS else ""
     panel.set_ylabel(shorten_label(symbol, channel.unit, 14), fontsize=8)
     panel.annotate(
-        _row_name(row, found),
+        _row_name(row, is_named),
         (0, 0.5),
         (-0.72 * 72, 0),
         xycoords="axes fraction",
@@ -220,7 +222,7 @@ def _motion(
         va="center",
         fontsize=_NAME_SIZE,
         weight="bold",
-        color=BLUE if found else NEUTRAL_MARK,
+        color=BLUE if is_named else NEUTRAL_MARK,
         annotation_clip=False,
     )
     panel.margins(x=0.01)
@@ -228,33 +230,33 @@ def _motion(
     panel.tick_params(labelsize=8)
 
 
-def _row_name(row: JointRow, found: bool) -> str:
+def _row_name(row: JointRow, is_named: bool) -> str:
     """Format the name of a joint or sensor in short lines."""
     name = break_name(sanitise(row.name, LONGEST_NAME), _NAME_LINE)
-    return f"{NAMED_JOINT_MARKER} {name}" if found else name
+    return f"{NAMED_JOINT_MARKER} {name}" if is_named else name
 
 
-def _residual(panel: Axes, story: DiagnosisReportData, shot: RunView, c: int) -> None:
+def _residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -> None:
     """Draw the residuals of a channel, with their RMS."""
-    times = shot.side.times[shot.row]
+    times = view.side.times[view.row]
     panel.axhspan(
         -2, 2, color=NOISE_BAND_GREY, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
     )
     panel.axhline(0, color=ZERO_LINE_GREY, linewidth=0.6, zorder=1)
-    whiches = ("before", "after") if has_extended_model(story) else ("before",)
-    for which in whiches:
-        left = _left(story, shot, c, which)
-        rows = decimate(left)
-        look = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
-        if which == "after":
-            look = {**EXTENDED_MODEL_LINE, "linewidth": 0.8, "zorder": 2}
-        look["rasterized"] = rows.size > MAX_OUTLINED_DOTS
-        panel.plot(times[rows], left[rows], **look)
-    sizes = [format_number(_size(story, shot, c, which), 2) for which in whiches]
+    models = ("before", "after") if has_extended_model(report) else ("before",)
+    for model in models:
+        residual = _left(report, view, c, model)
+        rows = decimate(residual)
+        line_style = {**BASE_MODEL_LINE, "linewidth": 1.0, "zorder": 3}
+        if model == "after":
+            line_style = {**EXTENDED_MODEL_LINE, "linewidth": 0.8, "zorder": 2}
+        line_style["rasterized"] = rows.size > MAX_OUTLINED_DOTS
+        panel.plot(times[rows], residual[rows], **line_style)
+    rms_texts = [format_number(_size(report, view, c, model), 2) for model in models]
     panel.text(
         1.0,
         1.02,
-        " → ".join(sizes),
+        " → ".join(rms_texts),
         transform=panel.transAxes,
         ha="right",
         va="bottom",
@@ -269,32 +271,32 @@ def _residual(panel: Axes, story: DiagnosisReportData, shot: RunView, c: int) ->
 
 def _one_scale(
     panels: Sequence[Axes],
-    story: DiagnosisReportData,
-    shot: RunView,
+    report: DiagnosisReportData,
+    view: RunView,
     rows: Sequence[JointRow],
     quantity: str,
 ) -> None:
     """Set one scale for a column of residuals, so that joints can be compared."""
-    most = MIN_RESIDUAL_AXIS_SIGMAS
+    limit = MIN_RESIDUAL_AXIS_SIGMAS
     for row in rows:
         if quantity in row.channels:
-            left = np.abs(_left(story, shot, row.channels[quantity], "before"))
-            there = left[np.isfinite(left)]
-            if there.size:
-                most = max(most, 1.08 * float(np.quantile(there, RESIDUAL_AXIS_QUANTILE)))
+            residual = np.abs(_left(report, view, row.channels[quantity], "before"))
+            finite = residual[np.isfinite(residual)]
+            if finite.size:
+                limit = max(limit, 1.08 * float(np.quantile(finite, RESIDUAL_AXIS_QUANTILE)))
     for panel in panels:
-        panel.set_ylim(-most, most)
+        panel.set_ylim(-limit, limit)
 
 
-def find_joint(story: DiagnosisReportData, kind: str, place: str) -> str:
+def find_joint(report: DiagnosisReportData, kind: str, place: str) -> str:
     """Return the joint that a place belongs to; empty without a joint or a robot.
 
     Args:
-        story: Report data.
+        report: Report data.
         kind: Kind of the place: joint, channel, actuator or body.
         place: Name of the place.
     """
-    robot = story.robot
+    robot = report.robot
     if kind == "joint":
         return "" if place == ALL_PLACES else sanitise(place, 40)
     if kind == "channel":
@@ -306,35 +308,37 @@ def find_joint(story: DiagnosisReportData, kind: str, place: str) -> str:
     if kind == "actuator":
         return next((sanitise(a.joint or "", 40) for a in robot.actuators if a.name == place), "")
     if kind == "body":
-        of = {body.id for body in robot.bodies if body.name == place}
-        moved = [j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in of]
-        return sanitise(moved[0], 40) if moved else ""
+        body_ids = {body.id for body in robot.bodies if body.name == place}
+        joints = [j.name for j in robot.joints if int(robot.compiled.jnt_bodyid[j.id]) in body_ids]
+        return sanitise(joints[0], 40) if joints else ""
     return ""
 
 
-def _joints_of_marks(story: DiagnosisReportData) -> set[str]:
+def _joints_of_marks(report: DiagnosisReportData) -> set[str]:
     """Return the joints of the channels, actuators and bodies in the diagnosis."""
-    return {find_joint(story, mark.kind, mark.name) for mark in list_place_marks(story)}
+    return {find_joint(report, mark.kind, mark.name) for mark in list_place_marks(report)}
 
 
 def _finish(
     figure: Figure,
     axes: Any,
-    story: DiagnosisReportData,
-    shot: RunView,
+    report: DiagnosisReportData,
+    view: RunView,
     rows: Sequence[JointRow],
-    left: float,
+    names_width: float,
 ) -> None:
     """Add title, legend and margins; the panels begin at `left` inches."""
     width, height = figure.get_size_inches().tolist()
-    total = len(list_joint_rows(story))
-    some = f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
+    total = len(list_joint_rows(report))
+    selection = (
+        f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
+    )
     # A sample time counts once, however many channels were recorded.
-    samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
-    kind = f"{story.validation_run} run" if shot.held_out else "run"
-    how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
-    title = f"The {kind} {how}, joint by joint: {shorten_label(shot.side.names[shot.row])}"
-    title += f" ({samples} samples{some})"
+    samples = int(np.isfinite(view.side.observed[view.row]).any(axis=1).sum())
+    kind = f"{report.validation_run} run" if view.held_out else "run"
+    reason = "that fits worst" if report.verdict.verdict == "adequate" else "with the largest gap"
+    title = f"The {kind} {reason}, joint by joint: {shorten_label(view.side.names[view.row])}"
+    title += f" ({samples} samples{selection})"
     figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     with warnings.catch_warnings():
@@ -350,11 +354,11 @@ def _finish(
         ncols=4,
         fontsize=9,
     )
-    before = "before → after" if has_extended_model(story) else "its size"
+    before = "before → after" if has_extended_model(report) else "its size"
     note = f"residual: measured − simulated; above each its RMS in σ, {before}"
     figure.text(0.5, 0.14 / height, note, fontsize=8, ha="center", va="center", color=CAPTION_GREY)
     figure.subplots_adjust(
-        left=left / width,
+        left=names_width / width,
         right=1 - 0.12 / width,
         top=1 - _HEAD / height,
         bottom=_FOOT / height,

@@ -84,10 +84,10 @@ def name_missing_physics(
         grows: Whether the parameter increases with the covariate.
         known: Effects in the model already, which cannot be missing.
     """
-    bare = number.partition("@")[0]
-    family = next((law for law, begins in LAW_PREFIXES.items() if bare.startswith(begins)), "")
-    found = MISSING_PHYSICS_NAMES.get((family, kind), "")
-    text = found if isinstance(found, str) else found[0 if grows else 1]
+    base_name = number.partition("@")[0]
+    family = next((law for law, begins in LAW_PREFIXES.items() if base_name.startswith(begins)), "")
+    explanation = MISSING_PHYSICS_NAMES.get((family, kind), "")
+    text = explanation if isinstance(explanation, str) else explanation[0 if grows else 1]
     effect = text.partition("(")[2].rstrip(")")
     if not text or any(one.partition("@")[0] == effect for one in known):
         return f"{LAW_NAMES.get(family, 'something')} that depends on {name}"

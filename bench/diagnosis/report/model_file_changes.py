@@ -33,11 +33,11 @@ def find_model_file_changes(before: str, after: str) -> tuple[ModelFileChange, .
     matcher = SequenceMatcher(None, old, new, autojunk=False)
     if matcher.ratio() < MIN_UNCHANGED_SHARE:
         return tuple(_commented(new))
-    found: list[ModelFileChange] = []
+    changes: list[ModelFileChange] = []
     for kind, i1, i2, j1, j2 in matcher.get_opcodes():
         if kind != "equal":
-            found += _block(old[i1:i2], new[j1:j2])
-    return tuple(found)
+            changes += _block(old[i1:i2], new[j1:j2])
+    return tuple(changes)
 
 
 def _elements(text: str) -> list[str]:

@@ -79,49 +79,49 @@ class MotionTable(NamedTuple):
     absent: int
 
 
-def build_motion_table(story: DiagnosisReportData, most: int = MAX_ROWS) -> MotionTable:
+def build_motion_table(report: DiagnosisReportData, most: int = MAX_ROWS) -> MotionTable:
     """Build the table of samples to show.
 
     Args:
-        story: Report data.
+        report: Report data.
         most: Approximate maximum number of samples.
     """
-    runs = _runs(story)
-    count = len(story.channels)
+    runs = _runs(report)
+    count = len(report.channels)
     shown = runs[: max(1, most // (MIN_ROWS_PER_CHANNEL * count))]
-    each = max(MIN_ROWS_PER_CHANNEL, most // (len(shown) * count))
-    parts = [_rows(story, run, c, each) for run in shown for c in range(count)]
-    names = ["run", "channel", "t", "measured", "before"] + ["after"] * has_extended_model(story)
-    names += ["residual_before"] + ["residual_after"] * has_extended_model(story)
+    samples_per_run = max(MIN_ROWS_PER_CHANNEL, most // (len(shown) * count))
+    parts = [_rows(report, run, c, samples_per_run) for run in shown for c in range(count)]
+    names = ["run", "channel", "t", "measured", "before"] + ["after"] * has_extended_model(report)
+    names += ["residual_before"] + ["residual_after"] * has_extended_model(report)
     columns = [[cell for part in parts for cell in part[i]] for i in range(len(names))]
     frame = Table(dict(zip(names, columns, strict=True)))
     longest = max(len(run.side.times[run.row]) for run in shown)
-    cut = _stretches(story, each) if longest > each else 0
-    return MotionTable(frame, tuple(shown), cut, longest, len(runs) - len(shown))
+    part_count = _stretches(report, samples_per_run) if longest > samples_per_run else 0
+    return MotionTable(frame, tuple(shown), part_count, longest, len(runs) - len(shown))
 
 
-def _runs(story: DiagnosisReportData) -> list[ShownRun]:
+def _runs(report: DiagnosisReportData) -> list[ShownRun]:
     """List all runs, the worst first, but the run of the printed figure before all others."""
-    sigma = np.array([c.sigma for c in story.channels])
-    first = select_worst_run(story)
-    found = []
-    for side in list_data_splits(story):
-        squares = np.square((side.observed - side.before) / sigma)
+    sigma = np.array([c.sigma for c in report.channels])
+    first = select_worst_run(report)
+    runs = []
+    for split in list_data_splits(report):
+        squares = np.square((split.observed - split.before) / sigma)
         use = ""
-        if side is story.held_out:
-            use = ", left out" if story.cross_validated else ", held out"
-        for row, name in enumerate(side.names):
-            there = squares[row][np.isfinite(squares[row])]
-            gap = float(np.sqrt(there.mean())) if there.size else 0.0
+        if split is report.held_out:
+            use = ", left out" if report.cross_validated else ", held out"
+        for row, name in enumerate(split.names):
+            finite = squares[row][np.isfinite(squares[row])]
+            gap = float(np.sqrt(finite.mean())) if finite.size else 0.0
             says = f"{sanitise(name, 40)}{use}: RMS residual {format_number(gap, 2)} σ"
-            found.append(ShownRun(side, row, says, gap))
-    shot = (id(first.side), first.row)
-    return sorted(found, key=lambda run: ((id(run.side), run.row) != shot, -run.gap))
+            runs.append(ShownRun(split, row, says, gap))
+    first_run = (id(first.side), first.row)
+    return sorted(runs, key=lambda run: ((id(run.side), run.row) != first_run, -run.gap))
 
 
-def _stretches(story: DiagnosisReportData, most: int) -> int:
+def _stretches(report: DiagnosisReportData, most: int) -> int:
     """Return the number of parts of a long run: the extremes of two or three signals are kept."""
-    return max(1, most // (6 if has_extended_model(story) else 4))
+    return max(1, most // (6 if has_extended_model(report) else 4))
 
 
 def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[np.intp]:
@@ -140,28 +140,30 @@ def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[
     edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
     long = np.diff([*edges, size]).max()
     # Each row holds one part; shorter parts are padded with values that are never extremes.
-    places = np.minimum(edges[:, None] + np.arange(long), size - 1)
-    own = places < np.append(edges[1:], size)[:, None]
+    indices = np.minimum(edges[:, None] + np.arange(long), size - 1)
+    is_inside = indices < np.append(edges[1:], size)[:, None]
     rows = np.arange(len(edges))
     chosen = [np.array([0, size - 1])]
     for signal in signals:
         for sign in (1.0, -1.0):
-            values = np.where(own & np.isfinite(signal[places]), sign * signal[places], -np.inf)
-            chosen.append(places[rows, values.argmax(axis=1)])
+            values = np.where(
+                is_inside & np.isfinite(signal[indices]), sign * signal[indices], -np.inf
+            )
+            chosen.append(indices[rows, values.argmax(axis=1)])
     return np.unique(np.concatenate(chosen))
 
 
-def _rows(story: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[list[str]]:
+def _rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[list[str]]:
     """Format the cells of a channel of a run, column by column."""
-    side, channel = run.side, story.channels[c]
-    times = side.times[run.row]
-    whiches = ("before", "after") if has_extended_model(story) else ("before",)
-    observed = side.observed[run.row, : len(times), c]
-    simulated = [getattr(side, which)[run.row, : len(times), c] for which in whiches]
-    residuals = [(observed - one) / channel.sigma for one in simulated]
-    kept = np.arange(len(times))
+    split, channel = run.side, report.channels[c]
+    times = split.times[run.row]
+    models = ("before", "after") if has_extended_model(report) else ("before",)
+    observed = split.observed[run.row, : len(times), c]
+    simulated = [getattr(split, model)[run.row, : len(times), c] for model in models]
+    residuals = [(observed - signal) / channel.sigma for signal in simulated]
+    rows = np.arange(len(times))
     if len(times) > most:
-        kept = select_extreme_samples([observed, *residuals], _stretches(story, most))
+        rows = select_extreme_samples([observed, *residuals], _stretches(report, most))
     digits = (
         int(np.clip(ceil(log10(NOISE_RESOLUTION / channel.sigma)), 0, 15))
         if channel.sigma > 0
@@ -170,11 +172,11 @@ def _rows(story: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     # A thousandth of a step shows whether time stamps have jitter.
     fine = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
-    count = len(kept)
-    texts = [[sanitise(side.names[run.row], 80)] * count, [sanitise(channel.name, 80)] * count]
-    texts.append(_written(times[kept], fine))
-    texts += [_written(values[kept], digits) for values in (observed, *simulated)]
-    return texts + [_written(values[kept], 2) for values in residuals]
+    count = len(rows)
+    texts = [[sanitise(split.names[run.row], 80)] * count, [sanitise(channel.name, 80)] * count]
+    texts.append(_written(times[rows], fine))
+    texts += [_written(values[rows], digits) for values in (observed, *simulated)]
+    return texts + [_written(values[rows], 2) for values in residuals]
 
 
 def _written(values: Array, digits: int) -> list[str]:
@@ -203,91 +205,108 @@ class MotionChart(NamedTuple):
     off: Mapping[str, tuple[str, ...]]
 
 
-def make_motion_chart(story: DiagnosisReportData) -> MotionChart:
+def make_motion_chart(report: DiagnosisReportData) -> MotionChart:
     """Make the chart with its table."""
-    table, places = build_motion_table(story), _places(story)
-    is_wide = len(places) > 2 or is_robot(story)
+    table, places = build_motion_table(report), _places(report)
+    is_wide = len(places) > 2 or is_robot(report)
     panels: list[Panel] = []
     for run in table.runs:
         for facets, c in places:
-            panels += _pair(story, run, c, {"run": run.says, **facets}, is_wide)
-    toggles = ("joint", "quantity") if is_robot(story) else ("channel",)
+            panels += _pair(report, run, c, {"run": run.says, **facets}, is_wide)
+    toggles = ("joint", "quantity") if is_robot(report) else ("channel",)
     return MotionChart(
         table,
         panels,
         2 if is_wide else 1,
         ("Left", "Right") if is_wide else ("Above", "Below"),
         toggles,
-        {toggles[0]: _off(story, places, toggles[0])},
+        {toggles[0]: _off(report, places, toggles[0])},
     )
 
 
-def _places(story: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
+def _places(report: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
     """Return the switches of each channel; for a robot, joint and quantity."""
-    if not is_robot(story):
-        return [({"channel": sanitise(c.name, 40)}, i) for i, c in enumerate(story.channels)]
-    found = []
-    for row in list_joint_rows(story):
+    if not is_robot(report):
+        return [({"channel": sanitise(c.name, 40)}, i) for i, c in enumerate(report.channels)]
+    places = []
+    for row in list_joint_rows(report):
         for quantity, c in row.channels.items():
-            own = story.channels[c].name.partition(".")[0] in QUANTITY_LABELS
-            what = QUANTITY_LABELS[quantity] if own else "sensor"
-            found.append(({"joint": sanitise(row.name, 40), "quantity": what}, c))
-    return found
+            is_joint = report.channels[c].name.partition(".")[0] in QUANTITY_LABELS
+            quantity_label = QUANTITY_LABELS[quantity] if is_joint else "sensor"
+            places.append(({"joint": sanitise(row.name, 40), "quantity": quantity_label}, c))
+    return places
 
 
 def _off(
-    story: DiagnosisReportData, places: Sequence[tuple[dict[str, str], int]], toggle: str
+    report: DiagnosisReportData, places: Sequence[tuple[dict[str, str], int]], toggle: str
 ) -> tuple[str, ...]:
     """Return the channels that are hidden at first: with many channels, those that fit well."""
     if len(places) <= MAX_INITIAL_CHANNELS:
         return ()
     gaps: dict[str, float] = {}
     counts: dict[str, int] = {}
-    by_name = {place.label: place.before for place in story.places if place.kind == "channel"}
+    by_name = {place.label: place.before for place in report.places if place.kind == "channel"}
     for facets, c in places:
         name = facets[toggle]
-        gaps[name] = max(gaps.get(name, 0.0), by_name.get(story.channels[c].name, 0.0))
+        gaps[name] = max(gaps.get(name, 0.0), by_name.get(report.channels[c].name, 0.0))
         counts[name] = counts.get(name, 0) + 1
-    left = MAX_INITIAL_CHANNELS
-    on: set[str] = set()
+    remaining = MAX_INITIAL_CHANNELS
+    visible: set[str] = set()
     for name in sorted(gaps, key=lambda one: -gaps[one]):
-        if not on or counts[name] <= left:
-            on.add(name)
-            left -= counts[name]
-    return tuple(name for name in gaps if name not in on)
+        if not visible or counts[name] <= remaining:
+            visible.add(name)
+            remaining -= counts[name]
+    return tuple(name for name in gaps if name not in visible)
 
 
 def _pair(
-    story: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], wide: bool
+    report: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], wide: bool
 ) -> tuple[Panel, Panel]:
     """Make the panels of a channel's motion and of its residual."""
-    channel = story.channels[c]
-    where = {"run": sanitise(run.side.names[run.row], 80), "channel": sanitise(channel.name, 80)}
-    extended = has_extended_model(story)
-    series = [Series("measured", "measured", MEASURED_STYLE, where, draw="points", under=True)]
-    left = [Series("simulated before", "residual_before", BASE_MODEL_STYLE, where)]
+    channel = report.channels[c]
+    selection = {
+        "run": sanitise(run.side.names[run.row], 80),
+        "channel": sanitise(channel.name, 80),
+    }
+    extended = has_extended_model(report)
+    series = [Series("measured", "measured", MEASURED_STYLE, selection, draw="points", under=True)]
+    residuals = [Series("simulated before", "residual_before", BASE_MODEL_STYLE, selection)]
     if extended:
-        series.append(Series("simulated after", "after", EXTENDED_MODEL_STYLE, where))
-        left.insert(0, Series("simulated after", "residual_after", EXTENDED_MODEL_STYLE, where))
-    series.append(Series("simulated before", "before", BASE_MODEL_STYLE, where))
-    across = Axis("time [s]", scales=("linear",))
+        series.append(Series("simulated after", "after", EXTENDED_MODEL_STYLE, selection))
+        residuals.insert(
+            0, Series("simulated after", "residual_after", EXTENDED_MODEL_STYLE, selection)
+        )
+    series.append(Series("simulated before", "before", BASE_MODEL_STYLE, selection))
+    time_axis = Axis("time [s]", scales=("linear",))
     name = sanitise(channel.name, 40)
     # For the joints of a robot, a common scale makes residuals comparable.
-    of = facets.get("quantity", name)
-    residual = Axis(f"residual of {of} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
-    up = Axis(format_label(brief(sanitise(channel.name), 24), channel.unit), scales=("linear",))
+    quantity = facets.get("quantity", name)
+    residual = Axis(f"residual of {quantity} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
+    value_axis = Axis(
+        format_label(brief(sanitise(channel.name), 24), channel.unit), scales=("linear",)
+    )
     band = (AxisSpan(-2.0, 2.0, "±2σ: 95 % of the noise", along="y"),)
     tells = _tells(format_unit(channel.unit), channel.sigma, extended)
     heights = (_ROW, _ROW) if wide else (_TALL, _LOW)
     above = Panel(
-        name, MOTION_TABLE_NAME, "t", tuple(series), across, up, facets, (), (), tells, heights[0]
+        name,
+        MOTION_TABLE_NAME,
+        "t",
+        tuple(series),
+        time_axis,
+        value_axis,
+        facets,
+        (),
+        (),
+        tells,
+        heights[0],
     )
     below = Panel(
         f"{name}: residual",
         MOTION_TABLE_NAME,
         "t",
-        tuple(left),
-        across,
+        tuple(residuals),
+        time_axis,
         residual,
         facets,
         spans=band,

@@ -37,18 +37,18 @@ class RunView(NamedTuple):
     channels: list[int]
 
 
-def select_worst_run(story: DiagnosisReportData) -> RunView:
+def select_worst_run(report: DiagnosisReportData) -> RunView:
     """Select the run with the largest gap in units of the noise, a held-out one if there is any."""
-    side = list_data_splits(story)[-1]
-    sigma = np.array([c.sigma for c in story.channels])
-    squares = ((side.observed - side.before) / sigma) ** 2
+    split = list_data_splits(report)[-1]
+    sigma = np.array([c.sigma for c in report.channels])
+    squares = ((split.observed - split.before) / sigma) ** 2
     with warnings.catch_warnings():
         # The mean of a run or channel without samples is NaN, which counts as zero.
         warnings.simplefilter("ignore", RuntimeWarning)
         row = int(np.argmax(np.nan_to_num(np.nanmean(squares, axis=(1, 2)))))
         by_channel = np.nan_to_num(np.nanmean(squares[row], axis=0))
     channels = np.argsort(-by_channel, kind="stable")[:MAX_CHANNELS]
-    return RunView(side, row, side is story.held_out, sorted(int(c) for c in channels))
+    return RunView(split, row, split is report.held_out, sorted(int(c) for c in channels))
 
 
 def decimate(values: Array) -> NDArray[np.intp]:

@@ -71,57 +71,57 @@ interval.
 """
 
 
-def format_summary(story: DiagnosisReportData) -> list[str]:
+def format_summary(report: DiagnosisReportData) -> list[str]:
     """Format the summary as terminal lines.
 
     They contain the verdict in a sentence, the gain, the location of the gap, changed parameters,
     and what remains unexplained.
     """
     # The title comes from a file: it must not contain line breaks or terminal control sequences.
-    lines = [sanitise(story.title, TERMINAL_WIDTH), ""]
-    for text in (format_headline(story), *format_gain_and_caveats(story)):
+    lines = [sanitise(report.title, TERMINAL_WIDTH), ""]
+    for text in (format_headline(report), *format_gain_and_caveats(report)):
         lines += wrap(text, TERMINAL_WIDTH)
-    for text in format_details(story):
+    for text in format_details(report):
         lines += ["", *wrap(text, TERMINAL_WIDTH, subsequent_indent="  ")]
     return lines
 
 
-def format_details(story: DiagnosisReportData) -> Iterator[str]:
+def format_details(report: DiagnosisReportData) -> Iterator[str]:
     """Yield the paragraphs below the headline."""
-    verdict = story.verdict.verdict
-    if story.verdict.recording_faults:
-        yield format_simulation_count(story)
+    verdict = report.verdict.verdict
+    if report.verdict.recording_faults:
+        yield format_simulation_count(report)
         return
     # For these verdicts, the description of an effect is part of the text above the details.
     explained = verdict in ("named", "partial")
-    for cause in story.verdict.causes:
+    for cause in report.verdict.causes:
         name = f"{format_sentence(format_effect(cause.effect))[:-1]} ({sanitise(cause.effect, 60)})"
         says = "" if explained else f"{_says(cause)}; "
         yield f"{name}: {says}{format_coefficients(cause)}"
     # The most important reasons come first; the page contains all of them.
-    if story.why:
-        yield "Why: " + " ".join(format_sentence(text) for text in story.why[:2])
-    largest_places = [format_largest_gap(story, kind) for kind in ("run", "channel", "phase")]
+    if report.why:
+        yield "Why: " + " ".join(format_sentence(text) for text in report.why[:2])
+    largest_places = [format_largest_gap(report, kind) for kind in ("run", "channel", "phase")]
     places = [text for text in largest_places if text]
     # Without a gap, the largest residual of a part is random.
     if places and verdict != "adequate":
         unit = "RMS in units of the noise (1 is the noise floor)"
         yield f"Where the gap is largest, {unit}: {'; '.join(places)}."
-    if story.parameters:
-        sentences = [format_parameter_shift(story, p) for p in story.parameters]
+    if report.parameters:
+        sentences = [format_parameter_shift(report, p) for p in report.parameters]
         yield "Parameters: " + " ".join(sentences)
     # For a single log with consistent runs there is nothing to report.
     if any(
         not one.is_consistent or one.by == "log"
-        for one in (*story.consistency.after, *story.consistency.before)
+        for one in (*report.consistency.after, *report.consistency.before)
     ):
-        yield "Agreement between runs: " + " ".join(format_consistency(story))
-    if story.lack_of_fit:
-        yield "What remains: " + " ".join(format_sentence(text) for text in story.lack_of_fit)
+        yield "Agreement between runs: " + " ".join(format_consistency(report))
+    if report.lack_of_fit:
+        yield "What remains: " + " ".join(format_sentence(text) for text in report.lack_of_fit)
     # For an ambiguous verdict, the experiment directly follows the headline.
-    if verdict != "ambiguous" and (proposed := format_next_run(story)):
+    if verdict != "ambiguous" and (proposed := format_next_run(report)):
         yield f"Next experiment: {proposed}"
-    yield format_simulation_count(story)
+    yield format_simulation_count(report)
 
 
 def _says(cause: Cause) -> str:
@@ -129,30 +129,30 @@ def _says(cause: Cause) -> str:
     return strip_place(sanitise(cause.says).rstrip("."))
 
 
-def format_headline(story: DiagnosisReportData) -> str:
+def format_headline(report: DiagnosisReportData) -> str:
     """Format in one sentence what is wrong with the simulator."""
-    verdict, causes = story.verdict.verdict, story.verdict.causes
-    if story.verdict.recording_faults:
-        return format_sentence(story.verdict.recording_faults[0].says)
-    if story.verdict.cut is not None:
-        return _headline_of_cut(story.verdict)
+    verdict, causes = report.verdict.verdict, report.verdict.causes
+    if report.verdict.recording_faults:
+        return format_sentence(report.verdict.recording_faults[0].says)
+    if report.verdict.cut is not None:
+        return _headline_of_cut(report.verdict)
     # A cause is reported as lacking only if the verdict supports it.
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
     if verdict == "unidentifiable":
         unknown = "it is not known what the simulation lacks"
         return (
-            f"These data do not identify {joined(list_unidentified_parameters(story))}: {unknown}."
+            f"These data do not identify {joined(list_unidentified_parameters(report))}: {unknown}."
         )
     if verdict == "unknown" or not causes:
-        none = f"none of the {len(rank_candidates(story))} known causes explains it"
-        none += " at any place" if has_placed_causes(story) else ""
-        return f"Something is missing from the simulation, and {none}."
+        conclusion = f"none of the {len(rank_candidates(report))} known causes explains it"
+        conclusion += " at any place" if has_placed_causes(report) else ""
+        return f"Something is missing from the simulation, and {conclusion}."
     if verdict == "ambiguous":
         return f"The simulation {format_lacking(causes)}: these data do not show which."
     if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
         return f"The simulation {format_lacking(causes)}, but {_undetermined(open_ones)}."
-    if bordering := story.verdict.bordering:
+    if bordering := report.verdict.bordering:
         (name, first), *_ = bordering.items()
         end = f"the {END[first.at_bound or 'high']} bound of its range"
         value = append_unit(format_number(first.value), first.unit)
@@ -162,16 +162,16 @@ def format_headline(story: DiagnosisReportData) -> str:
             "the cause may stand for a value beyond it."
         )
     if verdict == "partial":
-        more = "something else that no known cause explains"
-        if len(causes) == 1 and (said := format_number_error(causes[0])):
-            return format_sentence(f"{said}, and the simulation lacks {more}")
-        return f"The simulation {format_lacking(causes)}, and {_also(causes)}{more}."
+        remainder = "something else that no known cause explains"
+        if len(causes) == 1 and (number_error := format_number_error(causes[0])):
+            return format_sentence(f"{number_error}, and the simulation lacks {remainder}")
+        return f"The simulation {format_lacking(causes)}, and {_also(causes)}{remainder}."
     if len(causes) > 1:
         # With several causes the sentence would be too long; their descriptions follow it.
         return f"The simulation {format_lacking([replace(c, alternatives=()) for c in causes])}."
     (cause,) = causes
-    if said := format_number_error(cause):
-        return format_sentence(said)
+    if number_error := format_number_error(cause):
+        return format_sentence(number_error)
     if is_overstated(cause):
         return f"The simulation has too much {format_effect(cause.effect)}."
     return f"The simulation {format_lacking([replace(cause, alternatives=())])}: {_says(cause)}."
@@ -182,22 +182,22 @@ def _undetermined(causes: Sequence[Cause]) -> str:
     numbers = [n for cause in causes for n in cause.open_numbers.values()]
     at_bounds = [n for n in numbers if n.at_bound is not None]
     if not at_bounds:
-        which = "its number" if len(numbers) == 1 else "all of its numbers"
-        return f"these data do not determine {which if len(causes) == 1 else 'all numbers'}"
+        subject = "its number" if len(numbers) == 1 else "all of its numbers"
+        return f"these data do not determine {subject if len(causes) == 1 else 'all numbers'}"
     first = at_bounds[0]
     value = append_unit(format_number(first.value), first.unit)
     return f"the fit ends at the {END[first.at_bound or 'high']} bound of its range, {value}"
 
 
-def undetermined(story: DiagnosisReportData) -> Iterator[str]:
+def undetermined(report: DiagnosisReportData) -> Iterator[str]:
     """Yield which coefficients are not results, what that means, and what to do."""
-    found = [
+    open_numbers = [
         (f"{sanitise(cause.effect, 60)}, {sanitise(key, 60)}", fitted)
-        for cause in story.verdict.causes
+        for cause in report.verdict.causes
         for key, fitted in cause.open_numbers.items()
     ]
-    at_bounds = [(name, fitted) for name, fitted in found if fitted.at_bound is not None]
-    loose = [name for name, fitted in found if fitted.at_bound is None]
+    at_bounds = [(name, fitted) for name, fitted in open_numbers if fitted.at_bound is not None]
+    without_interval = [name for name, fitted in open_numbers if fitted.at_bound is None]
     if at_bounds:
         parts = [
             f"{name}: {append_unit(format_number(fitted.value), fitted.unit)} is the "
@@ -211,10 +211,10 @@ def undetermined(story: DiagnosisReportData) -> Iterator[str]:
             "suggest a value beyond it, or another cause acts in a similar way. Check units and "
             f"constants of the recording{remedy}."
         )
-    if loose:
+    if without_interval:
         yield (
-            f"{'; '.join(loose)}: the data give no finite interval, so the value is not a result. "
-            "Record a motion in which the effect is larger."
+            f"{'; '.join(without_interval)}: the data give no finite interval, so the value is not "
+            "a result. Record a motion in which the effect is larger."
         )
 
 
@@ -235,20 +235,20 @@ def _headline_of_cut(verdict: Verdict) -> str:
     return f"{nothing}; best candidate so far: {format_causes(verdict.causes)}."
 
 
-def format_early_stop(story: DiagnosisReportData) -> str:
+def format_early_stop(report: DiagnosisReportData) -> str:
     """Format why the search stopped early and which questions it skipped; empty if complete."""
-    found = story.verdict.cut
-    if found is None:
+    cut = report.verdict.cut
+    if cut is None:
         return ""
-    by = {"budget": "its time budget", "interrupt": "an interrupt"}[found.reason]
+    reason = {"budget": "its time budget", "interrupt": "an interrupt"}[cut.reason]
     open_ones = joined(
-        [QUESTION_TEXTS[name] for name in found.skipped_questions if name in QUESTION_TEXTS]
+        [QUESTION_TEXTS[name] for name in cut.skipped_questions if name in QUESTION_TEXTS]
     )
-    during = f"; last step: {sanitise(found.during_question, 80)}" if found.during_question else ""
-    return f"The search was stopped by {by}{during}. Not completed: {open_ones}."
+    last_step = f"; last step: {sanitise(cut.during_question, 80)}" if cut.during_question else ""
+    return f"The search was stopped by {reason}{last_step}. Not completed: {open_ones}."
 
 
-def list_unidentified_parameters(story: DiagnosisReportData) -> list[str]:
+def list_unidentified_parameters(report: DiagnosisReportData) -> list[str]:
     """List the parameters that the recording cannot identify.
 
     They are those reported by the search, else those without interval, else insensitive ones, else
@@ -256,47 +256,47 @@ def list_unidentified_parameters(story: DiagnosisReportData) -> list[str]:
     """
     # Each list is the fallback of the previous one, because at least one parameter must be named.
     unbounded = [
-        p.name for p in story.parameters if p.is_sensitive and not np.isfinite(p.before).all()
+        p.name for p in report.parameters if p.is_sensitive and not np.isfinite(p.before).all()
     ]
-    untouched = [p.name for p in story.parameters if not p.is_sensitive]
+    insensitive = [p.name for p in report.parameters if not p.is_sensitive]
     names = (
-        list(story.unidentified_parameters)
+        list(report.unidentified_parameters)
         or unbounded
-        or untouched
-        or [p.name for p in story.parameters]
+        or insensitive
+        or [p.name for p in report.parameters]
     )
     return [sanitise(name, 60) for name in names] or ["the simulation's parameters"]
 
 
-def format_gain_and_caveats(story: DiagnosisReportData) -> Iterator[str]:
+def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
     """Yield the sentences directly after the headline: gain, caveats and required details."""
-    verdict = story.verdict.verdict
-    yield from (format_sentence(note) for note in story.verdict.recording_notes)
-    if story.verdict.recording_faults:
-        yield from _of_faults(story.verdict.recording_faults)
+    verdict = report.verdict.verdict
+    yield from (format_sentence(note) for note in report.verdict.recording_notes)
+    if report.verdict.recording_faults:
+        yield from _of_faults(report.verdict.recording_faults)
         return
-    if story.verdict.cut is not None:
-        yield format_early_stop(story)
+    if report.verdict.cut is not None:
+        yield format_early_stop(report)
     # A result without a cause needs the tested causes and the detectable gap as context.
     if verdict == "adequate":
-        yield format_search_summary(story)
-        yield format_detectable_gap(story)
-    yield format_gain(story)
-    yield from undetermined(story)
-    if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
+        yield format_search_summary(report)
+        yield format_detectable_gap(report)
+    yield format_gain(report)
+    yield from undetermined(report)
+    if verdict == "partial" or (verdict == "named" and len(report.verdict.causes) > 1):
         # The headline describes a single diagnosed cause; several causes are described here.
         sayings = [
             format_number_error(cause) or f"{format_effect(cause.effect)}: {_says(cause)}"
-            for cause in story.verdict.causes
+            for cause in report.verdict.causes
         ]
         yield format_sentence("; ".join(sayings))
     if verdict == "ambiguous":
-        yield "To distinguish them: " + (format_next_run(story) or "no experiment is proposed.")
+        yield "To distinguish them: " + (format_next_run(report) or "no experiment is proposed.")
 
 
 def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
     """Yield the evidence for a wrong unit or sign, alternative explanations, and what to do."""
-    first, *others = faults
+    first, *further_faults = faults
     if first.error_after is not None:
         before = (
             f"from {format_number(first.error_before)} " if first.error_before is not None else ""
@@ -305,31 +305,31 @@ def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
             "With this correction the error of the tuned simulation on the fitted runs falls "
             f"{before}to {format_number(first.error_after)} times the noise."
         )
-    for text in (*first.alternatives, *(fault.says for fault in others)):
+    for text in (*first.alternatives, *(fault.says for fault in further_faults)):
         yield format_sentence(f"{'or' if text in first.alternatives else 'also'}: {text}")
     yield "No causes were searched, since each would only imitate this. Correct it and run again."
 
 
-def format_gain(story: DiagnosisReportData) -> str:
+def format_gain(report: DiagnosisReportData) -> str:
     """Format the held-out error before and after, and the noise floor.
 
     Without held-out runs, the text says that the gain was not measured.
     """
-    held_out = story.verdict.heldout
+    held_out = report.verdict.heldout
     if held_out is None:
-        return _format_fitted_gain(story)
-    base = _error(story, held_out.rmse_base)
-    extended = _error(story, held_out.rmse_extended)
-    perfect = f"{PERFECT_MODEL_NOTE} {_error(story, held_out.noise_floor)}"
-    runs = story.validation_runs
+        return _format_fitted_gain(report)
+    base = _error(report, held_out.rmse_base)
+    extended = _error(report, held_out.rmse_extended)
+    perfect = f"{PERFECT_MODEL_NOTE} {_error(report, held_out.noise_floor)}"
+    runs = report.validation_runs
     # Without a cause the extended model is the base model, so there is no error after.
-    if not story.verdict.causes:
+    if not report.verdict.causes:
         return f"On {runs} the error of the tuned simulation is {base} (RMSE); {perfect}."
     errors = f"the error on {runs} (RMSE) is {base} before and {extended} after; {perfect}."
     if not has_gap_closed(held_out):
         return errors[0].upper() + errors[1:]
     share = f"{format_percent(held_out.gap_closed)} of the gap{format_interval(held_out)}"
-    return f"{_closer(story)} {share}: {errors}"
+    return f"{_closer(report)} {share}: {errors}"
 
 
 def has_gap_closed(held_out: HeldOutResult) -> bool:
@@ -345,84 +345,84 @@ def format_interval(held_out: HeldOutResult) -> str:
     return f" ({format_percent(low).removesuffix(' %')} to {format_percent(high)})"
 
 
-def _closer(story: DiagnosisReportData) -> str:
+def _closer(report: DiagnosisReportData) -> str:
     """Return the beginning of the sentence about the share of the gap that is closed."""
-    causes = story.verdict.causes
-    if story.verdict.verdict == "unknown" and story.verdict.cut is None:
+    causes = report.verdict.causes
+    if report.verdict.verdict == "unknown" and report.verdict.cut is None:
         names = joined([format_effect(cause.effect) for cause in causes])
         return f"The best of them, {names}, {'closes' if len(causes) == 1 else 'close'} only"
     if len(causes) > 1:
         return "Together they close"
     if is_parameter_error(causes[0].effect) and not causes[0].alternatives:
         return "Correcting it closes"
-    if story.verdict.verdict == "partial":
+    if report.verdict.verdict == "partial":
         return format_sentence(f"{format_effect(causes[0].effect)} closes").rstrip(".")
-    if story.verdict.verdict != "ambiguous":
+    if report.verdict.verdict != "ambiguous":
         return "It closes"
-    several = len(causes[0].alternatives) > 1 and has_placed_causes(story)
+    several = len(causes[0].alternatives) > 1 and has_placed_causes(report)
     return "Each closes" if several else "Either closes"
 
 
-def _format_fitted_gain(story: DiagnosisReportData) -> str:
+def _format_fitted_gain(report: DiagnosisReportData) -> str:
     before, after = (
-        compute_normalised_rms(story, story.fitting, which) for which in ("before", "after")
+        compute_normalised_rms(report, report.fitting, which) for which in ("before", "after")
     )
     error = f"the tuned simulation's error is {format_number(before)} times the noise"
-    if story.verdict.causes:
+    if report.verdict.causes:
         error += f" before and {format_number(after)} times after"
     caution = "No run is held out, so the gain is not measured independently"
-    found = story.verdict.cut
-    if found is not None and "held_out" in found.skipped_questions:
-        caution = f"The gain was not measured on {story.validation_runs}"
+    cut = report.verdict.cut
+    if cut is not None and "held_out" in cut.skipped_questions:
+        caution = f"The gain was not measured on {report.validation_runs}"
     return f"{caution}; on the fitted runs {error}."
 
 
-def get_held_out_unit(story: DiagnosisReportData) -> str:
+def get_held_out_unit(report: DiagnosisReportData) -> str:
     """Return the unit of the held-out errors.
 
     It is the specified unit, or that of the channels whose combined noise is the noise floor.
     """
-    held_out = story.verdict.heldout
+    held_out = report.verdict.heldout
     if held_out is not None and held_out.unit:
         return held_out.unit
     # If the unit is not specified: the noise floor is the RMS noise of the channels of one unit.
     floor = held_out.noise_floor if held_out is not None else None
-    units = list(dict.fromkeys(c.unit for c in story.channels))
+    units = list(dict.fromkeys(c.unit for c in report.channels))
     for unit in units:
-        noises = [c.sigma for c in story.channels if c.unit == unit]
+        noises = [c.sigma for c in report.channels if c.unit == unit]
         together = float(np.sqrt(np.mean([sigma**2 for sigma in noises])))
         if isclose(together, floor or 0.0, rel_tol=0.02):
             return unit
     return units[0] if len(units) == 1 else "1"
 
 
-def _error(story: DiagnosisReportData, value: float | None) -> str:
-    return append_unit(format_number(value), get_held_out_unit(story))
+def _error(report: DiagnosisReportData, value: float | None) -> str:
+    return append_unit(format_number(value), get_held_out_unit(report))
 
 
-def format_search_summary(story: DiagnosisReportData) -> str:
+def format_search_summary(report: DiagnosisReportData) -> str:
     """Format the number of tested causes and the best candidate."""
-    candidates = story.verdict.candidates
+    candidates = report.verdict.candidates
     if not candidates:
         return "There were no candidate causes."
     best = candidates[0]
-    where = " at every place" if has_placed_causes(story) else ""
-    count = f"{len(rank_candidates(story))} possible causes were tested{where}"
+    where = " at every place" if has_placed_causes(report) else ""
+    count = f"{len(rank_candidates(report))} possible causes were tested{where}"
     none = f"{count} and none is significant"
     promising = f"{format_effect(best.effect)} ({format_p_value(best.p_value)})"
     return f"{none}; the most promising is {promising}."
 
 
-def format_detectable_gap(story: DiagnosisReportData) -> str:
+def format_detectable_gap(report: DiagnosisReportData) -> str:
     """Format how large a gap the noise could hide in each channel.
 
     With many channels, only the worst one of each kind is reported.
     """
-    sizes = zip(story.channels, compute_detectable_gap(story).tolist(), strict=True)
+    sizes = zip(report.channels, compute_detectable_gap(report).tolist(), strict=True)
     # The detectable gap of a channel with too few samples is unknown.
-    known = [(channel, size) for channel, size in sizes if isfinite(size)]
+    finite_sizes = [(channel, size) for channel, size in sizes if isfinite(size)]
     parts = []
-    for channel, size in _worst_of_each(known):
+    for channel, size in _worst_of_each(finite_sizes):
         amount = append_unit(format_number(size, 2), channel.unit)
         share = f"{format_number(size / channel.sigma, 2)} of its noise"
         parts.append(f"{amount} in {sanitise(channel.name, 30)} ({share})")
@@ -441,7 +441,7 @@ def _worst_of_each(sizes: Sequence[tuple[ChannelInfo, float]]) -> list[tuple[Cha
     return list(worst.values())
 
 
-def compute_detectable_gap(story: DiagnosisReportData) -> Array:
+def compute_detectable_gap(report: DiagnosisReportData) -> Array:
     """Compute the largest gap (C,) that the noise of a channel could hide at 95 %.
 
     The gap is an RMS in the unit of the channel. r are the n residuals in units of the noise, and s
@@ -457,10 +457,10 @@ def compute_detectable_gap(story: DiagnosisReportData) -> Array:
     its square, twice as much.
     """
     sizes = []
-    for c, channel in enumerate(story.channels):
+    for c, channel in enumerate(report.channels):
         rows = []
-        for side in list_data_splits(story):
-            rows += [*((side.observed - side.before)[:, :, c] / channel.sigma)]
+        for split in list_data_splits(report):
+            rows += [*((split.observed - split.before)[:, :, c] / channel.sigma)]
         residuals = np.concatenate([row[np.isfinite(row)] for row in rows])
         # A single sample has no neighbour, and its square is not a variance.
         if residuals.size < 2:
@@ -472,67 +472,69 @@ def compute_detectable_gap(story: DiagnosisReportData) -> Array:
         phi = 0.0
         if np.isfinite(products).any() and square:
             phi = float(np.clip(np.nanmean(products) / square, 0.0, MAX_PHI))  # (1)
-        counted = residuals.size * (1.0 - phi**2) / (1.0 + phi**2)  # (2)
-        doubt = 0.0 if channel.stated else 2.0 * NOISE_ESTIMATE_ERROR_FACTOR / residuals.size**0.5
-        chance = float(np.hypot(square * (2.0 / counted) ** 0.5, doubt))
-        excess = max(0.0, square - 1.0) + Z95_ONE_SIDED * chance  # (3)
+        effective_samples = residuals.size * (1.0 - phi**2) / (1.0 + phi**2)  # (2)
+        noise_error = (
+            0.0 if channel.stated else 2.0 * NOISE_ESTIMATE_ERROR_FACTOR / residuals.size**0.5
+        )
+        standard_error = float(np.hypot(square * (2.0 / effective_samples) ** 0.5, noise_error))
+        excess = max(0.0, square - 1.0) + Z95_ONE_SIDED * standard_error  # (3)
         sizes.append(channel.sigma * excess**0.5)
     return np.array(sizes)
 
 
-def list_data_splits(story: DiagnosisReportData) -> list[DataSplit]:
+def list_data_splits(report: DiagnosisReportData) -> list[DataSplit]:
     """List the fitted runs and the held-out runs, as far as they exist."""
-    both = (story.fitting, story.held_out)
-    return [side for side in both if side is not None and len(side.names)]
+    splits = (report.fitting, report.held_out)
+    return [split for split in splits if split is not None and len(split.names)]
 
 
-def compute_normalised_rms(story: DiagnosisReportData, side: DataSplit, which: str) -> float:
+def compute_normalised_rms(report: DiagnosisReportData, split: DataSplit, model: str) -> float:
     """Compute the RMS residual of a data split over all channels, in units of the noise.
 
     Args:
-        story: Report data.
-        side: Data split.
-        which: ``before`` or ``after``.
+        report: Report data.
+        split: Data split.
+        model: ``before`` or ``after``.
     """
-    sigma = np.array([c.sigma for c in story.channels])
-    left = (side.observed - getattr(side, which)) / sigma
+    sigma = np.array([c.sigma for c in report.channels])
+    residual = (split.observed - getattr(split, model)) / sigma
     # The mean of an empty set would cause a warning.
-    return float(np.sqrt(np.nanmean(left**2))) if np.isfinite(left).any() else float("nan")
+    return float(np.sqrt(np.nanmean(residual**2))) if np.isfinite(residual).any() else float("nan")
 
 
 def format_coefficients(cause: Cause) -> str:
     """Format a cause's coefficients with intervals, its p-value, and its alternatives."""
-    others = ""
+    alternatives_text = ""
     if cause.alternatives:
         names = format_effect_set(cause.alternatives)
-        others = f"; {names} would explain the data equally well"
+        alternatives_text = f"; {names} would explain the data equally well"
     parts = [text for text in (format_values(cause), format_p_value(cause.p_value)) if text]
-    return f"{'; '.join(parts)}{others}."
+    return f"{'; '.join(parts)}{alternatives_text}."
 
 
-def format_largest_gap(story: DiagnosisReportData, kind: str) -> str:
+def format_largest_gap(report: DiagnosisReportData, kind: str) -> str:
     """Format the run, channel or phase with the largest gap, if there are several.
 
     Args:
-        story: Report data.
+        report: Report data.
         kind: ``run``, ``channel`` or ``phase``.
     """
-    there = [place for place in story.places if place.kind == kind and isfinite(place.before)]
+    of_kind = [place for place in report.places if place.kind == kind and isfinite(place.before)]
     # With a single one, its gap is the largest anyway.
-    if len(there) < 2:
+    if len(of_kind) < 2:
         return ""
-    place: GapLocation = max(there, key=lambda p: p.before)
-    after = f" before, {format_number(place.after, 2)} after" if story.verdict.causes else ""
+    place: GapLocation = max(of_kind, key=lambda p: p.before)
+    after = f" before, {format_number(place.after, 2)} after" if report.verdict.causes else ""
     return f"{kind} {sanitise(place.label, 60)} ({format_number(place.before, 2)}{after})"
 
 
-def format_parameter_shift(story: DiagnosisReportData, p: ParameterChange) -> str:
+def format_parameter_shift(report: DiagnosisReportData, p: ParameterChange) -> str:
     """Format how far a parameter moves once the cause is in the model.
 
     The base model had changed it to absorb part of the gap.
 
     Args:
-        story: Report data.
+        report: Report data.
         p: Parameter before and after.
     """
     name = sanitise(p.name, 60)
@@ -540,7 +542,7 @@ def format_parameter_shift(story: DiagnosisReportData, p: ParameterChange) -> st
     if not p.is_sensitive:
         nominal = f"its nominal {format_number(p.before[0])}{unit}"
         return f"{name} does not influence these data and stays at {nominal}."
-    if not story.verdict.causes:
+    if not report.verdict.causes:
         # Without a cause, the last fit is also of the base model, and is the best one.
         return f"{name} = {tuned(p, 1)}."
     before, after = tuned(p, 0), tuned(p, 1)
@@ -589,15 +591,15 @@ def has_absorbed_gap(p: ParameterChange) -> bool:
     return bool(move > np.hypot(before, after) and move >= LEAST_MOVE * abs(p.before[0]))
 
 
-def format_next_run(story: DiagnosisReportData) -> str:
+def format_next_run(report: DiagnosisReportData) -> str:
     """Format the proposed next experiment; empty if there is none."""
-    proposed = story.verdict.next_experiment
+    proposed = report.verdict.next_experiment
     return format_sentence(proposed.says) if proposed is not None else ""
 
 
-def format_simulation_count(story: DiagnosisReportData) -> str:
+def format_simulation_count(report: DiagnosisReportData) -> str:
     """Format the number of simulations, system, engine and duration."""
-    verdict = story.verdict
+    verdict = report.verdict
     system = sanitise(verdict.system, 60)
     engine = sanitise(verdict.engine, 60)
     simulations = f"{verdict.simulations:,} simulations of system {system} on engine {engine}"

@@ -59,9 +59,9 @@ def _noun(name: str) -> str:
         # A verdict may name an effect of a plugin that is not loaded.
         return sanitise(name, 60)
     if effect.noun:
-        what = sanitise(effect.noun, 60)
-        return what + (
-            format_places(get_place_kind(name), [place], wrong=is_parameter_error(name))
+        noun = sanitise(effect.noun, 60)
+        return noun + (
+            format_places(get_place_kind(name), [place], is_parameter=is_parameter_error(name))
             if place
             else ""
         )
@@ -90,30 +90,32 @@ def is_parameter_error(effect: str) -> bool:
     if base in NUMERICS_NAMES:
         return True
     try:
-        said = effects.get_effect(base).noun
+        noun = effects.get_effect(base).noun
     except InputError:
-        said = ""
-    return bool(_WRONG.match(said))
+        noun = ""
+    return bool(_WRONG.match(noun))
 
 
-def format_places(kind: str, places: Sequence[str], last: str = "or", wrong: bool = False) -> str:
+def format_places(
+    kind: str, places: Sequence[str], last: str = "or", is_parameter: bool = False
+) -> str:
     """Format places: `` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``.
 
     Args:
         kind: Kind of the places.
         places: Names of the places.
         last: Conjunction before the last name.
-        wrong: Whether the effect is a wrong value of the place: `` of joint elbow``.
+        is_parameter: Whether the effect is a wrong value of the place: `` of joint elbow``.
     """
-    before, several = _AT.get(kind, ("at", "places"))
-    before = "of" if wrong else before
+    preposition, plural = _AT.get(kind, ("at", "places"))
+    preposition = "of" if is_parameter else preposition
     names = [sanitise(place, 40) for place in places]
     if names == [ALL_PLACES]:
-        return f" {before} every {kind}" if kind else " everywhere"
+        return f" {preposition} every {kind}" if kind else " everywhere"
     if len(names) < 3:
-        return f" {before} {kind} {joined(names, last)}".replace("  ", " ")
-    each = "any" if last == "or" else "each"
-    return f" {before} {each} of the {several} {joined(names, last)}"
+        return f" {preposition} {kind} {joined(names, last)}".replace("  ", " ")
+    quantifier = "any" if last == "or" else "each"
+    return f" {preposition} {quantifier} of the {plural} {joined(names, last)}"
 
 
 def format_effect_name(effect: str) -> str:

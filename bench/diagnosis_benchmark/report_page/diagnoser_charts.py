@@ -25,17 +25,17 @@ _SHARE_LIMITS = (-0.03, 1.03)
 _SHARE_AXIS = Axis("share", scales=("linear",), ends=_SHARE_LIMITS)
 
 
-def build_chart_tables(shown: DiagnoserReportData) -> dict[str, pd.DataFrame]:
+def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
     """Build the tables of the charts that are not tables of the comparison."""
-    table = shown.tables["table"]
+    table = data.tables["table"]
     alarms = table[table["metric"] == "false alarms"].set_index("diagnoser")["share"]
     named = table[(table["metric"] == PRIMARY_METRIC) & (table["of"] > 0)]
     board = named.assign(alarms=100 * named["diagnoser"].map(alarms))
     board[["share", "low", "high"]] *= 100
-    places = {metric: place for place, metric in enumerate(_list_shares(shown))}
+    places = {metric: place for place, metric in enumerate(_list_shares(data))}
     shares = table[table["metric"].isin(places)]
     levels = pd.DataFrame({"diagnoser": "", "level": P_VALUE_LEVELS, "share": P_VALUE_LEVELS})
-    calibration, sets = shown.tables["calibration"], shown.tables["sets"]
+    calibration, sets = data.tables["calibration"], data.tables["sets"]
     sizes = {label: place for place, label in enumerate(SET_SIZE_LABELS)}
     return {
         "board": board.dropna(subset="alarms"),
@@ -44,30 +44,30 @@ def build_chart_tables(shown: DiagnoserReportData) -> dict[str, pd.DataFrame]:
         if len(calibration)
         else calibration,
         "sets": sets.assign(place=sets["largest_set"].map(sizes)),
-        "cost": named.merge(shown.tables["costs"], on="diagnoser"),
+        "cost": named.merge(data.tables["costs"], on="diagnoser"),
     }
 
 
-def _list_shares(shown: DiagnoserReportData) -> list[str]:
+def _list_shares(data: DiagnoserReportData) -> list[str]:
     """List the metrics of the chart of shares that have answers."""
-    table = shown.tables["table"]
+    table = data.tables["table"]
     return [name for name in _SHARES if table.loc[table["metric"] == name, "of"].any()]
 
 
-def make_charts(shown: DiagnoserReportData) -> dict[str, list[Panel]]:
+def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
     """Make the panels of every chart by name; without data, a chart has none."""
-    tables = build_chart_tables(shown)
+    tables = build_chart_tables(data)
     return {
-        "board": _make_board(shown) if len(tables["board"]) else [],
-        "shares": _make_shares(shown, tables["shares"]) if len(tables["shares"]) else [],
-        "power": _make_power(shown) if len(shown.tables["power"]) else [],
-        "calibration": _make_calibration(shown) if len(tables["calibration"]) else [],
-        "sets": _make_sets(shown) if tables["sets"]["of"].any() else [],
-        "cost": _make_cost(shown) if len(tables["cost"]) else [],
+        "board": _make_board(data) if len(tables["board"]) else [],
+        "shares": _make_shares(data, tables["shares"]) if len(tables["shares"]) else [],
+        "power": _make_power(data) if len(data.tables["power"]) else [],
+        "calibration": _make_calibration(data) if len(tables["calibration"]) else [],
+        "sets": _make_sets(data) if tables["sets"]["of"].any() else [],
+        "cost": _make_cost(data) if len(tables["cost"]) else [],
     }
 
 
-def _make_board(shown: DiagnoserReportData) -> list[Panel]:
+def _make_board(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of diagnosed single causes against false alarms."""
     across = Axis(
         "false alarms if nothing is hidden [%]",
@@ -77,37 +77,37 @@ def _make_board(shown: DiagnoserReportData) -> list[Panel]:
         ends=(-0.15, 110.0),
     )
     up = Axis("single causes named [%]", scales=("linear",), ends=(-3.0, 103.0))
-    series, rules = shown.make_interval_series("share"), (ReferenceLine(1.0, "1 %", "x"),)
+    series, rules = data.make_interval_series("share"), (ReferenceLine(1.0, "1 %", "x"),)
     return [Panel("", "board", "alarms", series, across, up, rules=rules)]
 
 
-def _make_shares(shown: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
+def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
     """Make the chart of all shares of table.csv, one category per metric."""
     counts = table.groupby("metric")["of"].max()
-    names = tuple(f"{_SHARES[name]}\nn={int(counts[name])}" for name in _list_shares(shown))
+    names = tuple(f"{_SHARES[name]}\nn={int(counts[name])}" for name in _list_shares(data))
     across = Axis("what is counted; at most n answers or intervals", names=names)
-    series = shown.make_interval_series("share", beside=True)
+    series = data.make_interval_series("share", beside=True)
     return [Panel("", "shares", "place", series, across, _SHARE_AXIS)]
 
 
-def _make_power(shown: DiagnoserReportData) -> list[Panel]:
+def _make_power(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of the shares named and detected against the size of the hidden effect."""
-    table = shown.tables["power"]
+    table = data.tables["power"]
     sizes = tuple(sorted(float(size) for size in table["size"].unique()))
     across = Axis("size of the hidden effect [noises]", "log", ticks=sizes)
     panels = []
     for metric, title in (("named", "Named, in a set of at most two"), ("seen", "Detected")):
-        lines = shown.make_line_series("share", table, metric=metric)
+        lines = data.make_line_series("share", table, metric=metric)
         panels.append(Panel(title, "power", "size", lines, across, _SHARE_AXIS, {"what": title}))
     return panels
 
 
-def _make_calibration(shown: DiagnoserReportData) -> list[Panel]:
+def _make_calibration(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of the share of clean recordings with a p-value below each level."""
     ideal = Series(
         "calibrated p-value", "share", make_mark_style(GREY, (4.0, 3.0)), {"diagnoser": ""}
     )
-    lines = shown.make_line_series("share", shown.tables["calibration"])
+    lines = data.make_line_series("share", data.tables["calibration"])
     across = Axis("level", "log", ticks=P_VALUE_LEVELS)
     up = Axis(
         "share of clean recordings with p below the level", scales=("linear",), ends=_SHARE_LIMITS
@@ -115,10 +115,10 @@ def _make_calibration(shown: DiagnoserReportData) -> list[Panel]:
     return [Panel("", "calibration", "level", (*lines, ideal), across, up)]
 
 
-def _make_sets(shown: DiagnoserReportData) -> list[Panel]:
+def _make_sets(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of answers, and of correct ones, by the size of their largest set."""
     across = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
-    correct = shown.make_interval_series("share", beside=True)
+    correct = data.make_interval_series("share", beside=True)
     counts = tuple(replace(series, y="of", low="", high="") for series in correct)
     up = Axis("share of sets with the true cause", scales=("linear",), ends=_SHARE_LIMITS)
     many = Axis("answers of this size", scales=("linear",), holds=(0.0,))
@@ -128,14 +128,14 @@ def _make_sets(shown: DiagnoserReportData) -> list[Panel]:
     ]
 
 
-def _make_cost(shown: DiagnoserReportData) -> list[Panel]:
+def _make_cost(data: DiagnoserReportData) -> list[Panel]:
     """Make the chart of diagnosed single causes against the cost of an answer."""
     up = Axis("share of single causes named", scales=("linear",), ends=_SHARE_LIMITS)
     labels = {
         "simulations_median": "simulations for an answer, median",
         "processor_seconds_median": "processor time for an answer [s], median",
     }
-    series = shown.make_interval_series("share")
+    series = data.make_interval_series("share")
     return [
         Panel("", "cost", column, series, Axis(label, "log"), up, {"cost": label})
         for column, label in labels.items()

@@ -36,9 +36,9 @@ class OwnFailures(NamedTuple):
     kinds: list[str]
 
 
-def count_own_failures(shown: DiagnoserReportData) -> OwnFailures | None:
+def count_own_failures(data: DiagnoserReportData) -> OwnFailures | None:
     """Count the failures of simgap; None if it does not take part."""
-    own = select_graded_answers(shown.rows[shown.rows["diagnoser"] == REFERENCE_DIAGNOSER])
+    own = select_graded_answers(data.rows[data.rows["diagnoser"] == REFERENCE_DIAGNOSER])
     if own.empty:
         return None
     wrong = own[~is_correct(own)]
@@ -73,15 +73,17 @@ class Leader(NamedTuple):
     alarm_limit: float = 0.0
 
 
-def find_leader(shown: DiagnoserReportData) -> Leader | None:
+def find_leader(data: DiagnoserReportData) -> Leader | None:
     """Find the best diagnoser among those with few false alarms; None without clean recordings."""
-    table = shown.tables["table"]
+    table = data.tables["table"]
     alarms = index_by_diagnoser(table, "false alarms")
     named = index_by_diagnoser(table, PRIMARY_METRIC)
     if not any(row["of"] for row in alarms.values()):
         return None
-    quiet = [name for name in shown.order if alarms[name]["share"] <= TARGET_FALSE_ALARM_RATE]
-    candidates = [name for name in quiet if named[name]["of"]]
+    with_few_alarms = [
+        name for name in data.order if alarms[name]["share"] <= TARGET_FALSE_ALARM_RATE
+    ]
+    candidates = [name for name in with_few_alarms if named[name]["of"]]
     if not candidates:
         return Leader("")
     best = max(candidates, key=lambda name: float(named[name]["share"]))
@@ -94,13 +96,13 @@ def find_leader(shown: DiagnoserReportData) -> Leader | None:
     row, text = alarms[best], ""
     if row["high"] > TARGET_FALSE_ALARM_RATE:
         text = f"{int(row['count'])} false alarm{'s' * (row['count'] != 1)}"
-    significance = _format_significance(shown, best, others)
+    significance = _format_significance(data, best, others)
     return Leader(
         best, tuple(candidates), share, significance, int(row["of"]), text, float(row["high"])
     )
 
 
-def _format_significance(shown: DiagnoserReportData, best: str, others: list[str]) -> str:
+def _format_significance(data: DiagnoserReportData, best: str, others: list[str]) -> str:
     """Say whether simgap as the best diagnoser differs significantly from the others.
 
     Returns:
@@ -109,40 +111,40 @@ def _format_significance(shown: DiagnoserReportData, best: str, others: list[str
     """
     if not others or best != REFERENCE_DIAGNOSER:
         return ""
-    rows = index_by_diagnoser(shown.tables["pairs"], "named")
-    near = [name for name in others if float(rows[name]["p_holm"]) >= _SIGNIFICANCE_LEVEL]
-    if near:
-        return f"It does not differ significantly from {', '.join(near)} (McNemar, Holm)."
+    rows = index_by_diagnoser(data.tables["pairs"], "named")
+    similar = [name for name in others if float(rows[name]["p_holm"]) >= _SIGNIFICANCE_LEVEL]
+    if similar:
+        return f"It does not differ significantly from {', '.join(similar)} (McNemar, Holm)."
     largest = max(float(rows[name]["p_holm"]) for name in others)
     return f"It differs significantly from all others ({format_p_value(largest)}; McNemar, Holm)."
 
 
-def list_better_diagnosers(shown: DiagnoserReportData) -> list[dict[Hashable, Any]]:
+def list_better_diagnosers(data: DiagnoserReportData) -> list[dict[Hashable, Any]]:
     """List the rows of pairs.csv in which another diagnoser is significantly better than simgap."""
-    pairs = shown.tables["pairs"]
+    pairs = data.tables["pairs"]
     if pairs.empty:
         return []
     significant = pairs["p_holm"] < _SIGNIFICANCE_LEVEL
     return pairs[significant & (pairs["only_other"] > pairs["only_simgap"])].to_dict("records")
 
 
-def write_warnings(shown: DiagnoserReportData) -> Iterator[str]:
+def write_warnings(data: DiagnoserReportData) -> Iterator[str]:
     """Yield sentences about limitations of the results."""
-    if shown.experiment.trusted:
+    if data.experiment.trusted:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
-    if shown.case_count < shown.planned:
+    if data.case_count < data.planned:
         yield (
-            f"{shown.case_count} of {shown.planned} questions: those that every diagnoser has "
+            f"{data.case_count} of {data.planned} questions: those that every diagnoser has "
             "answered. Questions are asked in random order, so these are a fair sample."
         )
-    failed = shown.rows[shown.rows["status"] != "done"]
+    failed = data.rows[data.rows["status"] != "done"]
     if len(failed):
         counts = failed.groupby("diagnoser").size()
         each = ", ".join(f"{sanitise(name, 60)} {count}" for name, count in counts.items())
         yield f"Without an answer (crashed, too late or too costly): {each}."
-    for name, reason, count in summarise_unsupported(shown.left_out):
+    for name, reason, count in summarise_unsupported(data.left_out):
         yield f"{sanitise(name, 60)} does not support {count} of the questions: {reason}."
-    for name, reason in shown.skipped.items():
+    for name, reason in data.skipped.items():
         yield f"{sanitise(name, 60)} was not asked: {reason}"
 
 
@@ -156,4 +158,4 @@ def summarise_unsupported(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
         List of (diagnoser, reason, number of cases).
     """
     groups = left_out.groupby(["diagnoser", "reason"], sort=False).size().reset_index(name="of")
-    return [(str(n), str(why), int(of)) for n, why, of in groups.itertuples(index=False)]
+    return [(str(n), str(why), int(count)) for n, why, count in groups.itertuples(index=False)]

@@ -82,4 +82,4 @@ def test_the_file_of_a_robot_with_a_cause_in_it():
     assert change.element == "joint elbow"
     assert 'frictionloss="0.03"' in change.after
     assert "frictionloss" not in change.before
-    assert "friction.coulomb@elbow: 0.03 N*m" in change.comment
+    assert "friction.coulomb@elbow: 0.03 N·m" in change.comment
