@@ -107,11 +107,11 @@ def parametrize(*subjects: type) -> pytest.MarkDecorator:
             name = check.__name__
             marks = [pytest.mark.xfail(reason=known[name], strict=True)] if name in known else []
             title = f"{subject.__name__}-{name.removeprefix('check_')}"
-            cases.append(pytest.param(_bound(check, subject, failed), id=title, marks=marks))
+            cases.append(pytest.param(_bind_check(check, subject, failed), id=title, marks=marks))
     return pytest.mark.parametrize("check", cases)
 
 
-def _bound(check: Check, subject: type, failed: set[Check]) -> Callable[[], None]:
+def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[], None]:
     """Bind a check to its subject, as a test without arguments.
 
     Args:

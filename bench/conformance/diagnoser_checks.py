@@ -54,7 +54,7 @@ TRAINED_DIAGNOSERS: dict[type[Diagnoser], dict[str, Array]] = {}
 
 
 @cache
-def _made(hidden: bool) -> SimulatedRecording:
+def _get_recording(hidden: bool) -> SimulatedRecording:
     """Simulate a recording of the slider, with strong drag or without a hidden cause."""
     return simulate_recording(
         SimulationSpec(
@@ -73,14 +73,14 @@ def _made(hidden: bool) -> SimulatedRecording:
 
 
 @contextmanager
-def _case(
+def _open_case(
     kind: type[Diagnoser],
     hidden: bool = True,
     budget: int = SIMULATION_BUDGET,
     missing: bool = False,
 ) -> Iterator[DiagnosisCase]:
     """Make a case as a diagnoser gets it; its folder is deleted afterwards."""
-    made = _made(hidden)
+    made = _get_recording(hidden)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"
         made.write(path)
@@ -128,7 +128,7 @@ def _learned(kind: type[Diagnoser]) -> dict[str, Array]:
 
 
 def _train(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
-    simulator = type(_made(False).simulator)
+    simulator = type(_get_recording(False).simulator)
     assert issubclass(simulator, SystemSimulator)
     library = effects.list_effects_for(simulator.system)
     SIMULATION_COUNTER.reset(TRAINING_BUDGET)
@@ -160,8 +160,8 @@ class _Run(NamedTuple):
 @cache
 def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  # noqa: ARG001
     """Run a diagnoser; the result is cached for several checks, once for each value of `turn`."""
-    with _case(kind, hidden) as case:
-        before, touched = _bytes(case), ""
+    with _open_case(kind, hidden) as case:
+        before, touched = _copy_case_bytes(case), ""
         answers: list[Answer] = []
         try:
             with check_global_random_state(f"case.rng in {kind.__name__}.diagnose"):
@@ -174,7 +174,7 @@ def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) 
         (answer,) = answers
         names = {name for group in list_named_sets(answer) for name in group}
         foreign = tuple(sorted(names - set(case.library)))
-        return _Run(answer, foreign, _bytes(case) != before, touched)
+        return _Run(answer, foreign, _copy_case_bytes(case) != before, touched)
 
 
 def _answer(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
@@ -183,15 +183,15 @@ def _answer(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
     Raises:
         CheckError: the result is not a valid answer.
     """
-    given = kind().diagnose(case)
+    answer = kind().diagnose(case)
     try:
-        return Answer.of(given)
+        return Answer.of(answer)
     except InputError as error:
         look = f"{kind.__name__}.diagnose"
         raise CheckError(f"expected an answer; found {error}; see {look}") from None
 
 
-def _bytes(case: DiagnosisCase) -> list[bytes]:
+def _copy_case_bytes(case: DiagnosisCase) -> list[bytes]:
     arrays = [
         array.tobytes()
         for run in case.recording.runs
@@ -231,13 +231,13 @@ def check_leaves_the_recording_alone(kind: type[Diagnoser]) -> None:
 
 def check_leaves_global_chance_alone(kind: type[Diagnoser]) -> None:
     """Check that all random numbers come from case.rng."""
-    if said := _diagnose_cached(kind).touched:
-        raise CheckError(said)
+    if message := _diagnose_cached(kind).touched:
+        raise CheckError(message)
 
 
 def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
     """Check that the diagnoser answers with a tiny budget, or stops with the budget error."""
-    with _case(kind, budget=TINY_SIMULATION_BUDGET) as case:
+    with _open_case(kind, budget=TINY_SIMULATION_BUDGET) as case:
         try:
             _answer(kind, case)
         except SimulationBudgetExceededError:
@@ -253,7 +253,7 @@ def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
 
 def check_takes_missing_samples(kind: type[Diagnoser]) -> None:
     """Check that the diagnoser answers about a recording with missing samples."""
-    with _case(kind, missing=True) as case:
+    with _open_case(kind, missing=True) as case:
         _answer(kind, case)
 
 

@@ -212,11 +212,16 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | Non
             _scenario(host.system),
         )
         thetas = np.concatenate([_theta(simulator, share) for share in (0.05, 0.3, 0.7)])
-        seen = simulator.simulate(thetas, scenario)
+        observations = simulator.simulate(thetas, scenario)
         look = f"{effect.__name__} on {host.name}"
-        check(bool(np.isfinite(seen[-1]).all()), "finite observations", "others", look)
+        check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", look)
         before = plain.simulate(thetas[:1, : len(host.system.parameters)], scenario)
-        check(bool((seen != before).any()), "a change inside the plausible range", "none", look)
+        check(
+            bool((observations != before).any()),
+            "a change inside the plausible range",
+            "none",
+            look,
+        )
     return None if hosts else NO_SUPPORTING_SYSTEM
 
 

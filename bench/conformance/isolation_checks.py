@@ -37,14 +37,20 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
         with start_isolated_tuner(tuned, _SEED, "run", state=state) as tuner:
             words = np.array([_SEED], dtype=np.uint32)
             sealed = IsolatedRun(tuner, words, float("inf"))
-            there = drive_tuner(sealed, task, make_evaluate(task), np.random.default_rng(_SEED))
+            sandboxed_trace = drive_tuner(
+                sealed, task, make_evaluate(task), np.random.default_rng(_SEED)
+            )
     except (RunEndedError, KilledExternallyError) as error:
-        found = str(error).strip().splitlines()[-1:]
-        check(False, "a run in a process of its own", found, look)
+        last_line = str(error).strip().splitlines()[-1:]
+        check(False, "a run in a process of its own", last_line, look)
         raise
-    ended = there.reason.strip().splitlines()[-1:] if there.status != here.status else ""
-    check(there.status == here.status, f"the end {here.status} when sealed", ended, look)
-    same = np.array_equal(there.proposals, here.proposals)
+    ended = (
+        sandboxed_trace.reason.strip().splitlines()[-1:]
+        if sandboxed_trace.status != here.status
+        else ""
+    )
+    check(sandboxed_trace.status == here.status, f"the end {here.status} when sealed", ended, look)
+    same = np.array_equal(sandboxed_trace.proposals, here.proposals)
     check(same, "the same run when sealed", "another one", look)
     return None
 

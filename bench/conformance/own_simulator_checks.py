@@ -57,17 +57,17 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
     _started(simulator)
     try:
         for _ in range(2):
-            seen = simulator.observe()
+            observation = simulator.observe()
             for name in dict.fromkeys([*names, *own.coordinates, *own.rates, *own.levels]):
-                observed(simulator, seen, name)
+                observed(simulator, observation, name)
             if heavy:
                 _check_inertia(own, inertia_of(simulator))
             if forced:
                 simulator.apply_force(np.zeros(len(own.coordinates)))
             _step(simulator)
     except InputError as error:
-        said = str(error).removeprefix(f"simulator {own.name}: ")
-        wanted, _, found = said.partition(", found ")
+        message = str(error).removeprefix(f"simulator {own.name}: ")
+        wanted, _, found = message.partition(", found ")
         raise CheckError(f"{wanted}; found {found or 'it is not'}; see {own.__name__}") from None
     finally:
         simulator.close()
@@ -116,15 +116,15 @@ def _way(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
     """Compute the change (C,) of every channel over a run, in units of its scale."""
     inputs = {c.name: c.scale for c in simulator.inputs}
 
-    def seen() -> Array:
+    def observation() -> Array:
         now = simulator.observe()
         return np.array([observed(simulator, now, c.name) / c.scale for c in simulator.channels])
 
     _started(simulator)
-    before = seen()
+    before = observation()
     for _ in range(steps):
         simulator.step(inputs, seconds)
-    return seen() - before
+    return observation() - before
 
 
 def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
@@ -171,8 +171,8 @@ def _motion(simulator: OwnSimulator, force: Array | None) -> Array:
     _started(simulator)
     rows = []
     for i in range(_STEPS + 1):
-        seen = simulator.observe()
-        rows.append([observed(simulator, seen, name) for name in names])
+        observation = simulator.observe()
+        rows.append([observed(simulator, observation, name) for name in names])
         if force is not None:
             simulator.apply_force(force if i == 0 else np.zeros_like(force))
         _step(simulator)

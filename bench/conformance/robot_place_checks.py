@@ -36,17 +36,17 @@ def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
     must be rejected with a list of those that do.
     """
     classes = list_effect_places(effect)
-    for one in classes:
-        look = f"{effect.__name__} at {one.place or 'the world'}"
-        named = f"{effect.name}@{one.place}" if one.place else effect.name
-        check(one.name == named, f"name {named}", one.name, look)
-        for c in one.coefficients:
+    for effect_class in classes:
+        look = f"{effect.__name__} at {effect_class.place or 'the world'}"
+        named = f"{effect.name}@{effect_class.place}" if effect_class.place else effect.name
+        check(effect_class.name == named, f"name {named}", effect_class.name, look)
+        for c in effect_class.coefficients:
             finite = all(np.isfinite(ends).all() and ends[0] < ends[1] for ends in c.plausible)
             check(finite, f"a finite range for {c.name}", c.plausible, look)
             check(all(c.units), f"a unit for {c.name} ('1' for a number)", c.units, look)
     if not classes:
         return NO_PLACE
-    places = [one.place for one in classes if one.place]
+    places = [effect_class.place for effect_class in classes if effect_class.place]
     if places:
         _refuses(effect, places)
     return None
@@ -70,17 +70,22 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
     """
     classes = list_effect_places(effect)
     kind = make_arm_simulator(effect)
-    for one in classes:
-        look = f"{effect.__name__} at {one.place or 'the world'}"
-        c = np.zeros((len(one.coefficients), 2, 1))
-        for part, own in one().parts(c):
+    for effect_class in classes:
+        look = f"{effect.__name__} at {effect_class.place or 'the world'}"
+        c = np.zeros((len(effect_class.coefficients), 2, 1))
+        for part, own in effect_class().parts(c):
             none = _acts_on(part, own, kind) == ()
             check(none, "no contribution at zero", "one", look)
-        lanes = np.concatenate([_theta(one, 0.0), _theta(one, 0.7)])
-        seen = kind(observe=OBSERVED_CHANNELS, effects=[one]).simulate(lanes, make_scenario())
+        lanes = np.concatenate([_theta(effect_class, 0.0), _theta(effect_class, 0.7)])
+        observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
+            lanes, make_scenario()
+        )
         plain = kind(observe=OBSERVED_CHANNELS).simulate(np.empty((1, 0)), make_scenario())
         check(
-            is_bitwise_equal(seen[:1] + 0.0, plain + 0.0), "the plain motion at zero", "other", look
+            is_bitwise_equal(observations[:1] + 0.0, plain + 0.0),
+            "the plain motion at zero",
+            "other",
+            look,
         )
     return None if classes else NO_PLACE
 
@@ -93,42 +98,58 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     classes = list_effect_places(effect)
     kind = make_arm_simulator(effect)
     touched = {}
-    for one in classes:
-        look = f"{effect.__name__} at {one.place or 'the world'}"
-        thetas = np.concatenate([_theta(one, share) for share in (0.05, *_SHARES)])
-        seen = kind(observe=OBSERVED_CHANNELS, effects=[one]).simulate(thetas, make_scenario())
+    for effect_class in classes:
+        look = f"{effect.__name__} at {effect_class.place or 'the world'}"
+        thetas = np.concatenate([_theta(effect_class, share) for share in (0.05, *_SHARES)])
+        observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
+            thetas, make_scenario()
+        )
         plain = kind(observe=OBSERVED_CHANNELS).simulate(np.empty((1, 0)), make_scenario())
         # Only the last element is tested: at the low end of its range, a force may destabilise a
         # joint.
-        check(bool(np.isfinite(seen[-1]).all()), "finite observations", "others", look)
-        shown = one.signal in ("", *OBSERVED_CHANNELS) or not issubclass(one, Sensor)
-        check(bool((seen != plain).any()) == shown, "a change where it is seen", "none", look)
-        if issubclass(one, Sensor) and one.signal in OBSERVED_CHANNELS:
-            others = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != one.signal]
-            same = bool((seen[:, :, others] == plain[:, :, others]).all())
+        check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", look)
+        is_observable = effect_class.signal in ("", *OBSERVED_CHANNELS) or not issubclass(
+            effect_class, Sensor
+        )
+        check(
+            bool((observations != plain).any()) == is_observable,
+            "a change where it is seen",
+            "none",
+            look,
+        )
+        if issubclass(effect_class, Sensor) and effect_class.signal in OBSERVED_CHANNELS:
+            others = [i for i, name in enumerate(OBSERVED_CHANNELS) if name != effect_class.signal]
+            same = bool((observations[:, :, others] == plain[:, :, others]).all())
             check(same, "other channels left alone", "changes", look)
-        for part, own in one().parts(np.ones((len(one.coefficients), 2, 1))):
+        for part, own in effect_class().parts(np.ones((len(effect_class.coefficients), 2, 1))):
             touched[part.name] = _acts_on(part, own, kind)
-    apart = len({ends for ends in touched.values() if ends}) == sum(map(bool, touched.values()))
-    check(apart, "each place to be touched by one alone", touched, effect.__name__)
+    are_disjoint = len({ends for ends in touched.values() if ends}) == sum(
+        map(bool, touched.values())
+    )
+    check(are_disjoint, "each place to be touched by one alone", touched, effect.__name__)
     return None if classes else NO_PLACE
 
 
 def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicable | None:
     """Check that an effect family equals its members with the same coefficients, bit for bit."""
     kind = make_arm_simulator(effect)
-    families = [one for one in list_effect_places(effect) if hasattr(one, "members")]
+    families = [
+        effect_class
+        for effect_class in list_effect_places(effect)
+        if hasattr(effect_class, "members")
+    ]
     for whole in families:
         members = [type(member) for member in whole.members]
-        one = kind(observe=OBSERVED_CHANNELS, effects=[whole])
+        effect_class = kind(observe=OBSERVED_CHANNELS, effects=[whole])
         several = kind(observe=OBSERVED_CHANNELS, effects=members)
         # A family with one coefficient applies it at every place.
-        shared = len(one.parameters) < len(several.parameters)
+        shared = len(effect_class.parameters) < len(several.parameters)
         theta = _theta(whole, 0.3)
         each = np.tile(theta, len(members)) if shared else theta
         check(
             is_bitwise_equal(
-                one.simulate(theta, make_scenario()), several.simulate(each, make_scenario())
+                effect_class.simulate(theta, make_scenario()),
+                several.simulate(each, make_scenario()),
             ),
             "the motion of all members together",
             "another",
@@ -147,11 +168,11 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
     simulator = make_arm_simulator(effect)(observe=OBSERVED_CHANNELS, effects=classes)
     rows = [np.zeros((1, len(simulator.parameters)))]
     begin = 0
-    for one in classes:
-        end = begin + len(one.coefficients)
+    for effect_class in classes:
+        end = begin + len(effect_class.coefficients)
         for share in _SHARES:
             row = rows[0].copy()
-            row[:, begin:end] = _theta(one, share)
+            row[:, begin:end] = _theta(effect_class, share)
             rows.append(row)
         begin = end
     lanes = np.concatenate(rows)

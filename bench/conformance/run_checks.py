@@ -152,11 +152,11 @@ def _summary(checked: SuiteResult) -> str:
     """Summarise how many checks failed and how many were not run."""
     outcomes = [_outcome(line) for line in checked.lines.values()]
     idle = {what: outcomes.count(what) for what in ("not tested", "not applicable")}
-    made, failed = len(outcomes) - sum(idle.values()), outcomes.count("failed")
-    rest = "".join(f", {count} {what}" for what, count in idle.items() if count)
+    checked_count, failed = len(outcomes) - sum(idle.values()), outcomes.count("failed")
+    other_counts = "".join(f", {count} {what}" for what, count in idle.items() if count)
     if failed:
-        return f"{failed} of {made} checks failed{rest}"
-    return f"all {made} checks passed{rest}"
+        return f"{failed} of {checked_count} checks failed{other_counts}"
+    return f"all {checked_count} checks passed{other_counts}"
 
 
 def _outcome(line: str) -> str:

@@ -89,11 +89,13 @@ def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
     """Check that observations are (n, T, C) and finite, for several n and T."""
     simulator, look = kind(), f"{kind.__name__}.simulate"
     for n, samples in ((1, 2), (3, 40), (1, 1)):
-        seen = simulator.simulate(_points(simulator, n), _scenario(kind, samples))
+        observations = simulator.simulate(_points(simulator, n), _scenario(kind, samples))
         shape = (n, samples, len(simulator.channels))
-        check(seen.shape == shape, f"observations of shape {shape}", seen.shape, look)
+        check(
+            observations.shape == shape, f"observations of shape {shape}", observations.shape, look
+        )
         for place, channel in enumerate(simulator.channels):
-            bad = seen[:, :, place][~np.isfinite(seen[:, :, place])]
+            bad = observations[:, :, place][~np.isfinite(observations[:, :, place])]
             what = f"finite values of {channel.name} for parameters inside the bounds"
             check(not bad.size, what, bad[:1], look)
     simulator.close()
@@ -111,13 +113,13 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     run, longer = _scenario(kind, size=1.0), _scenario(kind, 300, 50.0, size=3.0)
     together = simulator.simulate(points.copy(), run)
 
-    def compare(seen: Array, after: str) -> None:
-        if not is_bitwise_equal(together, seen):
+    def compare(observations: Array, after: str) -> None:
+        if not is_bitwise_equal(together, observations):
             what = f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__
+            difference = _first_difference(kind, together, observations)
             raise CheckError(
-                f"expected the same numbers {after}; found "
-                f"{_first_difference(kind, together, seen)}; see {what}: it must set everything "
-                "that a run has changed"
+                f"expected the same numbers {after}; found {difference}; see {what}: it must set "
+                "everything that a run has changed"
             )
 
     simulator.simulate(_points(simulator, 2, seed=9), longer)
@@ -131,15 +133,15 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     other.close()
 
 
-def _first_difference(kind: type[Simulator], expected: Array, seen: Array) -> str:
+def _first_difference(kind: type[Simulator], expected: Array, observations: Array) -> str:
     """Describe where two observations (n, T, C) first differ in time."""
-    if expected.shape != seen.shape:
-        return f"shape {seen.shape} in place of {expected.shape}"
-    differs = (expected != seen) & ~(np.isnan(expected) & np.isnan(seen))
+    if expected.shape != observations.shape:
+        return f"shape {observations.shape} in place of {expected.shape}"
+    differs = (expected != observations) & ~(np.isnan(expected) & np.isnan(observations))
     if not differs.any():
         return "zeros of another sign"
     lane, sample, channel = min(np.argwhere(differs).tolist(), key=lambda at: at[1])
-    before, after = expected[lane, sample, channel], seen[lane, sample, channel]
+    before, after = expected[lane, sample, channel], observations[lane, sample, channel]
     # All digits are shown if the values differ only by rounding.
     digits = 6 if f"{before:.6g}" != f"{after:.6g}" else 17
     name = kind.channels[channel].name
@@ -168,9 +170,14 @@ def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simul
     clean = simulator.simulate(points, _scenario(kind))
     # The middle element has neighbours on both sides.
     points[1] = np.nan
-    seen = simulator.simulate(points, _scenario(kind))
-    check(bool(np.isnan(seen[1]).all()), "a lane of NaN", seen[1][:2], look)
-    check(is_bitwise_equal(clean[[0, 2]], seen[[0, 2]]), "neighbours as they were", "others", look)
+    observations = simulator.simulate(points, _scenario(kind))
+    check(bool(np.isnan(observations[1]).all()), "a lane of NaN", observations[1][:2], look)
+    check(
+        is_bitwise_equal(clean[[0, 2]], observations[[0, 2]]),
+        "neighbours as they were",
+        "others",
+        look,
+    )
     simulator.close()
 
 
@@ -184,12 +191,12 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
     # One point for each parameter, changed in that direction alone.
     points[1:] += 0.2 * np.diag(high - low)
     inputs = {c.name: np.ones(600) for c in simulator.inputs}
-    seen = simulator.simulate(
+    observations = simulator.simulate(
         cube.to_physical(points), Scenario(np.arange(600) / 60.0, inputs=inputs)
     )
-    for parameter, lane in zip(simulator.parameters, seen[1:], strict=True):
+    for parameter, lane in zip(simulator.parameters, observations[1:], strict=True):
         check(
-            not np.array_equal(lane, seen[0]),
+            not np.array_equal(lane, observations[0]),
             f"parameter {parameter.name} to change something",
             "nothing",
             kind.__name__,
@@ -205,12 +212,12 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
     scales = {c.name: c.scale for c in kind.channels}
     theta = np.array([[p.nominal for p in simulator.parameters]])
     run = _scenario(kind, 600, size=1.0)
-    seen = simulator.simulate(theta, run)
+    observations = simulator.simulate(theta, run)
     for name, value in kind.states.items():
         other = value + _MOVED * max(abs(value), scales.get(name, 1.0))
         moved = Scenario(run.times, {name: other}, run.inputs)
         check(
-            not np.array_equal(seen, simulator.simulate(theta, moved)),
+            not np.array_equal(observations, simulator.simulate(theta, moved)),
             f"initial state {name} = {other:g} in place of {value:g} to change something",
             "the same observation",
             f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__,

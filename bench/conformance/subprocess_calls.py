@@ -40,7 +40,7 @@ def call_in_processes(
     plugins = (inspect.getfile(subject),) if subject.__module__.startswith("simgap_plugin_") else ()
     results = dict(
         _pool(workers, plugins).iterate_results(
-            [(function, given) for given in arguments], CALL_TIMEOUT_SECONDS
+            [(function, argument) for argument in arguments], CALL_TIMEOUT_SECONDS
         )
     )
     return [results[place] for place in range(len(arguments))]

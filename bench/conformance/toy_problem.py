@@ -144,16 +144,16 @@ def run_tuner(
         fails: returns whether simulation number k fails.
         target: seed of the task.
     """
-    given, _ = make_task(dim, budget, target)
-    evaluate = make_evaluate(given, fails)
-    return drive_tuner(tuner, given, evaluate, np.random.default_rng(seed))
+    task, _ = make_task(dim, budget, target)
+    evaluate = make_evaluate(task, fails)
+    return drive_tuner(tuner, task, evaluate, np.random.default_rng(seed))
 
 
-def make_evaluate(given: Task, fails: Callable[[int], bool] = lambda _: False) -> Evaluate:
+def make_evaluate(task: Task, fails: Callable[[int], bool] = lambda _: False) -> Evaluate:
     """Make the function that simulates and evaluates points on a task.
 
     Args:
-        given: the task.
+        task: the task.
         fails: returns whether simulation number k fails.
     """
     simulated = 0
@@ -165,7 +165,7 @@ def make_evaluate(given: Task, fails: Callable[[int], bool] = lambda _: False) -
             simulated += 1
             if fails(simulated):
                 lane[:] = np.nan
-        losses = np.sqrt(((observations - given.observed) ** 2).mean(axis=(1, 2)))
+        losses = np.sqrt(((observations - task.observed) ** 2).mean(axis=(1, 2)))
         losses[np.isnan(losses)] = np.inf  # as the harness does for a failed simulation
         return observations, losses
 

@@ -36,8 +36,8 @@ _NAME = re.compile(r"[a-z][a-z0-9_-]*$")
 
 
 def _check_run_completed(kind: type[Tuner], trace: RunTrace, when: str) -> None:
-    found, look = f"{trace.status}: {trace.reason}", f"{kind.__name__}.tune"
-    check(trace.status in ("done", "converged"), f"a run that ends well {when}", found, look)
+    outcome, look = f"{trace.status}: {trace.reason}", f"{kind.__name__}.tune"
+    check(trace.status in ("done", "converged"), f"a run that ends well {when}", outcome, look)
 
 
 def check_api_is_complete(kind: type[Tuner]) -> None:
@@ -111,25 +111,27 @@ def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
     )
     # Writable copies: with read-only arrays, the tuner would crash before the check could report
     # it.
-    given = [task.start, task.observed, task.scale, task.training]
-    before = [array.copy() for array in given]
+    arrays = [task.start, task.observed, task.scale, task.training]
+    copies = [array.copy() for array in arrays]
     steps = make_trained_tuner(kind, 2).tune(task, np.random.default_rng(0))
     try:
-        asked = next(steps)
+        proposal = next(steps)
         for _ in range(10):
             points = np.array(
-                asked[0] if isinstance(asked, Proposal) else asked, dtype=np.float64, ndmin=2
+                proposal[0] if isinstance(proposal, Proposal) else proposal,
+                dtype=np.float64,
+                ndmin=2,
             ).clip(0.0, 1.0)
             observations = simulate_toy_problem(points)
             losses = np.sqrt(((observations - task.observed) ** 2).mean(axis=(1, 2)))
-            shown = [points, observations, losses]
-            given, before = given + shown, before + [array.copy() for array in shown]
-            asked = steps.send(Evaluation(points, observations, losses))
+            received = [points, observations, losses]
+            arrays, copies = arrays + received, copies + [array.copy() for array in received]
+            proposal = steps.send(Evaluation(points, observations, losses))
     except StopIteration:
         pass
     finally:
         steps.close()
-    changed = [a.shape for a, b in zip(given, before, strict=True) if not is_bitwise_equal(a, b)]
+    changed = [a.shape for a, b in zip(arrays, copies, strict=True) if not is_bitwise_equal(a, b)]
     check(
         not changed,
         "arguments as they were",
@@ -150,11 +152,13 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
         def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
             steps = make_trained_tuner(kind, 2).tune(task, rng)
             try:
-                wanted = next(steps)
+                proposal = next(steps)
                 while True:
-                    points, recommended = wanted if isinstance(wanted, Proposal) else (wanted, None)
+                    points, recommended = (
+                        proposal if isinstance(proposal, Proposal) else (proposal, None)
+                    )
                     asked.extend(np.atleast_2d(p) for p in (points, recommended) if p is not None)
-                    wanted = steps.send((yield wanted))
+                    proposal = steps.send((yield proposal))
             except StopIteration as stop:
                 return str(stop.value)
             finally:
@@ -275,13 +279,13 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     logs: list[Array] = []
     for look in _SEQUENTIAL_TEST_TARGETS:
         logs += [_final_logs((tuner, chance), target) for target in range(len(logs), look)]
-        mine, random = np.array(logs).T
-        differ = (mine != random).any()  # the test is undefined without a difference
-        p = float(wilcoxon(mine, random, alternative="less").pvalue) if differ else 1.0
+        tuner_logs, random = np.array(logs).T
+        differ = (tuner_logs != random).any()  # the test is undefined without a difference
+        p = float(wilcoxon(tuner_logs, random, alternative="less").pvalue) if differ else 1.0
         # Bonferroni correction: three looks at 5 % in total.
         if p < 0.05 / len(_SEQUENTIAL_TEST_TARGETS):
             return
-    medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (mine, random)]
+    medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (tuner_logs, random)]
     found = f"p = {p:.2g}, median error {' against '.join(medians)}"
     expected = f"errors below random search's (p < {0.05 / len(_SEQUENTIAL_TEST_TARGETS):.2g})"
     raise CheckError(f"expected {expected}; found {found}; see {kind.__name__}.tune")
@@ -332,12 +336,12 @@ def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
     # One worker trains by itself, four get the state trained here; all must agree with this
     # process.
     for workers, learned in ((1, None), (4, TRAINED_TUNERS.get((kind, 2)))):
-        there = call_in_processes(
+        other_outcomes = call_in_processes(
             compute_run_digests, [(kind, (seed,), learned) for seed in seeds], workers, kind
         )
-        ended = [str(digest) for digest in there if isinstance(digest, Exception)]
+        ended = [str(digest) for digest in other_outcomes if isinstance(digest, Exception)]
         check(not ended, f"runs that end in {workers} worker(s)", ended[:1], look)
-        same = [digest for (digest,) in there] == here
+        same = [digest for (digest,) in other_outcomes] == here
         check(same, f"the same runs in {workers} worker(s) as in this process", "others", look)
 
 

@@ -91,7 +91,7 @@ def write_bundle(
     """
     kind = _kind(folder)
     name = folder.resolve().name
-    files, left_out = _files(folder)
+    files, left_out = _list_result_files(folder)
     if kind == "comparison":
         if recordings:
             raise InputError("--with: recordings go with an explanation; leave them out")
@@ -123,9 +123,9 @@ def _kind(folder: Path) -> str:
     return "comparison"
 
 
-def _files(folder: Path) -> tuple[dict[str, Path], list[str]]:
+def _list_result_files(folder: Path) -> tuple[dict[str, Path], list[str]]:
     """List the files of a folder by their relative paths, and those that are left out."""
-    found, left_out = {}, []
+    files, left_out = {}, []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_symlink():
@@ -133,8 +133,8 @@ def _files(folder: Path) -> tuple[dict[str, Path], list[str]]:
         elif path.is_file() and any(part.startswith(".") for part in Path(name).parts):
             left_out.append(f"{name}: hidden")
         elif path.is_file() and name != MANIFEST_FILE:
-            found[name] = path
-    return found, left_out
+            files[name] = path
+    return files, left_out
 
 
 def _list_plugin_files(folder: Path) -> dict[str, Path]:
@@ -144,8 +144,8 @@ def _list_plugin_files(folder: Path) -> dict[str, Path]:
         for part in list_study_folders(folder)
         for file in read_configuration(part).plugins
     ]
-    there = [file for file in dict.fromkeys(plugins) if file.is_file()]
-    return {f"{_PLUGINS}/{file.name}": file for file in there}
+    existing_files = [file for file in dict.fromkeys(plugins) if file.is_file()]
+    return {f"{_PLUGINS}/{file.name}": file for file in existing_files}
 
 
 def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
@@ -161,9 +161,11 @@ def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
 
 def _format_explain_command(folder: Path) -> str:
     """Build the command that reproduces an explanation, as far as its folder states it."""
-    made = read_environment(folder)
-    tables = [each["file"] for each in made.get("recordings", []) if each["file"][-5:] != ".toml"]
-    words = format_explain_command(tables or ["RECORDING.csv"], made.get("settings", {}))
+    environment = read_environment(folder)
+    tables = [
+        each["file"] for each in environment.get("recordings", []) if each["file"][-5:] != ".toml"
+    ]
+    words = format_explain_command(tables or ["RECORDING.csv"], environment.get("settings", {}))
     return shlex.join(words)
 
 
@@ -210,9 +212,9 @@ class ArchiveVerification(NamedTuple):
     def to_document(self) -> dict[str, Any]:
         """Convert to a JSON document."""
         compared = [each.to_document() for each in self.comparisons]
-        told = self.explanation.to_document() if self.explanation else None
+        explanation = self.explanation.to_document() if self.explanation else None
         archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
-        parts = {"archive": archive, "comparisons": compared, "explanation": told}
+        parts = {"archive": archive, "comparisons": compared, "explanation": explanation}
         return {"follows": self.is_consistent, **parts}
 
 
@@ -230,30 +232,30 @@ def verify_archive(
     Raises:
         InputError: the file is not such an archive, or is unsafe to unpack.
     """
-    with unpack_archive(archive) as found:
-        about = _about(archive, found)
+    with unpack_archive(archive) as unpacked:
+        about = _describe_archive(archive, unpacked)
         count, size = about["files"], about["bytes"]
         say(f"{archive}: {about['kind']} of simgap {about['simgap']}, {count} files, {size} bytes")
-        doubts = [VerificationFailure(fault.file, 0, fault.says) for fault in found.faults]
+        doubts = [VerificationFailure(fault.file, 0, fault.says) for fault in unpacked.faults]
         if doubts:
             _format_result(doubts, archive, say)
             return ArchiveVerification(about, doubts, [], None)
         say(f"{MANIFEST_FILE}: every file is there and has its SHA-256, and there is no other")
         if about["kind"] == "explanation":
-            explained = _verify_extended_model(found.folder, say)
+            explained = _verify_extended_model(unpacked.folder, say)
             _format_result(explained.doubts, archive, say)
             return ArchiveVerification(about, [], [], explained)
         compared = [
             verify_comparison(part, say, plugins, every, own_plugins=False)._replace(
-                folder=archive / part.relative_to(found.folder.parent)
+                folder=archive / part.relative_to(unpacked.folder.parent)
             )
-            for part in list_study_folders(found.folder)
+            for part in list_study_folders(unpacked.folder)
         ]
         return ArchiveVerification(about, [], compared, None)
 
 
-def _about(archive: Path, found: UnpackedArchive) -> dict[str, Any]:
-    manifest = found.manifest
+def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any]:
+    manifest = unpacked.manifest
     return {
         "file": archive,
         "kind": manifest["kind"],
@@ -280,21 +282,21 @@ def verify_explanation(folder: Path, say: PrintLine) -> ExplanationVerification:
         folder: folder of the explanation.
         say: prints a line.
     """
-    found = _verify_extended_model(folder, say)
-    _format_result(found.doubts, folder, say)
-    return found
+    verification = _verify_extended_model(folder, say)
+    _format_result(verification.doubts, folder, say)
+    return verification
 
 
 def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerification:
-    found = ExplanationVerification([], [], [])
+    verification = ExplanationVerification([], [], [])
 
     def note(line: str) -> None:
-        found.checked.append(line)
+        verification.checked.append(line)
         say(line)
 
-    verdict = _verdict(folder, found)
+    verdict = _read_verdict(folder, verification)
     if verdict is None:
-        return found
+        return verification
     note(f"{VERDICT_FILE}: of the form of schema verdict: {verdict.verdict}")
     try:
         extended, _, _ = open_extended(folder / EXTENDED_MODEL_FILE, simulators.get)
@@ -302,32 +304,32 @@ def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerificat
         text = str(error).replace(f"{folder}/", "")
         # The hash of a robot's model file is known; its absence here is no verification failure.
         if "model" in text and "no such file" in text:
-            found.unchecked.append(f"{EXTENDED_MODEL_FILE}: {text}")
-            say(f"not checked: {found.unchecked[-1]}")
+            verification.unchecked.append(f"{EXTENDED_MODEL_FILE}: {text}")
+            say(f"not checked: {verification.unchecked[-1]}")
         else:
-            found.doubts.append(VerificationFailure(EXTENDED_MODEL_FILE, 0, text))
-        return found
+            verification.doubts.append(VerificationFailure(EXTENDED_MODEL_FILE, 0, text))
+        return verification
     note(f"{EXTENDED_MODEL_FILE}: loads as a simulator of {extended.system or extended.name}")
-    found.doubts.extend(_find_differing_numbers(verdict, extended))
-    if not found.doubts:
+    verification.doubts.extend(_find_differing_numbers(verdict, extended))
+    if not verification.doubts:
         note(f"{VERDICT_FILE} and {EXTENDED_MODEL_FILE} have the same numbers")
-    _score_extended_model(folder, verdict, found, note)
-    for line in found.unchecked:
+    _score_extended_model(folder, verdict, verification, note)
+    for line in verification.unchecked:
         say(f"not checked: {line}")
-    if not found.doubts:
-        say("all of it follows" if not found.unchecked else "what could be checked follows")
-    return found
+    if not verification.doubts:
+        say("all of it follows" if not verification.unchecked else "what could be checked follows")
+    return verification
 
 
-def _verdict(folder: Path, found: ExplanationVerification) -> Verdict | None:
+def _read_verdict(folder: Path, verification: ExplanationVerification) -> Verdict | None:
     try:
         document = json.loads((folder / VERDICT_FILE).read_text(encoding="utf-8"))
-        wrong = find_violations(document, "verdict")
-        if not wrong:
+        violations = find_violations(document, "verdict")
+        if not violations:
             return Verdict.from_document(document)
     except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
-        wrong = [get_first_line(error)]
-    found.doubts.extend(VerificationFailure(VERDICT_FILE, 0, line) for line in wrong)
+        violations = [get_first_line(error)]
+    verification.doubts.extend(VerificationFailure(VERDICT_FILE, 0, line) for line in violations)
     return None
 
 
@@ -357,24 +359,26 @@ def _find_differing_numbers(
 
 
 def _score_extended_model(
-    folder: Path, verdict: Verdict, found: ExplanationVerification, note: PrintLine
+    folder: Path, verdict: Verdict, verification: ExplanationVerification, note: PrintLine
 ) -> None:
     """Repeat the held-out error of the extended simulator, if the folder has the recording."""
-    made = read_environment(folder)
+    environment = read_environment(folder)
     stated = verdict.heldout.rmse_extended if verdict.heldout else None
     tables = sorted((folder / _RECORDINGS_FOLDER).glob("*.csv"))
     if stated is None:
-        found.unchecked.append("held-out error: the verdict states none")
+        verification.unchecked.append("held-out error: the verdict states none")
         return
     if len(tables) != 1:
         where = f"{len(tables)} recordings are" if tables else "the recording is not"
-        found.unchecked.append(f"held-out error: {where} in it (simgap bundle --with LOG.csv)")
+        verification.unchecked.append(
+            f"held-out error: {where} in it (simgap bundle --with LOG.csv)"
+        )
         return
-    hashes = {each["file"]: each["sha256"] for each in made.get("recordings", [])}
+    hashes = {each["file"]: each["sha256"] for each in environment.get("recordings", [])}
     for path in (tables[0], tables[0].with_suffix(".toml")):
         if path.name in hashes and path.is_file() and compute_sha256(path) != hashes[path.name]:
             wrong = f"expected the recording that was explained, SHA-256 {hashes[path.name][:12]}"
-            found.doubts.append(
+            verification.doubts.append(
                 VerificationFailure(
                     f"{_RECORDINGS_FOLDER}/{path.name}", 0, f"{wrong}; found another"
                 )
@@ -383,14 +387,20 @@ def _score_extended_model(
     try:
         result = score_model(folder / EXTENDED_MODEL_FILE, tables[0], held_out=True)
     except InputError as error:
-        found.unchecked.append(f"held-out error: {str(error).replace(f'{folder}/', '')}")
+        verification.unchecked.append(f"held-out error: {str(error).replace(f'{folder}/', '')}")
         return
     assert verdict.heldout is not None
     units = result["units"]
-    alike = [e for name, e in result["rmse"].items() if units[name] == verdict.heldout.unit]
-    again = math.sqrt(sum(e * e for e in alike) / len(alike)) if alike else math.nan
-    if not math.isclose(stated, again, rel_tol=_ERROR_TOLERANCE):
-        what = f"rmse_extended on held-out runs: {stated:.6g}, scored again {again:.6g}"
-        found.doubts.append(VerificationFailure(VERDICT_FILE, 0, what))
+    errors_in_unit = [
+        e for name, e in result["rmse"].items() if units[name] == verdict.heldout.unit
+    ]
+    repeated_error = (
+        math.sqrt(sum(e * e for e in errors_in_unit) / len(errors_in_unit))
+        if errors_in_unit
+        else math.nan
+    )
+    if not math.isclose(stated, repeated_error, rel_tol=_ERROR_TOLERANCE):
+        what = f"rmse_extended on held-out runs: {stated:.6g}, scored again {repeated_error:.6g}"
+        verification.doubts.append(VerificationFailure(VERDICT_FILE, 0, what))
         return
-    note(f"{VERDICT_FILE}: rmse_extended on held-out runs comes out again: {again:.6g}")
+    note(f"{VERDICT_FILE}: rmse_extended on held-out runs comes out again: {repeated_error:.6g}")

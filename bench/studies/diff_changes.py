@@ -41,9 +41,9 @@ def _flat(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any
 
 def select_relevant_environment(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Select the part of an environment that may influence results, with the hash of the code."""
-    told = {key: environment[key] for key in RESULT_RELEVANT_KEYS if key in environment}
+    selected = {key: environment[key] for key in RESULT_RELEVANT_KEYS if key in environment}
     code = environment.get("fingerprint", {}).get("code")
-    return {**told, **({"code": code} if code else {})}
+    return {**selected, **({"code": code} if code else {})}
 
 
 def describe_side(folder: Any, name: str, environment: Mapping[str, Any]) -> dict[str, Any]:
@@ -62,16 +62,19 @@ def describe_side(folder: Any, name: str, environment: Mapping[str, Any]) -> dic
     }
 
 
-def format_changes(found: Iterable[Mapping[str, Any]], most: int = 12) -> list[str]:
-    """Format changes as text lines, at most `most` of them.
+def format_changes(changes: Iterable[Mapping[str, Any]], max_count: int = 12) -> list[str]:
+    """Format changes as text lines, at most `max_count` of them.
 
     Args:
-        found: the changes.
-        most: maximum number of changes.
+        changes: the changes.
+        max_count: maximum number of changes.
     """
-    lines = [f"  {each['what']}: {_short(each['a'])} -> {_short(each['b'])}" for each in found]
-    rest = len(lines) - most
-    return [*lines[:most], *([f"  and {rest} more (--json has all)"] if rest > 0 else [])]
+    lines = [f"  {each['what']}: {_short(each['a'])} -> {_short(each['b'])}" for each in changes]
+    remaining_count = len(lines) - max_count
+    return [
+        *lines[:max_count],
+        *([f"  and {remaining_count} more (--json has all)"] if remaining_count > 0 else []),
+    ]
 
 
 def _short(value: Any) -> str:

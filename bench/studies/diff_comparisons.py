@@ -135,22 +135,24 @@ class ComparisonDiff:
         if not lines:
             return pd.DataFrame()
         frame = pd.DataFrame(lines)
-        there = frame["p_value"].notna().to_numpy()
+        has_p_value = frame["p_value"].notna().to_numpy()
         frame["p_holm"] = np.nan
-        frame.loc[there, "p_holm"] = correct_holm(frame.loc[there, "p_value"].to_numpy(dtype=float))
+        frame.loc[has_p_value, "p_holm"] = correct_holm(
+            frame.loc[has_p_value, "p_value"].to_numpy(dtype=float)
+        )
         frame["significant"] = frame["p_holm"] < FAMILYWISE_ERROR_RATE
         return frame
 
     def _lines(self) -> Iterator[dict[str, Any]]:
         ranges = set(self.b.curves.keys["range"])
         budget = min(side.stored.experiment.budget for side in (self.a, self.b))
-        moments = sorted({k for k in COMPARED_SIMULATION_COUNTS if k < budget} | {budget})
+        checkpoints = sorted({k for k in COMPARED_SIMULATION_COUNTS if k < budget} | {budget})
         for kind in dict.fromkeys(self.a.curves.keys["range"]):
             if kind not in ranges:
                 continue
             mine, other = (s.curves.select(range=str(kind)).list_tuners() for s in (self.a, self.b))
             for tuner in (t for t in mine if t in other):
-                for k in moments:
+                for k in checkpoints:
                     yield self._line(str(kind), tuner, k)
 
     def _line(self, kind: str, tuner: str, k: int) -> dict[str, Any]:

@@ -236,8 +236,8 @@ class ExplanationDiff:
         yield f"verdict: {words['a']}" + ("" if same else f" -> {words['b']}")
         for cause in self.causes:
             here, there = cause["in_a"], cause["in_b"]
-            told = f"{here} in both" if here == there else f"{here} -> {there}"
-            yield f"{'cause' if 'cause' in (here, there) else '     '} {cause['effect']}: {told}"
+            places = f"{here} in both" if here == there else f"{here} -> {there}"
+            yield f"{'cause' if 'cause' in (here, there) else '     '} {cause['effect']}: {places}"
         rows = [("number", "unit", "", "a", "95 %", "b", "95 %")]
         for row in (*document["coefficients"], *document["parameters"]):
             mark = "MOVED" if row["significant"] else ""

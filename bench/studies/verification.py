@@ -105,8 +105,8 @@ def verify_comparison(
     Raises:
         InputError: the comparison is not finished, or it is damaged.
     """
-    held = read_configuration(folder)
-    experiment = held.experiment
+    configuration = read_configuration(folder)
+    experiment = configuration.experiment
     if (folder / SEGMENTS_FOLDER).exists():
         raise InputError(f"{folder}: not finished, and its salt not revealed; resume it first")
     if experiment.shot:
@@ -123,7 +123,7 @@ def verify_comparison(
     # The salt in experiment.toml was already checked against its hash when the file was read.
     stored = read_checked_comparison(folder)
     note(_salt(experiment))
-    named = held.plugins if own_plugins else []
+    named = configuration.plugins if own_plugins else []
     files = [*named, *(str(Path(plugin).resolve()) for plugin in plugins)]
     load_plugins_for_experiment(list(dict.fromkeys(files)), experiment)
     problem = TuningProblem(experiment)
@@ -131,7 +131,7 @@ def verify_comparison(
         doubts = _rows(stored, problem, note, every)
     finally:
         problem.close()
-    doubts += _tables(folder, stored, note)
+    doubts += _verify_tables(folder, stored, note)
     for doubt in doubts[:20]:
         say(f"DOES NOT FOLLOW  {folder}/{doubt}")
     if len(doubts) > 20:
@@ -168,7 +168,7 @@ def _rows(
     for name, rows in runs.groupby("target", sort=False):
         doubts += _errors(problem, targets[str(name)], rows)
     say(f"runs.parquet: {len(targets)} targets drawn again, {len(runs)} rows compared with them")
-    shown = _chosen(runs, MAX_RESIMULATED_ROWS if not every else len(runs))
+    shown = _select_rows(runs, MAX_RESIMULATED_ROWS if not every else len(runs))
     for name, rows in shown.groupby("target", sort=False):
         doubts += _losses(problem, targets[str(name)], rows)
     say(f"runs.parquet: {len(shown)} of {len(runs)} rows simulated again")
@@ -198,7 +198,7 @@ def _errors(
     for column, values in expected.items():
         # Rounding of parameters that are far larger than their error is not a failure.
         slack = 1e-12 * float(np.abs(target.truth).max())
-        yield from _unlike(rows, column, values, _ARITHMETIC_TOLERANCE, slack)
+        yield from _find_first_difference(rows, column, values, _ARITHMETIC_TOLERANCE, slack)
 
 
 def _losses(
@@ -207,12 +207,14 @@ def _losses(
     """Yield rows of a target whose losses and errors differ from repeated simulations."""
     names = [parameter.name for parameter in problem.cube.parameters]
     channel = problem.error_channel
-    made = rows[rows["k"] > 0]
+    simulated_rows = rows[rows["k"] > 0]
     fitting = ProposalEvaluator(problem, target.blinded.fitting)
-    if len(made):
-        proposed = _points(problem, made[[f"proposal_{name}" for name in names]])
+    if len(simulated_rows):
+        proposed = _points(problem, simulated_rows[[f"proposal_{name}" for name in names]])
         losses = np.concatenate([fitting(point[None])[1] for point in proposed])
-        yield from _unlike(made, "loss", losses, _SIMULATION_TOLERANCE, _SIMULATION_TOLERANCE)
+        yield from _find_first_difference(
+            simulated_rows, "loss", losses, _SIMULATION_TOLERANCE, _SIMULATION_TOLERANCE
+        )
     recommended = _points(problem, rows[[f"recommendation_{name}" for name in names]])
     for column, side in (
         ("obs_error", target.blinded.fitting),
@@ -225,7 +227,7 @@ def _losses(
                 recommended[:0], recommended[there]
             )
             typical = _SIMULATION_TOLERANCE * float(problem.scale[channel])
-            yield from _unlike(
+            yield from _find_first_difference(
                 rows[there], column, rmse[:, channel], _SIMULATION_TOLERANCE, typical
             )
 
@@ -236,64 +238,78 @@ def _points(problem: TuningProblem, frame: pd.DataFrame) -> Array:
     return points
 
 
-def _unlike(
-    rows: pd.DataFrame, column: str, expected: Array, share: float, slack: float
+def _find_first_difference(
+    rows: pd.DataFrame,
+    column: str,
+    expected: Array,
+    relative_tolerance: float,
+    absolute_tolerance: float,
 ) -> Iterator[VerificationFailure]:
     """Yield the first row in which a column differs from the expected values."""
     if column not in rows:
         return
-    found = rows[column].to_numpy(dtype=float)
-    same = np.isclose(found, expected, rtol=share, atol=slack, equal_nan=True)
-    if not same.all():
-        place = int(np.argmin(same))
-        count = int((~same).sum())
-        says = f"{column}: expected {expected[place]:.9g}, found {found[place]:.9g}"
-        more = f" ({count} rows of {rows['target'].iloc[0]})" if count > 1 else ""
-        yield VerificationFailure("runs.parquet", int(rows.index[place]) + 1, says + more)
+    values = rows[column].to_numpy(dtype=float)
+    is_close = np.isclose(
+        values, expected, rtol=relative_tolerance, atol=absolute_tolerance, equal_nan=True
+    )
+    if not is_close.all():
+        place = int(np.argmin(is_close))
+        count = int((~is_close).sum())
+        message = f"{column}: expected {expected[place]:.9g}, found {values[place]:.9g}"
+        suffix = f" ({count} rows of {rows['target'].iloc[0]})" if count > 1 else ""
+        yield VerificationFailure("runs.parquet", int(rows.index[place]) + 1, message + suffix)
 
 
-def _chosen(runs: pd.DataFrame, most: int) -> pd.DataFrame:
-    """Select at most `most` rows, evenly spaced."""
-    places = np.unique(np.linspace(0, len(runs) - 1, min(most, len(runs))).round().astype(int))
-    return runs.iloc[places]
+def _select_rows(runs: pd.DataFrame, max_count: int) -> pd.DataFrame:
+    """Select at most `max_count` rows, evenly spaced."""
+    row_indices = np.unique(
+        np.linspace(0, len(runs) - 1, min(max_count, len(runs))).round().astype(int)
+    )
+    return runs.iloc[row_indices]
 
 
-def _tables(folder: Path, stored: StoredComparison, say: PrintLine) -> list[VerificationFailure]:
+def _verify_tables(
+    folder: Path, stored: StoredComparison, say: PrintLine
+) -> list[VerificationFailure]:
     """Verify that table.csv follows from the rows, and return the failures."""
     path = folder / "table.csv"
     if not path.exists():
         say("table.csv: none; simgap plot writes it")
         return []
-    found = pd.read_csv(path, keep_default_na=True)
+    stored_table = pd.read_csv(path, keep_default_na=True)
     expected = build_tables(stored)["table"]
-    if len(found) != len(expected):
+    if len(stored_table) != len(expected):
         return [
-            VerificationFailure(path.name, 0, f"expected {len(expected)} rows, found {len(found)}")
+            VerificationFailure(
+                path.name, 0, f"expected {len(expected)} rows, found {len(stored_table)}"
+            )
         ]
-    doubts = []
+    failures = []
     # The order of the rows is ignored: it depends on the version that wrote them.
     keys = ["experiment", "tuner", "range", "simulations", "metric"]
-    if not set(keys) - set(found):
+    if not set(keys) - set(stored_table):
         expected = expected.sort_values(keys, kind="stable")
-        found = found.fillna({"range": "", "metric": ""}).sort_values(keys, kind="stable")
-    lines = found.index
+        stored_table = stored_table.fillna({"range": "", "metric": ""}).sort_values(
+            keys, kind="stable"
+        )
+    lines = stored_table.index
     for column in expected:
-        if column not in found:
-            doubts.append(
+        if column not in stored_table:
+            failures.append(
                 VerificationFailure(path.name, 0, f"expected a column {column}, found none")
             )
             continue
         a = expected[column].reset_index(drop=True)
-        b = found[column].reset_index(drop=True)
+        b = stored_table[column].reset_index(drop=True)
         if pd.api.types.is_numeric_dtype(a) and a.dtype != bool:
-            same = np.isclose(
+            is_equal = np.isclose(
                 a.astype(float), b.astype(float), rtol=_ARITHMETIC_TOLERANCE, equal_nan=True
             )
         else:
-            same = (a.astype(str) == b.fillna("").astype(str)).to_numpy()
-        if not same.all():
-            place = int(np.argmin(same))
-            says = f"{column}: expected {a[place]}, found {b[place]}"
-            doubts.append(VerificationFailure(path.name, int(lines[place]) + 2, says))
-    say(f"table.csv: {len(found)} rows made again from runs.parquet")
-    return doubts
+            is_equal = (a.astype(str) == b.fillna("").astype(str)).to_numpy()
+        if not is_equal.all():
+            place = int(np.argmin(is_equal))
+            message = f"{column}: expected {a[place]}, found {b[place]}"
+            failures.append(VerificationFailure(path.name, int(lines[place]) + 2, message))
+    say(f"table.csv: {len(stored_table)} rows made again from runs.parquet")
+    return failures

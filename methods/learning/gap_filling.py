@@ -34,38 +34,38 @@ A smaller one means that the pole of the map is near, where the motion reaches t
 """
 
 
-def fill_gaps(seen: Array, shown: Array) -> Array:
+def fill_gaps(channel: Array, simulated: Array) -> Array:
     """Fill the gaps of a sensor's channel from a simulation, through the map (1) between them.
 
     The three numbers of the map are fitted to the available samples, as (2) and with Cauchy's
     weights, because an inaccurate model agrees with the sensor only in parts of a run.
 
     Args:
-        seen: (T,) channel with NaN for missing samples.
-        shown: (T,) simulated values at the same times, of another sensor.
+        channel: (T,) channel with NaN for missing samples.
+        simulated: (T,) simulated values at the same times, of another sensor.
 
     Returns:
         (T,) channel without gaps; unchanged if there are too few samples or no such map.
     """
-    there = np.isfinite(seen)
-    if there.all() or there.sum() < _MIN_SEEN_SAMPLES:
-        return seen
+    is_present = np.isfinite(channel)
+    if is_present.all() or is_present.sum() < _MIN_SEEN_SAMPLES:
+        return channel
     # A simulation at rest does not determine the map.
-    if not np.ptp(shown[there]) > 0:
-        return seen
+    if not np.ptp(simulated[is_present]) > 0:
+        return channel
     # Metres and pixels differ by orders of magnitude; scaling gives all columns of (2) equal
     # weight.
-    x = _scaled(shown, shown[there])
-    y = _scaled(seen, seen[there])
-    table = np.stack([np.ones_like(x), x, -x * y], axis=1)[there]
-    a, b, c = _fitted(table, y[there])
+    x = _scale_like(simulated, simulated[is_present])
+    y = _scale_like(channel, channel[is_present])
+    table = np.stack([np.ones_like(x), x, -x * y], axis=1)[is_present]
+    a, b, c = _fitted(table, y[is_present])
     below = 1 + c * x
     # A change of sign would put a part of the run behind the camera.
     if not (below > _MIN_DENOMINATOR).all():
-        return seen
+        return channel
     mapped = (a + b * x) / below  # (1)
-    unscaled = mapped * float(seen[there].std()) + float(seen[there].mean())
-    result: Array = np.where(there, seen, unscaled)
+    unscaled = mapped * float(channel[is_present].std()) + float(channel[is_present].mean())
+    result: Array = np.where(is_present, channel, unscaled)
     return result
 
 
@@ -76,14 +76,14 @@ def _fitted(table: Array, values: Array) -> Array:
     for _ in range(_ROUNDS):
         solution = np.linalg.lstsq(table * weights[:, None], values * weights, rcond=None)[0]
         numbers = solution.astype(np.float64)
-        rest: Array = values - table @ numbers
-        width = max(_OUTLYING * float(np.median(np.abs(rest))), _FINEST)
+        residual: Array = values - table @ numbers
+        width = max(_OUTLYING * float(np.median(np.abs(residual))), _FINEST)
         # This is the root of Cauchy's weight, because it multiplies both sides of (2).
-        weights = 1 / np.sqrt(1 + (rest / width) ** 2)
+        weights = 1 / np.sqrt(1 + (residual / width) ** 2)
     return numbers
 
 
-def _scaled(values: Array, some: Array) -> Array:
+def _scale_like(values: Array, some: Array) -> Array:
     """Return values in standard deviations from the mean, both computed from `some` of them."""
     spread = float(some.std())
     divisor = spread if spread > 0 else 1.0

@@ -83,7 +83,7 @@ class GaussianProcess:
             self.hyper = self._most_probable()
         k, _ = self._correlation(self._squares)
         self._lower = _cholesky(k, float(np.exp(self.hyper[-1])))
-        self.mean, self.variance, self._alpha = _profile(self._lower, values)
+        self.mean, self.variance, self._alpha = _compute_mean_and_variance(self._lower, values)
 
     def _correlation(self, squares: Array, hyper: Array | None = None) -> tuple[Array, Array]:
         """Compute the correlation of pairs, and its derivative by their scaled squared distance.
@@ -138,7 +138,7 @@ class GaussianProcess:
         n = len(self.values)
         k, slope = self._correlation(self._squares, hyper)
         lower = _cholesky(k, float(np.exp(hyper[-1])))
-        _, variance, alpha = _profile(lower, self.values)
+        _, variance, alpha = _compute_mean_and_variance(lower, self.values)
         # (2.30) with the profiled variance: its quadratic term is the constant n / 2.
         half_determinant = np.log(np.diag(lower)).sum()
         value = 0.5 * n * np.log(variance) + half_determinant
@@ -179,8 +179,8 @@ class GaussianProcess:
         spread = _cholesky(prior - explained.T @ explained, 1e-10)  # (2.26)
         noise = rng.standard_normal((draws, len(points)))
         centre = self.mean + cross @ self._alpha  # (2.25)
-        drawn = centre + self.variance**0.5 * (noise @ spread.T)
-        return np.asarray(drawn, dtype=np.float64)
+        samples = centre + self.variance**0.5 * (noise @ spread.T)
+        return np.asarray(samples, dtype=np.float64)
 
 
 def _cholesky(matrix: Array, jitter: float) -> Array:
@@ -194,14 +194,14 @@ def _cholesky(matrix: Array, jitter: float) -> Array:
             jitter = max(10.0 * jitter, 1e-12)
 
 
-def _profile(lower: Array, values: Array) -> tuple[float, float, Array]:
+def _compute_mean_and_variance(lower: Array, values: Array) -> tuple[float, float, Array]:
     """Return the maximum-likelihood constant mean and variance, and K⁻¹(values - mean)."""
     from scipy.linalg import cho_solve
 
     weights = cho_solve((lower, True), np.ones(len(values)))
     mean = float(weights @ values / weights.sum())
-    rest = values - mean
-    alpha = cho_solve((lower, True), rest)
-    variance = float(rest @ alpha) / len(values)
+    centred = values - mean
+    alpha = cho_solve((lower, True), centred)
+    variance = float(centred @ alpha) / len(values)
     # Equal values have variance zero, whose logarithm would be infinite.
     return mean, max(variance, 1e-20), alpha

@@ -55,15 +55,15 @@ class CMAES(Tuner):
         centre = task.start
         population = self.population
         while True:
-            strategy = self._strategy(centre, population, rng)
+            strategy = self._make_strategy(centre, population, rng)
             while not strategy.stop():
                 generation = strategy.ask()
                 # The coordinate that the simulation ignores is removed.
                 points = np.array(generation)[:, : task.dim]
-                asked: Array | Proposal = points
+                proposal: Array | Proposal = points
                 if self.recommend == "mean":
-                    asked = Proposal(points, self._mean(strategy, task.dim))
-                evaluation = yield asked
+                    proposal = Proposal(points, self._get_clipped_mean(strategy, task.dim))
+                evaluation = yield proposal
                 strategy.tell(generation, _rank_failures_last(evaluation.losses))
             if not self.restarts:
                 return "pycma: " + ", ".join(strategy.stop())
@@ -72,7 +72,9 @@ class CMAES(Tuner):
             centre = rng.uniform(size=task.dim)
             population = max(min(2 * strategy.popsize, task.budget), strategy.popsize)
 
-    def _strategy(self, centre: Array, population: int | None, rng: np.random.Generator) -> Any:
+    def _make_strategy(
+        self, centre: Array, population: int | None, rng: np.random.Generator
+    ) -> Any:
         """Make a strategy with its own random generator.
 
         By default pycma seeds and uses NumPy's global generator.
@@ -94,7 +96,7 @@ class CMAES(Tuner):
         return cma.CMAEvolutionStrategy(padded, self.sigma, options)
 
     @staticmethod
-    def _mean(strategy: Any, dim: int) -> Array:
+    def _get_clipped_mean(strategy: Any, dim: int) -> Array:
         """Return the distribution's mean, clipped to the cube."""
         mean: Array = np.clip(strategy.result.xfavorite[:dim], 0.0, 1.0)
         return mean

@@ -67,9 +67,11 @@ class EntropySearch(Tuner):
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
         """Run the published search, or the refined one."""
-        return self._published(task, rng) if self.published else self._refined(task, rng)
+        return (
+            self._tune_as_published(task, rng) if self.published else self._tune_refined(task, rng)
+        )
 
-    def _published(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+    def _tune_as_published(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
         """Search on a fixed grid, and stop when the estimate repeats."""
         grid = np.linspace(0.0, 1.0, self.grid)[:, None]
         if task.dim > 1:
@@ -89,13 +91,16 @@ class EntropySearch(Tuner):
             # The next fit starts from these values, because one more point changes them little.
             hyper = process.hyper
             p = compute_minimiser_probability(process, grid, _PUBLISHED_DRAWS, rng)
-            last = estimate
+            previous_estimate = estimate
             estimate = grid[p.argmax()]
-            if last is not None and np.abs(estimate - last).max() <= self.repeats_within:
+            if (
+                previous_estimate is not None
+                and np.abs(estimate - previous_estimate).max() <= self.repeats_within
+            ):
                 return "the estimate repeated"
             proposal = grid[compute_entropy_terms(p).argmax()]  # (1)
 
-    def _refined(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+    def _tune_refined(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
         """Search with new candidates for every simulation, without stopping."""
         design = generate_quasi_random_points(self.initial, rng.uniform(size=task.dim))
         points = np.empty((0, task.dim))
@@ -168,8 +173,8 @@ def compute_entropy_terms(p: Array) -> Array:
 
 def replace_failed_losses(losses: Array) -> Array:
     """Replace the losses of failed simulations by the largest finite loss."""
-    good = np.isfinite(losses)
-    return np.where(good, losses, np.max(losses, where=good, initial=0.0))
+    is_finite = np.isfinite(losses)
+    return np.where(is_finite, losses, np.max(losses, where=is_finite, initial=0.0))
 
 
 def compute_log_losses(losses: Array) -> Array:

@@ -70,7 +70,7 @@ class TuneNetLeastSquares(TuneNet):
         finish = LeastSquares(reproduced=_ROUNDING_LOSS)
         run = EvaluationHistory(task, _ROUNDING_LOSS)
         enough = run.enough / _ROUNDING_LOSS * finish.reproduced
-        trusted = yield from self._approach(run, task)
+        trusted = yield from self._take_network_steps(run, task)
         # Without any successful simulation, the middle of the training range is the start.
         if not np.isfinite(run.losses).any():
             yield from finish.fit_from_point(run, task.training.mean(axis=0))
@@ -78,7 +78,7 @@ class TuneNetLeastSquares(TuneNet):
         for fit in (_FULL_HORIZON, finish):
             if run.finished or not np.isfinite(run.losses).any():
                 break
-            model = yield from self._model(run, finish)
+            model = yield from self._build_linear_model(run, finish)
             model.trusted = trusted
             yield from fit.fit_from_model(run, model)
             if min(run.losses) <= enough:
@@ -88,30 +88,30 @@ class TuneNetLeastSquares(TuneNet):
             yield from finish.fit_from_point(run, run.find_untried_point(rng))
         return "the simulation reproduces the target"
 
-    def _approach(self, run: EvaluationHistory, task: Task) -> SimulationGenerator[bool]:
+    def _take_network_steps(self, run: EvaluationHistory, task: Task) -> SimulationGenerator[bool]:
         """Take TuneNet's steps while they divide the loss; return whether they did to the end."""
         estimate = self.get_trained_network().select_for(task).make_estimator(task)
         search = BroydenSearch(task)
         guess = task.start
         lowest = np.inf
-        idle = 0
+        unprofitable_steps = 0
         while not run.finished:
             evaluation = yield Proposal(guess, recommend=guess)
             run.record(evaluation)
             loss = float(evaluation.losses[0])
             # The first successful simulation has no loss to be compared with.
             pays = loss < self.pays * lowest or not np.isfinite(lowest)
-            idle = 0 if pays else idle + 1
+            unprofitable_steps = 0 if pays else unprofitable_steps + 1
             lowest = min(lowest, loss)
             # A single increase of a jagged loss is not enough to stop.
-            if idle == self.patience:
+            if unprofitable_steps == self.patience:
                 return False
             guess = search.propose_next(evaluation.proposals[0], estimate(evaluation.observations))
             if np.abs(guess - search.best).max() <= MIN_STEP:
                 break
-        return idle == 0
+        return unprofitable_steps == 0
 
-    def _model(
+    def _build_linear_model(
         self, run: EvaluationHistory, finish: LeastSquares
     ) -> SimulationGenerator[LinearModel]:
         """Build the linear model at the lowest loss.
@@ -124,7 +124,7 @@ class TuneNetLeastSquares(TuneNet):
         point = run.tried[best]
         residual = run.residuals[best]
         steps = np.array(run.tried) - point
-        chosen, basis = self._secants(steps, finite, finish.smallest_difference)
+        chosen, basis = self._choose_secants(steps, finite, finish.smallest_difference)
         directions = steps[chosen]
         changes = [run.residuals[i] - residual for i in chosen]
         missing = _orthogonal_complement(basis, len(point))
@@ -145,7 +145,7 @@ class TuneNetLeastSquares(TuneNet):
         slopes = np.asarray(solution, dtype=np.float64)
         return LinearModel(point, residual, slopes.T)
 
-    def _secants(
+    def _choose_secants(
         self, steps: Array, finite: Mask, smallest: float
     ) -> tuple[list[int], list[Array]]:
         """Choose secants among steps from the best point.
@@ -168,11 +168,11 @@ class TuneNetLeastSquares(TuneNet):
         # The nearest points come first; each step is orthogonalised by Gram-Schmidt.
         for i in nearest[usable[nearest]]:
             step = steps[i]
-            along = sum((q * (q @ step) for q in basis), np.zeros(len(step)))
-            across = step - along
-            length = np.linalg.norm(across)
+            parallel_part = sum((q * (q @ step) for q in basis), np.zeros(len(step)))
+            orthogonal_part = step - parallel_part
+            length = np.linalg.norm(orthogonal_part)
             if length > _MIN_ORTHOGONAL_SHARE * np.linalg.norm(step):
-                basis.append(across / length)
+                basis.append(orthogonal_part / length)
                 chosen.append(int(i))
         return chosen, basis
 

@@ -86,35 +86,38 @@ class NeuralPosteriorEstimation(Tuner):
         dim = simulator.dim
         each = max(self.each, 2 * (dim + 1))
         data = generate_training_data(simulator, rng, budget, self.scenarios, each)
-        spoilt = data.with_noise(self.noise * data.flattened_observations.std(axis=(0, 1)), rng)
-        self._read = read = InputFeatures.fit(data, self._reading())
+        noisy_data = data.with_noise(self.noise * data.flattened_observations.std(axis=(0, 1)), rng)
+        self._read = features = InputFeatures.fit(data, self._make_feature_config())
         # Each simulation is used twice, with and without noise, because targets may be of either
         # kind.
         rows = np.concatenate(
-            [read.compute_rows(some).reshape(-1, read.feature_count) for some in (data, spoilt)]
+            [
+                features.compute_rows(part).reshape(-1, features.feature_count)
+                for part in (data, noisy_data)
+            ]
         )
         theta = np.tile(data.parameters.reshape(-1, dim), (2, 1))
         with isolated_library_call(rng):
             from sbi import inference
 
             trainer = inference.NPE(
-                density_estimator=self._builder(),
+                density_estimator=self._make_flow_builder(),
                 tracker=NullTracker(),
                 show_progress_bars=False,
             )
-            trainer.append_simulations(_tensor(theta), _tensor(rows))
+            trainer.append_simulations(_to_tensor(theta), _to_tensor(rows))
             # The minimum (1), until the loss of sbi's held-out rows no longer decreases.
             self._flow = trainer.train(
                 max_num_epochs=self.epochs,
                 training_batch_size=min(100, len(rows) // 4),
             )
 
-    def _reading(self) -> FeatureConfig:
+    def _make_feature_config(self) -> FeatureConfig:
         return FeatureConfig(
             self.points, self.inputs, self.strictness, use_scenario_features=self.told
         )
 
-    def _builder(self) -> Callable[[Any, Any], Any]:
+    def _make_flow_builder(self) -> Callable[[Any, Any], Any]:
         from sbi.neural_nets import posterior_nn
 
         builder: Callable[[Any, Any], Any] = posterior_nn(
@@ -141,18 +144,17 @@ class NeuralPosteriorEstimation(Tuner):
         """
         flow = {name: array for name, array in state.items() if name.startswith("flow.")}
         others = {name: array for name, array in state.items() if name not in flow}
-        read, foreign = InputFeatures.from_arrays(others, self._reading())
-        broken = [name for name, array in flow.items() if not np.isfinite(array).all()]
-        if foreign or broken:
-            raise ValueError(
-                f"array {[*foreign, *broken][0]}: expected an array of the flow, of finite numbers"
-            )
-        self._flow = self._rebuilt(
-            {name.removeprefix("flow."): a for name, a in flow.items()}, read.feature_count
+        features, foreign = InputFeatures.from_arrays(others, self._make_feature_config())
+        not_finite = [name for name, array in flow.items() if not np.isfinite(array).all()]
+        if foreign or not_finite:
+            name = [*foreign, *not_finite][0]
+            raise ValueError(f"array {name}: expected an array of the flow, of finite numbers")
+        self._flow = self._rebuild_flow(
+            {name.removeprefix("flow."): a for name, a in flow.items()}, features.feature_count
         )
-        self._read = read
+        self._read = features
 
-    def _rebuilt(self, arrays: dict[str, Array], inputs: int) -> Any:
+    def _rebuild_flow(self, arrays: dict[str, Array], inputs: int) -> Any:
         """Rebuild a flow of the default design from its tensors, which determine its dimension."""
         import torch
 
@@ -163,9 +165,9 @@ class NeuralPosteriorEstimation(Tuner):
         rng = np.random.default_rng(0)
         with isolated_library_call(rng):
             # sbi takes the sizes from example data; the scaling is part of the tensors.
-            theta = _tensor(rng.standard_normal((4, dim)))
-            rows = _tensor(rng.standard_normal((4, inputs)))
-            flow = self._builder()(theta, rows)
+            theta = _to_tensor(rng.standard_normal((4, dim)))
+            rows = _to_tensor(rng.standard_normal((4, inputs)))
+            flow = self._make_flow_builder()(theta, rows)
             try:
                 flow.load_state_dict(
                     {name: torch.from_numpy(np.array(a)) for name, a in arrays.items()}
@@ -183,7 +185,7 @@ class NeuralPosteriorEstimation(Tuner):
         row = self._read(task.observed[None], task.lengths, task.scene)
         with isolated_library_call(rng):
             count = max(self.draws, task.budget)
-            samples = self._flow.sample((count,), condition=_tensor(row))
+            samples = self._flow.sample((count,), condition=_to_tensor(row))
             raw = samples.detach()[:, 0].numpy()
         # A flow has mass outside the range of its training, and may overflow far from it.
         draws = np.clip(np.nan_to_num(raw.astype(np.float64), nan=0.5), 0.0, 1.0)
@@ -194,7 +196,7 @@ class NeuralPosteriorEstimation(Tuner):
         return "its draws are used up"
 
 
-def _tensor(array: Array) -> Any:
+def _to_tensor(array: Array) -> Any:
     import torch
 
     return torch.as_tensor(array, dtype=torch.float32)

@@ -92,37 +92,37 @@ class TuRBO(Tuner):
             for point in points:
                 evaluation = yield point
                 losses.append(float(evaluation.losses[0]))
-            yield from self._region(task.dim, rng, np.array(points), np.array(losses))
+            yield from self._search_region(task.dim, rng, np.array(points), np.array(losses))
 
-    def _region(
+    def _search_region(
         self, dim: int, rng: np.random.Generator, points: Array, losses: Array
     ) -> TunerGenerator:
         """Search in one trust region until it has collapsed."""
         length = self.length
-        succeeded = 0
-        failed = 0
+        success_count = 0
+        failure_count = 0
         while length >= self.shortest:
-            point = self._sampled(points, losses, length, rng)
+            point = self._sample_best_candidate(points, losses, length, rng)
             evaluation = yield point
             loss = float(evaluation.losses[0])
             # An improvement by rounding does not count as success.
             if loss < _MIN_RELATIVE_IMPROVEMENT * losses.min():
-                succeeded += 1
-                failed = 0
+                success_count += 1
+                failure_count = 0
             else:
-                succeeded = 0
-                failed += 1
-            if succeeded == self.successes:
+                success_count = 0
+                failure_count += 1
+            if success_count == self.successes:
                 length = min(2.0 * length, self.longest)
-                succeeded = 0
-            elif failed == max(_MIN_FAILURES_TO_SHRINK, dim):
+                success_count = 0
+            elif failure_count == max(_MIN_FAILURES_TO_SHRINK, dim):
                 length = length / 2.0
-                failed = 0
+                failure_count = 0
             points = np.vstack([points, point])
             losses = np.append(losses, loss)
         return None
 
-    def _sampled(
+    def _sample_best_candidate(
         self, points: Array, losses: Array, length: float, rng: np.random.Generator
     ) -> Array:
         """Return the best candidate of a Thompson sample of the process in the trust region."""
@@ -142,7 +142,7 @@ class TuRBO(Tuner):
             sides = np.asarray(scales).ravel()
             # (1)
             sides = length * sides / np.exp(np.log(sides).mean())
-            candidates = self._candidates(points[values.argmin()], sides, rng)
+            candidates = self._draw_candidates(points[values.argmin()], sides, rng)
             with torch.no_grad():
                 chosen = MaxPosteriorSampling(model=model, replacement=False)(
                     torch.from_numpy(candidates)
@@ -150,7 +150,7 @@ class TuRBO(Tuner):
             best: Array = np.clip(chosen.numpy()[0].astype(np.float64), 0.0, 1.0)
         return best
 
-    def _candidates(self, centre: Array, sides: Array, rng: np.random.Generator) -> Array:
+    def _draw_candidates(self, centre: Array, sides: Array, rng: np.random.Generator) -> Array:
         """Draw points in the box around `centre`.
 
         In many dimensions each one differs from the centre in about 20 coordinates.
@@ -159,10 +159,10 @@ class TuRBO(Tuner):
         low = np.clip(centre - sides / 2.0, 0.0, 1.0)
         high = np.clip(centre + sides / 2.0, 0.0, 1.0)
         spread = low + (high - low) * _draw_sobol_points(rng, self.candidates, dim)
-        moved = rng.uniform(size=spread.shape) <= min(_MAX_PERTURBED_COORDINATES / dim, 1.0)
+        is_perturbed = rng.uniform(size=spread.shape) <= min(_MAX_PERTURBED_COORDINATES / dim, 1.0)
         # At least one coordinate is changed, because the centre has already been simulated.
-        moved[~moved.any(axis=1), rng.integers(dim)] = True
-        return np.where(moved, spread, centre)
+        is_perturbed[~is_perturbed.any(axis=1), rng.integers(dim)] = True
+        return np.where(is_perturbed, spread, centre)
 
 
 def _draw_sobol_points(rng: np.random.Generator, n: int, dim: int) -> Array:

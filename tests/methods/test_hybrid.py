@@ -74,7 +74,7 @@ def seen_so_far(points, matrix, offset=0.0):
 
 def modelled(run, matrix):
     """Return the model, and the points simulated for it."""
-    steps, asked = TuneNetLeastSquares()._model(run, LeastSquares()), []
+    steps, asked = TuneNetLeastSquares()._build_linear_model(run, LeastSquares()), []
     try:
         points = next(steps)
         while True:

@@ -32,12 +32,12 @@ def test_listed_as_skipped_without_its_extra(name, package, monkeypatch):
 
 def test_candidates_fill_the_trust_region_and_stay_in_the_cube():
     sides = np.array([0.2, 0.4])
-    points = TuRBO()._candidates(np.array([0.05, 0.5]), sides, np.random.default_rng(0))
+    points = TuRBO()._draw_candidates(np.array([0.05, 0.5]), sides, np.random.default_rng(0))
     assert points.shape == (1000, 2)
     assert np.allclose(points.min(axis=0), [0.0, 0.3], atol=1e-2)
     assert np.allclose(points.max(axis=0), [0.15, 0.7], atol=1e-2)
     centre = np.full(100, 0.5)
-    points = TuRBO()._candidates(centre, np.full(100, 0.2), np.random.default_rng(0))
+    points = TuRBO()._draw_candidates(centre, np.full(100, 0.2), np.random.default_rng(0))
     moved = (points != centre).sum(axis=1)
     assert moved.min() >= 1
     assert moved.mean() == pytest.approx(20.0, abs=1.0)
