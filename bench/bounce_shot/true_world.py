@@ -26,7 +26,6 @@ sphere of moment of inertia k m r^2 by f (1 + 1 / k) / m per second, so that wit
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import math
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ import numpy as np
 
 from bench.bounce_shot.ball_kinds import BallKind
 from sims.core.simulator import Array, InputError
+from sims.engines.adapters.mujoco_soft_contact import compute_damping_ratio
 
 AIR_DENSITY = 1.2
 """Density of air, kg/m^3."""
@@ -48,7 +48,7 @@ _IMPACT = 3e-5
 """Length of a step in contact in seconds, a hundredth of an impact."""
 _IMPEDANCE = 0.9999
 """Constraint impedance of the contact, the largest that MuJoCo allows."""
-_MOST_DAMPED = 60.0
+_MAX_DAMPING_RATIO = 60.0
 """Damping ratio at which the restitution is practically zero."""
 
 
@@ -95,31 +95,6 @@ def simulate_shot(
     if flight.gap(*start) <= 0:
         raise InputError(f"expected a ball above the ground, found its centre at {start}")
     return flight.run(start, times)
-
-
-@functools.cache
-def compute_damping_ratio(restitution: float) -> float:
-    """Return the damping ratio of a spring-damper contact with this restitution, 0 < e <= 1."""
-    # Bisection, because restitution decreases with damping; eighty halvings reach rounding
-    # accuracy.
-    low = 0.0
-    high = _MOST_DAMPED
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _restitution(middle) > restitution else (low, middle)
-    return 0.5 * (low + high)
-
-
-def _restitution(ratio: float) -> float:
-    """Return the restitution for a damping ratio by Schwager and Poeschel, equation (12)."""
-    # Both formulas are 0 / 0 at a damping ratio of 1, where their limit is exp(-2).
-    if ratio == 0.0 or abs(ratio - 1.0) < 1e-9:
-        return 1.0 if ratio == 0.0 else math.exp(-2.0)
-    if ratio < 1.0:
-        w = math.sqrt(1.0 - ratio * ratio)
-        return math.exp(-ratio / w * math.atan2(2.0 * ratio * w, 2.0 * ratio * ratio - 1.0))  # (3)
-    s = math.sqrt(ratio * ratio - 1.0)
-    return math.exp(-ratio / s * math.log((ratio + s) / (ratio - s)))  # (4)
 
 
 class _Flight:
@@ -174,7 +149,8 @@ class _Flight:
         """Set the contact damping for an impact at this speed."""
         self._touches = True
         # Rounded, so that almost equal impacts share the cached result.
-        ratio = compute_damping_ratio(round(self._ball.compute_restitution(speed), 9))
+        restitution = round(self._ball.compute_restitution(speed), 9)
+        ratio = compute_damping_ratio(restitution, _MAX_DAMPING_RATIO)
         # The contact of a spring lasts half of its period.
         frequency = math.pi / CONTACT_SECONDS
         self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency

@@ -5,8 +5,12 @@ There is no gravity, which the guide would support.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
+
+from sims.systems.slider_bullet_world import gravity  # same force as in Bullet
+
+__all__ = ["OPEN_LOOP", "gravity", "load", "model"]
 
 OPEN_LOOP = True
 """Whether the force depends on the input alone."""
@@ -40,8 +44,3 @@ def load(model: Any, inertia: float, constants: Mapping[str, float]) -> bool:  #
     """
     model.body_mass[1] = inertia
     return inertia > 0.0
-
-
-def gravity(constants: Mapping[str, float]) -> Callable[[float], float]:  # noqa: ARG001
-    """Return a function that gives zero, because gravity does not act along the guide."""
-    return lambda x: 0.0  # noqa: ARG005

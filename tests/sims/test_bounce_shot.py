@@ -21,7 +21,6 @@ from bench.bounce_shot.true_world import (
     CONTACT_SECONDS,
     GRAVITY,
     InclinedGround,
-    compute_damping_ratio,
     simulate_shot,
 )
 from sims.core.simulator import InputError, Scenario
@@ -226,28 +225,6 @@ def test_world_restitution_falls_with_speed_as_its_exponent_says():
     assert rebounds[1] == pytest.approx(
         0.8 * (math.sqrt(2 * GRAVITY * 1.5) / 4.0) ** -0.2, abs=0.005
     )
-
-
-def test_damping_ratio_inverts_the_restitution_of_a_contact_that_ends_with_its_force():
-    """Reference: a contact integrated by SciPy, r'' = -2 d r' - r until the force d r' + r/2
-    pulls.
-    """
-    for restitution in (0.1, 0.3, 0.7, 0.95):
-        ratio = compute_damping_ratio(restitution)
-
-        def ends(_, y, ratio=ratio):
-            return -2 * ratio * y[1] - y[0]
-
-        ends.terminal, ends.direction = True, -1
-        contact = solve_ivp(
-            lambda t, y, ends=ends: [y[1], ends(t, y)],
-            (0, 50),
-            [0, -1.0],
-            events=ends,
-            rtol=1e-10,
-            atol=1e-12,
-        )
-        assert contact.y[1, -1] == pytest.approx(restitution, abs=1e-6)
 
 
 @pytest.mark.parametrize(

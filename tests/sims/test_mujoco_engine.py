@@ -117,7 +117,7 @@ def test_effects_are_evaluated_at_finite_states_only(kind, rate, engine):
     assert np.isnan(found[1]).all()
 
 
-@pytest.mark.parametrize("restitution", [0.1, 0.37, 0.7, 0.9, 1.0])
+@pytest.mark.parametrize("restitution", [0.1, 0.37, 0.7, 0.9, 0.95, 1.0])
 def test_damping_ratio_against_the_spring_and_damper_itself(restitution):
     # x'' = -max(0, x + 2 D x') / ..., integrated until the force would pull.
     ratio, x, v, h = compute_damping_ratio(restitution), 0.0, 1.0, 1e-4

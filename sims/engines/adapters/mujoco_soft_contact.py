@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 from sims.engines.adapters.mujoco_bodies import CompiledWorld, MujocoMover
 from sims.engines.external.ball_rollout import BallState
 from sims.engines.external.element_forces import Vector
 
-_MOST_DAMPED = 2.0
+_MAX_DAMPING_RATIO = 2.0
 """Largest damping ratio of a soft contact."""
 
 
@@ -55,17 +56,20 @@ class MujocoSoftBall(MujocoMover):
         return super().advance(force)
 
 
-def compute_damping_ratio(restitution: float) -> float:
+@functools.cache
+def compute_damping_ratio(restitution: float, largest: float = _MAX_DAMPING_RATIO) -> float:
     """Return the damping ratio of a spring and damper that only push, for a given restitution.
-
-    It is at most 2, which gives a restitution of 0.06.
 
     T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
     20.
+
+    Args:
+        restitution: restitution of an impact.
+        largest: largest damping ratio; 2 gives a restitution of 0.06.
     """
     # Restitution decreases with damping. After 60 bisections, only rounding error remains.
     low = 0.0
-    high = _MOST_DAMPED
+    high = largest
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _compute_restitution(middle) > restitution else (low, middle)
