@@ -139,7 +139,7 @@ def _members(
 def _places(robot: RobotModel, effect: str) -> list[str]:
     """List the places of an effect family that has one number for all places."""
     if effect.startswith("input."):
-        return [actuator.name for actuator in robot.actuators if actuator.joint is not None]
+        return [actuator.name for actuator in robot.actuators if actuator.motion is not None]
     if effect.startswith("sensor."):
         return [ALL_PLACES]
     return [joint.name for joint in robot.joints]

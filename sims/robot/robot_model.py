@@ -54,6 +54,11 @@ class Joint:
         return self.kind in ("hinge", "slide")
 
     @property
+    def motion(self) -> Literal["hinge", "slide"] | None:
+        """Kind of its one coordinate, an angle or a length; None if it has several."""
+        return self.kind if self.kind in ("hinge", "slide") else None
+
+    @property
     def unit(self) -> str:
         """Unit of the position."""
         return "rad" if self.kind == "hinge" else "m"
@@ -76,6 +81,9 @@ class Actuator:
             ``pid``, or ``other``.
         range: range of its (first) control; None if not limited.
         force: lowest and highest force; None if not limited.
+        motion: whether it acts along an angle (``hinge``) or a length (``slide``): of its joint, of
+            its tendon, or of the force or torque at its site; None if it acts along neither.
+        moves: joints that it drives through a fixed tendon.
         control: address of its first control.
         controls: number of its controls: a pid may have, in this order, a position, a velocity, a
             force.
@@ -89,6 +97,16 @@ class Actuator:
     force: tuple[float, float] | None
     control: int = -1
     controls: int = 1
+    motion: Literal["hinge", "slide"] | None = None
+    moves: tuple[str, ...] = ()
+
+    @property
+    def control_unit(self) -> str:
+        """Unit of the control."""
+        length = {"hinge": "rad", "slide": "m"}.get(self.motion or "", "1")
+        force = {"hinge": "N*m", "slide": "N"}.get(self.motion or "", "1")
+        units = {"position": length, "velocity": f"{length}/s", "motor": force}
+        return units.get(self.kind, "1") if self.motion else "1"
 
 
 @dataclass(frozen=True)
@@ -228,6 +246,16 @@ class RobotModel:
         if hasattr(model, "actuator_ctrladr"):
             control, controls = int(model.actuator_ctrladr[i]), int(model.actuator_ctrlnum[i])
         limited = controls > 0 and bool(model.actuator_ctrllimited[control])
+        moves = self._joints_of_tendon(i)
+        motion = None
+        if joint is not None:
+            motion = self.joint(joint).motion
+        elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON):
+            kinds = {self.joint(name).motion for name in moves}
+            # A spatial tendon has a length, and no joints of its own.
+            motion = kinds.pop() if len(kinds) == 1 else None if kinds else "slide"
+        elif int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_SITE):
+            motion = "slide" if model.actuator_gear[i, :3].any() else "hinge"
         return Actuator(
             name=model.actuator(i).name or f"actuator{i}",
             id=i,
@@ -237,7 +265,23 @@ class RobotModel:
             force=_limit(model.actuator_forcerange[i], bool(model.actuator_forcelimited[i])),
             control=control,
             controls=controls,
+            motion=motion,
+            moves=moves if joint is None else (),
         )
+
+    def _joints_of_tendon(self, i: int) -> tuple[str, ...]:
+        """Return the joints of the fixed tendon that an actuator drives, if it drives one."""
+        import mujoco
+
+        model = self.compiled
+        if int(model.actuator_trntype[i]) != int(mujoco.mjtTrn.mjTRN_TENDON):
+            return ()
+        tendon = int(model.actuator_trnid[i, 0])
+        first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+        own = range(first, first + count)
+        is_joint = int(mujoco.mjtWrap.mjWRAP_JOINT)
+        joints = [int(model.wrap_objid[k]) for k in own if int(model.wrap_type[k]) == is_joint]
+        return tuple(self.joints[joint].name for joint in joints)
 
     @cached_property
     def bodies(self) -> tuple[Body, ...]:

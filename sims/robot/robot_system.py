@@ -220,7 +220,7 @@ def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[Robot
     if not joints:
         raise InputError(f"{robot.path}: expected a hinge or slide joint, found none that moves")
     channels = _channels(robot)
-    inputs = [Channel(f"u.{a.name}", _unit(robot, a.name)) for a in robot.actuators]
+    inputs = [Channel(f"u.{a.name}", a.control_unit) for a in robot.actuators]
     inputs += [Channel(f"force.{j.name}", j.force_unit) for j in joints]
     model = robot.compiled
     states = {f"q.{j.name}": float(model.qpos0[j.position]) for j in joints}
@@ -313,16 +313,6 @@ def _parameters(effect: type[Effect]) -> list[Parameter]:
         unit = c.units[0] or "1"
         result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
     return result
-
-
-def _unit(robot: RobotModel, actuator: str) -> str:
-    """Return the unit of an actuator's control."""
-    a = robot.actuator(actuator)
-    if a.joint is None:
-        return "1"
-    joint = robot.joint(a.joint)
-    units = {"position": joint.unit, "velocity": f"{joint.unit}/s", "motor": joint.force_unit}
-    return units.get(a.kind, "1")
 
 
 def _channels(robot: RobotModel) -> tuple[Channel, ...]:

@@ -131,6 +131,7 @@ def make_shared_effects(
         effect: registered effect.
         drives: places of the actuators.
     """
+    drives = [one for one in drives if one.coordinate is not None]
     joints = {one.coordinate: one for one in drives}
     kinds = {one.kind for one in drives}
     if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
@@ -362,6 +363,12 @@ def _for_one(effect: type[Effect]) -> bool:
     return alone and issubclass(effect, Force | Friction)
 
 
+def _takes(effect: type[Effect], spot: EffectPlace) -> bool:
+    """Return whether an actuator takes commands of the kind that an effect changes."""
+    # A power effect is undefined for a set point.
+    return effect.name != "input.power" or spot.unit.startswith(("N", "1"))
+
+
 def _acts_at(
     effect: type[Effect], spot: EffectPlace, found: Mapping[str, Sequence[EffectPlace]]
 ) -> bool:
@@ -377,12 +384,16 @@ def _acts_at(
         return False
     if effect.name == "joint.coupling" and not spot.coupled:
         return False
+    # On a tendon or a site, only the command and the numbers of the actuator are defined.
+    if effect.at == "actuator" and spot.coordinate is None:
+        if issubclass(effect, ModelValueEffect):
+            return spot.stated.get(effect.name, 1.0) != 0.0
+        return issubclass(effect, Input) and effect.needs != "servo" and _takes(effect, spot)
     if effect.name == "link.length" and not spot.stated["link.length"]:
         return False
     if effect.name == "joint.axis" and not spot.tilts:
         return False
-    # A power effect is undefined for a set point.
-    if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):
+    if effect.at == "actuator" and not _takes(effect, spot):
         return False
     if effect.name in POSITION_SENSOR_EFFECTS and not spot.name.startswith("q."):
         return False

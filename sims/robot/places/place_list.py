@@ -14,7 +14,7 @@ import numpy as np
 from sims.robot.coupled_drives import list_coupling_places as coupled_places
 from sims.robot.places.centre_of_mass_limits import observable_axes, reach
 from sims.robot.places.observable_tilts import observable_tilts
-from sims.robot.robot_model import RobotModel
+from sims.robot.robot_model import Actuator, RobotModel
 
 MUJOCO_EFFECT_WORDS = {
     "armature": "inertia.armature",
@@ -33,6 +33,10 @@ MUJOCO_EFFECT_WORDS = {
     "stiffness": "spring.linear",
 }
 """MuJoCo's words for numbers of a model file, and the effects that change them."""
+
+
+STANDARD_GRAVITY = 9.81
+"""Acceleration in m/s^2 by which a mass has its typical weight."""
 
 
 class EffectPlace(NamedTuple):
@@ -91,6 +95,7 @@ def list_places(
     sizes = coefficient_scales(robot)
     found: dict[str, list[EffectPlace]] = {"joint": [], "actuator": [], "body": [], "channel": []}
     numbers: dict[str, int] = {}
+    mass = sum(body.mass for body in robot.bodies)
     may_be_coupled = coupled_places(robot)
     bodies = robot.compiled.jnt_bodyid
     lasts = {int(body): i for i, body in enumerate(bodies)}
@@ -115,19 +120,19 @@ def list_places(
     for actuator in robot.actuators:
         on = next((s for s in found["joint"] if s.name == actuator.joint), None)
         if on is None:
+            on = _beyond_joints(actuator, found["joint"], mass)
+        if on is None:
             continue
-        unit = _control_unit(actuator.kind, on)
         found["actuator"].append(
             on._replace(
                 name=actuator.name,
                 signal=f"u.{actuator.name}",
-                unit=unit,
+                unit=actuator.control_unit,
                 stated=_gains(robot, actuator.id),
                 words=f"actuator {actuator.name}",
-                servo=actuator.kind == "position",
+                servo=actuator.kind == "position" and on.coordinate is not None,
             )
         )
-    mass = sum(body.mass for body in robot.bodies)
     longest = float(np.linalg.norm(robot.compiled.body_pos[1:], axis=1).max(initial=0.0))
     for body in robot.bodies:
         words = f"body {body.name}"
@@ -167,11 +172,22 @@ def list_places(
     return found
 
 
-def _control_unit(kind: str, on: EffectPlace) -> str:
-    """Return the unit of an actuator's control."""
-    length = "rad" if on.kind == "hinge" else "m"
-    force = "N*m" if on.kind == "hinge" else "N"
-    return {"position": length, "velocity": f"{length}/s", "motor": force}.get(kind, "1")
+def _beyond_joints(
+    actuator: Actuator, joints: Sequence[EffectPlace], mass: float
+) -> EffectPlace | None:
+    """Return a place like a joint for an actuator on a tendon or a site; None if there is none.
+
+    Args:
+        actuator: an actuator that drives no single joint.
+        joints: places of the joints.
+        mass: mass in kg of all moving bodies, whose weight is the typical force at a site.
+    """
+    if actuator.motion is None:
+        return None
+    moved = [place for place in joints if place.name in actuator.moves]
+    size = max((place.size for place in moved), default=STANDARD_GRAVITY * mass)
+    inertia = max((place.inertia for place in moved), default=mass)
+    return EffectPlace(actuator.name, actuator.motion, None, "", "", size, inertia, {}, "")
 
 
 def _gains(robot: RobotModel, actuator: int) -> dict[str, float]:
