@@ -363,10 +363,10 @@ def _for_one(effect: type[Effect]) -> bool:
     return alone and issubclass(effect, Force | Friction)
 
 
-def _takes(effect: type[Effect], spot: EffectPlace) -> bool:
+def _takes(effect: type[Effect], place: EffectPlace) -> bool:
     """Return whether an actuator takes commands of the kind that an effect changes."""
     # A power effect is undefined for a set point.
-    return effect.name != "input.power" or spot.unit.startswith(("N", "1"))
+    return effect.name != "input.power" or place.unit.startswith(("N", "1"))
 
 
 def _acts_at(
