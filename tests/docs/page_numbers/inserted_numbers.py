@@ -9,8 +9,8 @@ A page marks what is inserted; Markdown does not show the marks.
   the cell above it.
 * Lines: ``<!-- lines: EXPRESSION -->`` up to ``<!-- /lines -->``.
 
-Expressions use the names of `page_values` and `page_cells`. A number keeps its text while it agrees
-with its value, rounded to the written digits.
+Expressions use the names of `page_values`, `page_cells` and `diagnoser_board`. A number keeps its
+text while it agrees with its value, rounded to the written digits.
 """
 
 import math
@@ -18,7 +18,7 @@ import re
 from itertools import pairwise
 
 from tests.docs.documentation_pages import pages
-from tests.docs.page_numbers import page_cells, page_values
+from tests.docs.page_numbers import diagnoser_board, page_cells, page_values
 
 NUMBER = re.compile(r"(?<![\w.,/-])[-−]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?(?![\w]|-\w)")
 """Pattern of a number; digits in names such as UR5 or squash-018 do not match."""
@@ -27,7 +27,7 @@ CELLS = re.compile(r"<!-- cells: (?P<source>.+?) -->\n\n(?P<text>(?: *\|.*\n)+)"
 LINES = re.compile(r"<!-- lines: (?P<source>.+?) -->\n\n(?P<text>.*?)\n<!-- /lines -->", re.S)
 BAR = re.compile(r"(?<!\\)\|")
 WORDS = "none one two three four five six seven eight nine ten eleven twelve".split()  # noqa: SIM905
-NAMES = {**vars(page_values), **vars(page_cells)}
+NAMES = {**vars(page_values), **vars(page_cells), **vars(diagnoser_board)}
 
 
 def insert_numbers(text):
