@@ -36,12 +36,12 @@ def refused(words):
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_are_taken(page, capsys):
+def test_commands_are_accepted(page, capsys):
     lines = [*commands(page.read_text(encoding="utf-8"))]
     assert [line for line in lines if refused(line)] == []
 
 
-def test_commands_in_the_table_of_the_readme_are_taken(capsys):
+def test_commands_in_the_table_of_the_readme_are_accepted(capsys):
     from tests.docs.test_examples import table_commands
 
     assert len(table_commands()) >= 17
@@ -76,7 +76,7 @@ def named_wrongly(words):
     return ""
 
 
-def test_what_commands_name_exists(capsys):
+def test_files_named_in_commands_exist(capsys):
     """Checks tuners with a simulator that can train them, experiments and data sets."""
     lines = [line for page in pages() for line in commands(page.read_text(encoding="utf-8"))]
     checked = [line for line in lines if line[:1] in (["train"], ["compare"], ["download"])]
@@ -94,17 +94,17 @@ def test_what_commands_name_exists(capsys):
         ("simgap download so10", "unknown data set"),
     ],
 )
-def test_a_command_that_names_what_does_not_exist_is_found(line, said, capsys):
+def test_a_command_with_a_missing_file_is_found(line, said, capsys):
     assert said in named_wrongly(line.split()[1:])
 
 
-def test_there_are_commands():
+def test_pages_contain_commands():
     assert sum(len([*commands(page.read_text(encoding="utf-8"))]) for page in pages()) > 60
 
 
 @pytest.mark.parametrize(
     "line", ["simgap explain", "simgap compare ball-drop --budgets 3", "simgap compair x"]
 )
-def test_a_command_that_is_none_is_found(line, capsys):
+def test_an_unknown_command_is_found(line, capsys):
     (words,) = commands(f"```sh\n{line}   # words\n```\n")
     assert refused(words)

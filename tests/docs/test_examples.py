@@ -29,7 +29,7 @@ def test_the_tuner_of_the_page_keeps_the_contract(tmp_path):
     assert "all 14 checks passed" in done.stdout
 
 
-def test_the_experiment_of_the_page_reads_as_it_says(tmp_path):
+def test_the_experiment_of_the_page_loads_as_described(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(block("compare.md", "mine.toml"), encoding="utf-8")
     experiment = load_experiment(str(path))

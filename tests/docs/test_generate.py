@@ -9,12 +9,12 @@ from tests.docs.generate_pages import COMMAND, PAGES, ROWS, row_schema
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_the_page_is_what_the_code_says(name):
+def test_the_generated_page_is_up_to_date(name):
     assert text_of(name) == PAGES[name](), f"docs/{name} is stale; renew it with: {COMMAND}"
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_the_schema_of_a_row_is_what_the_columns_say(name):
+def test_the_row_schema_agrees_with_the_columns(name):
     path = ROOT / "bench" / "schemas" / f"{name}.schema.json"
     assert path.read_text() == row_schema(name), f"{path} is stale; renew it with: {COMMAND}"
 
@@ -30,11 +30,11 @@ def test_every_tuner_is_on_its_page():
     assert [name for name, *_ in tuner_table.registered() if f"`{name}`" not in page] == []
 
 
-def test_every_equation_is_set_once_and_used():
+def test_every_equation_is_rendered_once_and_used():
     page = text_of("reference/tuners.md")
     assert [words for words, latex in tuner_table.SET.items() if latex not in page] == []
 
 
-def test_an_equation_that_is_changed_in_the_code_has_to_be_set_anew():
+def test_a_changed_equation_must_be_rendered_again():
     with pytest.raises(KeyError, match="EI = f"):
         list(tuner_table.paragraphs("With m the mean:\n\n    (1)  EI = f - m"))

@@ -27,7 +27,7 @@ def tables(folder):
 
 
 @pytest.mark.parametrize("folder", COMPARED, ids=lambda f: f.relative_to(REFERENCE).as_posix())
-def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
+def test_a_stored_page_has_the_numbers_of_its_tables(folder):
     compared = 0
     for name, shown in tables(folder).items():
         path = folder / f"{name}.csv"
@@ -45,7 +45,7 @@ def test_a_kept_page_has_the_numbers_of_the_tables_beside_it(folder):
 
 
 @pytest.mark.parametrize("folder", TODAY, ids=lambda f: f.relative_to(REFERENCE).as_posix())
-def test_a_kept_page_asks_nobody_and_runs_its_own_script_alone(folder):
+def test_a_stored_page_requests_nothing_and_runs_only_its_own_script(folder):
     text = (folder / "report.html").read_text(encoding="utf-8")
     script = re.findall(r"<script>(.*?)</script>", text, re.S)[-1]
     assert f'content="{_policy(script)}"' in text

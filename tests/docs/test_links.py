@@ -8,7 +8,7 @@ from tests.docs.documentation_pages import DOCS, FENCE, LINK, ROOT, anchors, pag
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
+def test_links_exist(page):
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     broken = []
     for _, link in LINK.findall(text):
@@ -26,7 +26,7 @@ PLACE = re.compile(r"`((?:bench|docs|examples|methods|results|sims|tests)/[\w./*
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: str(page.relative_to(ROOT)))
-def test_files_that_a_page_names_are_there(page):
+def test_files_that_a_page_names_exist(page):
     named = PLACE.findall(page.read_text(encoding="utf-8"))
     made = {"results/train/", "results/inspect/"}  # written by commands
     # Names in capitals are placeholders for the reader.

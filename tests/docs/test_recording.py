@@ -26,7 +26,7 @@ def files(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_example_reads_as_the_page_says(files):
+def test_the_example_loads_as_the_page_says(files):
     recording = read_recording("swing.csv", Pendulum)
     light, heavy, last = recording.runs
     assert read_system_name("swing.csv") == "pendulum"
@@ -38,7 +38,7 @@ def test_the_example_reads_as_the_page_says(files):
     assert [run.held_out for run in recording.runs] == [False, False, True]
 
 
-def test_inspect_says_what_the_page_shows(files):
+def test_inspect_prints_the_output_of_the_page(files):
     lines = [*format_summary(read_recording("swing.csv", Pendulum), Pendulum)]
     assert "\n".join(lines) + "\n" == BLOCKS["inspect"]
 
@@ -50,7 +50,7 @@ def test_the_smallest_description_is_enough(files):
 
 
 @pytest.mark.parametrize("row", FAULTS, ids=[quoted(row[2])[0] for row in FAULTS])
-def test_a_fault_is_told_what_the_page_says(files, row):
+def test_a_fault_has_the_message_of_the_page(files, row):
     # Columns of the table: file, original text, changed text, message.
     (name,), (before,), (after,), (message,) = map(quoted, row)
     (files / name).write_text(BLOCKS[name].replace(before, after, 1), encoding="utf-8")
@@ -73,7 +73,7 @@ CONSTANTS = {"gravity", "length", "mass"}
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_every_key_that_the_reader_knows_stands_on_the_page_and_none_else(files, place):
+def test_the_page_documents_exactly_the_keys_of_the_reader(files, place):
     table = PLACES[place]
     # The message for an unknown key lists all known keys.
     spoilt = {"": "nonsense = 1\n" + BLOCKS["swing.toml"]}.get(

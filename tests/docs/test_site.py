@@ -99,7 +99,7 @@ def site(built):
 
 
 @pytest.mark.slow
-def test_nothing_is_asked_of_the_network(built, site):
+def test_the_site_requests_nothing_from_the_network(built, site):
     assert len(site) > 80
     assert {
         file.name: from_elsewhere(page) for file, page in site.items() if from_elsewhere(page)
@@ -113,21 +113,21 @@ def test_nothing_is_asked_of_the_network(built, site):
 
 
 @pytest.mark.slow
-def test_links_and_pictures_of_the_site_lead_somewhere(site):
+def test_links_and_pictures_of_the_site_exist(site):
     assert sum(len(page.links) for page in site.values()) > 5000
     assert lost(site) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["compare", "explain", "add-a-tuner", "verdicts", "start"])
-def test_the_front_page_leads_there_in_one_click(built, site, page):
+def test_the_front_page_links_to_every_section(built, site, page):
     front = (built / "index.html").read_text(encoding="utf-8")
     cards = front[front.index('class="grid cards"') : front.index('id="one-page-a-task"')]
     assert f"{page}.html" in Page(cards).links
 
 
 @pytest.mark.slow
-def test_no_marks_of_markdown_are_left(built, site):
+def test_all_markdown_is_rendered(built, site):
     left = {"```", "](", "**", "{#", ":::"}
     found = {
         (file.name, mark)
@@ -140,13 +140,13 @@ def test_no_marks_of_markdown_are_left(built, site):
 
 
 @pytest.mark.slow
-def test_equations_are_set_without_a_script(built):
+def test_equations_are_rendered_without_a_script(built):
     page = (built / "reference" / "tuners.html").read_text(encoding="utf-8")
     assert page.count("<math") > 20
 
 
 @pytest.mark.slow
-def test_public_names_have_their_docstrings(built):
+def test_public_names_show_their_docstrings(built):
     page = (built / "reference" / "api.html").read_text(encoding="utf-8")
     assert "Everything that a tuner gets of one target" in page
 
@@ -175,7 +175,7 @@ def test_every_page_is_in_the_navigation():
 # Tests of the helper functions with faulty pages.
 
 
-def test_a_picture_from_elsewhere_is_found():
+def test_an_external_picture_is_found():
     assert from_elsewhere(
         Page('<img src="https://example.org/a.png"><a href="https://x.org">x</a>')
     )
@@ -184,7 +184,7 @@ def test_a_picture_from_elsewhere_is_found():
 
 
 @pytest.mark.parametrize("address", ["gone.html", "there.html#gone", "#gone", "gone.png"])
-def test_a_link_that_leads_nowhere_is_found(tmp_path, address):
+def test_a_dead_link_is_found(tmp_path, address):
     (tmp_path / "there.html").write_text('<h1 id="here">a</h1>', encoding="utf-8")
     sound = '<a href="there.html#here">x</a><a href="https://example.org">x</a>'
     (tmp_path / "page.html").write_text(sound, encoding="utf-8")
@@ -193,7 +193,7 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path, address):
     assert lost(parsed(tmp_path)) == [("page.html", address)]
 
 
-def test_a_page_is_laid_out_as_it_is_told(tmp_path):
+def test_a_page_has_the_requested_layout(tmp_path):
     text = Stage(tmp_path).page(DOCS / "verdicts.md")
     assert "# What the verdicts mean {#what-the-verdicts-mean}" in text
     text = Stage(tmp_path).page(DOCS / "explain.md")
@@ -207,7 +207,7 @@ def test_a_page_is_laid_out_as_it_is_told(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["index", "verdicts", "reference/tuners", "reference/api"])
 @pytest.mark.parametrize("width", WIDTHS)
-def test_a_page_is_whole_from_a_disk(browser, built, name, width):
+def test_a_page_works_without_a_server(browser, built, name, width):
     with Opened(browser, built / f"{name}.html", width=width) as opened:
         opened.page.wait_for_load_state("load")
         assert opened.complaints == []
@@ -215,7 +215,7 @@ def test_a_page_is_whole_from_a_disk(browser, built, name, width):
 
 
 @pytest.mark.slow
-def test_the_search_finds_a_page_from_a_disk(browser, built):
+def test_the_search_works_without_a_server(browser, built):
     with Opened(browser, built / "index.html") as opened:
         opened.page.keyboard.press("Control+k")
         opened.page.locator("input:focus").fill("eccentricity")
@@ -226,6 +226,6 @@ def test_the_search_finds_a_page_from_a_disk(browser, built):
 
 
 @pytest.mark.slow
-def test_the_front_page_keeps_nobody_out(browser, built):
+def test_the_front_page_is_accessible(browser, built):
     with Opened(browser, built / "index.html") as opened:
         assert opened.barriers() == []

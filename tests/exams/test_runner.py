@@ -89,7 +89,7 @@ def test_an_interrupted_exam_continues_and_versions_share_a_folder(tmp_path, cap
     assert failed == {"items.jsonl", "items.csv", "summary.csv", "README.md", "figures"}
 
 
-def test_a_name_that_no_question_has_is_refused(tmp_path, capsys):
+def test_an_unknown_case_name_is_refused(tmp_path, capsys):
     assert main(["planted", "--only", "no-robot", "--out", str(tmp_path)]) == 2
     assert "no question of planted has such a name" in capsys.readouterr().out
     assert main(["planted", "--spread", "--out", str(tmp_path)]) == 2
@@ -99,7 +99,7 @@ def test_a_name_that_no_question_has_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", EXAMS)
-def test_questions_have_names_of_their_own_and_a_fair_order(name):
+def test_case_names_are_unique_and_any_part_of_the_order_is_balanced(name):
     from importlib import import_module
 
     pytest.importorskip("pinocchio", reason="pin has no wheel here")

@@ -19,7 +19,7 @@ def wheel(tmp_path_factory):
     return build(tmp_path_factory.mktemp("wheel"))
 
 
-def test_the_wheel_holds_code_schemas_scripts_experiments_references_and_licences(wheel):
+def test_the_wheel_contains_exactly_the_package_files(wheel):
     assert faults(wheel) == []
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
@@ -54,7 +54,7 @@ def test_a_wheel_that_lacks_a_file_or_has_one_too_many_is_found(wheel, tmp_path,
 
 
 @pytest.mark.slow
-def test_it_is_installed_and_used_away_from_the_checkout(wheel, tmp_path):
+def test_the_wheel_works_outside_the_checkout(wheel, tmp_path):
     python = environment(tmp_path / "env")
     (packages,) = (tmp_path / "env" / "lib").glob("python3*/site-packages")
     with zipfile.ZipFile(wheel) as packed:

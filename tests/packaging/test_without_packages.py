@@ -37,14 +37,14 @@ def on(python):
 
 
 @pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13"])
-def test_the_pins_without_the_large_packages_are_those_of_the_lock(python):
+def test_pins_without_large_packages_agree_with_the_lock(python):
     explain, lock = on(python)(FILE), on(python)(LOCK)
     assert not set(WITHOUT) & set(explain)
     assert {name: lock.get(name) for name in explain} == explain
 
 
 @pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13"])
-def test_every_pin_is_one_that_the_project_allows(python):
+def test_every_pin_is_allowed_by_the_project(python):
     lock = {canonicalize_name(name): v for name, v in on(python)(LOCK).items()}
     explain = {canonicalize_name(name): v for name, v in on(python)(FILE).items()}
     for line in direct():
@@ -75,7 +75,7 @@ def test_the_pins_without_the_large_packages_are_complete():
     assert len(seen) > 40
 
 
-def test_python_3_10_gets_upper_bounds_where_its_pip_would_not_find_back():
+def test_python_3_10_has_upper_bounds_where_pip_cannot_backtrack():
     """If an index does not state Requires-Python, pip 23 tries releases for Python 3.11."""
     there = {"python_version": "3.10"}
     bounded = {
@@ -87,7 +87,7 @@ def test_python_3_10_gets_upper_bounds_where_its_pip_would_not_find_back():
     assert not bounded["etils"].contains("1.14.0")
 
 
-def test_no_page_or_message_advises_to_install_from_an_index_where_it_is_not():
+def test_no_page_or_message_advises_to_install_simgap_from_an_index():
     """simgap is on no index: `pip install simgap[npe]` would fail or install a foreign package."""
     files = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
     files += [p for name in ("bench", "methods", "sims") for p in (ROOT / name).rglob("*.py")]
@@ -115,7 +115,7 @@ def made(*words, code=0, **kept):
         ("", "install -r requirements.lock", "requirements-explain"),
     ],
 )
-def test_make_installs_what_without_leaves(tmp_path, without, installed, absent):
+def test_make_installs_all_packages_except_without(tmp_path, without, installed, absent):
     stamp = tmp_path / "env" / ".installed"
     shown = made("--dry-run", str(stamp), f"VENV={tmp_path / 'env'}", f"WITHOUT={without}")
     assert installed in shown
@@ -123,7 +123,7 @@ def test_make_installs_what_without_leaves(tmp_path, without, installed, absent)
 
 
 @pytest.mark.skipif(not shutil.which("make"), reason="no make")
-def test_make_refuses_to_leave_out_what_explain_needs(tmp_path):
+def test_make_refuses_to_omit_packages_that_explain_needs(tmp_path):
     folder = tmp_path / "env"
     said = made("install", f"VENV={folder}", "WITHOUT=numpy", f"PYTHON={sys.executable}", code=2)
     assert "WITHOUT=numpy: expected torch, pybullet or torch,pybullet" in said
@@ -140,7 +140,7 @@ def test_make_refuses_to_leave_out_what_explain_needs(tmp_path):
         ("", "torch", True),
     ],
 )
-def test_another_without_than_last_time_installs_again(tmp_path, last, now, again):
+def test_a_changed_without_installs_again(tmp_path, last, now, again):
     stamp = tmp_path / "env" / ".installed"
     stamp.parent.mkdir()
     stamp.write_text(f"{last}\n")
@@ -169,7 +169,7 @@ def python(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_explain_works_and_the_lists_say_what_is_absent(python, tmp_path):
+def test_explain_works_and_lists_report_absent_packages(python, tmp_path):
     def simgap(*arguments, code=0):
         run = "import sys, simgap; sys.exit(simgap.main(sys.argv[1:]))"
         done = subprocess.run(

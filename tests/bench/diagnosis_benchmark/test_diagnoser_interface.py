@@ -13,7 +13,7 @@ from sims.core.simulation_counter import (
 from sims.core.simulator import InputError, Scenario
 
 
-def test_answers_may_be_words_dictionaries_or_themselves():
+def test_answers_may_be_strings_dictionaries_or_answers():
     assert Answer.of("adequate") == Answer("adequate")
     cause = {"effect": "wind", "alternatives": ["drag.linear"], "p_value": 0.5}
     cause["coefficients"] = {"speed": {"low": 1.0, "high": None}}
@@ -33,13 +33,13 @@ def test_answers_may_be_words_dictionaries_or_themselves():
         ({"verdict": "adequate", "parameters": {"mass": (1.0,)}}, r"expected \(low, high\)"),
     ],
 )
-def test_what_is_no_answer_is_said_in_one_line(given, says):
+def test_an_invalid_answer_is_one_message(given, says):
     with pytest.raises(InputError, match=says) as error:
         Answer.of(given)
     assert "\n" not in str(error.value)
 
 
-def test_more_simulations_than_allowed_are_refused_whole():
+def test_a_batch_beyond_the_budget_is_refused_as_a_whole():
     tally = SimulationCounter()
     tally.reset(10)
     tally.count(8)
@@ -50,7 +50,7 @@ def test_more_simulations_than_allowed_are_refused_whole():
     assert tally.used == 8
 
 
-def test_every_lane_is_counted():
+def test_every_simulation_of_a_batch_is_counted():
     kind = get_simulator("slider")
     made = kind(engine="batch", effects=["drag.linear"])
     SIMULATION_COUNTER.reset()
@@ -72,7 +72,7 @@ class Counts(Diagnoser):
         return "unknown"
 
 
-def test_a_case_is_what_a_user_has(tmp_path):
+def test_a_case_contains_only_the_files_of_a_user(tmp_path):
     made = simulate_recording(
         SimulationSpec(system="slider", noise={"x": 0.01}, observe=("x",), runs=3, seconds=1.0)
     )

@@ -71,7 +71,7 @@ def grid(one, name):
     return [row.locator("td").all_inner_texts() for row in cells]
 
 
-def test_what_simgap_gets_wrong_comes_first(opened):
+def test_failures_of_simgap_are_the_first_table(opened):
     rows = answers()
     wrong = wrong_of(rows, "simgap")
     assert wrong
@@ -90,7 +90,7 @@ def test_what_simgap_gets_wrong_comes_first(opened):
     assert any(f"{counted} {format_percent(top)}" in text.replace("\xa0", " ") for text in said)
 
 
-def test_the_view_is_in_the_address(browser, opened, page):
+def test_the_view_is_stored_in_the_url(browser, opened, page):
     rows = answers()
     opened.page.locator("#wrong").get_by_label("diagnoser").select_option("gp")
     assert opened.text("#wrong .count").startswith(f"{len(wrong_of(rows, 'gp'))} of ")
@@ -109,7 +109,7 @@ def test_the_view_is_in_the_address(browser, opened, page):
     assert opened.text("#answers .count") == f"{rows} of {rows} rows"
 
 
-def test_every_chart_and_table_stands_there_and_nothing_is_broken(opened):
+def test_the_page_has_all_charts_and_tables_without_errors(opened):
     charts = ("board", "shares", "power", "calibration", "sets", "cost")
     for name in charts:
         assert opened.page.locator(f"figure#{name} canvas").count() >= 1, name
@@ -121,7 +121,7 @@ def test_every_chart_and_table_stands_there_and_nothing_is_broken(opened):
     assert opened.complaints == []
 
 
-def test_on_a_phone_and_without_a_script(browser, page):
+def test_the_page_works_on_a_phone_and_without_scripts(browser, page):
     with Opened(browser, page, width=400, java_script_enabled=False) as one:
         assert one.overflow() <= 0
         assert one.page.locator("#power img.still").is_visible()
@@ -132,7 +132,7 @@ def test_on_a_phone_and_without_a_script(browser, page):
         assert f"{len(wrong) - len(shown)} more rows." in one.text("#wrong")
 
 
-def test_one_who_is_better_than_simgap_is_said_to_be():
+def test_a_better_diagnoser_than_simgap_is_reported():
     """The labels, and so the answers, of simgap and of the Gaussian process are swapped."""
     rows = answers()
     swapped = rows.assign(diagnoser=rows["diagnoser"].replace({"simgap": "gp", "gp": "simgap"}))
@@ -143,7 +143,7 @@ def test_one_who_is_better_than_simgap_is_said_to_be():
     assert "No other diagnoser is significantly better" not in said
 
 
-def test_without_simgap_there_is_no_word_of_it():
+def test_a_page_without_simgap_does_not_mention_it():
     rows = answers()
     others = rows[rows["diagnoser"] != "simgap"]
     html = render_page(shown(others, ORDER[1:], skipped={}))
@@ -151,7 +151,7 @@ def test_without_simgap_there_is_no_word_of_it():
     assert "simgap fails" not in html
 
 
-def test_failures_name_who_was_right():
+def test_failures_list_the_diagnosers_that_are_right():
     rows = answers()
     frame = build_failure_table(rows, ORDER).set_index(["diagnoser", "question"])
     right_by_one = {name: wrong_of(rows, name) for name in ORDER}

@@ -81,7 +81,7 @@ def made(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_short_one_from_outside_is_in_the_table(made):
+def test_a_diagnoser_of_a_plugin_file_is_in_the_table(made):
     _, out = made
     own = [row for row in items(out) if row["diagnoser"] == "fifteen"]
     assert [row["status"] for row in own] == ["done", "done"]
@@ -92,14 +92,14 @@ def test_a_short_one_from_outside_is_in_the_table(made):
     assert lines["fifteen", "named, alone"]["of"] == "1"
 
 
-def test_one_that_looks_for_the_truth_finds_none(made):
+def test_a_diagnoser_cannot_read_the_truth(made):
     _, out = made
     peeks = [row for row in items(out) if row["diagnoser"] == "peeks"]
     assert {(row["status"], row["verdict"]) for row in peeks} == {("done", "adequate")}
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_it_would_find_it_if_it_were_trusted(made, tmp_path):
+def test_a_trusted_diagnoser_could_read_the_truth(made, tmp_path):
     _, out = made
     path, knowing = written(tmp_path, "peeks"), out.parent / "knowing.py"
     given = ["--plugin", str(knowing), "--out", str(tmp_path / "out"), "--jobs", "0"]
@@ -108,7 +108,7 @@ def test_it_would_find_it_if_it_were_trusted(made, tmp_path):
     assert {(row["verdict"], row["trusted"]) for row in rows} == {("unknown", "True")}
 
 
-def test_what_fails_costs_itself_and_stays_in_the_table(made):
+def test_failed_answers_stay_in_the_table_and_stop_no_other(made):
     code, out = made
     assert code == 1
     rows = {row["diagnoser"]: row for row in items(out) if row["kind"] == "single"}
@@ -122,7 +122,7 @@ def test_what_fails_costs_itself_and_stays_in_the_table(made):
     assert clean["hangs"]["alarm"] == "True"  # a missing answer is not reliable
 
 
-def test_python_reads_what_the_command_has_made(made):
+def test_python_reads_the_folder_of_the_command(made):
     _, out = made
     run = simgap.ComparisonResult(out)
     assert len(run.runs) == 2 * (1 + len(MISBEHAVING))
@@ -174,7 +174,7 @@ def test_cases_a_diagnoser_does_not_support_count_nowhere(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_it_goes_on_where_it_was(made, tmp_path, capsys):
+def test_a_study_resumes(made, tmp_path, capsys):
     path = written(tmp_path, "fifteen")
     out = tmp_path / "out"
     given = ["--plugin", str(PLUGIN), "--jobs", "1"]
@@ -199,7 +199,7 @@ def test_it_goes_on_where_it_was(made, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_a_secret_is_kept_until_the_end_and_draws_other_questions(tmp_path):
+def test_a_secret_salt_draws_other_questions_and_is_stored_at_the_end(tmp_path):
     path = written(tmp_path, "fifteen")
     path.write_text(path.read_text().replace('salt = "public"\n', ""))
     out, public = tmp_path / "out", load_experiment(str(written(tmp_path, "fifteen")))
@@ -213,7 +213,7 @@ def test_a_secret_is_kept_until_the_end_and_draws_other_questions(tmp_path):
     assert not names & drawn
 
 
-def test_a_seed_says_nothing_of_the_salt():
+def test_a_seed_does_not_reveal_the_salt():
     question = CaseSpec("clean", "slider", None, None, ANY_CONDITIONS, 0)
     public, secret = (question.draw_case(3, salt) for salt in ("public", "a"))
     assert public.name == "clean-slider-3000"
@@ -221,7 +221,7 @@ def test_a_seed_says_nothing_of_the_salt():
     assert secret.seed not in (public.seed, question.draw_case(3, "b").seed)
 
 
-def test_circumstances_are_as_asked():
+def test_recording_conditions_are_as_requested():
     asked = RequestedConditions(50, 3, "ar1")
     item = CaseSpec("clean", "pendulum", None, None, asked, 0).draw_case(0)
     assert (item.rate, item.runs, item.noise) == (50, 3, "ar1")
@@ -254,7 +254,7 @@ def test_an_unknown_diagnoser_is_refused(tmp_path, capsys):
     assert "unknown diagnoser 'oracle'; there are: classifier" in capsys.readouterr().err
 
 
-def test_two_at_a_time_are_refused(tmp_path):
+def test_two_studies_in_one_folder_are_refused(tmp_path):
     held = AnswerStore(tmp_path)
     with pytest.raises(InputError, match="another simgap is at work there"):
         AnswerStore(tmp_path)
@@ -262,7 +262,7 @@ def test_two_at_a_time_are_refused(tmp_path):
     AnswerStore(tmp_path).close()
 
 
-def test_the_shipped_sheets_are_as_large_as_they_say():
+def test_shipped_experiments_have_the_stated_numbers_of_questions():
     names = ("small", "full", "machines")
     small, full, machines = (
         build_case_set(read_config(load_experiment(f"diagnosis-{name}"))) for name in names

@@ -63,7 +63,7 @@ def compare(folder, command):
         return code, list(csv.DictReader(file))
 
 
-def test_a_command_answers_the_board(tmp_path, restored_registries):
+def test_a_command_is_a_diagnoser(tmp_path, restored_registries):
     stub, prompt = tmp_path / "stub.py", tmp_path / "prompt.txt"
     stub.write_text(STUB)
     code, rows = compare(tmp_path, f"{sys.executable} {stub} {prompt}")

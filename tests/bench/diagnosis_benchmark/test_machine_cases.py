@@ -107,7 +107,7 @@ ASKED = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("system", "name"), ASKED)
-def test_each_effect_does_what_the_library_says(system, name, arm):
+def test_each_effect_agrees_with_the_library(system, name, arm):
     c = SOMEWHERE[name.partition("@")[0]]
     if name == "gravity.tilt" and system == "servo":
         c = c[:1]
@@ -119,7 +119,7 @@ def test_each_effect_does_what_the_library_says(system, name, arm):
     assert len(list_coefficient_names(system, name)) == len(c)
 
 
-def test_another_coefficient_would_not_agree(arm):
+def test_a_different_coefficient_does_not_agree(arm):
     own = seen("arm2", {"mass.scale@forearm": (0.22,)})
     other = by_simgap("arm2", {"mass.scale@forearm": (0.2,)}, arm)
     assert np.abs(own - other).max() > SOFT
@@ -171,7 +171,7 @@ def case_of(item, folder):
 @pytest.mark.parametrize(
     ("system", "effect"), [("servo", "friction.coulomb"), ("arm2", "input.delay")]
 )
-def test_what_is_hidden_leaves_its_size(system, effect, tmp_path):
+def test_residuals_have_the_size_of_the_hidden_effect(system, effect, tmp_path):
     item = draw_case("single", system, 11, effect, 6.0, RequestedConditions(50, 3))
     case = case_of(item, tmp_path)
     assert item.size == 6.0
@@ -182,7 +182,7 @@ def test_what_is_hidden_leaves_its_size(system, effect, tmp_path):
     assert left == pytest.approx(np.sqrt(1 + 6.0**2), rel=0.08)
 
 
-def test_texts_say_nothing_of_what_is_hidden():
+def test_files_do_not_reveal_the_hidden_effect():
     clean = draw_case("clean", "arm2", 3)
     item = replace(clean, kind="single", effects={"mass.scale@forearm": (0.1,)})
     texts = render_recording(item)
@@ -194,7 +194,7 @@ def test_texts_say_nothing_of_what_is_hidden():
     assert item.name not in whole
 
 
-def test_an_item_is_a_recipe():
+def test_a_case_is_restored_from_its_json():
     item = draw_case("clean", "servo", 5)
     assert BenchmarkCase.from_json(item.to_json()) == item
     assert render_recording(item) == render_recording(BenchmarkCase.from_json(item.to_json()))

@@ -80,21 +80,21 @@ def test_a_cause_is_no_broken_convention(cause, tmp_path):
     assert check(log.path).differences() == []
 
 
-def test_a_change_that_transforms_nothing_finds_nothing(tmp_path, monkeypatch):
+def test_an_identity_transform_is_no_difference(tmp_path, monkeypatch):
     log = write_log(tmp_path / "log", *_seed("sign of command"))
     assert check(log.path).differences() != []
     monkeypatch.setattr(SignalChange, "applied", lambda change, signals: signals[change.source])
     assert check(log.path).differences() == []
 
 
-def test_soft_friction_is_no_other_zero(tmp_path):
+def test_soft_friction_is_not_taken_for_another_zero(tmp_path):
     """With MuJoCo's soft friction, another zero improves the fit less than friction does."""
     log = write_log(tmp_path / "log", 2002, None, "friction")
     comparison = check(log.path)
     assert comparison.differences() == []
 
 
-def test_a_model_that_diverges_between_samples_tells_nothing(tmp_path):
+def test_a_model_that_diverges_between_samples_gives_no_difference(tmp_path):
     """Milliseconds read as seconds: in 20 s an unstable joint exceeds the range of numbers."""
     model = valid_input.ARM.replace(b'name="hip"', b'name="hip" stiffness="-5e4"')
     (tmp_path / "arm.xml").write_bytes(model)
@@ -108,7 +108,7 @@ def _seed(broken):
     return SEEDS[broken][0], broken
 
 
-def test_whole_turns_are_put_back_beside_the_command():
+def test_whole_turns_are_unwrapped_towards_the_command():
     angle = np.linspace(2.0, 9.0, 60)
     wrapped = (angle + math.pi) % (2 * math.pi) - math.pi
     wrapped[7] = np.nan

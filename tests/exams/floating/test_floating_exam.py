@@ -39,7 +39,7 @@ def frictionless(machine):
     return replace(machine, links=links, drives=drives)
 
 
-def test_the_world_keeps_energy_and_what_else_is_kept(machine):
+def test_the_world_conserves_energy_and_momenta(machine):
     """Without friction energy is constant; without gravity momentum is constant as well."""
     import pinocchio
 
@@ -60,7 +60,7 @@ def test_the_world_keeps_energy_and_what_else_is_kept(machine):
     np.testing.assert_allclose(spins, spins[0][None].repeat(len(spins), 0), atol=1e-8)
 
 
-def test_friction_makes_the_world_lose_energy(machine):
+def test_friction_dissipates_energy(machine):
     machine = frictionless(machine)
     hinge = machine.hinges[0]
     world, run = World(machine, {f"friction.coulomb@{hinge}": (0.05,)}), begun(machine)
@@ -70,7 +70,7 @@ def test_friction_makes_the_world_lose_energy(machine):
     assert energy[0] - energy[-1] == pytest.approx(0.05 * way, rel=0.02), "force times way"
 
 
-def test_simgap_begins_where_the_recording_says_and_moves_alike(machine, tmp_path):
+def test_simgap_agrees_with_the_world_from_the_recorded_state(machine, tmp_path):
     """simgap and the reference world, with different pose conventions, make the same motion."""
     from bench.core.plugin_registries import make_robot_simulator
     from sims.core.simulator import Scenario
@@ -109,7 +109,7 @@ def test_a_wrong_mass_below_a_ball_joint_is_found_by_the_command(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_held_out_run_that_is_chaotic_is_no_gap(tmp_path):
+def test_a_chaotic_held_out_run_is_no_gap(tmp_path):
     """A chaotic held-out run must not count as a discrepancy.
 
     Errors of its initial state grow by a factor of 1,400. A fit with derivatives at the wrong state

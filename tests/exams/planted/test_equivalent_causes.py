@@ -17,7 +17,7 @@ EQUAL_RATIO = STANDARD.equal_below
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 
-def test_a_twin_is_as_good_and_another_cause_is_not():
+def test_an_equivalent_cause_fits_as_well_and_another_does_not():
     # For a cart on a slide, its mass and the armature of the slide have the same effect.
     item = drawn("double-pendulum-cart/armature/2")
     assert item.place == "slider"
@@ -37,7 +37,7 @@ def test_every_planted_kind_can_be_refitted():
 
 
 @pytest.mark.slow
-def test_a_law_with_the_planted_one_as_a_special_case_is_as_good():
+def test_a_law_that_contains_the_planted_one_fits_as_well():
     item = drawn("pusher/frictionloss/0")
     names = [f"{e}@{item.place}" for e in ("friction.stribeck", "friction.direction")]
     stribeck, direction = held_out_ratios(item, names).values()

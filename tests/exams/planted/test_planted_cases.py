@@ -73,7 +73,7 @@ def errors(model, item, path):
     "name",
     ["walker-servo/kp/0", "walker-servo/damping/0", "reacher/armature/1", "pusher/frictionloss/0"],
 )
-def test_a_file_with_the_planted_number_follows_the_data(name, tmp_path):
+def test_a_model_file_with_the_planted_number_fits_the_data(name, tmp_path):
     item = drawn(name)
     path = item.write(tmp_path)
     model = tmp_path / "robot.xml"
@@ -81,7 +81,7 @@ def test_a_file_with_the_planted_number_follows_the_data(name, tmp_path):
     assert errors(mujoco.MjModel.from_xml_path(str(model)), item, path) > GAP[0]
 
 
-def test_a_planted_mass_is_that_of_a_changed_urdf():
+def test_a_planted_mass_equals_a_changed_urdf():
     robot = ROBOTS["ur5"]
     try:
         tree = ElementTree.fromstring(robot.text)
@@ -103,7 +103,7 @@ def test_a_planted_mass_is_that_of_a_changed_urdf():
     assert model.body_subtreemass[1] == pytest.approx(expected.body_subtreemass[1])
 
 
-def test_an_item_is_drawn_the_same_every_time(tmp_path):
+def test_a_case_is_drawn_the_same_every_time(tmp_path):
     first, second = drawn("reacher/damping/0"), drawn("reacher/damping/0")
     assert first == second
     digests = [
@@ -143,7 +143,7 @@ def test_force_limits_are_reached_in_part_of_the_motion():
     assert max(shares) < 0.9
 
 
-def test_the_exam_has_enough_questions_and_files():
+def test_the_exam_covers_enough_causes_and_model_files():
     assert len(questions()) >= 130
     files = {robot.path for robot in ROBOTS.values() if not robot.is_urdf}
     assert len(files) >= 5

@@ -62,7 +62,7 @@ def test_a_joint_with_dry_friction_stops_where_and_when_theory_says():
     np.testing.assert_allclose(motion.q[moving, 0], expected[moving], atol=1e-12)
 
 
-def test_friction_over_the_joint_takes_its_work():
+def test_position_dependent_friction_dissipates_its_work():
     least, sine, cosine, period, inertia = 0.2, 0.2, -0.3, 1.3, 0.4
     world = World(roller(), {"friction.position@axle": (least, sine, cosine, period)})
     start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.5]))
@@ -97,7 +97,7 @@ def test_a_loaded_gear_lifts_beyond_its_drive_line(effect, lifts):
         assert (abs(motion.q[-1, 0] - 0.5) > 1e-4) == moves
 
 
-def test_a_joint_that_warms_loses_its_friction():
+def test_a_warming_joint_loses_its_friction():
     dry, viscous, time, inertia = 0.3, 0.2, 0.9, 0.4
     start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([3.0]))
     cold = -np.expm1(-STAMPS / time) * time / inertia
@@ -168,7 +168,7 @@ def test_halving_the_step_changes_nothing_that_a_sensor_sees():
     np.testing.assert_allclose(first, second, atol=1e-6)
 
 
-def test_what_is_hidden_in_a_body_changes_its_inertia_as_stated():
+def test_a_hidden_body_effect_changes_the_inertia_as_stated():
     machine = robot_models.machine("arm2-motor", np.random.default_rng(0))
     plain, heavy = World(machine), World(machine, {"mass.scale@elbow_link": (0.2,)})
     light, swollen = plain.plant.model.inertias[2], heavy.plant.model.inertias[2]
@@ -180,7 +180,7 @@ def test_what_is_hidden_in_a_body_changes_its_inertia_as_stated():
     np.testing.assert_allclose(shifted.inertia, light.inertia)
 
 
-def test_an_armature_slows_a_joint_by_what_it_adds():
+def test_an_armature_slows_a_joint_by_its_inertia():
     pull = Run(STAMPS, {"m_axle": np.ones(STAMPS.size)}, np.zeros(1), np.zeros(1))
     motion = World(roller(), {"inertia.armature@axle": (0.1,)}).move(pull, STAMPS)
     assert motion.q[-1, 0] == pytest.approx(16.0 / (2 * 0.5), rel=1e-12)
@@ -199,7 +199,7 @@ def test_an_elastic_joint_swings_at_the_frequency_of_two_masses_and_a_spring():
     assert np.pi / np.mean(np.diff(turns)) == pytest.approx(expected, rel=0.02)
 
 
-def test_a_gap_is_passed_alone_and_a_flank_takes_the_link_along():
+def test_backlash_decouples_the_link_within_its_gap():
     """The motor has a tenth of the roller's inertia and moves alone until it meets the flank."""
     gap, pull = 0.02, np.full(STAMPS.size, 0.1)
     world = World(roller(), {"joint.backlash@axle": (gap, 0.1)})
@@ -212,7 +212,7 @@ def test_a_gap_is_passed_alone_and_a_flank_takes_the_link_along():
     assert motion.q[-1, 0] == pytest.approx(expected, rel=1e-2)
 
 
-def test_friction_that_remembers_takes_its_energy_over_its_way():
+def test_friction_with_memory_dissipates_over_its_distance():
     """Energy balance: J v^2 / 2 = u x - F (x - d (1 - exp(-x / d)))."""
     dry, way, pull = 0.3, 0.1, np.full(STAMPS.size, 0.4)
     world = World(roller(), {"friction.hysteresis@axle": (dry, way)})
@@ -230,7 +230,7 @@ def test_friction_that_remembers_takes_its_energy_over_its_way():
         ("friction.hysteresis", (0.02, 0.03), 3e-3),
     ],
 )
-def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
+def test_the_library_agrees_with_the_reference_world(effect, c, close, tmp_path):
     """The library agrees with the reference world for the second joint of an arm.
 
     The difference is given as a fraction of the change that the effect causes. The effects are a
@@ -247,7 +247,7 @@ def test_the_library_moves_as_this_world_does(effect, c, close, tmp_path):
     ("effect", "c", "close"),
     [("joint.coupling", -0.3, 1e-3), ("supply.sag", 0.02, 0.03), ("supply.braking", 0.5, 0.11)],
 )
-def test_drives_of_the_library_move_as_those_of_this_world_do(robot, effect, c, close, tmp_path):
+def test_drives_of_the_library_agree_with_the_reference_world(robot, effect, c, close, tmp_path):
     """The library agrees with the reference world for coupling, a shared battery and braking loss.
 
     The tolerances are larger where the library uses values of the previous step, which is accurate
@@ -304,7 +304,7 @@ def test_a_shaft_turns_two_joints_and_one_battery_serves_all_drives():
         np.testing.assert_allclose(slack.forces(u, q, way * v), share * whole)
 
 
-def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():
+def test_friction_follows_the_load_of_another_drive():
     """Friction follows the heat of another joint, which grows with its work and decays in time."""
     machine = robot_models.machine("arm2-motor", np.random.default_rng(1))
     world = World(machine, foreign=Heated(1, 0, 0.5, 0.2, 1.0))
@@ -322,7 +322,7 @@ def test_a_joint_is_rubbed_by_what_another_ones_drive_has_done():
     assert course.state[-1] == pytest.approx(heat[-1], rel=0.05)
 
 
-def test_teeth_follow_a_joint_half_a_tooth_behind():
+def test_friction_with_teeth_lags_by_half_a_tooth():
     teeth = Cogging(0, 0.3, 0.4)
     assert teeth.caught(0.0, [0.1]) == 0.0
     assert teeth.caught(0.0, [1.0]) == pytest.approx(0.8)
@@ -330,7 +330,7 @@ def test_teeth_follow_a_joint_half_a_tooth_behind():
     assert teeth.push(0.8, [1.0]) == pytest.approx(0.3 * np.sin(2 * np.pi * 2.0))
 
 
-def test_a_binding_range_rubs_only_where_it_is():
+def test_a_binding_range_rubs_only_within_it():
     world = World(roller(), foreign=Binding(0, 0.5, 3.0, 0.5))
     start = Run(STAMPS, {"m_axle": 0 * STAMPS}, np.zeros(1), np.array([2.0]))
     v = world.move(start, STAMPS).v[:, 0]
@@ -339,7 +339,7 @@ def test_a_binding_range_rubs_only_where_it_is():
     assert v[-1] ** 2 == pytest.approx(4.0 - 2 * 0.5 * 0.95 / 0.4, rel=1e-4)
 
 
-def test_commands_arrive_late_and_dull_as_stated():
+def test_commands_are_delayed_and_filtered_as_stated():
     command = np.where(STAMPS >= 1.0, 1.0, 0.0)
     run = Run(STAMPS, {"m_axle": command}, np.zeros(1), np.zeros(1))
     late = World(roller(), {"input.delay@m_axle": (0.105,)}).move(run, STAMPS)

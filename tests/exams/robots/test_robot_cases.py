@@ -27,7 +27,7 @@ def item():
 
 
 @pytest.mark.slow
-def test_an_item_follows_from_its_name(item):
+def test_a_case_is_determined_by_its_name(item):
     first = robot_cases.draw_robot_case("clean", "arm2-servo", "any", 0)
     was = robot_cases.setting_of(first.name)
     robot_cases.setting_of.cache_clear()
@@ -40,14 +40,14 @@ def test_an_item_follows_from_its_name(item):
         }
 
 
-def test_a_hidden_cause_is_as_large_as_it_says(item):
+def test_a_hidden_cause_has_the_stated_size(item):
     assert 2.9 < item.size < 10.3
     gauge = robot_cases.gauge_of(item.name)
     assert gauge.gap(item.effects) == pytest.approx(item.size, rel=1e-6)
     assert gauge.gap({}) == 0.0
 
 
-def test_initial_states_absorb_what_they_can(item):
+def test_the_size_excludes_what_initial_states_absorb(item):
     gauge, setting = robot_cases.gauge_of(item.name), robot_cases.setting_of(item.name)
     base = [seen.copy() for seen in gauge.base]
     for seen, basis in zip(base, gauge.free, strict=True):
@@ -56,7 +56,7 @@ def test_initial_states_absorb_what_they_can(item):
     assert all(basis.shape[1] == 2 * len(setting.machine.joints) for basis in gauge.free)
 
 
-def test_the_files_say_what_is_known_and_not_what_is_hidden(item, tmp_path):
+def test_files_state_known_values_and_not_the_hidden_cause(item, tmp_path):
     path = item.write(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "recording.csv", "recording.toml", "robot.urdf",
@@ -78,14 +78,14 @@ def test_the_files_say_what_is_known_and_not_what_is_hidden(item, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["white", "ar1", "quantised"])
-def test_noise_is_as_strong_as_it_says(kind):
+def test_noise_has_the_stated_size(kind):
     noise = SensorNoise({"q.a": 1e-3, "qd.a": 5e-3}, kind, 0.6, 0.4)
     smooth = np.column_stack([np.linspace(0, 3, 20_000), np.linspace(0, -7, 20_000)])
     rest = noise.add_to(smooth, np.random.default_rng(0)) - smooth
     np.testing.assert_allclose(rest.std(axis=0), [1e-3, 5e-3], rtol=0.04)
 
 
-def test_every_place_of_every_effect_can_be_drawn(item):
+def test_every_effect_can_be_drawn_at_every_place(item):
     setting = robot_cases.setting_of(item.name)
     rng = np.random.default_rng(0)
     for effect in planted_effects.effects("servo"):
@@ -111,7 +111,7 @@ def test_a_slipping_encoder_jumps_and_stays(item):
 
 
 @pytest.mark.slow
-def test_what_is_alike_in_a_servo_is_found_so_and_a_sensor_of_force_splits_it(item):
+def test_equivalent_causes_in_a_servo_are_separated_by_a_force_sensor(item):
     """A constant force is equivalent to a command offset multiplied by kp."""
     whole = robot_cases.setting_of(item.name)
     runs = tuple(

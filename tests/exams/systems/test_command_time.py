@@ -36,9 +36,7 @@ def sets_of(explained):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("asked", ASKED, ids=[effect for _, effect, _ in ASKED])
-def test_commands_that_were_interpolated_are_named_and_so_is_what_is_hidden(
-    asked, tmp_path, monkeypatch
-):
+def test_interpolated_commands_and_the_hidden_cause_are_both_named(asked, tmp_path, monkeypatch):
     item = drawn(*asked)
     moved(monkeypatch, **{"input.hold": (1.0,)})
     sets = sets_of(explain(write_case(item, tmp_path)))
@@ -49,7 +47,7 @@ def test_commands_that_were_interpolated_are_named_and_so_is_what_is_hidden(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [-0.02, 0.02])
-def test_clocks_that_are_two_samples_apart_are_a_delay_of_either_sign(late, tmp_path, monkeypatch):
+def test_a_clock_offset_of_two_samples_is_a_delay_of_either_sign(late, tmp_path, monkeypatch):
     item = drawn("slider", "friction.load", 2)
     moved(monkeypatch, **{"input.delay": (late,)})
     explained = explain(write_case(item, tmp_path))
@@ -60,7 +58,7 @@ def test_clocks_that_are_two_samples_apart_are_a_delay_of_either_sign(late, tmp_
         assert number.value == pytest.approx(late, abs=2e-3)
 
 
-def test_what_the_description_states_is_not_asked_again(tmp_path, monkeypatch):
+def test_a_stated_offset_is_not_estimated_again(tmp_path, monkeypatch):
     item = drawn("slider", "friction.load", 2)
     moved(monkeypatch, **{"input.hold": (1.0,)})
     path = write_case(item, tmp_path)

@@ -137,7 +137,7 @@ def test_scipy_and_mujoco_agree_about_each_effect(system, effect):
     assert changes.max() > 50 * max(tolerance)  # Otherwise the agreement would mean nothing.
 
 
-def test_every_effect_of_the_library_has_its_world():
+def test_every_effect_of_the_library_is_in_the_reference_world():
     for system, effects in SOMEWHERE.items():
         assert set(effects) == set(library.list_effects_for(SIMULATORS[system].system))
 
@@ -190,7 +190,7 @@ def test_a_latch_turns_the_slider_round_in_half_a_period_every_other_time():
     np.testing.assert_allclose(other[:, 0], speed * TIMES, atol=1e-9)
 
 
-def test_patch_takes_its_work_and_holds_what_is_too_slow():
+def test_patch_dissipates_its_work_and_stops_a_slow_slider():
     mass, rubs, half = BASE["slider"]["mass"], 0.5, 0.1
     x, v = strange("slider", {"patch": (rubs, 0.4, half)}, (0.0, 0.8)).T
     assert v[-1] ** 2 == pytest.approx(0.8**2 - 2 * rubs * 2 * half / mass, rel=1e-5)
@@ -200,7 +200,7 @@ def test_patch_takes_its_work_and_holds_what_is_too_slow():
     assert x[-1] == pytest.approx(0.3 + 0.3**2 * mass / (2 * rubs), abs=0.01)
 
 
-def test_pendulum_meets_the_same_causes():
+def test_foreign_causes_act_on_the_pendulum_as_on_the_slider():
     start = (0.5, 0.0)
     free = strange("pendulum", {}, start)
     far = {"patch": (0.1, 3.0, 0.1), "latch": (1.0, 3.0)}
@@ -217,7 +217,7 @@ def test_pendulum_meets_the_same_causes():
 THROWN = (0.0, 0.0, 3.0, 1.5, -0.5, 1.0)
 
 
-def test_updraft_lifts_above_its_place_alone():
+def test_updraft_lifts_only_above_its_position():
     everywhere = strange("ball", {"updraft": (2.0, 0.0, 1e6)}, THROWN)
     lifted = simulate_with_scipy(
         world("ball", **{"force.bias": (2.0,)}), Scenario(TIMES, _named(THROWN)), CHANNELS["ball"]
@@ -227,7 +227,7 @@ def test_updraft_lifts_above_its_place_alone():
     np.testing.assert_allclose(nowhere, strange("ball", {}, THROWN), atol=1e-8)
 
 
-def test_layer_drags_above_its_height_alone():
+def test_layer_drags_only_above_its_height():
     everywhere = strange("ball", {"layer": (0.1, -5.0)}, THROWN)
     dragged = simulate_with_scipy(
         world("ball", **{"drag.quadratic": (0.1,)}),
@@ -250,7 +250,7 @@ def test_gust_on_the_ball_is_a_push_for_a_while():
     )
 
 
-def test_wear_lowers_one_bounce_after_the_other():
+def test_wear_lowers_each_bounce():
     times = np.arange(4000) / 1000
     z = strange("ball", {"wear": (0.1,)}, (0, 0, 2.5, 0, 0, 0), times=times)[:, 2]
     t = np.sqrt(2 * 2.0 / 9.81)

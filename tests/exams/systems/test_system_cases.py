@@ -78,7 +78,7 @@ def refitted(item):
         ("pendulum", 9, "force.bias", 2.0),
     ],
 )
-def test_the_gap_is_as_large_as_wanted(system, seed, effect, size):
+def test_the_gap_has_the_requested_size(system, seed, effect, size):
     item = draw_case("single", system, seed, effect, size)
     assert item.size == size
     assert refitted(item) == pytest.approx(size, rel=0.05)
@@ -93,7 +93,7 @@ def test_the_gap_is_as_large_as_wanted(system, seed, effect, size):
         ("pendulum", "input.lag"),
     ],
 )
-def test_the_hidden_effect_explains_all(system, effect):
+def test_the_hidden_effect_leaves_only_noise(system, effect):
     """Solver and engine differ by less than one sigma of evidence."""
     item = SystemQuestion("marks", "single", system, effect, 0, 4.0).draw().item
     drawn = restore_conditions(item)
@@ -107,18 +107,18 @@ def test_the_hidden_effect_explains_all(system, effect):
         assert left * observed.size**0.5 < 1.0  # Sigmas of evidence against the truth.
 
 
-def test_a_cause_that_no_drawing_shows_is_refused():
+def test_a_cause_without_a_visible_draw_is_refused():
     with pytest.raises(UndrawableError, match="absorb the cause"):
         SystemQuestion("marks", "single", "slider", "input.gain", 0, 3.0).draw()
 
 
-def test_what_the_sensors_cannot_show_is_not_asked():
+def test_cases_that_the_sensors_cannot_show_are_refused():
     assert draw_case("single", "slider", 0, "input.gain") is None  # The estimated mass explains it.
     # The initial position explains it.
     assert draw_case("single", "slider", 0, "sensor.bias") is None
 
 
-def test_of_two_effects_neither_does_for_both():
+def test_neither_of_two_effects_explains_both():
     item = draw_case("double", "ball", 1)
     observed = effect_sizing.simulate_observations(restore_conditions(item), item.effects)
     left = [
@@ -129,7 +129,7 @@ def test_of_two_effects_neither_does_for_both():
     assert min(left) >= MIN_DISTINCT_SIZE
 
 
-def test_a_foreign_cause_is_out_of_the_librarys_reach():
+def test_no_effect_of_the_library_explains_a_foreign_cause():
     item = draw_case("foreign", "ball", 0, "layer")
     assert item.source == "scipy"
     assert list(item.effects) == ["layer"]
@@ -137,7 +137,7 @@ def test_a_foreign_cause_is_out_of_the_librarys_reach():
 
 
 @pytest.mark.parametrize("system", ["ball", "slider"])
-def test_a_gust_blows_in_every_run(system):
+def test_every_run_contains_the_gust(system):
     drawn = draw_conditions(system, np.random.default_rng(0), ("gust",))
     numbers = effect_coefficients.draw_unmodelled_cause(
         "gust", replace(drawn, scenarios=drawn.scenarios[:2]), np.random.default_rng(0)
@@ -151,7 +151,7 @@ def test_a_gust_blows_in_every_run(system):
 
 
 @pytest.mark.parametrize(("system", "driven", "names"), EQUIVALENT_EFFECTS)
-def test_equivalent_effects_leave_nothing_of_each_other(system, driven, names):
+def test_equivalent_effects_explain_each_other(system, driven, names):
     hidden = ("input.gain",) if driven else ("gravity.tilt",)
     drawn = draw_conditions(system, np.random.default_rng(3), hidden, short=True)
     assert drawn.is_driven is driven
@@ -183,7 +183,7 @@ def test_the_same_seed_gives_the_same_files(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "system"), [("clean", "ball"), ("clean", "pendulum"), ("single", "slider")]
 )
-def test_files_are_recordings(tmp_path, kind, system):
+def test_written_files_load_as_recordings(tmp_path, kind, system):
     # A case whose effect these sensors cannot show is not drawn.
     item = next(filter(None, (draw_case(kind, system, index) for index in range(2, 9))))
     recording = read_recording(write_case(item, tmp_path), SIMULATORS[system].system())
@@ -208,7 +208,7 @@ def test_files_are_recordings(tmp_path, kind, system):
 
 
 @pytest.mark.parametrize("kind", ["white", "ar1", "quantised"])
-def test_noise_is_of_its_kind(kind):
+def test_noise_has_the_stated_colour_or_step(kind):
     noise = SensorNoise({"q": 0.01}, kind, 0.6, 0.4, True)
     values = np.linspace(0, 1, 20000)[:, None]
     error = (noise.add_to(values, np.random.default_rng(0)) - values)[:, 0]
@@ -220,7 +220,7 @@ def test_noise_is_of_its_kind(kind):
     assert distinct < 100 if kind == "quantised" else distinct > 19000
 
 
-def test_the_sheet_asks_enough_of_everything():
+def test_the_exam_covers_all_effects_sizes_and_conditions():
     sheet = questions()
     marks = [q for q in sheet if q.part == "marks"]
     assert len(marks) >= 600
@@ -234,7 +234,7 @@ def test_the_sheet_asks_enough_of_everything():
     assert {q.kind for q in quick()} == {"clean", "single", "double", "foreign"}
 
 
-def test_a_question_is_drawn_until_it_shows():
+def test_a_case_is_redrawn_until_its_effect_is_visible():
     # The effect is visible only in the velocity channel, which few cases record.
     item = SystemQuestion("marks", "single", "slider", "sensor.gain", 0, 2.5).draw().item
     assert item.seed > 0
