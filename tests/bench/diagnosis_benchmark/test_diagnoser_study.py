@@ -92,14 +92,14 @@ def test_a_diagnoser_of_a_plugin_file_is_in_the_table(made):
     assert lines["fifteen", "named, alone"]["of"] == "1"
 
 
-def test_a_diagnoser_cannot_read_the_truth(made):
+def test_a_diagnoser_cannot_read_the_hidden_causes(made):
     _, out = made
     peeks = [row for row in items(out) if row["diagnoser"] == "peeks"]
     assert {(row["status"], row["verdict"]) for row in peeks} == {("done", "adequate")}
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_trusted_diagnoser_could_read_the_truth(made, tmp_path):
+def test_a_trusted_diagnoser_could_read_the_hidden_causes(made, tmp_path):
     _, out = made
     path, knowing = written(tmp_path, "peeks"), out.parent / "knowing.py"
     given = ["--plugin", str(knowing), "--out", str(tmp_path / "out"), "--jobs", "0"]
