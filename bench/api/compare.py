@@ -227,11 +227,11 @@ def load_experiment_plugins(
     Raises:
         InputError: The experiment does not exist, or a plugin cannot be used.
     """
-    whole = experiment if isinstance(experiment, Experiment) else load_experiment(str(experiment))
-    whole = whole.chosen(trusted=whole.trusted or trust, isolation=isolation)
-    load_plugins_for_experiment([str(Path(plugin).resolve()) for plugin in plugins], whole)
+    loaded = experiment if isinstance(experiment, Experiment) else load_experiment(str(experiment))
+    loaded = loaded.chosen(trusted=loaded.trusted or trust, isolation=isolation)
+    load_plugins_for_experiment([str(Path(plugin).resolve()) for plugin in plugins], loaded)
     # The robot's default commands are filled in, so that the result folder contains them.
-    return complete_robot_experiment(whole)
+    return complete_robot_experiment(loaded)
 
 
 def _cluster(address: str | None) -> Pool | None:
@@ -258,7 +258,7 @@ def _discard_line(_line: str) -> None:
 
 
 def _apply_changes(
-    whole: Experiment,
+    experiment: Experiment,
     labels: Sequence[str] | None,
     seeds: int | None,
     changes: Mapping[str, float | None],
@@ -268,26 +268,26 @@ def _apply_changes(
     Raises:
         InputError: A tuner or diagnoser does not exist.
     """
-    if whole.diagnosis:
-        return _choose_diagnosers(whole, labels, changes)
-    whole = whole.chosen(**changes)
+    if experiment.diagnosis:
+        return _choose_diagnosers(experiment, labels, changes)
+    experiment = experiment.chosen(**changes)
     if seeds:
-        whole = whole.with_seeds(seeds)
+        experiment = experiment.with_seeds(seeds)
     if labels is None:
-        return whole
-    known = {*registered.names(), *(entry.label for entry in whole.tuners)}
+        return experiment
+    known = {*registered.names(), *(entry.label for entry in experiment.tuners)}
     for label in labels:
         if label not in known:
             raise make_unknown_name_error("tuner", label, sorted(known))
-    return whole.with_tuners(labels)
+    return experiment.with_tuners(labels)
 
 
 def _choose_diagnosers(
-    whole: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
+    experiment: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
 ) -> Experiment:
     """Apply changes to a comparison of diagnosers, whose targets are benchmark cases."""
     sample = changes.get("targets")
-    table = dict(whole.diagnosis)
+    table = dict(experiment.diagnosis)
     if sample is not None:
         table["sample"] = sample
     if labels is not None:
@@ -296,7 +296,7 @@ def _choose_diagnosers(
                 raise make_unknown_name_error("diagnoser", label, diagnosers.names())
         table["diagnosers"] = list(labels)
     rest = {name: value for name, value in changes.items() if name != "targets"}
-    return whole.chosen(diagnosis=table, **rest)
+    return experiment.chosen(diagnosis=table, **rest)
 
 
 def _label(tuner: str | type[Tuner]) -> str:
@@ -353,8 +353,8 @@ class ComparisonResult:
     @property
     def _in_files(self) -> bool:
         """True if tables and figures are only available as files in the folder."""
-        asked = self.experiment
-        return bool(asked.shot or asked.calibration or asked.diagnosis)
+        experiment = self.experiment
+        return bool(experiment.shot or experiment.calibration or experiment.diagnosis)
 
     @property
     def _what(self) -> str:
@@ -444,8 +444,8 @@ class ComparisonResult:
         """
         if self._in_files:
             raise InputError(f"figures of {self._what} are files: {self.folder / 'figures'}")
-        asked = [behind] if isinstance(behind, str) else behind
-        references = [find_reference(one) for one in asked]
+        names = [behind] if isinstance(behind, str) else behind
+        references = [find_reference(one) for one in names]
         return comparison_figures.draw_figure(self._stored, self._labels, name, behind=references)
 
     def summary(self) -> pd.DataFrame:
@@ -473,8 +473,8 @@ class ComparisonResult:
 
     def __repr__(self) -> str:
         failed = int((~self.statuses["status"].isin(("done", "converged"))).sum())
-        what = "answers" if self.experiment.diagnosis else "runs"
-        runs = f"{len(self.statuses)} {what}, {failed} of them failed or skipped"
+        unit = "answers" if self.experiment.diagnosis else "runs"
+        runs = f"{len(self.statuses)} {unit}, {failed} of them failed or skipped"
         return f"<comparison {self.experiment.name}: {runs}; {self.folder}>"
 
     def _repr_html_(self) -> str:

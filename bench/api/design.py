@@ -43,17 +43,17 @@ class NextRecording:
 
     def lines(self) -> list[str]:
         """Format the recommended run and its expected benefit as text."""
-        found = self.design
-        if found is None:
+        design = self.design
+        if design is None:
             return ["no run could be simulated that stays within the limits of what moves"]
-        begin = ", ".join(f"{name} = {value:.4g}" for name, value in found.initial.items())
-        lasting = f"{found.times[-1]:.3g} s"
-        lines = [f"record next, {lasting}: {found.says}; begin near {begin}"]
-        if found.by == "T":
-            return [*lines, *_format_discrimination(found)]
-        factor = math.exp(min(found.gain, 50.0))
-        what = f"it narrows what is known of all numbers together {factor:.3g} times"
-        return [*lines, f"nothing is open: {what}"]
+        begin = ", ".join(f"{name} = {value:.4g}" for name, value in design.initial.items())
+        lasting = f"{design.times[-1]:.3g} s"
+        lines = [f"record next, {lasting}: {design.says}; begin near {begin}"]
+        if design.by == "T":
+            return [*lines, *_format_discrimination(design)]
+        factor = math.exp(min(design.gain, 50.0))
+        benefit = f"it narrows what is known of all numbers together {factor:.3g} times"
+        return [*lines, f"nothing is open: {benefit}"]
 
     @check_arguments
     def write(self, path: str | Path) -> None:
@@ -78,26 +78,26 @@ class NextRecording:
         write_files({path: "\n".join(rows) + "\n"})
 
 
-def _format_discrimination(found: NextRunDesign) -> list[str]:
+def _format_discrimination(design: NextRunDesign) -> list[str]:
     """Format which causes a run distinguishes, and which it does not."""
     lines = []
-    if found.distinguished_effects:
+    if design.distinguished_effects:
         sizes = [
-            f"{name} ({math.sqrt(found.told[name]):.3g})" for name in found.distinguished_effects
+            f"{name} ({math.sqrt(design.told[name]):.3g})" for name in design.distinguished_effects
         ]
         lines.append(
-            f"it tells {found.effect} from {', '.join(sizes)}: by so many noises, once every "
+            f"it tells {design.effect} from {', '.join(sizes)}: by so many noises, once every "
             "number is fitted again, whichever is true"
         )
-    stays = [name for name in found.told if name not in found.distinguished_effects]
+    stays = [name for name in design.told if name not in design.distinguished_effects]
     if stays:
         lines.append(f"no run of this kind tells it from {', '.join(stays)}")
-    best = max((found.told[name] for name in stays), default=0.0)
+    best = max((design.told[name] for name in stays), default=0.0)
     if best > 0 and (times := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
         lines.append(f"recorded {times} times it would tell it from one more of these")
-    if found.settles_all:
+    if design.settles_all:
         lines.append("that settles it")
-    others = [group for group in found.groups if len(group) > 1 and found.effect not in group]
+    others = [group for group in design.groups if len(group) > 1 and design.effect not in group]
     lines += [f"should it be one of {', '.join(group)}: these stay open" for group in others]
     return lines
 
@@ -133,10 +133,14 @@ def design(recording: Sources, options: DesignOptions) -> NextRecording:
     seconds, longest = options.seconds, options.longest
     if not 0 < seconds <= MAX_RUN_SECONDS:
         raise InputError(f"seconds: expected 0 to {MAX_RUN_SECONDS:g}, found {seconds!r}")
-    most = min(MAX_LENGTH_FACTOR * seconds, MAX_RUN_SECONDS) if longest is None else longest
-    if not seconds <= most <= MAX_RUN_SECONDS:
-        raise InputError(f"longest: expected {seconds:g} to {MAX_RUN_SECONDS:g}, found {most!r}")
+    longest_seconds = (
+        min(MAX_LENGTH_FACTOR * seconds, MAX_RUN_SECONDS) if longest is None else longest
+    )
+    if not seconds <= longest_seconds <= MAX_RUN_SECONDS:
+        raise InputError(
+            f"longest: expected {seconds:g} to {MAX_RUN_SECONDS:g}, found {longest_seconds!r}"
+        )
     sources = list_sources(recording, options)
     return NextRecording(
-        *explaining.explain_and_design(sources, seconds, most, with_all_cores(options))
+        *explaining.explain_and_design(sources, seconds, longest_seconds, with_all_cores(options))
     )

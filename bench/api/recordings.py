@@ -103,6 +103,6 @@ def import_logs(options: ImportRequest) -> ImportResult:
         raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
     check_absent([path])
     paths = [Path(log) for log in logs]
-    made = describe_logs(paths, read_robot(model), model, path.parent, options)
-    write_checked_description(path, made.text)
-    return made
+    result = describe_logs(paths, read_robot(model), model, path.parent, options)
+    write_checked_description(path, result.text)
+    return result

@@ -118,9 +118,9 @@ def run_training(
         return train_or_load(experiment, lesson, watch, again)
     except RunEndedError as ended:
         # The error from the isolated process arrives as text: its name and its message.
-        name, _, said = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")
+        name, _, message = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")
         if name.endswith(TrainingBudgetTooSmallError.__name__):
-            raise TrainingBudgetTooSmallError(said) from None
+            raise TrainingBudgetTooSmallError(message) from None
         raise
 
 
@@ -148,10 +148,10 @@ def default_experiment(simulator: str) -> str:
     fitting = [e.name for e in shipped if e.simulator == simulator and e.calibration is None]
     if len(fitting) == 1:
         return fitting[0]
-    there = f"choose one with --experiment: {', '.join(fitting)}"
+    hint = f"choose one with --experiment: {', '.join(fitting)}"
     if not fitting:
-        there = "none of the project tunes it; give a TOML file with --experiment FILE"
-    raise InputError(f"simulator {simulator}: expected an experiment that tunes it; {there}")
+        hint = "none of the project tunes it; give a TOML file with --experiment FILE"
+    raise InputError(f"simulator {simulator}: expected an experiment that tunes it; {hint}")
 
 
 @dataclass

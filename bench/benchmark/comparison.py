@@ -115,7 +115,7 @@ class Comparison:
         self.results = results
         # Tuners must not access true parameters, results of other tuners, or earlier trainings.
         results.hidden_paths = tuple(
-            str(place.resolve()) for place in (self.folder, get_weights_folder())
+            str(path.resolve()) for path in (self.folder, get_weights_folder())
         )
         ids = [job.request.run for job in results.plan]
         if not (self.folder / SEGMENTS_FOLDER).exists():
@@ -145,9 +145,11 @@ class Comparison:
             InputError: a row is damaged, or belongs to another plan.
         """
         experiment = self.configuration.experiment
-        for path, held, records in journal.list_segment_contents():
+        for path, statuses_by_index, records in journal.list_segment_contents():
             file = RunsTable(path, SEGMENT_REMEDY)
-            statuses = check_segment_statuses(path, held, experiment, ids, SEGMENT_REMEDY)
+            statuses = check_segment_statuses(
+                path, statuses_by_index, experiment, ids, SEGMENT_REMEDY
+            )
             runs = file.read_runs(experiment, records)
             check_runs(runs, file, experiment)
             check_rows_match_statuses(runs, file, statuses, partial(_at_file, file), "its statuses")
@@ -169,10 +171,10 @@ class Comparison:
     def _stored(self) -> list[RunStatus]:
         """Return the statuses of a finished comparison in the order of its plan."""
         statuses = read_comparison(self.folder, ["run", "tuner", "k"]).statuses
-        made = statuses[statuses["status"] != "skipped"]
+        executed = statuses[statuses["status"] != "skipped"]
         rows: list[dict[str, Any]] = [
             {str(name): value for name, value in row.items()}
-            for row in made[STATUS_COLUMN_NAMES].to_dict("records")
+            for row in executed[STATUS_COLUMN_NAMES].to_dict("records")
         ]
         return [RunStatus(**row) for row in rows]
 
@@ -209,16 +211,16 @@ class Comparison:
                 self.configuration.experiment.trusted,
             )
             self._write_spectra(results)
-            made = StudyOutcome(
+            outcome = StudyOutcome(
                 len(journal.statuses), len(results.plan), results.interrupted, results.stopped
             )
-            if made.is_complete:
+            if outcome.is_complete:
                 reveal_salt(self.folder, self.secret)
                 self.configuration = read_configuration(self.folder)
                 journal.delete_segments()
             else:
                 journal.close()
-        return made
+        return outcome
 
     def close(self) -> None:
         """Release the folder without running what is missing."""
@@ -247,10 +249,14 @@ class Comparison:
         Raises:
             InputError: the folder is damaged.
         """
-        held = self.configuration
+        configuration = self.configuration
         ends = tuple(self._ends())
         return StudyProgress(
-            held.experiment.name, "runs finished", held.fingerprint, ends, self._under_way
+            configuration.experiment.name,
+            "runs finished",
+            configuration.fingerprint,
+            ends,
+            self._under_way,
         )
 
     def _ends(self) -> list[RunEnd]:
@@ -260,11 +266,14 @@ class Comparison:
         if planned is not None:
             path = self.folder / SEGMENTS_FOLDER / PLAN_FILE
             check_plan(planned, experiment, path, PLAN_REMEDY)
-        made: dict[str, RunStatus] = {}
-        for path, held in read_statuses_by_file(self.folder):
-            check_segment_statuses(path, held, experiment, planned, SEGMENT_REMEDY)
-            made |= {status.run: status for status in held.values()}
-        return [_end(name, made.get(name)) for name in (made if planned is None else planned)]
+        statuses_by_run: dict[str, RunStatus] = {}
+        for path, statuses_by_index in read_statuses_by_file(self.folder):
+            check_segment_statuses(path, statuses_by_index, experiment, planned, SEGMENT_REMEDY)
+            statuses_by_run |= {status.run: status for status in statuses_by_index.values()}
+        return [
+            _end(name, statuses_by_run.get(name))
+            for name in (statuses_by_run if planned is None else planned)
+        ]
 
     @property
     def _under_way(self) -> bool:
@@ -294,9 +303,9 @@ class Comparison:
         return failed
 
 
-def _at_file(file: RunsTable, _row: int, says: str) -> InputError:
+def _at_file(file: RunsTable, _row: int, problem: str) -> InputError:
     """Make the error for a status of a journal file, which belongs to none of its rows."""
-    return file.make_error(None, says)
+    return file.make_error(None, problem)
 
 
 def _end(name: str, status: RunStatus | None) -> RunEnd:

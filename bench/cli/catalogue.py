@@ -38,11 +38,11 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
     """List every command with its options, as `simgap --help` does."""
     # argparse has no public way to list the arguments of a parser.
     (choices,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-    says = {action.dest: action.help for action in choices._choices_actions}
+    summaries = {action.dest: action.help for action in choices._choices_actions}
     return [
         {
             "name": name,
-            "says": says[name],
+            "says": summaries[name],
             "schema": name,
             "exit_codes": list(EXIT_CODES),
             "options": [
@@ -183,11 +183,11 @@ def list_experiments() -> list[JsonDocument]:
     from bench.benchmark.problem import experiment
     from bench.benchmark.problem.availability import availability
 
-    told = []
+    shown = []
     for name in experiment.list_experiment_names():
         each = experiment.load_experiment(name)
         lacks = availability(each)
-        told.append(
+        shown.append(
             {
                 "name": each.name,
                 "says": each.says,
@@ -204,7 +204,7 @@ def list_experiments() -> list[JsonDocument]:
                 "tuners_skipped": dict(lacks.tuners),
             }
         )
-    return told
+    return shown
 
 
 def list_references() -> list[JsonDocument]:

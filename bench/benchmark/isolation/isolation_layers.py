@@ -80,18 +80,23 @@ def list_readable_paths(hidden: tuple[str, ...]) -> tuple[str, ...]:
 
 @cache
 def _readable(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, ...]:
-    kept = [Path(path).resolve() for path in hidden]
+    hidden_paths = [Path(path).resolve() for path in hidden]
     interpreter = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
-    places = [*sorted(interpreter), *site.getsitepackages(), site.getusersitepackages(), *packages]
-    found = []
-    for text in places:
+    candidates = [
+        *sorted(interpreter),
+        *site.getsitepackages(),
+        site.getusersitepackages(),
+        *packages,
+    ]
+    readable_paths = []
+    for text in candidates:
         place = Path(text or ".").resolve()
-        own = place == PROJECT_ROOT and not (PROJECT_ROOT / "numpy").exists()
-        if not own and not any(path.is_relative_to(place) for path in kept):
-            found.append(str(place))
+        is_project_root = place == PROJECT_ROOT and not (PROJECT_ROOT / "numpy").exists()
+        if not is_project_root and not any(path.is_relative_to(place) for path in hidden_paths):
+            readable_paths.append(str(place))
     libraries = [str(Path(prefix) / "lib") for prefix in sorted(interpreter)]
-    own_packages = [str(PROJECT_ROOT / name) for name in _IMPORTABLE_PATHS]
-    return tuple(dict.fromkeys([*found, *libraries, *own_packages, *_SYSTEM_PATHS]))
+    project_packages = [str(PROJECT_ROOT / name) for name in _IMPORTABLE_PATHS]
+    return tuple(dict.fromkeys([*readable_paths, *libraries, *project_packages, *_SYSTEM_PATHS]))
 
 
 def enter_namespaces() -> list[str]:
@@ -182,21 +187,21 @@ def _layer(active: list[str], *names: str) -> Iterator[None]:
         active.extend(names)
 
 
-def _set_resource_limits(own_user: bool) -> None:
+def _set_resource_limits(has_user_namespace: bool) -> None:
     """Limit core dumps, open files and file sizes, and threads if they are counted separately."""
-    wanted = {
+    limits = {
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: _FILES,
         resource.RLIMIT_FSIZE: MAX_FOLDER_BYTES,
-        **({resource.RLIMIT_NPROC: _THREADS} if own_user else {}),
+        **({resource.RLIMIT_NPROC: _THREADS} if has_user_namespace else {}),
     }
-    for limit, most in wanted.items():
+    for limit, maximum in limits.items():
         hard = resource.getrlimit(limit)[1]
-        least = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(limit, (least, least))
+        value = maximum if hard == resource.RLIM_INFINITY else min(maximum, hard)
+        resource.setrlimit(limit, (value, value))
 
 
-def sort_layers(held: Iterable[str]) -> list[str]:
+def sort_layers(active_layers: Iterable[str]) -> list[str]:
     """Return the active isolation layers in the order of `ISOLATION_LAYERS`."""
-    there = {"process", *held}
-    return [name for name in ISOLATION_LAYERS if name in there]
+    active = {"process", *active_layers}
+    return [name for name in ISOLATION_LAYERS if name in active]

@@ -137,18 +137,18 @@ _READ_ONLY = 0b0011
 """MOUNT_ATTR_RDONLY and NOSUID."""
 
 
-def mount_filesystem(kind: str, place: str, options: str = "") -> None:
+def mount_filesystem(kind: str, mount_point: str, options: str = "") -> None:
     """Mount a virtual file system, such as tmpfs or proc, in this mount namespace.
 
     Args:
         kind: type of the file system.
-        place: mount point.
+        mount_point: mount point.
         options: options of the file system.
 
     Raises:
         OSError: the kernel does not permit it.
     """
-    _mount(kind, place, _MS_CAREFUL, options)
+    _mount(kind, mount_point, _MS_CAREFUL, options)
 
 
 def make_mounts_private() -> None:
@@ -168,14 +168,24 @@ def make_mounts_read_only() -> None:
     """
     attributes = struct.pack("<QQQQ", _READ_ONLY, 0, 0, 0)
     size = ctypes.c_size_t(len(attributes))
-    here = ctypes.c_int(-100)
-    call_system(_MOUNT_SETATTR, here, b"/", ctypes.c_uint(_AT_RECURSIVE), attributes, size)
+    current_folder = ctypes.c_int(-100)
+    call_system(
+        _MOUNT_SETATTR, current_folder, b"/", ctypes.c_uint(_AT_RECURSIVE), attributes, size
+    )
 
 
-def _mount(kind: str, place: str, flags: int, options: str) -> None:
-    text = kind.encode()
-    held = ctypes.c_ulong(flags)
-    check_result(load_libc().mount(text, os.fsencode(place), text, held, options.encode() or None))
+def _mount(kind: str, mount_point: str, flags: int, options: str) -> None:
+    filesystem = kind.encode()
+    flags_argument = ctypes.c_ulong(flags)
+    check_result(
+        load_libc().mount(
+            filesystem,
+            os.fsencode(mount_point),
+            filesystem,
+            flags_argument,
+            options.encode() or None,
+        )
+    )
 
 
 def set_parent_death_signal() -> None:
@@ -253,15 +263,15 @@ def restrict_file_access(readable: Iterable[str], writable: Iterable[str]) -> No
 
 def _allow(rules: int, path: str, rights: int) -> None:
     try:
-        place = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
     except OSError:
         return
     try:
         if not os.path.isdir(path):
             rights &= _LANDLOCK_OF_A_FILE
-        attributes = struct.pack("<Qi", rights, place)
+        attributes = struct.pack("<Qi", rights, descriptor)
         call_system(
             _LANDLOCK_ADD_RULE, ctypes.c_int(rules), ctypes.c_int(1), attributes, ctypes.c_uint32(0)
         )
     finally:
-        os.close(place)
+        os.close(descriptor)

@@ -24,15 +24,15 @@ def limited_memory(mebibytes: int) -> Iterator[None]:
         yield
         return
     resource = import_resource_module()
-    before = resource.getrlimit(resource.RLIMIT_DATA)
+    previous_limits = resource.getrlimit(resource.RLIMIT_DATA)
     # The limit is relative to the present size, which depends on the packages loaded.
-    wanted = _data_bytes() + mebibytes * 2**20
-    soft = wanted if before[1] == resource.RLIM_INFINITY else min(wanted, before[1])
-    resource.setrlimit(resource.RLIMIT_DATA, (soft, before[1]))
+    limit = _data_bytes() + mebibytes * 2**20
+    soft = limit if previous_limits[1] == resource.RLIM_INFINITY else min(limit, previous_limits[1])
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, previous_limits[1]))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
+        resource.setrlimit(resource.RLIMIT_DATA, previous_limits)
 
 
 def limit_memory(mebibytes: int) -> None:
@@ -43,8 +43,8 @@ def limit_memory(mebibytes: int) -> None:
     """
     if mebibytes:
         resource = import_resource_module()
-        wanted = _data_bytes() + mebibytes * 2**20
-        resource.setrlimit(resource.RLIMIT_DATA, (wanted, wanted))
+        limit = _data_bytes() + mebibytes * 2**20
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
 def import_resource_module() -> Any:

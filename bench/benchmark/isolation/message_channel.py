@@ -163,11 +163,11 @@ class MessageChannel:
         """
         self.send(kind, json.dumps(document).encode(), flags=flags)
 
-    def _write(self, whole: bytes, deadline: float) -> None:
-        left = memoryview(whole)
-        while left:
+    def _write(self, message: bytes, deadline: float) -> None:
+        unsent = memoryview(message)
+        while unsent:
             try:
-                left = left[os.write(self._writing, left) :]
+                unsent = unsent[os.write(self._writing, unsent) :]
             except BlockingIOError:
                 if not self._outgoing.poll(_milliseconds(deadline)):
                     raise TimeoutError from None
@@ -186,25 +186,25 @@ class MessageChannel:
             ProtocolError: the data are not a valid message.
             TimeoutError: there is no message in time.
         """
-        there = self._read(self._view, deadline)
-        while there < _HEAD.size:
-            there += self._read(self._view[there:], deadline)
+        received = self._read(self._view, deadline)
+        while received < _HEAD.size:
+            received += self._read(self._view[received:], deadline)
         kind, flags, size, length = _HEAD.unpack_from(self._buffer)
         if length > limit:
             raise ProtocolError(f"it sent {length} bytes at once, {limit} are allowed")
-        if there > _HEAD.size + length:
+        if received > _HEAD.size + length:
             raise ProtocolError("it spoke without having been asked")
-        there -= _HEAD.size
+        received -= _HEAD.size
         if _HEAD.size + length > _BUFFER:
-            return Message(kind, flags, size, self._long(there, length, deadline))
+            return Message(kind, flags, size, self._long(received, length, deadline))
         body = self._view[_HEAD.size : _HEAD.size + length]
-        while there < length:
-            there += self._read(body[there:], deadline)
+        while received < length:
+            received += self._read(body[received:], deadline)
         return Message(kind, flags, size, body)
 
-    def _long(self, there: int, length: int, deadline: float) -> memoryview:
+    def _long(self, received: int, length: int, deadline: float) -> memoryview:
         """Read a body that is longer than the buffer; memory grows only with the data received."""
-        body = bytearray(self._view[_HEAD.size : _HEAD.size + there])
+        body = bytearray(self._view[_HEAD.size : _HEAD.size + received])
         while len(body) < length:
             part = self._view[: min(_BUFFER, length - len(body))]
             body += part[: self._read(part, deadline)]
@@ -224,9 +224,9 @@ class MessageChannel:
 
 
 def _milliseconds(deadline: float) -> float | None:
-    left = (deadline - perf_counter()) * 1e3
+    remaining = (deadline - perf_counter()) * 1e3
     # A larger timeout exceeds the range of `poll`, and is replaced by no timeout.
-    return None if left > _LONGEST else max(0.0, left)
+    return None if remaining > _LONGEST else max(0.0, remaining)
 
 
 def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
@@ -235,12 +235,14 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
     Raises:
         ValueError: an array has a type that is not permitted.
     """
-    held = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    for name, array in held.items():
+    contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    for name, array in contiguous.items():
         if array.dtype.str not in _TYPES:
             raise ValueError(f"array {name!r:.80}: expected numbers, found {array.dtype}")
-    says = [[name, array.dtype.str, array.shape] for name, array in held.items()]
-    return json.dumps(says).encode() + b"\n", *(array.tobytes() for array in held.values())
+    descriptions = [[name, array.dtype.str, array.shape] for name, array in contiguous.items()]
+    return json.dumps(descriptions).encode() + b"\n", *(
+        array.tobytes() for array in contiguous.values()
+    )
 
 
 def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
@@ -252,14 +254,14 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
     line, _, _ = bytes(body[:_NAMES]).partition(b"\n")
     rest = body[len(line) + 1 :]
     try:
-        says = json.loads(line)
-        arrays, place = {}, 0
-        for name, kind, shape in says[:_ARRAYS]:
-            array, place = _array(rest, place, kind, shape)
+        descriptions = json.loads(line)
+        arrays, offset = {}, 0
+        for name, kind, shape in descriptions[:_ARRAYS]:
+            array, offset = _array(rest, offset, kind, shape)
             arrays[_name(name)] = array
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ProtocolError("it sent what are no arrays") from None
-    if place != len(rest) or not len(arrays) == len(says) <= _ARRAYS:
+    if offset != len(rest) or not len(arrays) == len(descriptions) <= _ARRAYS:
         raise ProtocolError("it sent more or less than the arrays that it names")
     return arrays
 
@@ -280,13 +282,13 @@ _NAME_LENGTH = 500
 
 
 def _array(
-    data: memoryview, place: int, kind: str, shape: Sequence[int]
+    data: memoryview, offset: int, kind: str, shape: Sequence[int]
 ) -> tuple[NDArray[Any], int]:
     """Read the array at a position.
 
     Args:
         data: bytes of all arrays.
-        place: position of the array.
+        offset: position of the array.
         kind: type of the array.
         shape: shape of the array.
 
@@ -301,7 +303,7 @@ def _array(
     size = int(np.dtype(kind).itemsize)
     for n in shape:
         size *= n
-    if size > len(data) - place:
+    if size > len(data) - offset:
         raise ValueError
-    array = np.frombuffer(data[place : place + size], dtype=kind).reshape(shape)
-    return array.copy(), place + size
+    array = np.frombuffer(data[offset : offset + size], dtype=kind).reshape(shape)
+    return array.copy(), offset + size

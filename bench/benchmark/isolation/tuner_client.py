@@ -80,13 +80,13 @@ class IsolatedTuner:
         child.wait_until_ready()
         started = perf_counter()
         deadline = started + START_TIMEOUT_SECONDS
-        wanted = {
+        description = {
             "name": tuned.name,
             "module": tuned.module,
             "file": tuned.file,
             "options": dict(tuned.options),
         }
-        child.send(b"B", json.dumps(wanted).encode(), deadline=deadline)
+        child.send(b"B", json.dumps(description).encode(), deadline=deadline)
         child.receive(deadline=deadline)
         self.import_seconds = perf_counter() - started
         if state is not None:

@@ -53,9 +53,9 @@ SIGKILL is also sent by the kernel if memory is exhausted.
 
 _SHUTDOWN_TIMEOUT_SECONDS = 1.0
 """Timeout in seconds for the end of a process that has closed its pipe."""
-_COURTESY = 1.0
+_REPORT_TIMEOUT_SECONDS = 1.0
 """Timeout in seconds for a process's report of the files that it has written."""
-_FILES = 1_000_000
+_MAX_REPORTED_FILES = 1_000_000
 """Maximum reported number of files; larger reports are cut to it."""
 
 
@@ -74,9 +74,9 @@ class Written(NamedTuple):
 NOTHING_WRITTEN = Written(0, ())
 
 
-def _name(said: object) -> str:
+def _name(name: object) -> str:
     """Convert a file name to text that fits into one line."""
-    return " ".join(to_printable(str(said)[:100]).split())
+    return " ".join(to_printable(str(name)[:100]).split())
 
 
 class ForkServerClient:
@@ -193,14 +193,29 @@ class ForkServerClient:
 
 def _environment(folder: str) -> dict[str, str]:
     """Return the environment variables of tuner processes."""
-    kept = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "SYSTEMROOT")
-    told = {name: os.environ[name] for name in kept if name in os.environ}
+    inherited_names = (
+        "PATH",
+        "LANG",
+        "LC_ALL",
+        "LD_LIBRARY_PATH",
+        "CUDA_VISIBLE_DEVICES",
+        "SYSTEMROOT",
+    )
+    variables = {name: os.environ[name] for name in inherited_names if name in os.environ}
     # Libraries would otherwise compute differently, and results would differ in the last digits.
-    told |= {name: value for name, value in os.environ.items() if name.startswith(_NUMERICAL)}
+    variables |= {name: value for name, value in os.environ.items() if name.startswith(_NUMERICAL)}
     # Compiled steps are loaded from the cache folder before the process is isolated.
-    told["SIMGAP_COMPILED"] = str(compiled.get_cache_folder())
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return {**one, **told, "HOME": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+    variables["SIMGAP_COMPILED"] = str(compiled.get_cache_folder())
+    single_thread = dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+    )
+    return {
+        **single_thread,
+        **variables,
+        "HOME": folder,
+        "TMPDIR": folder,
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
 
 
 class IsolatedProcess:
@@ -307,12 +322,12 @@ class IsolatedProcess:
         """
         if not self._open:
             return NOTHING_WRITTEN
-        deadline = perf_counter() + _COURTESY
+        deadline = perf_counter() + _REPORT_TIMEOUT_SECONDS
         try:
             self.send(b"N", deadline=deadline)
-            said = self.receive(deadline=deadline).to_document()
-            count = max(0, min(int(said["count"]), _FILES))
-            return Written(count, tuple(map(_name, said["names"][:3])) if count else ())
+            report = self.receive(deadline=deadline).to_document()
+            count = max(0, min(int(report["count"]), _MAX_REPORTED_FILES))
+            return Written(count, tuple(map(_name, report["names"][:3])) if count else ())
         except (RunEndedError, KilledExternallyError, ProtocolError):
             return NOTHING_WRITTEN
         except (TypeError, ValueError, LookupError, OverflowError):
@@ -339,10 +354,10 @@ class IsolatedProcess:
         except PeerClosedError:
             raise self._gone() from None
 
-    def fail_with_protocol_error(self, says: str) -> RunEndedError:
+    def fail_with_protocol_error(self, violation: str) -> RunEndedError:
         """End a process that violated the protocol, and return the error to raise."""
         self.end()
-        return RunEndedError("crashed", f"the tuner's process broke the pipe: {says}")
+        return RunEndedError("crashed", f"the tuner's process broke the pipe: {violation}")
 
     def _gone(self) -> RunEndedError | KilledExternallyError:
         code = self.end(kill=False)

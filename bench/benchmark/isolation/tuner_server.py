@@ -47,25 +47,25 @@ _LIMIT = 1 << 40
 """Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
 
 
-def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]) -> None:
+def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers: list[str]) -> None:
     """Serve requests until the harness closes the channel.
 
     Args:
         channel: message channel to the harness.
-        reach: access policy of this process.
-        held: names of the active isolation layers.
+        policy: access policy of this process.
+        active_layers: names of the active isolation layers.
     """
-    channel.send_document(b"R", held)
+    channel.send_document(b"R", active_layers)
     # NumPy was preloaded, so code that uses its global generator would get the same numbers in each
     # run.
     np.random.seed()  # noqa: NPY002
     with suppress(PeerClosedError):
         tuner = None
-        told: set[str] = set()
+        reported_paths: set[str] = set()
         while True:
             message = channel.receive(_LIMIT)
             if message.kind == b"N":
-                _tell_written(channel, reach.folder, told)
+                _report_written_files(channel, policy.folder, reported_paths)
                 continue
             try:
                 tuner = _handle_message(channel, message, tuner)
@@ -76,14 +76,18 @@ def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]
                 _report_failure(channel, traceback.format_exc())
 
 
-def _tell_written(channel: MessageChannel, folder: str, told: set[str]) -> None:
+def _report_written_files(channel: MessageChannel, folder: str, reported_paths: set[str]) -> None:
     """Report files that the tuner has written and that are not in `told`; add them to `told`.
 
     Hidden files and compiled Python files are left out, because libraries write them and they are
     not needed.
     """
-    new = [path for path in islice(_written(folder), _MOST_FILES) if path not in told]
-    told.update(new)
+    new = [
+        path
+        for path in islice(_iterate_written_files(folder), _MOST_FILES)
+        if path not in reported_paths
+    ]
+    reported_paths.update(new)
     names = [os.path.relpath(path, folder) for path in sorted(new)[:3]]
     channel.send_document(b"N", {"count": len(new), "names": names})
 
@@ -92,10 +96,10 @@ _MOST_FILES = 10_000
 """Maximum number of files that are counted."""
 
 
-def _written(folder: str) -> Iterator[str]:
-    for place, folders, files in os.walk(folder):
+def _iterate_written_files(folder: str) -> Iterator[str]:
+    for parent, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if name[0] != "." and name != "__pycache__"]
-        yield from (os.path.join(place, name) for name in files if name[0] != ".")
+        yield from (os.path.join(parent, name) for name in files if name[0] != ".")
 
 
 def _report_failure(channel: MessageChannel, text: str) -> None:
@@ -106,8 +110,8 @@ def _report_failure(channel: MessageChannel, text: str) -> None:
 def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | None) -> Tuner | None:
     """Execute the request of one message, and return the present tuner."""
     if message.kind == b"B":
-        wanted = message.to_document()
-        tuner = load_class(wanted)(**wanted["options"])
+        description = message.to_document()
+        tuner = load_class(description)(**description["options"])
         channel.send(b"K")
     elif tuner is None:
         raise RuntimeError("asked before there was a tuner")
@@ -121,32 +125,35 @@ def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | No
     return tuner
 
 
-def load_class(wanted: dict[str, Any], base: type[Any] = Tuner) -> type[Any]:
+def load_class(description: dict[str, Any], base: type[Any] = Tuner) -> type[Any]:
     """Load the class of a tuner or of another plugin.
 
     Args:
-        wanted: ``name`` of the class, and its ``file`` or ``module``.
+        description: ``name`` of the class, and its ``file`` or ``module``.
         base: required base class.
 
     Raises:
         ImportError: the class is not there any more.
     """
     module = (
-        _of_file(wanted["file"]) if wanted["file"] else importlib.import_module(wanted["module"])
+        _load_plugin_file(description["file"])
+        if description["file"]
+        else importlib.import_module(description["module"])
     )
     for value in vars(module).values():
         if (
             inspect.isclass(value)
             and issubclass(value, base)
-            and getattr(value, "name", "") == wanted["name"]
+            and getattr(value, "name", "") == description["name"]
         ):
             return value
     raise ImportError(
-        f"{wanted['file'] or wanted['module']} has no {base.__name__.lower()} {wanted['name']}"
+        f"{description['file'] or description['module']} has no {base.__name__.lower()} "
+        f"{description['name']}"
     )
 
 
-def _of_file(path: str) -> Any:
+def _load_plugin_file(path: str) -> Any:
     stem = os.path.splitext(os.path.basename(path))[0]
     spec = importlib.util.spec_from_file_location(f"simgap_plugin_{stem}", path)
     if spec is None or spec.loader is None:
@@ -164,18 +171,18 @@ def make_generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
 
 
 def _tune(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
-    given = unpack_arrays(message.body)
+    arrays = unpack_arrays(message.body)
     task = Task(
-        dim=given["start"].size,
-        start=given["start"],
-        observed=given["observed"],
-        scale=given["scale"],
-        training=given["training"],
-        budget=int(given["budget"]),
-        lengths=tuple(given["lengths"].tolist()),
-        scene=ScenarioInfo(given["initial"], given["inputs"]),
+        dim=arrays["start"].size,
+        start=arrays["start"],
+        observed=arrays["observed"],
+        scale=arrays["scale"],
+        training=arrays["training"],
+        budget=int(arrays["budget"]),
+        lengths=tuple(arrays["lengths"].tolist()),
+        scene=ScenarioInfo(arrays["initial"], arrays["inputs"]),
     )
-    steps = tuner.tune(task, make_generator(given))
+    steps = tuner.tune(task, make_generator(arrays))
     try:
         _exchange(channel, steps, task)
     except StopIteration as stop:
@@ -196,14 +203,14 @@ def _exchange(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoR
     """
     dim, used = task.dim, 0
     length, channels = task.observed.shape
-    asked = next(steps)
+    proposal = next(steps)
     while True:
         recommendation: bytes | Array = b""
-        if type(asked) is Proposal:
-            asked, recommend = asked
+        if type(proposal) is Proposal:
+            proposal, recommend = proposal
             if recommend is not None:
                 recommendation = to_points(recommend, dim, "recommendations")[0]
-        points = to_points(asked, dim, "proposals")
+        points = to_points(proposal, dim, "proposals")
         # One point beyond the budget is enough for the harness to see that the budget is exceeded.
         points = points[: max(task.budget - used, 0) + 1]
         channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
@@ -219,7 +226,7 @@ def _exchange(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoR
         observations = numbers[n * dim + n :].reshape(n, length, channels)
         proposals.setflags(write=False)
         losses.setflags(write=False)
-        asked = steps.send(Evaluation(proposals, observations, losses))
+        proposal = steps.send(Evaluation(proposals, observations, losses))
 
 
 def _set_processor(processor: int) -> None:
@@ -240,20 +247,20 @@ class _RemoteTrainingSimulator:
     def __init__(self, channel: MessageChannel, which: int) -> None:
         self._channel, self._which = channel, which
         channel.send(b"P", flags=which)
-        self._take(channel.receive(_LIMIT))
+        self._read_properties(channel.receive(_LIMIT))
 
-    def _take(self, answer: Message) -> dict[str, NDArray[Any]]:
+    def _read_properties(self, answer: Message) -> dict[str, NDArray[Any]]:
         if answer.kind == b"X":
-            refused = answer.to_document()
+            refusal = answer.to_document()
             kinds = {"budget": BudgetExceededError, "value": ValueError}
-            raise kinds.get(refused["kind"], RuntimeError)(refused["says"])
-        given = unpack_arrays(answer.body)
-        self.training, self.scale = given["training"], given["scale"]
+            raise kinds.get(refusal["kind"], RuntimeError)(refusal["says"])
+        arrays = unpack_arrays(answer.body)
+        self.training, self.scale = arrays["training"], arrays["scale"]
         self.dim = self.training.shape[1]
-        self.lengths = tuple(given["lengths"].tolist())
-        self.scene = ScenarioInfo(given["initial"], given["inputs"])
-        self.used, self.budget = given["counts"].tolist()
-        return given
+        self.lengths = tuple(arrays["lengths"].tolist())
+        self.scene = ScenarioInfo(arrays["initial"], arrays["inputs"])
+        self.used, self.budget = arrays["counts"].tolist()
+        return arrays
 
     def sample(self, rng: np.random.Generator, n: int) -> Array:
         return rng.uniform(self.training[0], self.training[1], size=(n, self.dim))
@@ -266,10 +273,10 @@ class _RemoteTrainingSimulator:
         requested = np.array(points, dtype=np.float64).reshape(-1, self.dim)
         request = pack_arrays({"rng": encode_rng_state(sent), "points": requested})
         self._channel.send(b"P", *request, flags=2 + self._which)
-        given = self._take(self._channel.receive(_LIMIT))
+        arrays = self._read_properties(self._channel.receive(_LIMIT))
         if is_sendable:
-            rng.bit_generator.state = decode_rng_state(given["rng"])
-        return given["observations"]
+            rng.bit_generator.state = decode_rng_state(arrays["rng"])
+        return arrays["observations"]
 
 
 class _RemoteTrainingCallback:
@@ -288,8 +295,8 @@ class _RemoteTrainingCallback:
 
 
 def _fit(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
-    given = unpack_arrays(message.body)
+    arrays = unpack_arrays(message.body)
     tuner.watch = _RemoteTrainingCallback(channel) if message.flags else None
-    tuner.fit(_RemoteTrainingSimulator(channel, 0), make_generator(given), int(given["budget"]))
+    tuner.fit(_RemoteTrainingSimulator(channel, 0), make_generator(arrays), int(arrays["budget"]))
     tuner.watch = None
     channel.send(b"L", *pack_arrays(tuner.state()))

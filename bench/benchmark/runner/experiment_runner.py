@@ -340,16 +340,16 @@ def _store_untrained_runs(
 ) -> _ReadyRuns:
     """Store runs whose training failed as failures, and return the other missing runs."""
     missing = [
-        place for place in range(len(results.plan)) if place not in results.run_sink.statuses
+        index for index in range(len(results.plan)) if index not in results.run_sink.statuses
     ]
     ready = _ReadyRuns([], progress("running", len(missing)))
-    for place in missing:
-        order = results.plan[place].request
+    for index in missing:
+        order = results.plan[index].request
         failure = failures.get((order.entry.label, order.seed))
         if failure is None:
-            ready.places.append(place)
+            ready.places.append(index)
         else:
-            _store_result(results, place, failure)
+            _store_result(results, index, failure)
             ready.step()
     return ready
 
@@ -410,7 +410,7 @@ def _train(
         WeightsError: stored weights are damaged. The user must repair this, and no run has started.
     """
     experiment = results.problem.experiment
-    wanted = [
+    requested = [
         (entry, seed)
         for entry in experiment.tuners
         if entry.label not in results.skipped and tuners.get(entry.tuner).learned
@@ -418,16 +418,16 @@ def _train(
     ]
     failures: dict[tuple[str, int], Exception] = {}
     # A progress bar without steps would never end.
-    if not wanted:
+    if not requested:
         return failures
-    step = progress("training", len(wanted))
+    step = progress("training", len(requested))
     lessons = [
         TrainingRequest(entry, seed, results.tuned.get(entry.label), results.hidden_paths)
-        for entry, seed in wanted
+        for entry, seed in requested
     ]
     calls = [(train_or_load, (experiment, lesson)) for lesson in lessons]
-    for place, training in pool.iterate_results(calls, math.inf):
-        entry, seed = wanted[place]
+    for index, training in pool.iterate_results(calls, math.inf):
+        entry, seed = requested[index]
         if isinstance(training, TrainingResult):
             results.trainings[entry.label, seed] = training
         elif isinstance(training, WeightsError):
@@ -438,9 +438,9 @@ def _train(
     return failures
 
 
-def _store_result(results: ExperimentRun, place: int, outcome: RunOutcome | Exception) -> None:
+def _store_result(results: ExperimentRun, index: int, outcome: RunOutcome | Exception) -> None:
     """Store the result of a worker: an outcome, or the error that ended the run."""
-    problem, job = results.problem, results.plan[place]
+    problem, job = results.problem, results.plan[index]
     # Every run gets rows and a status, because a failure is a result too.
     if isinstance(outcome, TimeoutError):
         reason = f"killed past its limit of {problem.experiment.timeout:g} s"
@@ -456,4 +456,4 @@ def _store_result(results: ExperimentRun, place: int, outcome: RunOutcome | Exce
     columns = build_rows(
         problem, job.request, job.target, outcome, results.spectra.get(job.target.blinded.name)
     )
-    results.run_sink.append(place, columns, make_status(problem, job.request, outcome))
+    results.run_sink.append(index, columns, make_status(problem, job.request, outcome))

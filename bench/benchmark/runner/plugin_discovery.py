@@ -77,8 +77,8 @@ def make_tuner_stub(known: dict[str, Any]) -> type[TunerStub]:
         "__doc__": str(known["says"]),
         "__module__": __name__,
     }
-    made: type[TunerStub] = type(fields["name"], (TunerStub,), fields)
-    return made
+    stub: type[TunerStub] = type(fields["name"], (TunerStub,), fields)
+    return stub
 
 
 class DiagnoserStub(Diagnoser):
@@ -102,8 +102,8 @@ def make_diagnoser_stub(known: dict[str, Any]) -> type[DiagnoserStub]:
         "__doc__": str(known["says"]),
         "__module__": __name__,
     }
-    made: type[DiagnoserStub] = type(fields["name"], (DiagnoserStub,), fields)
-    return made
+    stub: type[DiagnoserStub] = type(fields["name"], (DiagnoserStub,), fields)
+    return stub
 
 
 def register_plugins(plugins: Iterable[Plugin]) -> None:
@@ -144,15 +144,15 @@ def load_plugins_for_experiment(paths: Sequence[str], experiment: Experiment) ->
     known = [Plugin(path) for path in paths]
     if not experiment.trusted:
         needed = {experiment.simulator} | find_named_effects(experiment.settings, experiment.world)
-        known = inspect_plugins(paths, needed | _extended(paths))
-        _refuse_both(known, experiment)
+        known = inspect_plugins(paths, needed | _list_extended_names(paths))
+        _check_no_shared_file(known, experiment)
     register_plugins(known)
     _known_plugins.update({plugin.path: plugin for plugin in known})
     if not experiment.trusted:
         _announce_installed(entry.tuner for entry in experiment.tuners)
 
 
-def _extended(paths: Iterable[str]) -> set[str]:
+def _list_extended_names(paths: Iterable[str]) -> set[str]:
     """Return the names of the systems and effects of extended simulators.
 
     Args:
@@ -169,7 +169,7 @@ def _extended(paths: Iterable[str]) -> set[str]:
     return names
 
 
-def _refuse_both(plugins: Iterable[Plugin], experiment: Experiment) -> None:
+def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> None:
     """Raise an error if a file with a simulator or effect in use also has a tuner in use.
 
     Raises:
@@ -179,12 +179,12 @@ def _refuse_both(plugins: Iterable[Plugin], experiment: Experiment) -> None:
     for plugin in plugins:
         for known in plugin.tuners:
             if plugin.is_loaded and known["name"] in labels:
-                raise _among_truths(labels[known["name"]], plugin.path)
+                raise _make_untrusted_code_error(labels[known["name"]], plugin.path)
 
 
-def _among_truths(label: str, place: object) -> InputError:
+def _make_untrusted_code_error(label: str, file: object) -> InputError:
     return InputError(
-        f"tuner {label}: the code of {place} runs in this process, where the truths are: a "
+        f"tuner {label}: the code of {file} runs in this process, where the truths are: a "
         "simulator or effect in it is used here, or it was loaded by hand; put the tuner into a "
         "file of its own, or trust the tuners"
     )
@@ -233,19 +233,19 @@ def must_build_isolated(entry: TunerEntry) -> bool:
         PartUnavailableError: the tuner cannot be used here.
     """
     _announce_installed([entry.tuner])
-    kind, place = tuners.get(entry.tuner), tuners.place(entry.tuner)
+    kind, file = tuners.get(entry.tuner), tuners.place(entry.tuner)
     if not issubclass(kind, TunerStub):
-        if place is not None:
-            raise _among_truths(entry.label, place)
+        if file is not None:
+            raise _make_untrusted_code_error(entry.label, file)
         return False
     try:
         retry_if_killed(lambda: _build(entry))
         return True
     except RunEndedError as ended:
-        said = "".join(str(ended).strip().splitlines()[-1:])
-        kind_of_error, _, why = said.partition(": ")
-        said = why if kind_of_error in ("TypeError", "ValueError") else said
-        raise InputError(f"tuner {entry.label}: {said}") from None
+        message = "".join(str(ended).strip().splitlines()[-1:])
+        error_name, _, explanation = message.partition(": ")
+        message = explanation if error_name in ("TypeError", "ValueError") else message
+        raise InputError(f"tuner {entry.label}: {message}") from None
 
 
 def _build(entry: TunerEntry) -> None:
@@ -265,25 +265,25 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
     Raises:
         InputError: a file cannot be used.
     """
-    wanted = set(needed)
-    found = []
+    needed_names = set(needed)
+    plugins = []
     claimed: dict[tuple[str, str], str] = {}
     for path in paths:
         # An extended simulator is data and contains no code.
         if path.endswith(".toml"):
-            found.append(Plugin(path))
+            plugins.append(Plugin(path))
             continue
-        parts = _asked({"file": path, "kind": "", "name": ""}, path)
+        parts = _inspect({"file": path, "kind": "", "name": ""}, path)
         worlds = {part["name"] for part in parts if part["kind"] not in _ISOLATED_REGISTRIES}
         for part in parts:
-            if part["name"] in wanted and part["kind"] not in _ISOLATED_REGISTRIES:
-                _refuse_taken(part["kind"], part["name"], path, claimed)
+            if part["name"] in needed_names and part["kind"] not in _ISOLATED_REGISTRIES:
+                _check_name_free(part["kind"], part["name"], path, claimed)
         methods = [tuple(p for p in parts if p["kind"] == kind) for kind in _ISOLATED_REGISTRIES]
-        found.append(Plugin(path, bool(worlds & wanted), *methods))
-    return found
+        plugins.append(Plugin(path, bool(worlds & needed_names), *methods))
+    return plugins
 
 
-def _refuse_taken(kind: str, name: str, path: str, claimed: dict[tuple[str, str], str]) -> None:
+def _check_name_free(kind: str, name: str, path: str, claimed: dict[tuple[str, str], str]) -> None:
     """Raise an error if a name in a file's description is already in use.
 
     This is checked before the file's code is loaded, because the description may be wrong.
@@ -292,12 +292,14 @@ def _refuse_taken(kind: str, name: str, path: str, claimed: dict[tuple[str, str]
         InputError: the name is in use.
     """
     for registry in REGISTRIES:
-        taken = registry.kind == kind and name in registry.names()
-        if taken and registry.place(name) != Path(path).resolve():
+        is_taken = registry.kind == kind and name in registry.names()
+        if is_taken and registry.place(name) != Path(path).resolve():
             raise InputError(f"plugin {path}: {kind} '{name}' exists already; give it another name")
-    other = claimed.setdefault((kind, name), path)
-    if other != path:
-        raise InputError(f"plugin {path}: {kind} '{name}' is in {other} too; give one another name")
+    other_path = claimed.setdefault((kind, name), path)
+    if other_path != path:
+        raise InputError(
+            f"plugin {path}: {kind} '{name}' is in {other_path} too; give one another name"
+        )
 
 
 def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
@@ -311,7 +313,7 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
         PartUnavailableError: it cannot be used here.
         InputError: it cannot be inspected.
     """
-    known = _asked({"file": "", "kind": kind, "name": name}, name)
+    known = _inspect({"file": "", "kind": kind, "name": name}, name)
     if known and "skipped" in known[0]:
         raise PartUnavailableError(kind, name, known[0]["skipped"])
     return Plugin("", False, *(tuple(known) if kind == k else () for k in _ISOLATED_REGISTRIES))
@@ -324,27 +326,27 @@ def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
         name: registered name.
         registry: registry of the part.
     """
-    place = registry.entry(name)
-    known = registry.place(name) is not None or place is None
-    return not known and not str(place).startswith(_PROJECT_PACKAGES)
+    entry_point = registry.entry(name)
+    known = registry.place(name) is not None or entry_point is None
+    return not known and not str(entry_point).startswith(_PROJECT_PACKAGES)
 
 
-def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
+def _inspect(question: dict[str, str], label: str) -> list[dict[str, Any]]:
     """Return the answer of an isolated process that has loaded the given plugin."""
     file = question["file"]
     if file and not Path(file).is_file():
         raise InputError(f"plugin {file}: no such file")
     try:
-        answer = retry_if_killed(lambda: _answer(question, [file] if file else []))
+        answer = retry_if_killed(lambda: _request_inspection(question, [file] if file else []))
     except RunEndedError as ended:
-        said = "takes too long to load" if ended.status == "timeout" else ended.reason
-        raise InputError(f"plugin {what}: {said.strip().splitlines()[-1]}") from None
+        message = "takes too long to load" if ended.status == "timeout" else ended.reason
+        raise InputError(f"plugin {label}: {message.strip().splitlines()[-1]}") from None
     if isinstance(answer, dict):
         raise InputError(with_isolation(str(answer.get("fault"))))
-    return [_plain(part, file) for part in answer]
+    return [_validate_part(part, file) for part in answer]
 
 
-def _answer(question: dict[str, str], files: list[str]) -> Any:
+def _request_inspection(question: dict[str, str], files: list[str]) -> Any:
     child = get_fork_server().start_process(
         f"{__name__}:serve_inspection", files, modules=[__name__]
     )
@@ -357,7 +359,7 @@ def _answer(question: dict[str, str], files: list[str]) -> Any:
         child.end()
 
 
-def _plain(part: Any, file: str) -> dict[str, Any]:
+def _validate_part(part: Any, file: str) -> dict[str, Any]:
     """Validate a part of an answer, and convert it to plain values."""
     kinds = [registry.kind for registry in REGISTRIES]
     if not isinstance(part, dict) or part.get("kind") not in kinds or "name" not in part:
@@ -365,24 +367,26 @@ def _plain(part: Any, file: str) -> dict[str, Any]:
     keys = ("kind", "name", "trains_as", "says")
     text = {key: to_printable(str(part.get(key, ""))[:500]) for key in keys}
     # The hash contains the file's content, in addition to the plugin's own description.
-    told = [str(part.get("source", "")), Path(file).read_bytes() if file else b""]
+    hashed = [str(part.get("source", "")), Path(file).read_bytes() if file else b""]
     # A part of a file is found by the file; a module name could pass information to its runs.
     module = "" if file else str(part.get("module", ""))
-    rest = {"file": file, "module": module, "source": compute_digest(*told)}
+    rest = {"file": file, "module": module, "source": compute_digest(*hashed)}
     flags = {key: part.get(key) for key in ("stochastic", "learned")}
     skipped = {"skipped": str(part["skipped"])[:500]} if "skipped" in part else {}
     return {**text, **rest, **flags, **skipped}
 
 
-def serve_inspection(channel: MessageChannel, _reach: AccessPolicy, held: list[str]) -> None:
+def serve_inspection(
+    channel: MessageChannel, _reach: AccessPolicy, active_layers: list[str]
+) -> None:
     """Answer one question about a plugin; runs in the isolated process.
 
     Args:
         channel: channel to the harness.
         _reach: access policy; not used.
-        held: names of the active isolation layers.
+        active_layers: names of the active isolation layers.
     """
-    channel.send_document(b"R", held)
+    channel.send_document(b"R", active_layers)
     question = channel.receive().to_document()
     try:
         answer: Any = _parts(question["file"]) if question["file"] else [_one(question)]

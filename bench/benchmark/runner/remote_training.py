@@ -49,8 +49,8 @@ def train_remotely(
         RunEndedError: the tuner failed.
         KilledExternallyError: its process was killed externally.
     """
-    given = {"stream": stream.astype(np.int64), "budget": np.array(practice.budget)}
-    child.send(b"F", *pack_arrays(given), flags=watch is not None, deadline=_NO_DEADLINE)
+    request = {"stream": stream.astype(np.int64), "budget": np.array(practice.budget)}
+    child.send(b"F", *pack_arrays(request), flags=watch is not None, deadline=_NO_DEADLINE)
     grounds: list[Ground] = [practice]
     while True:
         message = child.receive(MAX_STATE_BYTES, _NO_DEADLINE)
@@ -84,14 +84,14 @@ def _serve(
         raise ProtocolError("it sent what nobody asked for")
 
 
-def _parse_progress(said: Any) -> tuple[str, int, int, float, float]:
+def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:
     """Parse a progress message: stage, epoch, number of epochs, and two losses.
 
     Raises:
         ProtocolError: the message has another content.
     """
     try:
-        stage, epoch, epochs, loss, held_out = said
+        stage, epoch, epochs, loss, held_out = document
         return to_printable(str(stage)[:80]), int(epoch), int(epochs), float(loss), float(held_out)
     except (TypeError, ValueError, OverflowError):
         raise ProtocolError("it told of no epoch") from None
@@ -108,7 +108,7 @@ def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) 
             refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
             child.send(b"X", refusal, deadline=_NO_DEADLINE)
             return
-    told = {
+    properties = {
         "training": ground.training,
         "scale": ground.scale,
         "lengths": np.array(ground.lengths, dtype=np.int64),
@@ -116,7 +116,7 @@ def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) 
         "inputs": ground.scene.inputs,
         "counts": np.array([ground.used, ground.budget], dtype=np.int64),
     }
-    child.send(b"O", *pack_arrays({**told, **result}), deadline=_NO_DEADLINE)
+    child.send(b"O", *pack_arrays({**properties, **result}), deadline=_NO_DEADLINE)
 
 
 def _simulated(message: Message, ground: Ground) -> dict[str, NDArray[Any]]:

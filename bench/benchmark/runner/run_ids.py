@@ -109,37 +109,39 @@ def _classes(experiment: Experiment) -> list[str]:
     return sources
 
 
-def check_unchanged(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
+def check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, str]) -> None:
     """Raise an error if the configuration of a study has changed.
 
     Args:
         folder: folder of the study.
-        before: fingerprint when the study was started.
-        now: present fingerprint.
+        initial: fingerprint when the study was started.
+        present: present fingerprint.
 
     Raises:
         InputError: something has changed since the study was started.
     """
-    if not before:
+    if not initial:
         raise InputError(
             f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
         )
     # The first difference is reported: direct changes are listed before their consequences.
-    for what, hashed in now.items():
-        if before.get(what) != hashed:
+    for what, hashed in present.items():
+        if initial.get(what) != hashed:
             raise InputError(
-                f"{folder}: its {what} changed since it was begun ({before.get(what)} then, "
+                f"{folder}: its {what} changed since it was begun ({initial.get(what)} then, "
                 f"{hashed} now); runs of two kinds are not mixed: put it back as it was, or start "
                 "a new comparison"
             )
 
 
-def check_resumable(folder: Path, held: FolderConfiguration, plugins: Sequence[str]) -> list[str]:
+def check_resumable(
+    folder: Path, configuration: FolderConfiguration, plugins: Sequence[str]
+) -> list[str]:
     """Check that a study can be resumed, and load its plugins.
 
     Args:
         folder: folder of the study.
-        held: configuration with which the study was started.
+        configuration: configuration with which the study was started.
         plugins: additional plugin files.
 
     Returns:
@@ -149,11 +151,15 @@ def check_resumable(folder: Path, held: FolderConfiguration, plugins: Sequence[s
         InputError: something relevant has changed since the study was started.
     """
     # The study's own plugins come first and in their order, as when it was started.
-    given = {str(Path(p).resolve()) for p in plugins}
-    everything = held.plugins + sorted(given - set(held.plugins))
-    load_plugins_for_experiment(everything, held.experiment)
-    check_unchanged(folder, held.fingerprint, compute_fingerprint(held.experiment, everything))
-    return everything
+    additional = {str(Path(p).resolve()) for p in plugins}
+    all_plugins = configuration.plugins + sorted(additional - set(configuration.plugins))
+    load_plugins_for_experiment(all_plugins, configuration.experiment)
+    check_unchanged(
+        folder,
+        configuration.fingerprint,
+        compute_fingerprint(configuration.experiment, all_plugins),
+    )
+    return all_plugins
 
 
 class RunIds:

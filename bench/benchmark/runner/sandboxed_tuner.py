@@ -46,12 +46,12 @@ _idle_tuners: OrderedDict[Any, IsolatedTuner] = OrderedDict()
 
 def get_fork_server() -> ForkServerClient:
     """Return the fork server of this process; it is started at the first call."""
-    held = _fork_servers.get(0)
-    if held is None or not held.is_alive:
+    server = _fork_servers.get(0)
+    if server is None or not server.is_alive:
         # A fork server that was killed externally is closed too, because its folder still exists.
         close_isolated_processes()
-        held = _fork_servers[0] = ForkServerClient()
-    return held
+        server = _fork_servers[0] = ForkServerClient()
+    return server
 
 
 @cache
@@ -62,7 +62,7 @@ def list_active_isolation_layers() -> tuple[str, ...]:
         InputError: no isolated process can be started.
     """
     try:
-        return retry_if_killed(_seals)
+        return retry_if_killed(_find_active_layers)
     except RunEndedError as ended:
         raise InputError(
             f"no tuner can have a process of its own here: {ended}; mend that, or give --trust for "
@@ -70,7 +70,7 @@ def list_active_isolation_layers() -> tuple[str, ...]:
         ) from None
 
 
-def _seals() -> tuple[str, ...]:
+def _find_active_layers() -> tuple[str, ...]:
     child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")
     try:
         child.wait_until_ready()
@@ -103,22 +103,20 @@ def retry_if_killed(work: Callable[[], Result]) -> Result:
         try:
             return work()
         except KilledExternallyError as killed:
-            said = str(killed)
+            message = str(killed)
     # After several kills the work itself is the more likely cause.
-    raise RunEndedError("crashed", f"{said}, {MAX_RETRIES} times")
+    raise RunEndedError("crashed", f"{message}, {MAX_RETRIES} times")
 
 
 def make_tuner_spec(entry: TunerEntry) -> TunerSpec:
     """Return the specification of the tuner of an entry, for an isolated process."""
     kind = tuners.get(entry.tuner)
-    place = tuners.place(entry.tuner)
+    file = tuners.place(entry.tuner)
     module = getattr(kind, "module", "") or kind.__module__
-    ahead = (
-        find_preloadable_packages(str(place) if place else _file_of(module))
-        if place or module
-        else ()
+    preloaded = (
+        find_preloadable_packages(str(file) if file else _file_of(module)) if file or module else ()
     )
-    return TunerSpec(kind.name, module, str(place or ""), dict(entry.options), ahead)
+    return TunerSpec(kind.name, module, str(file or ""), dict(entry.options), preloaded)
 
 
 def _file_of(module: str) -> str:
@@ -135,15 +133,15 @@ def find_preloadable_packages(file: str) -> tuple[str, ...]:
 
     The files are parsed; their code does not run.
     """
-    wanted: dict[str, None] = {}
+    packages: dict[str, None] = {}
     files = [file]
     while files:
         for name in _imported(files.pop()):
-            if name.partition(".")[0] in _PRELOADABLE_PACKAGES and name not in wanted:
-                wanted[name] = None
+            if name.partition(".")[0] in _PRELOADABLE_PACKAGES and name not in packages:
+                packages[name] = None
                 if name.startswith("methods."):
                     files.append(_file_of(name))
-    return tuple(wanted)
+    return tuple(packages)
 
 
 def _imported(file: str) -> list[str]:
@@ -188,9 +186,9 @@ def start_isolated_tuner(
         RunEndedError: the tuner cannot be built.
         KilledExternallyError: the process was killed externally.
     """
-    kept = isolation == "tuner"
+    is_reused = isolation == "tuner"
     # Weights are hashed only if an idle tuner could have different ones.
-    key = (repr(tuned), seed, hidden, memory, _digest(state or {})) if kept else None
+    key = (repr(tuned), seed, hidden, memory, _digest(state or {})) if is_reused else None
     tuner = _idle_tuners.pop(key, None)
     if tuner is not None:
         tuner.import_seconds = 0.0
@@ -213,7 +211,7 @@ def start_isolated_tuner(
     except BaseException:
         tuner.child.end()
         raise
-    if not kept:
+    if not is_reused:
         tuner.child.end()
     elif tuner.child.is_alive:
         _idle_tuners[key] = tuner

@@ -41,9 +41,9 @@ class PreparedStudy(NamedTuple):
             hashes: hashes of everything that must not change while the study runs.
             redraws: number of targets that were drawn again, for environment.json.
         """
-        held = () if self.experiment.trusted else list_active_isolation_layers()
+        layers = () if self.experiment.trusted else list_active_isolation_layers()
         configuration = FolderConfiguration(self.experiment, list(self.plugins), dict(hashes))
-        create_folder(self.folder, configuration, self.jobs, self.secret, held, redraws)
+        create_folder(self.folder, configuration, self.jobs, self.secret, layers, redraws)
         return self.folder
 
 

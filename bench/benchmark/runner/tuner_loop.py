@@ -82,14 +82,14 @@ class _DivergenceError(Exception):
     """A tuner proposed or recommended a point that is not finite."""
 
 
-def _points(asked: object, dim: int, what: str) -> Array:
+def _points(proposed: object, dim: int, label: str) -> Array:
     """Return proposals as a new (n, dim) array, clipped to the unit cube."""
-    points = to_points(asked, dim, what)
+    points = to_points(proposed, dim, label)
     # Nearly all points are inside, so the expensive check is done only if some are not.
     if not _is_in_unit_cube(points):
         if not np.isfinite(points).all():
             first = points[~np.isfinite(points).all(axis=1)][0]
-            raise _DivergenceError(f"the tuner gave {what} that are not finite: {first}")
+            raise _DivergenceError(f"the tuner gave {label} that are not finite: {first}")
         points.clip(0.0, 1.0, out=points)
     return points
 
@@ -226,14 +226,14 @@ def drive_tuner(
         status, reason = "crashed", traceback.format_exc()
     finally:
         # After an interrupt, too, the tuner must close its resources.
-        fault = _close_generator(steps)
+        close_error = _close_generator(steps)
     if status == "timeout":
         reason = f"stopped after {perf_counter() - started:.1f} s, limit {seconds:g} s"
-    elif fault:
-        status, reason = "crashed", fault
+    elif close_error:
+        status, reason = "crashed", close_error
     elif status in ("done", "converged") and record.diverged:
-        says = f"none of {record.used} simulations has a finite loss"
-        status, reason = "diverged", f"{says} ({reason or 'budget used'})"
+        explanation = f"none of {record.used} simulations has a finite loss"
+        status, reason = "diverged", f"{explanation} ({reason or 'budget used'})"
     return record.trace(status, reason)
 
 

@@ -207,8 +207,8 @@ def train_or_load(
         WeightsError: there is a file, but it is damaged or belongs to another training.
         RunEndedError: the tuner failed in its process.
     """
-    before: list[str] = []
-    return retry_if_killed(lambda: _train(experiment, lesson, watch, anew, before))
+    earlier_requests: list[str] = []
+    return retry_if_killed(lambda: _train(experiment, lesson, watch, anew, earlier_requests))
 
 
 def _train(
@@ -216,13 +216,13 @@ def _train(
     lesson: TrainingRequest,
     watch: TrainingCallback | None,
     anew: bool,
-    before: list[str],
+    earlier_requests: list[str],
 ) -> TrainingResult:
     entry, seed = lesson.entry, lesson.seed
     name = compute_training_key(experiment, entry, seed)
     path = get_weights_folder() / f"{name}.npz"
     if path.exists() and not anew:
-        simulations, seconds = _checked(path, name)[_COST_ARRAY]
+        simulations, seconds = _read_checked_arrays(path, name)[_COST_ARRAY]
         # Weights that do not fit must be reported now, and not in every run.
         _check_weights(lesson, path)
         return TrainingResult(path, int(simulations), float(seconds), was_cached=True)
@@ -233,7 +233,7 @@ def _train(
     )
     learn = _train_in_process if lesson.tuned is None else _train_isolated
     rough = RandomisedSimulator(problem) if entry.randomised else None
-    practice = _ReplayCheckedSimulator(problem, experiment.training_budget, before, rough)
+    practice = _ReplayCheckedSimulator(problem, experiment.training_budget, earlier_requests, rough)
     started = perf_counter()
     state = learn(lesson, practice, stream, watch)
     seconds = perf_counter() - started
@@ -260,11 +260,11 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
         self,
         problem: TuningProblem,
         budget: int,
-        before: list[str],
+        earlier_requests: list[str],
         nuisance: RandomisedSimulator | None = None,
     ) -> None:
         super().__init__(problem, budget, nuisance)
-        self._before, self._place = before, 0
+        self._before, self._place = earlier_requests, 0
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
         """Simulate points, and check them against the requests before a kill.
@@ -281,10 +281,10 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
         Raises:
             RunEndedError: the request differs from the one before the kill.
         """
-        asked = compute_digest(repr(rng.bit_generator.state), np.asarray(points).tobytes())
+        request = compute_digest(repr(rng.bit_generator.state), np.asarray(points).tobytes())
         if self._place == len(self._before):
-            self._before.append(asked)
-        elif self._before[self._place] != asked:
+            self._before.append(request)
+        elif self._before[self._place] != request:
             raise RunEndedError("crashed", NOT_REPRODUCIBLE_REASON)
         self._place += 1
         return super().simulate(rng, points)
@@ -314,10 +314,10 @@ def _train_isolated(
     with start_isolated_tuner(lesson.tuned, lesson.seed, "run", lesson.hidden) as tuner:
         state = train_remotely(tuner.child, practice, stream, watch)
     # These names are arguments of `np.savez` or reserved in the file.
-    taken = {"file", "allow_pickle", _COST_ARRAY, _KEY} & set(state)
-    if taken:
+    reserved = {"file", "allow_pickle", _COST_ARRAY, _KEY} & set(state)
+    if reserved:
         raise RunEndedError(
-            "crashed", f"the tuner learned what cannot be kept by the names {taken}"
+            "crashed", f"the tuner learned what cannot be kept by the names {reserved}"
         )
     return state
 
@@ -337,11 +337,11 @@ def _check_weights(lesson: TrainingRequest, path: Path) -> None:
         ):
             return
     except RunEndedError as ended:
-        said = ended.reason.strip().splitlines()[-1:]
-        raise _not_of(path, lesson.entry, "".join(said)) from None
+        last_line = ended.reason.strip().splitlines()[-1:]
+        raise _make_weights_error(path, lesson.entry, "".join(last_line)) from None
 
 
-def _not_of(path: Path, entry: TunerEntry, why: object) -> WeightsError:
+def _make_weights_error(path: Path, entry: TunerEntry, why: object) -> WeightsError:
     return WeightsError(f"{path}: not the weights of {entry.label}: {why}; {_REMEDY}")
 
 
@@ -366,7 +366,7 @@ def load_trained_tuner(entry: TunerEntry, path: Path) -> Tuner:
     try:
         tuner.restore(read_weights(path))
     except ValueError as error:
-        raise _not_of(path, entry, error) from None
+        raise _make_weights_error(path, entry, error) from None
     return tuner
 
 
@@ -376,12 +376,12 @@ def read_weights(path: Path) -> dict[str, Array]:
     Raises:
         WeightsError: the file is missing, damaged, or of another training.
     """
-    state = _checked(path, path.stem)
+    state = _read_checked_arrays(path, path.stem)
     del state[_COST_ARRAY], state[_KEY]
     return state
 
 
-def _checked(path: Path, name: str) -> dict[str, Array]:
+def _read_checked_arrays(path: Path, name: str) -> dict[str, Array]:
     """Read and check the arrays of a weights file.
 
     Args:
@@ -406,17 +406,17 @@ def _checked(path: Path, name: str) -> dict[str, Array]:
         raise WeightsError(
             f"{path}: expected trained weights, found none or a damaged file; {_REMEDY}"
         ) from None
-    counts, held = arrays.get(_COST_ARRAY, np.empty(0)), arrays.get(_KEY, np.empty(0))
+    counts, stored_key = arrays.get(_COST_ARRAY, np.empty(0)), arrays.get(_KEY, np.empty(0))
     if (
         counts.shape != (2,)
         or counts.dtype != np.float64
-        or held.dtype != np.uint8
-        or held.ndim != 1
+        or stored_key.dtype != np.uint8
+        or stored_key.ndim != 1
     ):
         raise WeightsError(
             f"{path}: expected trained weights, found arrays {sorted(arrays)[:4]}; {_REMEDY}"
         )
-    found = held.tobytes().decode("utf-8", "replace")
+    found = stored_key.tobytes().decode("utf-8", "replace")
     if found != name:
         raise WeightsError(
             f"{path}: expected the weights of {name}, found those of {found:.80}; {_REMEDY}"

@@ -134,8 +134,8 @@ class InProcessPool:
             Index of the call, and its result or exception.
         """
         with limit_to_one_thread():
-            for place in range(len(calls)):
-                function, arguments = calls[place]
+            for index in range(len(calls)):
+                function, arguments = calls[index]
                 try:
                     result = function(*arguments)
                 except InputError as error:
@@ -146,7 +146,7 @@ class InProcessPool:
                 except SystemExit as error:
                     traceback.print_exc()
                     result = WorkerDiedError(f"it asked to exit with {error.code!r}")
-                yield place, result
+                yield index, result
 
 
 @dataclass
@@ -238,9 +238,9 @@ class LocalPool:
             # The timeout is needed because a worker that exits with code 0 completes no future.
             wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
             for slot in self._slots:
-                for one, result in slot.collect(following):
-                    pace.note(monotonic() - one.given)
-                    yield one.place, result
+                for call, result in slot.collect(following):
+                    pace.note(monotonic() - call.given)
+                    yield call.place, result
             pace.adapt()
 
     def _hand_out(
@@ -296,43 +296,43 @@ class _WorkerSlot:
         ending.start()
         ending.join(timeout=5.0)
 
-    def give(self, one: _AssignedCall, calls: Sequence[Call], limit: float | None) -> None:
+    def give(self, call: _AssignedCall, calls: Sequence[Call], limit: float | None) -> None:
         """Assign a call to the process; replace a pool that broke in the meantime.
 
         Args:
-            one: call to assign.
+            call: call to assign.
             calls: all calls.
             limit: hard time limit in seconds; None for no limit.
         """
-        function, arguments = calls[one.place]
-        one.given = monotonic()
+        function, arguments = calls[call.place]
+        call.given = monotonic()
         try:
             future = self._pool.schedule(function, args=arguments, timeout=limit)
         except RuntimeError:  # the pool broke between two calls
             self._renew()
             future = self._pool.schedule(function, args=arguments, timeout=limit)
-        self.given[future] = one
+        self.given[future] = call
 
-    def collect(self, again: deque[_AssignedCall]) -> list[tuple[_AssignedCall, Any]]:
+    def collect(self, waiting: deque[_AssignedCall]) -> list[tuple[_AssignedCall, Any]]:
         """Return the ended calls; put those that a lost worker did not begin back into `again`."""
         ended: list[tuple[_AssignedCall, Any]] = []
         lost = False
         for future in [future for future in self.given if future.done()]:
-            one, error = self.given.pop(future), future.exception()
+            call, error = self.given.pop(future), future.exception()
             lost = lost or _loses_the_worker(error)
             if error is None:
                 self._futile = 0
-            if _should_retry(one, error):
-                again.appendleft(one)
+            if _should_retry(call, error):
+                waiting.appendleft(call)
             else:
-                ended.append((one, future.result() if error is None else _end_of(error)))
+                ended.append((call, future.result() if error is None else _convert_error(error)))
         if not lost and self._died_quietly():
             lost = True
-            at = next(future for future in self.given if future.running())
-            ended.append((self.given.pop(at), WorkerDiedError(_says(0))))
+            running = next(future for future in self.given if future.running())
+            ended.append((self.given.pop(running), WorkerDiedError(_describe_worker_exit(0))))
         if lost:
             self._futile = 0 if ended else self._futile
-            again.extendleft(reversed(self.given.values()))
+            waiting.extendleft(reversed(self.given.values()))
             self._renew()
         return ended
 
@@ -346,8 +346,8 @@ class _WorkerSlot:
     def _renew(self) -> None:
         self._futile += 1
         if self._futile > _MAX_IMMEDIATE_DEATHS:
-            said = "what they say stands above, if anything"
-            raise InputError(f"worker processes die as soon as they start; {said}")
+            hint = "what they say stands above, if anything"
+            raise InputError(f"worker processes die as soon as they start; {hint}")
         self.given.clear()
         self.stop()
         self._births.close()
@@ -364,30 +364,30 @@ def _loses_the_worker(error: BaseException | None) -> bool:
     return _exit_code(error) is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
 
 
-def _should_retry(one: _AssignedCall, error: BaseException | None) -> bool:
+def _should_retry(call: _AssignedCall, error: BaseException | None) -> bool:
     """Return whether to repeat a call, because its end gives no information about it.
 
     It also counts the deaths of workers during the call.
     """
     code = _exit_code(error)
     # A broken pool has not begun the call, or has not reported its result.
-    again = isinstance(error, BrokenExecutor) or (
-        code in _EXTERNAL_KILL_EXIT_CODES and one.deaths < MAX_RETRIES
+    is_repeated = isinstance(error, BrokenExecutor) or (
+        code in _EXTERNAL_KILL_EXIT_CODES and call.deaths < MAX_RETRIES
     )
-    if again:
-        one.deaths += code is not None
-    return again
+    if is_repeated:
+        call.deaths += code is not None
+    return is_repeated
 
 
-def _end_of(error: BaseException) -> BaseException:
+def _convert_error(error: BaseException) -> BaseException:
     """Return the exception that replaces the result of a failed call."""
     if isinstance(error, FutureTimeoutError):
         return TimeoutError(str(error))  # two different classes before Python 3.11
     code = _exit_code(error)
-    return error if code is None else WorkerDiedError(_says(code))
+    return error if code is None else WorkerDiedError(_describe_worker_exit(code))
 
 
-def _says(code: int) -> str:
+def _describe_worker_exit(code: int) -> str:
     """Describe how a worker process ended."""
-    said = describe_exit("the worker process", code)
-    return f"{said} (out of memory?)" if code == -9 else said
+    description = describe_exit("the worker process", code)
+    return f"{description} (out of memory?)" if code == -9 else description

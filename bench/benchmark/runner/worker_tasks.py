@@ -110,11 +110,11 @@ _problems: dict[int, tuple[Experiment, TuningProblem]] = {}
 
 def get_problem(experiment: Experiment) -> TuningProblem:
     """Return the problem of an experiment; it is cached until another one is needed."""
-    held = _problems.get(0)
-    if held is None or held[0] != experiment:
+    cached = _problems.get(0)
+    if cached is None or cached[0] != experiment:
         close_problem()
-        held = _problems[0] = (experiment, TuningProblem(experiment))
-    return held[1]
+        cached = _problems[0] = (experiment, TuningProblem(experiment))
+    return cached[1]
 
 
 def close_problem() -> None:
@@ -167,10 +167,10 @@ def execute_run(
         repeated = _ReplayCheckedEvaluator(evaluator, [] if requests is None else requests)
         trace, written, import_seconds = _run_isolated(experiment, order, task, repeated)
     seconds = perf_counter() - started
-    beside = problem.simulated - simulated - len(trace.losses)
+    hidden_simulations = problem.simulated - simulated - len(trace.losses)
     # A simulator that raises an error has counted simulations without a result.
-    if beside > 0 and trace.status != "crashed":
-        raise HiddenSimulationError(f"{beside} simulations beside the budget")
+    if hidden_simulations > 0 and trace.status != "crashed":
+        raise HiddenSimulationError(f"{hidden_simulations} simulations beside the budget")
     if trace.status == "crashed":
         # The stderr of a worker is discarded; without workers the author of the tuner sees it.
         sys.stderr.write(trace.reason)
@@ -191,8 +191,8 @@ class _ReplayCheckedEvaluator:
     kill could repeat its run until the result is good.
     """
 
-    def __init__(self, evaluate: Evaluate, before: list[Array]) -> None:
-        self._evaluate, self._before, self._place = evaluate, before, 0
+    def __init__(self, evaluate: Evaluate, earlier_requests: list[Array]) -> None:
+        self._evaluate, self._before, self._place = evaluate, earlier_requests, 0
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
         if self._place == len(self._before):
@@ -226,11 +226,11 @@ def _run_isolated(
     assert order.tuned is not None
     state = None if order.weights is None else read_weights(order.weights)
     names = _names(experiment, order)
-    house = start_isolated_tuner(
+    opened = start_isolated_tuner(
         order.tuned, order.seed, experiment.isolation, order.hidden, experiment.memory, state
     )
     try:
-        with house as tuner:
+        with opened as tuner:
             run = IsolatedRun(tuner, make_seed_words(*names), experiment.timeout)
             trace = drive_tuner(run, task, evaluate, make_rng(*names), experiment.timeout)
             written = tuner.child.written()

@@ -38,13 +38,13 @@ def add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_bundle(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.studies.archive_bundle import write_bundle
 
-    made = write_bundle(options.run, options.out, options.recordings)
-    document = made.to_document()
+    archived = write_bundle(options.run, options.out, options.recordings)
+    document = archived.to_document()
     size = f"{document['bytes'] / 1e6:.3g} MB"
-    say(f"{made.archive}: {made.kind}, {made.files} files, {size}")
+    say(f"{archived.archive}: {archived.kind}, {archived.files} files, {size}")
     say(f"SHA-256 {document['sha256']}")
-    for line in made.left_out:
+    for line in archived.left_out:
         say(f"left out: {line}")
-    say(f"to make it again: {made.command}")
-    say(f"to check it: simgap verify {made.archive}")
+    say(f"to make it again: {archived.command}")
+    say(f"to check it: simgap verify {archived.archive}")
     return CommandResult(document)

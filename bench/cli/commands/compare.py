@@ -66,9 +66,9 @@ def _begin_or_resume(options: argparse.Namespace) -> list[Study]:
     from sims.core.argument_checks import check_options
     from sims.core.simulator import InputError
 
-    given = collect_options(options, ComparisonOptions)
+    values = collect_options(options, ComparisonOptions)
     if options.resume:
-        changed = {"experiment": options.experiment, **given}
+        changed = {"experiment": options.experiment, **values}
         refused = [n for n, value in changed.items() if value and n not in _UNCHANGED_BY_RESUME]
         if refused:
             raise InputError(
@@ -76,7 +76,7 @@ def _begin_or_resume(options: argparse.Namespace) -> list[Study]:
                 f"{', '.join(refused)}"
             )
         return [resume_study(part, options.plugin) for part in list_study_folders(options.resume)]
-    comparison = check_options(ComparisonOptions, given)
+    comparison = check_options(ComparisonOptions, values)
     chosen = build_experiment(options.experiment, comparison)
     with prefix_errors_with_option("--out", options.out):
         return begin_studies(chosen, comparison)
@@ -111,28 +111,28 @@ def _run_study(
     from bench.cli.study_summary import summarise_study
 
     with ProgressBars() as bars:
-        made = study.run(options.jobs, bars.start_bar, pool)
-    standing: JsonDocument = {**made._asdict(), "complete": made.is_complete}
-    if made.skipped:
-        say(f"skipped: {made.skipped}")
+        outcome = study.run(options.jobs, bars.start_bar, pool)
+    standing: JsonDocument = {**outcome._asdict(), "complete": outcome.is_complete}
+    if outcome.skipped:
+        say(f"skipped: {outcome.skipped}")
         return CommandResult({**summarise_study(study), **standing, "failed": 0, "resume": None})
     failed = study.report(say)
-    resume = None if made.is_complete else f"simgap compare --resume {study.folder}"
+    resume = None if outcome.is_complete else f"simgap compare --resume {study.folder}"
     document = {**summarise_study(study), **standing, "failed": failed, "resume": resume}
     if resume:
-        return CommandResult(document, _report_missing(study, made, resume))
+        return CommandResult(document, _report_missing(study, outcome, resume))
     return CommandResult(
         document, EXIT_PROBLEMS_FOUND if failed and not options.allow_failures else EXIT_OK
     )
 
 
-def _report_missing(study: Study, made: StudyOutcome, resume: str) -> int:
+def _report_missing(study: Study, outcome: StudyOutcome, resume: str) -> int:
     """Print what is missing and how to continue; return the exit code."""
-    why = "interrupted" if made.interrupted else made.stopped or "stopped"
+    why = "interrupted" if outcome.interrupted else outcome.stopped or "stopped"
     things, ended = study.status().what.rsplit(" ", 1)  # For example: runs finished.
     for line in (
-        f"{why}; {made.finished} of {made.planned} {things} are {ended} and kept",
+        f"{why}; {outcome.finished} of {outcome.planned} {things} are {ended} and kept",
         f"to finish: {resume}",
     ):
         print(f"simgap: {line}", file=sys.stderr)
-    return EXIT_INTERRUPTED if made.interrupted else EXIT_PROBLEMS_FOUND
+    return EXIT_INTERRUPTED if outcome.interrupted else EXIT_PROBLEMS_FOUND

@@ -53,22 +53,22 @@ def _run_datasheet(options: argparse.Namespace, say: PrintLine) -> CommandResult
     check_folder_empty(options.out)
     display = ProgressDisplay(options.budget, silent=options.json)
     with display, InterruptHandler(display.note) as interrupts:
-        given = collect_options(options, DatasheetOptions)
-        given |= {"say": display.note, "stop": interrupts.is_stop_requested, "listener": display}
-        sheet = check_options(DatasheetOptions, given)
+        settings = collect_options(options, DatasheetOptions)
+        settings |= {"say": display.note, "stop": interrupts.is_stop_requested, "listener": display}
+        sheet = check_options(DatasheetOptions, settings)
         if sheet.explained is None:
             check_joint_exists(options.recordings, sheet)
             search = {field.name: getattr(sheet, field.name) for field in fields(ExplainOptions)}
             explained = explain(options.recordings, **search)
             # The explanation took minutes, so it is written even if the data sheet fails.
             explained.write(options.out / "explained", pdf=options.pdf)
-            given["explained"] = explained
+            settings["explained"] = explained
         display.finish("computing what these data would have shown")
-        made = datasheet(options.recordings, **given)
-    paths = made.write(options.out)
-    for line in made.lines():
+        data_sheet = datasheet(options.recordings, **settings)
+    paths = data_sheet.write(options.out)
+    for line in data_sheet.lines():
         say(line)
     say("")
     for path in paths:
         say(f"{path.suffix[1:]:7} {path}")
-    return CommandResult({"sheet": made.document(), "files": paths})
+    return CommandResult({"sheet": data_sheet.document(), "files": paths})

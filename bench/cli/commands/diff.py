@@ -43,18 +43,18 @@ def _run_diff(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     if options.out is not None:
         check_absent([options.out])
-    found = _found(options.a, options.b)
-    fails = options.fail_on == "worse" and found.is_worse
-    fails = fails or (options.fail_on == "change" and found.has_changed)
-    for line in found.format_lines():
+    difference = _compare_folders(options.a, options.b)
+    fails = options.fail_on == "worse" and difference.is_worse
+    fails = fails or (options.fail_on == "change" and difference.has_changed)
+    for line in difference.format_lines():
         say(line)
     if options.out is not None:
-        write_files({options.out: found.to_table().to_csv(index=False)})
+        write_files({options.out: difference.to_table().to_csv(index=False)})
         say(f"table   {options.out}")
-    return CommandResult(found.to_document(), EXIT_PROBLEMS_FOUND if fails else EXIT_OK)
+    return CommandResult(difference.to_document(), EXIT_PROBLEMS_FOUND if fails else EXIT_OK)
 
 
-def _found(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
+def _compare_folders(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
     """Compare two folders of one kind.
 
     Raises:
@@ -63,12 +63,14 @@ def _found(a: Path, b: Path) -> ComparisonDiff | ExplanationDiff:
     from bench.studies import diff_comparisons, diff_explanations
     from sims.core.simulator import InputError
 
-    told = [(folder / diff_explanations.VERDICT).is_file() for folder in (a, b)]
-    if all(told):
+    is_explanation = [(folder / diff_explanations.VERDICT).is_file() for folder in (a, b)]
+    if all(is_explanation):
         return diff_explanations.ExplanationDiff(
             diff_explanations.load_side(a), diff_explanations.load_side(b)
         )
-    if any(told):
-        one, other = (a, b) if told[0] else (b, a)
-        raise InputError(f"expected two of one kind: {one} is an explanation, {other} is none")
+    if any(is_explanation):
+        explanation, other = (a, b) if is_explanation[0] else (b, a)
+        raise InputError(
+            f"expected two of one kind: {explanation} is an explanation, {other} is none"
+        )
     return diff_comparisons.diff_comparisons(a, b)

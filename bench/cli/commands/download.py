@@ -49,15 +49,15 @@ def _download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     chosen = (
         dataset_catalogue.names() if _ALL in options.names else list(dict.fromkeys(options.names))
     )
-    wanted = [dataset_catalogue.get(name) for name in chosen]
-    if not wanted:
+    data_sets = [dataset_catalogue.get(name) for name in chosen]
+    if not data_sets:
         every = [dataset_catalogue.get(name) for name in dataset_catalogue.names()]
         for data_set in every:
             for line in _lines(data_set):
                 say(line)
         return CommandResult({"data_sets": [_document(each) for each in every], "downloaded": []})
     downloaded = []
-    for data_set in wanted:
+    for data_set in data_sets:
         present = _present(data_set, options.out)
         if present:
             say(f"{data_set.name}: already in {present}")
@@ -68,7 +68,7 @@ def _download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
             say(_how_found(data_set, options.out))
         for name in _experiments(data_set):
             say(f"needed by: simgap compare {name}")
-    documents = [_document(each, options.out) for each in wanted]
+    documents = [_document(each, options.out) for each in data_sets]
     return CommandResult({"data_sets": documents, "downloaded": downloaded})
 
 
@@ -116,8 +116,8 @@ def _how_found(data_set: DataSet, out: Path) -> str:
 
 
 def _lines(data_set: DataSet) -> list[str]:
-    here = data_set.folder()
-    state = f"in {here}" if here else f"not here: run `{data_set.command}`"
+    folder = data_set.folder()
+    state = f"in {folder}" if folder else f"not here: run `{data_set.command}`"
     needed = ", ".join(_experiments(data_set))
     return [
         f"{data_set.name:22} {data_set.size:>7}  {data_set.licence:11} {state}",
@@ -132,15 +132,15 @@ def _experiments(data_set: DataSet) -> list[str]:
     from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
     from bench.datasets.dataset_catalogue import providing
 
-    found = []
+    names = []
     for name in list_experiment_names():
         each = load_experiment(name)
         paths = [("robot", each.model)]
         if each.recording:
             paths.append(("recording", each.recording.path))
         if data_set in [providing(*path) for path in paths]:
-            found.append(name)
-    return found
+            names.append(name)
+    return names
 
 
 def _document(data_set: DataSet, out: Path | None = None) -> JsonDocument:

@@ -134,7 +134,7 @@ def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         )
         paths = explanation.write(folder, pdf=options.pdf, ranges=options.ranges)
     settings = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS}
-    made = write_explanation_environment(folder, started, settings, options.recordings)
+    environment_file = write_explanation_environment(folder, started, settings, options.recordings)
     for line in format_summary(explanation.story):
         say(line)
     left_out = explanation.ranges.left_out if options.ranges else ()
@@ -150,7 +150,7 @@ def _run_explain(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         "title": explanation.story.title,
         "unsaid": explanation.unsaid,
         "folder": folder,
-        "files": [*paths, made],
+        "files": [*paths, environment_file],
     }
     if options.ranges:
         document["ranges"] = [one.document() for one in explanation.ranges.ranges]
@@ -212,25 +212,25 @@ def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandRe
         with pool:
             pool.load_plugins([Plugin(str(path)) for path in options.plugin])
             rows = explain_batch(logs, out, settings, pool, done, interrupts.is_stop_requested)
-    left = len(logs) - len(rows)
+    remaining = len(logs) - len(rows)
     folders = {log.name: log.folder for log in logs}
-    given = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS} | {"each": True}
-    words = format_explain_command(options.recordings, {**given, "out": out})
+    relevant = {name: getattr(options, name) for name in _RESULT_RELEVANT_OPTIONS} | {"each": True}
+    words = format_explain_command(options.recordings, {**relevant, "out": out})
     recordings = dict(zip(folders, options.recordings, strict=True))
-    report = write_summary_page(rows, BatchPageInput(out, folders, recordings, words, left))
-    write_explanation_environment(out, started, given, options.recordings)
+    report = write_summary_page(rows, BatchPageInput(out, folders, recordings, words, remaining))
+    write_explanation_environment(out, started, relevant, options.recordings)
     together = summarise_causes(rows)
     for line in ("", *together, f"\nreport  {report}", f"table   {out / LOGS_TABLE_FILE}"):
         say(line)
     code = EXIT_PROBLEMS_FOUND if any(row.error for row in rows) else EXIT_OK
-    if left:
-        say(f"{left} of {len(logs)} left: the same command goes on with them")
+    if remaining:
+        say(f"{remaining} of {len(logs)} left: the same command goes on with them")
         code = EXIT_INTERRUPTED
-    found = [{**asdict(row), "folder": folders[row.log]} for row in rows]
+    results = [{**asdict(row), "folder": folders[row.log]} for row in rows]
     document = {
-        "logs": found,
+        "logs": results,
         "together": together,
-        "left": left,
+        "left": remaining,
         "table": out / LOGS_TABLE_FILE,
         "report": report,
     }

@@ -112,13 +112,13 @@ def run_track(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.logs.film_tracking import track_film
 
     diameter, fps, scale = options.ball_diameter, options.fps, options.scale
-    found = track_film(
+    track = track_film(
         options.video, options.out, render_track_figure, diameter, fps, scale, options.pdf
     )
-    for note in found.notes:
+    for note in track.notes:
         print(f"simgap: {options.video}: {note}", file=sys.stderr)
-    for line in found.lines:
+    for line in track.lines:
         say(line)
     endings = (".csv", ".toml", ".png", ".pdf") if options.pdf else (".csv", ".toml", ".png")
     files = [options.out.with_suffix(ending) for ending in endings]
-    return CommandResult({**found.to_document(), "recording": options.out, "files": files})
+    return CommandResult({**track.to_document(), "recording": options.out, "files": files})

@@ -35,20 +35,20 @@ def add_import_arguments(parser: argparse.ArgumentParser) -> None:
 def _import(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     from bench.api.recordings import ImportRequest, import_logs
 
-    made = import_logs(**collect_options(options, ImportRequest))
-    say(f"{options.out}: {len(made.guessed)} guesses, each marked there; nothing was copied")
-    for line in made.checks:
+    result = import_logs(**collect_options(options, ImportRequest))
+    say(f"{options.out}: {len(result.guessed)} guesses, each marked there; nothing was copied")
+    for line in result.checks:
         say(f"check: {line}")
-    for line in made.guessed:
+    for line in result.guessed:
         say(f"guess: {line}")
-    for line in made.untold:
+    for line in result.untold:
         say(f"not told: {line}")
     say(f"next: simgap inspect {options.out}")
     return CommandResult(
         {
             "description": options.out,
-            "checks": made.checks,
-            "guesses": made.guessed,
-            "untold": made.untold,
+            "checks": result.checks,
+            "guesses": result.guessed,
+            "untold": result.untold,
         }
     )

@@ -16,10 +16,10 @@ def add_info_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _info(options: argparse.Namespace, say: PrintLine) -> CommandResult:  # noqa: ARG001
-    found = collect_info()
-    for line in _format_info(found):
+    information = collect_info()
+    for line in _format_info(information):
         say(line)
-    return CommandResult(found)
+    return CommandResult(information)
 
 
 def collect_info() -> JsonDocument:
@@ -72,12 +72,12 @@ def _revision() -> str | None:
 
     if not (_HOME / ".git").exists():
         return None
-    said = ("git", "-C", str(_HOME), "describe", "--always", "--dirty=+", "--abbrev=12")
+    command = ("git", "-C", str(_HOME), "describe", "--always", "--dirty=+", "--abbrev=12")
     try:
-        done = subprocess.run(said, capture_output=True, text=True, timeout=10, check=True)
+        process = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip() or None
+    return process.stdout.strip() or None
 
 
 def _processors() -> int | None:
@@ -116,20 +116,22 @@ def _packages() -> Iterator[JsonDocument]:
     from packaging.requirements import Requirement
 
     try:
-        wanted = [Requirement(text) for text in requires("simgap") or ()]
+        requirements = [Requirement(text) for text in requires("simgap") or ()]
     except PackageNotFoundError:  # Run from the source, without an installation.
-        wanted = []
-    for each in wanted:
-        extra = _extra(str(each.marker or ""))
-        if extra == "dev" or not (each.marker is None or each.marker.evaluate({"extra": extra})):
+        requirements = []
+    for requirement in requirements:
+        extra = _extra(str(requirement.marker or ""))
+        if extra == "dev" or not (
+            requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+        ):
             continue
-        version = _version(each.name)
+        version = _version(requirement.name)
         # simgap is in no package index, so its extras cannot be installed by name.
-        remedy = f'pip install "{each.name}{each.specifier}"'
+        remedy = f'pip install "{requirement.name}{requirement.specifier}"'
         missing = None if version else f"not installed ({remedy})"
-        if version and not each.specifier.contains(version, prereleases=True):
-            missing = f"expected {each.specifier}"
-        yield {"name": each.name, "of": extra, "version": version, "missing": missing}
+        if version and not requirement.specifier.contains(version, prereleases=True):
+            missing = f"expected {requirement.specifier}"
+        yield {"name": requirement.name, "of": extra, "version": version, "missing": missing}
 
 
 def _extra(marker: str) -> str:
@@ -158,23 +160,24 @@ def _missing(package: str, load: Callable[[], Any]) -> str | None:
     return None
 
 
-def _format_info(found: JsonDocument) -> Iterator[str]:
+def _format_info(information: JsonDocument) -> Iterator[str]:
     """Format the information as text."""
-    revision = f" ({found['revision']})" if found["revision"] else ""
-    yield f"simgap {found['simgap']}{revision}, {found['implementation']} {found['python']}"
-    memory = f", {found['memory'] / 2**30:.3g} GiB" if found["memory"] else ""
-    yield f"{found['platform']}, {found['processors']} processors{memory}"
+    revision = f" ({information['revision']})" if information["revision"] else ""
+    python = f"{information['implementation']} {information['python']}"
+    yield f"simgap {information['simgap']}{revision}, {python}"
+    memory = f", {information['memory'] / 2**30:.3g} GiB" if information["memory"] else ""
+    yield f"{information['platform']}, {information['processors']} processors{memory}"
     yield ""
-    for name, path in found["paths"].items():
+    for name, path in information["paths"].items():
         yield f"{name:14} {path or 'not set'}"
     yield ""
-    yield from (_line(engine, "engine ") for engine in found["engines"])
+    yield from (_line(engine, "engine ") for engine in information["engines"])
     yield ""
-    for package in found["packages"]:
+    for package in information["packages"]:
         yield _line(package, f"[{package['of']}] " if package["of"] else "")
 
 
-def _line(each: JsonDocument, before: str) -> str:
+def _line(each: JsonDocument, prefix: str) -> str:
     version = each["version"] or ""
     missing = f"MISSING: {each['missing']}" if each["missing"] else ""
-    return f"{before + each['name']:26} {'  '.join(filter(None, [version, missing]))}"
+    return f"{prefix + each['name']:26} {'  '.join(filter(None, [version, missing]))}"

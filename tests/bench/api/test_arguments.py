@@ -78,7 +78,7 @@ def test_an_object_that_an_argument_cannot_be_is_refused_by_name(function, name)
         (lambda: simgap.compare("ball-drop", tuners=dict), "found the class dict"),
         (
             lambda: simgap.compare("ball-drop", tuner="random"),
-            "unknown argument of compare 'tuner'; there are: ",
+            "unknown argument of compare 'tuner'; did you mean tuners",
         ),
         (
             lambda: simgap.compare("ball-drop", ["random"]),

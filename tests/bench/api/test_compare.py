@@ -107,7 +107,7 @@ def test_what_cannot_be_is_one_line_in_the_callers_language(experiment, tmp_path
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("")
     for given, message in [
-        ({"tuners": ["cma"]}, "unknown tuner 'cma'; there are: "),
+        ({"tuners": ["cma"]}, "unknown tuner 'cma'; did you mean cma_es"),
         ({"tuners": [3]}, r"tuners\[0\]: expected a name or a subclass of Tuner, found 3"),
         ({"tuners": [Halving()]}, "expected a name or a subclass of Tuner, found a Halving"),
         ({"budget": 0}, "budget: expected a whole number of at least 1, found 0"),

@@ -269,7 +269,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"hoop": 1}, "unknown entry of .shot. in experiment bounce-shot 'hoop'; there are: angle"),
+        ({"hoop": 1}, "unknown entry of .shot. in experiment bounce-shot 'hoop'; did you mean "),
         ({"balls": ["moon"]}, "unknown ball 'moon'"),
         ({"angle": 0.3}, r"shot.angle: expected \[low, high\], found 0.3"),
         ({"hoop_x": [2, 1]}, "expected 0 <= low <= high"),

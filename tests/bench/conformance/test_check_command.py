@@ -152,7 +152,6 @@ def test_unknown_name_is_one_line(capsys):
     assert main(["check", "cma_ess"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(
-        "simgap: unknown tuner, simulator, effect or diagnoser 'cma_ess'; "
-        "there are: actuator.damping, actuator.limit, actuator.stiffness, arm, backlash, ball"
+        "simgap: unknown tuner, simulator, effect or diagnoser 'cma_ess'; did you mean cma_es?"
     )
     assert error.count("\n") == 1

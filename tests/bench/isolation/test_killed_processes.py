@@ -127,7 +127,7 @@ def test_a_look_at_the_seals_is_begun_again_as_often_as_a_run(monkeypatch, kills
             case held:
                 return held
 
-    monkeypatch.setattr(sandboxed_tuner, "_seals", looked)
+    monkeypatch.setattr(sandboxed_tuner, "_find_active_layers", looked)
     # Call the undecorated function, because another test may have cached its result.
     look = sandboxed_tuner.list_active_isolation_layers.__wrapped__
     if kills < sandboxed_tuner.MAX_RETRIES:

@@ -146,7 +146,7 @@ def test_a_simulator_without_engines_is_a_system_too(tmp_path, spring):
         ({"theta": ["0.5,0.6"]}, r"expected 1 values \(restitution\), found 2"),
         ({"theta": ["restitution=high"]}, "--theta restitution=high: expected a number"),
         ({"theta": ["restitution=1", "restitution=1"]}, "restitution is given twice"),
-        ({"effects": ["drag.cubic=1"]}, "unknown effect 'drag.cubic'; there are: .*drag.linear"),
+        ({"effects": ["drag.cubic=1"]}, "unknown effect 'drag.cubic'; did you mean "),
         (
             {"effects": ["input.delay=1"]},
             "system ball cannot have effect input.delay: it has no input",
