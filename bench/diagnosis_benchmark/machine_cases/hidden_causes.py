@@ -142,8 +142,8 @@ def draw_effect_shape(
     sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED_EFFECTS else 1.0
     if effect in _MAX_COEFFICIENTS:
         return lambda s: (sign * _MAX_COEFFICIENTS[effect] * s,)
-    if effect in _SHAPES:
-        return _SHAPES[effect](typical, rng)
+    if effect in MOTION_SCALED_EFFECTS:
+        return MOTION_SCALED_EFFECTS[effect](typical, rng)
     if effect == "gravity.tilt":
         more = (0.0,) if setting.system == "arm2" else ()
         return lambda s: (0.3 * sign * s, *more)
@@ -179,7 +179,7 @@ def _stribeck(typical: dict[str, float], rng: np.random.Generator) -> Coefficien
     return lambda s: (0.3 * typical["force"] * s, 0.3 * extra * typical["force"] * s, speed)
 
 
-_SHAPES: dict[str, Callable[..., CoefficientFunction]] = {
+MOTION_SCALED_EFFECTS: dict[str, Callable[..., CoefficientFunction]] = {
     "drag.linear": _per_force(lambda typical: typical["speed"]),
     "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
     "force.bias": _per_force(lambda typical: 1.0),
@@ -189,6 +189,10 @@ _SHAPES: dict[str, Callable[..., CoefficientFunction]] = {
     "inertia.armature": lambda typical, rng: lambda s: (2.0 * typical["inertia"] * s,),
     "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
 }
+"""Functions that draw the shape of an effect from the typical scales of its joint and a generator.
+
+The scales are force, inertia, position, speed and travel.
+"""
 
 
 def draw_unmodelled_cause(

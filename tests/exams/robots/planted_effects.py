@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.diagnosis_benchmark.machine_cases.hidden_causes import MOTION_SCALED_EFFECTS
+
 JOINT = (
     "friction.coulomb", "friction.stribeck", "drag.linear", "drag.quadratic", "spring.linear",
     "inertia.armature", "force.bias", "force.ripple", "friction.direction",
@@ -85,6 +87,8 @@ def named(effect, place):
 
 def shape(effect, place, setting, rng):
     """Return a function from strength to coefficients."""
+    if effect in MOTION_SCALED_EFFECTS and effect not in SIGNED:
+        return MOTION_SCALED_EFFECTS[effect](_at(setting, place), rng)
     sign = float(rng.choice([-1.0, 1.0])) if effect in SIGNED else 1.0
     if effect in SHAPES:
         return SHAPES[effect](place, setting, rng)
@@ -102,14 +106,6 @@ def _command(setting, place):
     return np.concatenate([run.commands[place] for run in setting.fitted])
 
 
-def _per_force(bottom):
-    def far(place, setting):
-        typical = _at(setting, place)
-        return 2.0 * typical["force"] / bottom(typical)
-
-    return far
-
-
 def _drawn(place, setting):
     """Return a typical force of one drive, or the sum over all drives if there is no place."""
     if place:
@@ -118,30 +114,12 @@ def _drawn(place, setting):
 
 
 SCALES = {
-    "friction.coulomb": _per_force(lambda typical: 2.0),
-    "drag.linear": _per_force(lambda typical: typical["speed"]),
-    "drag.quadratic": _per_force(lambda typical: typical["speed"] ** 2),
-    "spring.linear": _per_force(lambda typical: typical["position"] + 0.05),
-    "force.bias": _per_force(lambda typical: 1.0),
+    "force.bias": lambda place, setting: 2.0 * _at(setting, place)["force"],
     "supply.sag": lambda place, setting: 1.0 / _drawn(place, setting),
-    "inertia.armature": lambda place, setting: 2.0 * _at(setting, place)["inertia"],
     "input.bias": lambda place, setting: float(np.ptp(_command(setting, place))) / 2,
     "servo.deadband": lambda place, setting: float(np.ptp(_command(setting, place))) / 8,
     "input.deadband": lambda place, setting: float(np.abs(_command(setting, place)).max()) / 2,
 }
-
-
-def _stribeck(place, setting, rng):
-    typical, extra = _at(setting, place), float(rng.uniform(2.0, 6.0))
-    speed = typical["speed"] * float(rng.uniform(0.15, 0.5))
-    return lambda s: (0.3 * typical["force"] * s, 0.3 * extra * typical["force"] * s, speed)
-
-
-def _ripple(place, setting, rng):
-    typical, angle = _at(setting, place), rng.uniform(0, 2 * np.pi)
-    period = float(np.clip(typical["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
-    sine, cosine = float(np.sin(angle)), float(np.cos(angle))
-    return lambda s: (2 * typical["force"] * sine * s, 2 * typical["force"] * cosine * s, period)
 
 
 def _tilt(place, setting, rng):
@@ -182,7 +160,7 @@ def _power(place, setting, rng):
 
 def _direction(place, setting, rng):
     """Return different damping for the two directions; one is at most 0.3 times the other."""
-    far = SCALES["drag.linear"](place, setting)
+    (far,) = shape("drag.linear", place, setting, rng)(1.0)
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)
     return lambda s: (far * shares[0] * s, far * shares[1] * s)
@@ -289,8 +267,6 @@ SHAPES = {
     "servo.profile": _profile,
     "input.power": _power,
     "sensor.eccentricity": _eccentric,
-    "friction.stribeck": _stribeck,
-    "force.ripple": _ripple,
     "gravity.tilt": _tilt,
     "mass.offset": _offset,
     "input.saturation": _saturation,
@@ -300,5 +276,5 @@ SHAPES = {
 def family(effect, setting, rng):
     """Return a function from strength to coefficients of different sizes for every joint."""
     shares = {joint: float(rng.uniform(0.5, 1.5)) for joint in setting.machine.joints}
-    far = {joint: SCALES[effect](joint, setting) for joint in shares}
+    far = {joint: shape(effect, joint, setting, rng)(1.0)[0] for joint in shares}
     return lambda s: {f"{effect}@{joint}": (shares[joint] * far[joint] * s,) for joint in shares}
