@@ -177,7 +177,7 @@ class ConventionComparison:
             corrected = best.hypothesis.applied(corrected)
         if not differences:
             return []
-        hypotheses = [one.hypothesis for one in differences]
+        hypotheses = [difference.hypothesis for difference in differences]
         parts = self._parts(corrected)
         explained = _log_likelihood(self._follow(parts)) + _log_scales(hypotheses, parts)
         if explained < self._log_likelihood_of_causes(corrected) + CAUSES_MARGIN:
@@ -185,7 +185,8 @@ class ConventionComparison:
         if not self._removes_missing_force(described, corrected):
             return []
         before, after = (
-            _log_likelihood(self._follow(one)) for one in _equally_long(described, corrected)
+            _log_likelihood(self._follow(difference))
+            for difference in _equally_long(described, corrected)
         )
         after += _log_scales(hypotheses, corrected)
         return differences if after > before + LOG_LIKELIHOOD_MARGIN else []

@@ -40,8 +40,8 @@ def corrected(
     }
     for kind in KINDS:
         result[kind] = dotted(result.get(kind, {}), units[kind])
-    for one in differences:
-        hypothesis = one.hypothesis
+    for difference in differences:
+        hypothesis = difference.hypothesis
         for kind in KINDS:
             before = copy.deepcopy(result[kind])
             for name, change in hypothesis.changes.items():
@@ -60,14 +60,14 @@ def _moved(
 ) -> dict[str, Any]:
     """Return the table of a signal whose values are in another column."""
     is_signal = change.source in tables
-    own = dict(tables[change.source if is_signal else name])
+    table = dict(tables[change.source if is_signal else name])
     if change.source != name:
         if not is_signal:  # A column of the log that is not used so far.
-            return {**own, "column": change.source}
-        own.setdefault("column", change.source)
-        if own["column"] == name:
-            del own["column"]
-    return own
+            return {**table, "column": change.source}
+        table.setdefault("column", change.source)
+        if table["column"] == name:
+            del table["column"]
+    return table
 
 
 def _changed(

@@ -200,7 +200,7 @@ class Hypothesis:
             tuple(signal.name for signal in self.signals),
             factors[self.signals[0].name],
             self.units[0] if self.units[0] != self.signals[0].stated else None,
-            self._says(file, factors),
+            self._sentence(file, factors),
             tuple(lines),
             before,
             after,
@@ -210,7 +210,7 @@ class Hypothesis:
         """Return the key `scale` of a signal's table, including a factor already specified."""
         return self.scale * signal.scale
 
-    def _says(self, file: str, factors: Mapping[str, float]) -> str:
+    def _sentence(self, file: str, factors: Mapping[str, float]) -> str:
         first, unit = self.signals[0], self.units[0]
         names = listed([signal.said for signal in self.signals], _NAMED)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
@@ -253,17 +253,19 @@ class Subject:
     def signals(self, channels: Sequence[str]) -> tuple[Signal, ...]:
         """Return the recorded signals with the units that the description specifies."""
         try:
-            stated = stated_columns(self.recording.path, self.kind)
+            conversions = stated_columns(self.recording.path, self.kind)
         except InputError:
             # A recording made in memory has no description and is in SI units.
-            stated = {}
+            conversions = {}
         inputs = [c for c in self.kind.inputs if c.name in self.recording.runs[0].inputs]
-        own = [c for c in self.kind.channels if c.name in channels]
-        found = []
-        for kind, declared in (("channels", own), ("inputs", inputs)):
+        declared_channels = [c for c in self.kind.channels if c.name in channels]
+        signals = []
+        for kind, declared in (("channels", declared_channels), ("inputs", inputs)):
             for c in declared:
-                found.append(Signal(c.name, kind, c.unit, *stated.get(c.name, (c.unit, 1.0, 1.0))))
-        return tuple(found)
+                signals.append(
+                    Signal(c.name, kind, c.unit, *conversions.get(c.name, (c.unit, 1.0, 1.0)))
+                )
+        return tuple(signals)
 
     def rescaled(self, factors: Mapping[str, float]) -> Recording:
         """Return the recording with signals multiplied by factors."""
@@ -293,39 +295,39 @@ def wrong_units(
     Returns:
         The fault; None if there is none, or no channel has a gross misfit.
     """
-    seen = np.isfinite(world.observed)
-    residual = np.where(seen, world.observed - base.fit.simulated, 0.0)
+    is_recorded = np.isfinite(world.observed)
+    residual = np.where(is_recorded, world.observed - base.fit.simulated, 0.0)
     shares = _shares(world, residual, noise)
     if not (shares > GROSS).any():
         return None
-    before = _rms(residual, seen, noise)
+    before = _rms(residual, is_recorded, noise)
     known = before if np.isfinite(before) else None
     signals = subject.signals(world.channels)
-    asked = list(_hypotheses(signals, _suspects(world, shares)))
+    hypotheses = list(_hypotheses(signals, _suspected_parts(world, shares)))
     excess = REMAINING * (before - 1.0)
-    good: list[tuple[Hypothesis, float]] = []
+    accepted: list[tuple[Hypothesis, float]] = []
     others: list[str] = []
-    for one in _promising(subject, asked):
-        after, missed = _fitted(subject, one.factors())
+    for hypothesis in _promising(subject, hypotheses):
+        after, missed = _fit_rescaled(subject, hypothesis.factors())
         if after - 1.0 > excess or missed > FOLLOWED:
             continue
-        how = _distinction(subject, one, after, int(seen.sum()))
-        if how == "sharp":
-            good.append((one, after))
-        elif how == "absorbed":
-            good.append((one, after))
-            others += [_BEYOND.format(name) for name in _ends(world, base.fit)]
-    if not good:
+        distinction = _distinction(subject, hypothesis, after, int(is_recorded.sum()))
+        if distinction == "sharp":
+            accepted.append((hypothesis, after))
+        elif distinction == "absorbed":
+            accepted.append((hypothesis, after))
+            others += [_BEYOND.format(name) for name in _parameters_at_bounds(world, base.fit)]
+    if not accepted:
         return None
     # Among hypotheses that fit equally well, the simplest is preferred.
-    least = min(after for _, after in good)
-    alike = [pair for pair in good if pair[1] <= EQUAL * least]
-    alike.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
-    (best, after), *others_alike = alike
+    lowest_misfit = min(after for _, after in accepted)
+    equally_good = [pair for pair in accepted if pair[1] <= EQUAL * lowest_misfit]
+    equally_good.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
+    (best, after), *others_alike = equally_good
     # Hypotheses that differ only in the sign are not alternatives.
     same = best.signals, best.units
     rest = [pair for pair in others_alike if (pair[0].signals, pair[0].units) != same]
-    others = [*(one.fault(subject.file, None, None).says for one, _ in rest), *others]
+    others = [*(hypothesis.fault(subject.file, None, None).says for hypothesis, _ in rest), *others]
     alternatives = tuple(dict.fromkeys(others))
     return replace(best.fault(subject.file, known, after), alternatives=alternatives)
 
@@ -351,28 +353,33 @@ def recognised(
         return None
     (coefficient,) = cause.coefficients.values()
     gain = 1.0 + coefficient.value
-    named = world.available_effects[cause.effect].signal
+    signal_name = world.available_effects[cause.effect].signal
     kind = "channels" if effect == "sensor.gain" else "inputs"
-    own = [s for s in subject.signals(world.channels) if s.kind == kind]
-    usual = world.simulator.system.reading(world.channels) if kind == "channels" else ""
-    signal = next((s for s in own if s.name == (named or usual)), own[0] if own else None)
+    signals = [s for s in subject.signals(world.channels) if s.kind == kind]
+    default_name = world.simulator.system.reading(world.channels) if kind == "channels" else ""
+    signal = next(
+        (s for s in signals if s.name == (signal_name or default_name)),
+        signals[0] if signals else None,
+    )
     if signal is None or not gain:
         return None
     # A sensor gain multiplies the true value, an input gain the commanded value.
     factor = 1.0 / gain if kind == "channels" else gain
-    for one in _of_one((signal,)):
-        wanted = one.factors()[signal.name]
+    for hypothesis in _hypotheses_of_one_unit((signal,)):
+        wanted = hypothesis.factors()[signal.name]
         if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
-            others = tuple(_BEYOND.format(name) for name in _ends(world, base))
-            return replace(one.fault(subject.file, None, None), alternatives=others)
+            alternatives = tuple(
+                _BEYOND.format(name) for name in _parameters_at_bounds(world, base)
+            )
+            return replace(hypothesis.fault(subject.file, None, None), alternatives=alternatives)
     if kind == "channels" and abs(gain) <= IGNORED:
-        says = (
+        message = (
             f"The fit makes {signal.said} nearly independent of the simulation (a sensor gain of "
             f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "
             f"sign of {signal.said} in {subject.file}"
         )
-        others = tuple(_BEYOND.format(name) for name in _ends(world, base))
-        return RecordingFault((signal.name,), factor, None, says, (), None, None, others)
+        alternatives = tuple(_BEYOND.format(name) for name in _parameters_at_bounds(world, base))
+        return RecordingFault((signal.name,), factor, None, message, (), None, None, alternatives)
     return None
 
 
@@ -392,14 +399,14 @@ def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
     return replace(run, channels=scaled(run.channels), inputs=scaled(run.inputs), before=before)
 
 
-def _ends(world: RunEvaluator, fit: TrajectoryFit) -> list[str]:
+def _parameters_at_bounds(world: RunEvaluator, fit: TrajectoryFit) -> list[str]:
     """List the parameters that the base fit leaves at a bound."""
-    found = []
-    for place in fit.free.tolist():
-        parameter = world.parameters[place]
-        if bound_of(float(fit.theta[place]), *parameter.bounds) is not None:
-            found.append(parameter.name)
-    return found
+    names = []
+    for index in fit.free.tolist():
+        parameter = world.parameters[index]
+        if bound_of(float(fit.theta[index]), *parameter.bounds) is not None:
+            names.append(parameter.name)
+    return names
 
 
 def _shares(world: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
@@ -409,22 +416,22 @@ def _shares(world: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
     """
     shares = []
     for c, sigma in enumerate(noise.sigma.tolist()):
-        there = np.isfinite(world.observed[..., c])
-        moved = float(np.std(world.observed[..., c][there])) if there.any() else 0.0
+        is_recorded = np.isfinite(world.observed[..., c])
+        deviation = float(np.std(world.observed[..., c][is_recorded])) if is_recorded.any() else 0.0
         # A failed simulation counts as an infinite residual.
-        left = float(np.mean(np.nan_to_num(residual[..., c][there], nan=np.inf) ** 2))
-        beyond = max(left - sigma**2, 0.0) ** 0.5
-        shares.append(beyond / moved if moved > 3.0 * sigma else 0.0)
+        mean_square = float(np.mean(np.nan_to_num(residual[..., c][is_recorded], nan=np.inf) ** 2))
+        excess = max(mean_square - sigma**2, 0.0) ** 0.5
+        shares.append(excess / deviation if deviation > 3.0 * sigma else 0.0)
     return np.array(shares)
 
 
-def _rms(residual: Array, seen: Any, noise: NoiseModel) -> float:
-    scaled = (residual / noise.sigma)[seen]
+def _rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
+    scaled = (residual / noise.sigma)[is_recorded]
     rms = float(np.sqrt(np.mean(np.square(scaled)))) if scaled.size else 0.0
     return rms if np.isfinite(rms) else np.inf
 
 
-def _suspects(world: RunEvaluator, shares: Array) -> frozenset[str] | None:
+def _suspected_parts(world: RunEvaluator, shares: Array) -> frozenset[str] | None:
     """Return the joints and actuators of a robot to check; None for other systems: check all."""
     if not world.kind.has_model:
         return None
@@ -443,13 +450,13 @@ def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> I
     """
     for signal in signals:
         if suspects is None or signal.name.partition(".")[2] in suspects:
-            yield from _of_one((signal,))
+            yield from _hypotheses_of_one_unit((signal,))
     by_unit: dict[tuple[str, str, str], list[Signal]] = {}
     for signal in signals:
         by_unit.setdefault((signal.kind, signal.si, signal.stated), []).append(signal)
     for alike in by_unit.values():
         if len(alike) > 1:
-            yield from _of_one(tuple(alike))
+            yield from _hypotheses_of_one_unit(tuple(alike))
     for units in _TOGETHER:
         either = [s for s in signals if s.si in units]
         for wanted in (units, {si: si for si in units}):
@@ -460,42 +467,44 @@ def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> I
             si = either[0].si
             stated = tuple(s.stated for s in either)
             yield Hypothesis(tuple(either), stated, 1.0 / UNITS[si][units[si]])
-    yield from _reversed(signals, suspects)
+    yield from _reversed_joints(signals, suspects)
 
 
-def _of_one(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
+def _hypotheses_of_one_unit(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
     """Yield the hypotheses of signals that share a unit."""
     first = signals[0]
-    own = (first.stated,) * len(signals)
-    yield Hypothesis(signals, own, -1.0)
+    stated_units = (first.stated,) * len(signals)
+    yield Hypothesis(signals, stated_units, -1.0)
     units = UNITS.get(first.si, {})
     stated = abs(first.gain / first.scale)
-    reached = {1.0}
+    tested_factors = {1.0}
     for unit, gain in units.items():
         if unit != first.stated and not math.isclose(gain, stated, rel_tol=1e-6):
             yield Hypothesis(signals, (unit,) * len(signals))
             yield Hypothesis(signals, (unit,) * len(signals), -1.0)
-            reached.add(gain / stated)
+            tested_factors.add(gain / stated)
     # These factors undo a conversion that was made twice.
     for factor in [*(1.0 / gain for gain in units.values()), *([1e3, 1e-3] if not units else [])]:
-        if not any(math.isclose(factor, known, rel_tol=CLOSE) for known in reached):
-            yield Hypothesis(signals, own, factor)
-            yield Hypothesis(signals, own, -factor)
+        if not any(math.isclose(factor, known, rel_tol=CLOSE) for known in tested_factors):
+            yield Hypothesis(signals, stated_units, factor)
+            yield Hypothesis(signals, stated_units, -factor)
 
 
-def _reversed(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
+def _reversed_joints(
+    signals: Sequence[Signal], suspects: frozenset[str] | None
+) -> Iterator[Hypothesis]:
     """Yield hypotheses of joints with reversed direction: all their channels change sign."""
     joints: dict[str, list[Signal]] = {}
     for signal in signals:
         quantity, _, joint = signal.name.partition(".")
         if signal.kind == "channels" and quantity in ("q", "qd", "tau"):
             joints.setdefault(joint, []).append(signal)
-    for joint, own in joints.items():
-        if len(own) > 1 and (suspects is None or joint in suspects):
-            yield Hypothesis(tuple(own), tuple(s.stated for s in own), -1.0)
+    for joint, joint_signals in joints.items():
+        if len(joint_signals) > 1 and (suspects is None or joint in suspects):
+            yield Hypothesis(tuple(joint_signals), tuple(s.stated for s in joint_signals), -1.0)
 
 
-def _promising(subject: Subject, asked: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Select the hypotheses that fit best from the starts of the base fit.
 
     They are screened by the beginning of the runs, where wrong parameters matter least, and then by
@@ -510,8 +519,8 @@ def _promising(subject: Subject, asked: Sequence[Hypothesis]) -> list[Hypothesis
             world.close()
         return [those[i] for i in np.argsort(scores, kind="stable").tolist()]
 
-    first = best(asked, BEGINNING)[:SCREENED]
-    return list(dict.fromkeys([*first[:TRIED], *best(first, 1.0)[:TRIED]]))
+    screened = best(hypotheses, BEGINNING)[:SCREENED]
+    return list(dict.fromkeys([*screened[:TRIED], *best(screened, 1.0)[:TRIED]]))
 
 
 def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[RunEvaluator, NoiseModel]:
@@ -521,7 +530,7 @@ def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[RunEvaluator
     return world, NoiseModel(sigma, np.zeros(len(sigma)))
 
 
-def _fitted(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
+def _fit_rescaled(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
     """Fit the base model to the rescaled recording.
 
     Returns:
@@ -529,20 +538,20 @@ def _fitted(subject: Subject, factors: Mapping[str, float]) -> tuple[float, floa
     """
     world, noise = _world(subject, factors)
     fit = fit_base_model(world, noise).fit
-    seen = np.isfinite(world.observed)
-    residual = np.where(seen, world.observed - fit.simulated, 0.0)
+    is_recorded = np.isfinite(world.observed)
+    residual = np.where(is_recorded, world.observed - fit.simulated, 0.0)
     world.close()
-    return _rms(residual, seen, noise), float(_shares(world, residual, noise).max())
+    return _rms(residual, is_recorded, noise), float(_shares(world, residual, noise).max())
 
 
 def _distinction(
-    subject: Subject, one: Hypothesis, after: float, samples: int
+    subject: Subject, hypothesis: Hypothesis, after: float, samples: int
 ) -> Literal["sharp", "absorbed", "none"]:
     """Test whether a hypothesis is distinct from nearby factors, the second half of (1).
 
     Args:
         subject: Recording and simulator to check.
-        one: Hypothesis to test.
+        hypothesis: Hypothesis to test.
         after: RMS residual with the hypothesis, in units of the noise.
         samples: Number of samples.
 
@@ -551,19 +560,25 @@ def _distinction(
         an input, but its unit can be recognised; ``none`` otherwise.
     """
 
-    def left(step: float) -> float:
-        return _fitted(subject, {name: step * k for name, k in one.factors().items()})[0]
+    def residual_with_factor(step: float) -> float:
+        return _fit_rescaled(subject, {name: step * k for name, k in hypothesis.factors().items()})[
+            0
+        ]
 
-    if one.scale == -1.0 and one.units == tuple(s.stated for s in one.signals):
+    if hypothesis.scale == -1.0 and hypothesis.units == tuple(s.stated for s in hypothesis.signals):
         return "sharp"
     if after > EXPLAINED:
-        near = min(left(1.0 / NEAR), left(NEAR))
-        if near - 1.0 < FAR_BETTER * (after - 1.0):
+        nearby_residual = min(residual_with_factor(1.0 / NEAR), residual_with_factor(NEAR))
+        if nearby_residual - 1.0 < FAR_BETTER * (after - 1.0):
             return "none"
-    near = min(left(1.0 / STEP), left(STEP))
-    if 2.0 * samples * math.log(near / after) > SHARP:
+    nearby_residual = min(residual_with_factor(1.0 / STEP), residual_with_factor(STEP))
+    if 2.0 * samples * math.log(nearby_residual / after) > SHARP:
         return "sharp"
     # A factor that is not a unit cannot be recognised for an input of arbitrary scale.
-    is_unit = one.scale == 1.0 and all(signal.kind == "inputs" for signal in one.signals)
-    absorbed = is_unit and near * EQUAL > after and left(OFF) > WORSE * after
+    is_unit = hypothesis.scale == 1.0 and all(
+        signal.kind == "inputs" for signal in hypothesis.signals
+    )
+    absorbed = (
+        is_unit and nearby_residual * EQUAL > after and residual_with_factor(OFF) > WORSE * after
+    )
     return "absorbed" if absorbed else "none"

@@ -102,24 +102,24 @@ class LogColumn(NamedTuple):
 
 def split_name(text: str) -> list[str]:
     """Split a name into words: ``jointPositions[2]`` becomes joint, positions, 2."""
-    split = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
+    spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
     words = []
-    for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", split):
-        glued = _GLUED.fullmatch(part.lower())
-        words += [glued["what"], glued["command"]] if glued else [part.lower()]
+    for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", spaced):
+        joined_words = _GLUED.fullmatch(part.lower())
+        words += [joined_words["what"], joined_words["command"]] if joined_words else [part.lower()]
     return [word for word in words if word]
 
 
 def guess_role(column: LogColumn) -> Role | None:
     """Return the role of a column by its name and unit, else by its file's name, or None."""
-    own, file = _words(column)
-    if own & ROLE_KEYWORDS["command"] or (
-        file & ROLE_KEYWORDS["command"] and not own & ROLE_KEYWORDS["other"]
+    column_words, file_words = _words(column)
+    if column_words & ROLE_KEYWORDS["command"] or (
+        file_words & ROLE_KEYWORDS["command"] and not column_words & ROLE_KEYWORDS["other"]
     ):
         return "command"
     if column.quantity in _ROLE_OF_QUANTITY:
         return _ROLE_OF_QUANTITY[column.quantity]
-    return _measured(own) or _measured(file)
+    return _measured_role(column_words) or _measured_role(file_words)
 
 
 def commanded_role(column: LogColumn) -> Role | None:
@@ -131,9 +131,9 @@ def commanded_role(column: LogColumn) -> Role | None:
         return _ROLE_OF_QUANTITY[column.quantity]
     if column.quantity in ("angle", "length"):
         return "position"
-    own, file = _words(column)
+    column_words, file_words = _words(column)
     # `joint_command` gives no more information than `command`; `joint_position_command` does.
-    return _measured(own - _VAGUE) or _measured(file - _VAGUE)
+    return _measured_role(column_words - _VAGUE) or _measured_role(file_words - _VAGUE)
 
 
 def is_measured(column: LogColumn) -> bool:
@@ -148,7 +148,7 @@ def _words(column: LogColumn) -> tuple[set[str], set[str]]:
     return set(split_name(column.bare)), set(split_name(stem))
 
 
-def _measured(words: set[str]) -> Role | None:
+def _measured_role(words: set[str]) -> Role | None:
     """Return the role of a measured signal that some words indicate; None if there is none."""
     roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
     # `current` in "current position" is not an electric current, and a joint state may be a
@@ -227,14 +227,14 @@ def clocks(columns: Iterable[LogColumn]) -> list[LogColumn]:
     The order is: the stamp of a message's header, other columns with a name or unit of time, and
     increasing columns with other names.
     """
-    ranked = []
+    ranked_columns = []
     for place, column in enumerate(columns):
         words = set(split_name(column.bare))
-        named = bool(words & TIME_COLUMN_NAMES) or column.quantity == "time"
-        if _increases(column.values, MAX_REPEATED if named else 0.0):
-            rank = 0 if named and "header" in words else 1 if named else 2
-            ranked.append((rank, place, column))
-    return [column for _, _, column in sorted(ranked, key=lambda one: one[:2])]
+        is_named = bool(words & TIME_COLUMN_NAMES) or column.quantity == "time"
+        if _increases(column.values, MAX_REPEATED if is_named else 0.0):
+            rank = 0 if is_named and "header" in words else 1 if is_named else 2
+            ranked_columns.append((rank, place, column))
+    return [column for _, _, column in sorted(ranked_columns, key=lambda one: one[:2])]
 
 
 def guess_time_unit(stamps: Array) -> str | None:
@@ -261,18 +261,18 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
     Returns:
         The unit, or None if neither fits the range.
     """
-    usual, other, size = (
+    si_unit, small_unit, size = (
         ("rad", "deg", DEGREES_PER_RADIAN) if joint.kind == "hinge" else ("m", "mm", 1e3)
     )
     ends = np.array([np.nanmin(values), np.nanmax(values)])
     if joint.range is None:
         return (
-            usual
+            si_unit
             if joint.kind != "hinge" or np.abs(ends).max() <= MAX_UNLIMITED_POSITION_RAD
-            else other
+            else small_unit
         )
-    for unit, one in ((usual, 1.0), (other, size)):
-        if _within(ends / one, joint.range):
+    for unit, size_of_unit in ((si_unit, 1.0), (small_unit, size)):
+        if _within(ends / size_of_unit, joint.range):
             return unit
     return None
 

@@ -83,32 +83,32 @@ class NormalisedPositions:
 
 
 def normalised_positions(
-    log: Path, largest: float, stated: str, calibration: Path | None
+    log: Path, largest: float, stated_unit: str, calibration: Path | None
 ) -> NormalisedPositions | None:
     """Return the conversion of positions to angles; None if they are angles already.
 
     Args:
         log: Log that contains the positions.
         largest: Largest magnitude of the positions.
-        stated: Unit that the user states; empty if none is stated.
+        stated_unit: Unit that the user states; empty if none is stated.
         calibration: File that the user names; None to search one in and next to the dataset.
 
     Raises:
         InputError: Positions stated as normalised are out of range, or the file cannot be read.
     """
-    within = largest <= LARGEST
-    asked = stated == "normalised" or calibration is not None
-    if asked and not within:
+    is_within = largest <= LARGEST
+    is_requested = stated_unit == "normalised" or calibration is not None
+    if is_requested and not is_within:
         raise InputError(
             f"{log}: expected normalised positions within -100 to 100, found {largest:.4g}; leave "
             "out --calibration and --position-unit normalised"
         )
-    if calibration is None and within and not stated:
+    if calibration is None and is_within and not stated_unit:
         episode = split_episode_path(log)
         folders = _folders(episode[0]) if episode else []
         calibration = find_calibration(folders)
-        asked = calibration is not None
-    if not asked:
+        is_requested = calibration is not None
+    if not is_requested:
         return None
     motors = read_calibration(calibration) if calibration is not None else {}
     return NormalisedPositions(motors, calibration)
@@ -140,16 +140,19 @@ def may_be_normalised(recording: Recording) -> Iterator[Anomaly]:
     channels = meta.get("channels")
     if not isinstance(channels, dict) or not _episodes(description, meta):
         return
-    degrees = [
+    names_in_degrees = [
         name
-        for name, own in channels.items()
+        for name, table in channels.items()
         if name.startswith("q.")
-        and isinstance(own, dict)
-        and str(own.get("unit", "")).startswith("deg")
-        and "scale" not in own
+        and isinstance(table, dict)
+        and str(table.get("unit", "")).startswith("deg")
+        and "scale" not in table
     ]
     values = [
-        run.channels[name] for run in recording.runs for name in degrees if name in run.channels
+        run.channels[name]
+        for run in recording.runs
+        for name in names_in_degrees
+        if name in run.channels
     ]
     largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=np.inf)
     if np.degrees(largest) <= LARGEST:

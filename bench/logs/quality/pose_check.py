@@ -61,11 +61,11 @@ def check_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly
     robot: Any = kind
     for joint in robot.robot.joints:
         if joint.has_one_coordinate:
-            yield from _beyond(recording, joint)
-    yield from _servos(recording, robot.robot)
+            yield from _check_range(recording, joint)
+    yield from _check_servos(recording, robot.robot)
 
 
-def _beyond(recording: Recording, joint: Any) -> Iterator[Anomaly]:
+def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
     """Find positions far beyond a joint's limits; only the first such run is reported."""
     column = f"q.{joint.name}"
     unit, (smaller, name) = joint.unit, _SMALLER[joint.unit]
@@ -74,30 +74,32 @@ def _beyond(recording: Recording, joint: Any) -> Iterator[Anomaly]:
         if values is None or not np.isfinite(values).any():
             continue
         ends = np.array([np.nanmin(values), np.nanmax(values)])
-        found = float(ends[np.argmax(np.abs(ends))])
+        extreme = float(ends[np.argmax(np.abs(ends))])
         if joint.range is None:
-            if joint.kind == "hinge" and abs(found) > MAX_PLAUSIBLE_TURNS * 2.0 * np.pi:
-                turns = f"{abs(found) / (2.0 * np.pi):.3g} turns"
-                what = f"found {found:.4g} rad, {turns}; is the unit degrees?"
-                yield Anomaly(f"run {run.name}, column {column}: {what}", False)
+            if joint.kind == "hinge" and abs(extreme) > MAX_PLAUSIBLE_TURNS * 2.0 * np.pi:
+                turns = f"{abs(extreme) / (2.0 * np.pi):.3g} turns"
+                message = f"found {extreme:.4g} rad, {turns}; is the unit degrees?"
+                yield Anomaly(f"run {run.name}, column {column}: {message}", False)
                 return
             continue
         low, high = joint.range
         slack = MAX_RANGE_EXCESS * (high - low)
         if low - slack <= ends[0] and ends[1] <= high + slack:
-            over = np.array([low - ends[0], ends[1] - high])
-            if over.max() > RANGE_TOLERANCE * (high - low):
-                end = int(over.argmax())
-                stop = f"joint {joint.name} of the model stops at {(low, high)[end]:.4g}"
-                what = f"goes to {ends[end]:.4g} {unit}, and {stop}; is its range right?"
-                yield Anomaly(f"run {run.name}, column {column}: {what}", False)
+            excess = np.array([low - ends[0], ends[1] - high])
+            if excess.max() > RANGE_TOLERANCE * (high - low):
+                side = int(excess.argmax())
+                stop = f"joint {joint.name} of the model stops at {(low, high)[side]:.4g}"
+                message = f"goes to {ends[side]:.4g} {unit}, and {stop}; is its range right?"
+                yield Anomaly(f"run {run.name}, column {column}: {message}", False)
                 return
             continue
         scaled = smaller * ends
         fits = low - slack <= scaled[0] and scaled[1] <= high + slack
         doubt = f"is the unit {name}?" if fits else "is the unit right?"
-        what = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
-        yield Anomaly(f"run {run.name}, column {column}: {what}, found {found:.4g}; {doubt}", True)
+        message = f"expected within {low:.4g} to {high:.4g} {unit}, the joint's range"
+        yield Anomaly(
+            f"run {run.name}, column {column}: {message}, found {extreme:.4g}; {doubt}", True
+        )
         return
 
 
@@ -117,20 +119,20 @@ def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
     model = robot.compiled
     data = mujoco.MjData(model)
     joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    found = []
+    accelerations = []
     with capture_mujoco_warnings():
         for row in np.unique(np.linspace(0, run.times.size - 1, CHECKED_INSTANTS).astype(np.intp)):
             mujoco.mj_resetData(model, data)
             for joint in joints:
-                seen = run.channels.get(f"q.{joint.name}")
-                if seen is not None and np.isfinite(seen[row]):
-                    data.qpos[joint.position] = seen[row]
-                data.qfrc_applied[joint.velocity] = _at(run, f"force.{joint.name}", row)
+                positions = run.channels.get(f"q.{joint.name}")
+                if positions is not None and np.isfinite(positions[row]):
+                    data.qpos[joint.position] = positions[row]
+                data.qfrc_applied[joint.velocity] = _input_value(run, f"force.{joint.name}", row)
             for actuator in robot.actuators:
-                data.ctrl[actuator.control] = _at(run, f"u.{actuator.name}", row)
+                data.ctrl[actuator.control] = _input_value(run, f"u.{actuator.name}", row)
             mujoco.mj_forward(model, data)
-            found.append([data.qacc[joint.velocity] for joint in joints])
-    return np.array(found)
+            accelerations.append([data.qacc[joint.velocity] for joint in joints])
+    return np.array(accelerations)
 
 
 def find_contacts(
@@ -210,7 +212,7 @@ def _place(kind: type[Simulator], positions: Mapping[str, Array]) -> Iterator[An
             yield data
 
 
-def _at(run: Run, name: str, row: int) -> float:
+def _input_value(run: Run, name: str, row: int) -> float:
     return float(run.inputs[name][row]) if name in run.inputs else 0.0
 
 
@@ -221,70 +223,70 @@ class _Pair(NamedTuple):
     like: float
 
 
-def _servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
+def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
     """Find servos whose joints do not behave like a servo."""
-    driven = [
+    servo_signals = [
         (f"u.{a.name}", f"q.{a.joint}")
         for a in robot.actuators
-        if a.kind == "position" and a.joint is not None and _both(recording, a)
+        if a.kind == "position" and a.joint is not None and _has_both(recording, a)
     ]
     pairs = {
-        (command, position): _pair(recording, command, position)
-        for command, _ in driven
-        for _, position in driven
+        (command, position): _compare(recording, command, position)
+        for command, _ in servo_signals
+        for _, position in servo_signals
     }
-    for command, position in driven:
-        own = pairs[command, position]
+    for command, position in servo_signals:
+        pair = pairs[command, position]
         if (
-            own.like > MIN_FOLLOWING_CORRELATION
-            and DEGREE_SLOPE_RANGE[0] < own.slope < DEGREE_SLOPE_RANGE[1]
+            pair.like > MIN_FOLLOWING_CORRELATION
+            and DEGREE_SLOPE_RANGE[0] < pair.slope < DEGREE_SLOPE_RANGE[1]
         ):
-            far = f"{own.slope:.3g} times as far as {command} says"
-            what = f"moves {far}; is its unit degrees?"
-            yield Anomaly(f"column {position}: {what}", True)
+            ratio_text = f"{pair.slope:.3g} times as far as {command} says"
+            message = f"moves {ratio_text}; is its unit degrees?"
+            yield Anomaly(f"column {position}: {message}", True)
         elif (
-            own.like > MIN_FOLLOWING_CORRELATION
-            and 1.0 / DEGREE_SLOPE_RANGE[1] < own.slope < 1.0 / DEGREE_SLOPE_RANGE[0]
+            pair.like > MIN_FOLLOWING_CORRELATION
+            and 1.0 / DEGREE_SLOPE_RANGE[1] < pair.slope < 1.0 / DEGREE_SLOPE_RANGE[0]
         ):
-            far = f"1/{1.0 / own.slope:.3g} of what {command} says"
+            ratio_text = f"1/{1.0 / pair.slope:.3g} of what {command} says"
             yield Anomaly(
-                f"column {position}: moves {far}; is the unit of {command} degrees?", False
+                f"column {position}: moves {ratio_text}; is the unit of {command} degrees?", False
             )
-        elif own.like < -MIN_FOLLOWING_CORRELATION and own.slope < MAX_REVERSED_SLOPE:
+        elif pair.like < -MIN_FOLLOWING_CORRELATION and pair.slope < MAX_REVERSED_SLOPE:
             yield Anomaly(f"column {position}: moves against {command}; is a sign wrong?", False)
-    yield from _swapped(driven, pairs)
+    yield from _check_exchanged(servo_signals, pairs)
 
 
-def _swapped(
-    driven: list[tuple[str, str]], pairs: dict[tuple[str, str], _Pair]
+def _check_exchanged(
+    servo_signals: list[tuple[str, str]], pairs: dict[tuple[str, str], _Pair]
 ) -> Iterator[Anomaly]:
     """Find two joints that follow each other's commands and not their own."""
-    for i, (command, position) in enumerate(driven):
-        for other_command, other in driven[i + 1 :]:
-            crossed = pairs[command, other].like, pairs[other_command, position].like
-            own = pairs[command, position].like, pairs[other_command, other].like
+    for i, (command, position) in enumerate(servo_signals):
+        for other_command, other in servo_signals[i + 1 :]:
+            crossed_correlations = pairs[command, other].like, pairs[other_command, position].like
+            own_correlations = pairs[command, position].like, pairs[other_command, other].like
             if (
-                min(crossed) > MIN_FOLLOWING_CORRELATION
-                and max(map(abs, own)) < MAX_UNRELATED_CORRELATION
+                min(crossed_correlations) > MIN_FOLLOWING_CORRELATION
+                and max(map(abs, own_correlations)) < MAX_UNRELATED_CORRELATION
             ):
-                what = f"columns {position} and {other}: each follows the other's command"
-                yield Anomaly(f"{what}; are they swapped?", False)
+                subject = f"columns {position} and {other}: each follows the other's command"
+                yield Anomaly(f"{subject}; are they swapped?", False)
 
 
-def _both(recording: Recording, actuator: Any) -> bool:
+def _has_both(recording: Recording, actuator: Any) -> bool:
     """Return whether an actuator's command and its joint's position are recorded."""
     first = recording.runs[0]
     return f"u.{actuator.name}" in first.inputs and f"q.{actuator.joint}" in first.channels
 
 
-def _pair(recording: Recording, command: str, position: str) -> _Pair:
+def _compare(recording: Recording, command: str, position: str) -> _Pair:
     """Compute (1) over all runs, each run about its own means."""
     squares = np.zeros(3)
     for run in recording.runs:
         u, q = run.inputs[command], run.channels[position]
-        seen = np.isfinite(u) & np.isfinite(q)
-        if seen.sum() > 1:
-            squares += _products(u[seen], q[seen])
+        is_finite = np.isfinite(u) & np.isfinite(q)
+        if is_finite.sum() > 1:
+            squares += _products(u[is_finite], q[is_finite])
     uu, uq, qq = squares
     if min(uu, qq) <= 0 or uq == 0:
         return _Pair(1.0, 0.0)  # One of the two is constant, so nothing can be concluded.

@@ -99,12 +99,12 @@ def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anom
     for run in recording.runs:
         if run.times.size < _FEW:
             continue
-        odd = _gap(run) or _slow(recording, run, kind)
+        odd = _check_gap(run) or _check_time_scale(recording, run, kind)
         if odd is not None:
             yield odd
 
 
-def _gap(run: Run) -> Anomaly | None:
+def _check_gap(run: Run) -> Anomaly | None:
     intervals = np.diff(run.times)
     place = int(intervals.argmax())
     gap = float(intervals[place])
@@ -116,7 +116,7 @@ def _gap(run: Run) -> Anomaly | None:
     return Anomaly(f"run {run.name}: {where}, {known}; divide it there into two runs", True)
 
 
-def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
+def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | None:
     """Find a run in which every coordinate moves far more slowly or far faster than expected.
 
     All coordinates share the stamps, so a coordinate that moves as expected clears them; another
@@ -132,7 +132,7 @@ def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | No
     else:
         accelerations = _accelerations(recording, run, system)
     # A servo holds its position by force, so large forces at rest are normal.
-    servo = kind.has_model and _driven(run)
+    servo = kind.has_model and _has_inputs(run)
     sizes = {channel.name: channel.scale for channel in system.channels}
     first: Anomaly | None = None
     for column, name in enumerate(system.coordinates):
@@ -143,27 +143,33 @@ def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Anomaly | No
         pull = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
         if not (spread > MIN_MOTION_SHARE * sizes.get(name, 1.0) and pull > 0):
             continue
-        own = (spread / pull) ** 0.5  # Equation (2).
-        recorded = interval * _lag(x)
-        ratio = recorded / own
+        expected_seconds = (spread / pull) ** 0.5  # Equation (2).
+        recorded_seconds = interval * _lag(x)
+        ratio = recorded_seconds / expected_seconds
         if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
-            moves = f"{name} moves in {recorded:.3g} s as {kind.name} would within {own:.2g} s"
+            moves = (
+                f"{name} moves in {recorded_seconds:.3g} s as {kind.name} would within "
+                f"{expected_seconds:.2g} s"
+            )
             first = first or Anomaly(f"run {run.name}: {moves}; are the stamps seconds?", False)
             continue
         if ratio < TIME_UNIT_RATIO_THRESHOLD or interval < (
-            DRIVEN_SYSTEM_FACTOR * own if servo else own
+            DRIVEN_SYSTEM_FACTOR * expected_seconds if servo else expected_seconds
         ):
             return None
         unit = min(_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
-        moves = f"{name} takes {recorded:.3g} s to move as {kind.name} would within {own:.2g} s"
+        moves = (
+            f"{name} takes {recorded_seconds:.3g} s to move as {kind.name} would within "
+            f"{expected_seconds:.2g} s"
+        )
         apart = f"samples lie {interval:.3g} s apart"
         remedy = f"are the stamps {_UNITS[unit]}? then divide t by {unit:g}"
-        certain = not _driven(run) or interval >= DRIVEN_SYSTEM_FACTOR * own
+        certain = not _has_inputs(run) or interval >= DRIVEN_SYSTEM_FACTOR * expected_seconds
         first = first or Anomaly(f"run {run.name}: {moves}, and {apart}; {remedy}", certain)
     return first
 
 
-def _driven(run: Run) -> bool:
+def _has_inputs(run: Run) -> bool:
     return any(np.any(signal) for signal in run.inputs.values())
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from html import unescape
 from math import pi
 from types import SimpleNamespace
 
@@ -131,7 +132,7 @@ def test_the_first_line_is_the_correction_and_applying_it_explains_the_recording
     assert fault["unit"] == "rad"
     assert Verdict.from_document(document).to_document() == document
     page = (tmp_path / "wrong" / "report.html").read_text()
-    assert "<code>[channels.q] unit = &quot;rad&quot;</code>" in page
+    assert '<code>[channels.q] unit = "rad"</code>' in unescape(page)
 
     about = path.with_suffix(".toml")
     about.write_text(about.read_text().replace('"deg"', '"rad"'))
