@@ -142,9 +142,9 @@ def small():
     )
     work = data_layout.BatchArrays(
         order=np.array([1, 0]), parameters=np.ones((2, 1)), mass=np.ones(2), x=np.ones((2, 1)),
-        v=np.ones((2, 1)), steps=np.ones((1, 4)), inputs=np.zeros((0, 1, 4)), longest=np.ones(2),
-        planned=np.ones(2), ground=np.zeros((4, 2)), every=2, patience=np.inf,
-        kept=np.zeros((2, 3, 3)),
+        v=np.ones((2, 1)), steps=np.ones((1, 4)), inputs=np.zeros((0, 1, 4)), max_steps=np.ones(2),
+        planned_counts=np.ones(2), ground=np.zeros((4, 2)), steps_per_record=2, patience=np.inf,
+        records=np.zeros((2, 3, 3)),
     )  # fmt: skip
     return program, work, data_layout.allocate_block(7), 8, np.ones(2), np.ones(2)
 
@@ -158,7 +158,7 @@ def small():
         ("parameters", np.ones((2, 2))),
         ("steps", np.ones((3, 4))),
         ("inputs", np.zeros((1, 1, 4))),
-        ("kept", np.zeros((2, 2, 3))),
+        ("records", np.zeros((2, 2, 3))),
         ("mass", np.ones(2, dtype=np.float32)),
         ("x", np.ones((4, 1))[::2]),
         ("v", np.ones((2, 2))),

@@ -69,11 +69,11 @@ def record_flight(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffe
     time = 0.0
     impact = compute_impact_time(program, block)
     for step in range(arrays.steps.shape[1] + 1):
-        if step % arrays.every == 0:
+        if step % arrays.steps_per_record == 0:
             while impact <= time:
                 bounce(program, arrays, block, impact)
                 impact = compute_impact_time(program, block)
-            record_arc(program, arrays, block, step // arrays.every, time)
+            record_arc(program, arrays, block, step // arrays.steps_per_record, time)
         if step < arrays.steps.shape[1]:
             time += arrays.steps[row, step]
 
@@ -97,9 +97,9 @@ def record_arc(
     for k in range(d):
         v = a[V + k, 0]
         acceleration = a[K1 + k, 0]
-        arrays.kept[element, record, k] = a[X + k, 0] + s * (v + s * (0.5 * acceleration))  # (1)
-        arrays.kept[element, record, d + k] = v + s * acceleration  # (2)
-        arrays.kept[element, record, 2 * d + k] = acceleration
+        arrays.records[element, record, k] = a[X + k, 0] + s * (v + s * (0.5 * acceleration))  # (1)
+        arrays.records[element, record, d + k] = v + s * acceleration  # (2)
+        arrays.records[element, record, 2 * d + k] = acceleration
 
 
 def compute_impact_time(program: ProgramArrays, block: BlockBuffers) -> float:

@@ -102,12 +102,12 @@ class _BatchRunner:
             v=self._v,
             steps=self._steps,
             inputs=self._inputs,
-            longest=self._max_steps,
-            planned=self._planned_counts,
+            max_steps=self._max_steps,
+            planned_counts=self._planned_counts,
             ground=self._get_ground_parameters,
-            every=batch.steps_per_sample,
+            steps_per_record=batch.steps_per_sample,
             patience=self._patience,
-            kept=self.records,
+            records=self.records,
         )
         if batch.system.uniform and not any(isinstance(e, (Force, Friction)) for e, _ in effects):
             self._run(FLY_ELEMENTS, program, arrays)

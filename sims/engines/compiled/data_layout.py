@@ -57,12 +57,12 @@ class BatchArrays(NamedTuple):
         v: (L, D) initial velocity.
         steps: (L or 1, S) step sizes in seconds.
         inputs: (U, L or 1, S) inputs.
-        longest: (L,) longest step in seconds.
-        planned: (L,) number of planned steps.
+        max_steps: (L,) longest step in seconds.
+        planned_counts: (L,) number of planned steps.
         ground: (4, L) floor, restitution, friction, minimum remaining fraction of tangential speed.
-        every: number of steps between recorded states.
+        steps_per_record: number of steps between recorded states.
         patience: maximum number of steps of an element, as a multiple of the planned ones.
-        kept: (L, R, 3 D) recorded states, to be filled in.
+        records: (L, R, 3 D) recorded states, to be filled in.
     """
 
     order: IntTable
@@ -72,12 +72,12 @@ class BatchArrays(NamedTuple):
     v: FloatArray
     steps: FloatArray
     inputs: FloatArray
-    longest: FloatArray
-    planned: FloatArray
+    max_steps: FloatArray
+    planned_counts: FloatArray
     ground: FloatArray
-    every: int
+    steps_per_record: int
     patience: float
-    kept: FloatArray
+    records: FloatArray
 
 
 class BlockBuffers(NamedTuple):
@@ -219,8 +219,8 @@ def check_array_layout(
         ),
         *(
             (arrays.mass, (element_count,)),
-            (arrays.longest, (element_count,)),
-            (arrays.planned, (element_count,)),
+            (arrays.max_steps, (element_count,)),
+            (arrays.planned_counts, (element_count,)),
         ),
         *(
             (spans, (element_count,)),
@@ -232,7 +232,7 @@ def check_array_layout(
             arrays.inputs,
             (len(arrays.inputs), 1 if arrays.inputs.shape[1] == 1 else element_count, steps),
         ),
-        (arrays.kept, (element_count, steps // arrays.every + 1, 3 * d)),
+        (arrays.records, (element_count, steps // arrays.steps_per_record + 1, 3 * d)),
         *((block.r, (len(block.r), width)), (block.a, (NUMBER_ROW_COUNT, width))),
     ]
     for group, kind in ((int_arrays, np.int64), (real_arrays, np.float64)):

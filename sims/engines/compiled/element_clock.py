@@ -61,8 +61,8 @@ def load_element(
     for k in range(d):
         a[X + k, i] = arrays.x[element, k]
         a[V + k, i] = arrays.v[element, k]
-    a[MAX_STEP, i] = arrays.longest[element]
-    a[STEP_LIMIT, i] = arrays.longest[element]
+    a[MAX_STEP, i] = arrays.max_steps[element]
+    a[STEP_LIMIT, i] = arrays.max_steps[element]
     a[EVENT_DELAY, i] = np.inf
     a[MASS, i] = arrays.mass[element]
     a[FLOOR_LEVEL, i] = arrays.ground[FLOOR, element]
@@ -108,15 +108,15 @@ def record_and_check_remaining(
     step = n[STEP_INDEX, i]
     if n[IS_STEP_START, i] != 0:
         n[IS_STEP_START, i] = 0
-        if step % arrays.every == 0:
-            record_state(program, arrays, block, i, step // arrays.every)
+        if step % arrays.steps_per_record == 0:
+            record_state(program, arrays, block, i, step // arrays.steps_per_record)
         if step == arrays.steps.shape[1]:
             return False
     if arrays.patience < np.inf and a[REMAINING_TIME, i] > 0.0:
         a[STEP_COUNT, i] += 1.0
-        if a[STEP_COUNT, i] > arrays.patience * arrays.planned[n[ELEMENT, i]]:
+        if a[STEP_COUNT, i] > arrays.patience * arrays.planned_counts[n[ELEMENT, i]]:
             # Failed elements are recognised by their last recorded state.
-            arrays.kept[n[ELEMENT, i], arrays.kept.shape[1] - 1, :] = np.nan
+            arrays.records[n[ELEMENT, i], arrays.records.shape[1] - 1, :] = np.nan
             return False
     return True
 
@@ -137,9 +137,9 @@ def record_state(
     d = program.flags[DIMENSIONS]
     element = block.n[ELEMENT, i]
     for k in range(d):
-        arrays.kept[element, record, k] = a[X + k, i]
-        arrays.kept[element, record, d + k] = a[V + k, i]
-        arrays.kept[element, record, 2 * d + k] = a[K1 + k, i]
+        arrays.records[element, record, k] = a[X + k, i]
+        arrays.records[element, record, d + k] = a[V + k, i]
+        arrays.records[element, record, 2 * d + k] = a[K1 + k, i]
 
 
 def next_step(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:

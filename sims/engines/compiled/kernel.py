@@ -149,12 +149,24 @@ class CompiledKernel:
             columns,
             *arrays.steps.shape,
         ]
-        sizes += [*arrays.inputs.shape[:2], arrays.every, len(block.r), w, block.r.shape[1]]
+        sizes += [
+            *arrays.inputs.shape[:2],
+            arrays.steps_per_record,
+            len(block.r),
+            w,
+            block.r.shape[1],
+        ]
         limits = np.array([arrays.patience, max_phase])
         ints = [*program, arrays.order, block.n]
         reals = [
             *(block.r, block.a, arrays.parameters, arrays.mass, arrays.x, arrays.v, arrays.steps),
-            *(arrays.inputs, arrays.longest, arrays.planned, arrays.ground, arrays.kept),
+            *(
+                arrays.inputs,
+                arrays.max_steps,
+                arrays.planned_counts,
+                arrays.ground,
+                arrays.records,
+            ),
             *(spans, divisions, limits),
         ]
         arguments = np.array([*sizes, *map(_address, ints), *map(_address, reals)], dtype=np.int64)

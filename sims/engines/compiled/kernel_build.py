@@ -222,7 +222,8 @@ def _get_argument_types(numba: Any) -> dict[str, Any]:
         "ProgramArrays": data_layout.ProgramArrays(whole_table, whole, whole, whole, whole),
         "BatchArrays": data_layout.BatchArrays(
             order=whole, parameters=table, mass=row, x=table, v=table, steps=table, inputs=box,
-            longest=row, planned=row, ground=table, every=1, patience=1.0, kept=box,
+            max_steps=row, planned_counts=row, ground=table, steps_per_record=1, patience=1.0,
+            records=box,
         ),
         "BlockBuffers": data_layout.BlockBuffers(table, table, whole_table),
     }  # fmt: skip

@@ -49,9 +49,9 @@ def step_in_lockstep(
         for step in range(step_count + 1):
             evaluate_forces(program, block, w)
             compute_frictionless_acceleration(program, block, w, K1)
-            if step % arrays.every == 0:
+            if step % arrays.steps_per_record == 0:
                 for i in range(count):
-                    record_state(program, arrays, block, i, step // arrays.every)
+                    record_state(program, arrays, block, i, step // arrays.steps_per_record)
             if step == step_count:
                 break
             h = arrays.steps[0, step]
