@@ -30,6 +30,7 @@ from bench.benchmark.storage.result_folder import CONFIGURATION_FILE, read_confi
 from bench.core.plugin_registries import simulators
 from bench.diagnosis.score_extended import score_model
 from bench.diagnosis.verdict import Verdict
+from bench.misspecification.calibration import MODEL_LABELS
 from bench.schemas import find_violations
 from bench.studies.study import list_study_folders
 from bench.studies.verification import VerificationFailure, VerificationResult, verify_comparison
@@ -96,7 +97,7 @@ def write_bundle(
         if recordings:
             raise InputError("--with: recordings go with an explanation; leave them out")
         files |= _list_plugin_files(folder)
-        command = f"simgap compare {name}/{CONFIGURATION_FILE}"
+        command = _format_compare_command(folder, name)
     else:
         files |= _list_recording_files(recordings)
         command = _format_explain_command(folder)
@@ -146,6 +147,24 @@ def _list_plugin_files(folder: Path) -> dict[str, Path]:
     ]
     existing_files = [file for file in dict.fromkeys(plugins) if file.is_file()]
     return {f"{_PLUGINS}/{file.name}": file for file in existing_files}
+
+
+def _list_comparison_folders(folder: Path) -> Iterator[Path]:
+    """Yield the folders of the comparisons in a folder; a study of two has both in its own."""
+    for part in list_study_folders(folder):
+        models = [part / label for label in MODEL_LABELS if (part / label).is_dir()]
+        yield from models or [part]
+
+
+def _format_compare_command(folder: Path, name: str) -> str:
+    """Build the command that repeats a comparison, or a suite's comparisons of some methods."""
+    configurations = [read_configuration(part) for part in list_study_folders(folder)]
+    experiment = configurations[0].experiment
+    if not experiment.suite or experiment.diagnosis:
+        return f"simgap compare {name}/{CONFIGURATION_FILE}"
+    plugins = [f"--plugin {name}/{_PLUGINS}/{Path(f).name}" for f in configurations[0].plugins]
+    tuners = ",".join(entry.label for entry in experiment.tuners)
+    return " ".join(["simgap compare suite", *plugins, f"--tuners {tuners}"])
 
 
 def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
@@ -249,7 +268,7 @@ def verify_archive(
             verify_comparison(part, say, plugins, every, own_plugins=False)._replace(
                 folder=archive / part.relative_to(unpacked.folder.parent)
             )
-            for part in list_study_folders(unpacked.folder)
+            for part in _list_comparison_folders(unpacked.folder)
         ]
         return ArchiveVerification(about, [], compared, None)
 

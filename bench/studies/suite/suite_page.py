@@ -185,7 +185,8 @@ def _build_cells(
             )  # fmt: skip
             parts.append(frame[np.isfinite(frame["median"])])
     page.add_table("curves", pd.concat(parts, ignore_index=True), _DIGITS)
-    across = Axis("simulations used on the target", "symlog", ("symlog", "linear"))
+    ticks = tuple(float(k) for k in (0, *tables.checkpoints))
+    across = Axis("simulations used on the target", "symlog", ("symlog", "linear"), ticks)
     cells = []
     for row in tables.suite.cells.itertuples():
         cell = str(row.cell)

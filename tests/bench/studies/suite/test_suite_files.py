@@ -11,6 +11,7 @@ import pytest
 from bench.benchmark.problem.experiment import expand_sweep, load_experiment
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
+from bench.studies.archive_bundle import verify_archive, write_bundle
 from bench.studies.study import begin_studies, report_jointly
 from bench.studies.suite import suite_report
 from bench.studies.suite.suite_runs import read_suite_runs, write_suite_runs
@@ -154,6 +155,9 @@ def test_a_method_of_ones_own_is_ranked_among_the_stored_ones(tmp_path, small_su
         text = (tmp_path / "own" / cell / "experiment.toml").read_text()
         assert 'suite = "suite 1"' in text
     assert set(read_suite_runs(tmp_path / "own").cells["suite"]) == {"suite 1"}
+    bundle = write_bundle(tmp_path / "own", tmp_path / "own.zip")
+    assert bundle.command == "simgap compare suite --plugin own/plugins/mine.py --tuners mine"
+    assert verify_archive(bundle.archive, lambda line: None, [str(plugin)]).is_consistent
 
 
 def test_a_cell_comes_out_again_with_its_salt(tmp_path, small_suite, monkeypatch):
