@@ -229,7 +229,9 @@ class Comparison:
 
     def _begun(self) -> ExperimentRun:
         if self.results is None:
-            raise InputError(f"{self.folder}: opened to be looked at; resume it to make the rest")
+            raise InputError(
+                f"{self.folder}: this study is read-only; resume it to run what is missing"
+            )
         return self.results
 
     def _write_spectra(self, results: ExperimentRun) -> None:

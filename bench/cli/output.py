@@ -32,10 +32,10 @@ EXIT_INTERRUPTED = 130
 """Exit code of a command that was interrupted, by the convention of shells."""
 EXIT_CODES = {
     EXIT_OK: "done",
-    EXIT_PROBLEMS_FOUND: "done, and something failed in it: a run, a check, a claim; "
-    "or what was asked to make it so",
-    EXIT_ERROR: "a fault of the input, told in one line; nothing was half-written",
-    EXIT_INTERRUPTED: "interrupted; what was finished is kept",
+    EXIT_PROBLEMS_FOUND: "done, but a run, a check or a claim failed, or a condition was met that "
+    "an option names",
+    EXIT_ERROR: "an error in the input, described in one line; no incomplete results are left",
+    EXIT_INTERRUPTED: "interrupted; finished results are kept",
 }
 """Meaning of every exit code."""
 

@@ -224,7 +224,7 @@ def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandRe
         say(line)
     code = EXIT_PROBLEMS_FOUND if any(row.error for row in rows) else EXIT_OK
     if remaining:
-        say(f"{remaining} of {len(logs)} left: the same command goes on with them")
+        say(f"{remaining} of {len(logs)} recordings remain; run the same command again to continue")
         code = EXIT_INTERRUPTED
     results = [{**asdict(row), "folder": folders[row.log]} for row in rows]
     document = {

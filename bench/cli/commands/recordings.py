@@ -171,7 +171,7 @@ def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
         f"{options.out}: {runs} of {options.seconds:g} s at {options.rate:g} Hz, channels "
         f"{', '.join(first.channels)}"
     )
-    say(f"{truth}: what made it")
+    say(f"{truth}: its true parameters")
     return CommandResult(
         {
             "recording": options.out,

@@ -24,8 +24,8 @@ def add_status_arguments(status: argparse.ArgumentParser) -> None:
         metavar="DIR",
         type=parse_path,
         nargs="?",
-        help="the folder of a comparison or bounce shot; without it: which seals hold around "
-        "tuners on this machine",
+        help="the folder of a comparison or bounce shot; without it: which isolation "
+        "layers of tuners are active on this machine",
     )
     status.add_argument("--runs", action="store_true", help="list every run or shot")
     status.set_defaults(command=_status)
@@ -50,9 +50,9 @@ def _print_isolation_layers(say: PrintLine) -> list[JsonDocument]:
     from bench.benchmark.runner.sandboxed_tuner import list_active_isolation_layers
 
     there = list_active_isolation_layers()
-    say("seals around a tuner's process on this machine (docs/sealing.md)")
+    say("isolation layers of a tuner's process on this machine (docs/sealing.md)")
     for name, says in ISOLATION_LAYERS.items():
-        say(f"  {name:10} {'holds' if name in there else 'DOES NOT HOLD':14} {says}")
+        say(f"  {name:10} {'active' if name in there else 'NOT AVAILABLE':14} {says}")
     return [
         {"name": name, "holds": name in there, "says": says}
         for name, says in ISOLATION_LAYERS.items()
@@ -79,11 +79,11 @@ def _describe_isolation(study: Study) -> JsonDocument:
 def _format_isolation(seal: JsonDocument) -> str:
     """Format the isolation of a study as text."""
     if seal["trusted"]:
-        return "trusted: its tuners run inside the harness"
+        return "trusted: its tuners run without isolation"
     missing, salt = seal["missing"], seal["salt_sha256"]
-    kept = "sealed: a process for each "
+    kept = "isolated: a process for each "
     kept += "run" if seal["isolation"] == "run" else "tuner and seed"
-    without = f", WITHOUT the seals {', '.join(missing)}" if missing else ", every seal holds"
+    without = f", WITHOUT the layers {', '.join(missing)}" if missing else ", all layers active"
     told = f"; salt with SHA-256 {salt[:12]}" if salt else "; its salt is public"
     return kept + without + told + (", revealed" if seal["revealed"] else "")
 

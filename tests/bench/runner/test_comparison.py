@@ -305,7 +305,7 @@ def test_one_function_tells_which_study_an_experiment_or_a_folder_is(tmp_path, s
     assert isinstance(there, Comparison)
     standing = there.status()
     assert (standing.finished, len(standing.ends), standing.is_complete) == (0, 16, False)
-    with pytest.raises(InputError, match="opened to be looked at; resume it"):
+    with pytest.raises(InputError, match="this study is read-only; resume it"):
         there.run()
 
 

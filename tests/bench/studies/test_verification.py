@@ -179,10 +179,10 @@ def test_a_salt_beside_the_experiments_own_is_refused(tmp_path, capsys):
 def test_seals_of_this_machine_and_of_a_folder_are_said(sound, capsys):
     assert main(["status"]) == 0
     said = capsys.readouterr().out
-    assert "process    holds" in said
+    assert "process    active" in said
     assert main(["status", str(sound)]) == 0
     said = capsys.readouterr().out
-    assert "sealed: a process for each run" in said
+    assert "isolated: a process for each run" in said
     assert "revealed" in said
 
 
@@ -212,4 +212,4 @@ def test_trusted_runs_are_marked_in_every_table_and_figure(tmp_path, capsys, mon
             assert pd.read_csv(path).get("trusted", pd.Series([False])).all(), path.name
     assert pd.read_parquet(tmp_path / "out" / "runs.parquet")["trusted"].all()
     assert main(["status", str(tmp_path / "out")]) == 0
-    assert "trusted: its tuners run inside the harness" in capsys.readouterr().out
+    assert "trusted: its tuners run without isolation" in capsys.readouterr().out
