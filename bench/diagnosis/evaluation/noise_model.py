@@ -62,12 +62,6 @@ class NoiseModel:
     sigma: Array
     phi: Array
 
-    def with_correlation(self, phi: Array | float) -> NoiseModel:
-        """Return the noise with other correlations."""
-        correlations = np.asarray(phi, dtype=np.float64)
-        spread = np.broadcast_to(correlations, self.sigma.shape)
-        return NoiseModel(self.sigma, spread.copy())
-
 
 def _unit(phi: float) -> NoiseModel:
     """Return the noise of one channel with the given correlation and variance one."""

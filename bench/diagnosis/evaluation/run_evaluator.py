@@ -232,12 +232,6 @@ class RunEvaluator:
         gaps = [np.diff(track.scenario.times) for track in self.tracks]
         return min((float(np.median(gap)) for gap in gaps if gap.size), default=0.0)
 
-    @property
-    def max_travel(self) -> float:
-        """Largest range of the primary coordinate within one run; 0 if it is not recorded."""
-        system = self.simulator.system
-        return self._range(system.coordinates[system.primary] if system.coordinates else "")
-
     def get_effect_travel(self, effect: str) -> float:
         """Return the largest range within one run of the coordinate that an effect acts on.
 

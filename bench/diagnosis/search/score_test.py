@@ -169,27 +169,6 @@ def compute_calibrated_scores(
     return test.compute_scores(residual, draw(SURROGATE_COUNT_FACTOR * count))
 
 
-def score_candidates(
-    at: TrajectoryFit,
-    residual: Array,
-    directions: DirectionSet,
-    seen: Mask,
-    noise: NoiseModel,
-    surrogate: Array | None = None,
-) -> CandidateScores:
-    """Score every effect once, with a new `ScoreTest`.
-
-    Args:
-        at: the model that the directions refer to.
-        residual: (R, T, C) residual of the model, zero where no sample exists.
-        directions: directions of the candidates.
-        seen: (R, T, C) mask of available samples.
-        noise: its sigma weights the channels.
-        surrogate: (S, R, T, C) surrogate residuals; None to omit the p-value.
-    """
-    return ScoreTest(at, directions, seen, noise).compute_scores(residual, surrogate)
-
-
 class _BestScores:
     """Best likelihood of every group and effect over the correlations so far.
 

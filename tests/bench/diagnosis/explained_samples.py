@@ -60,9 +60,9 @@ def world(recorded, **options):
 
 def white(world, sigma):
     """Return a white noise model with one sigma for all channels or one per channel."""
-    return NoiseModel(
-        np.broadcast_to(np.asarray(sigma, dtype=float), (len(world.channels),)).copy(), np.zeros(1)
-    ).with_correlation(0.0)
+    count = len(world.channels)
+    values = np.broadcast_to(np.asarray(sigma, dtype=float), (count,)).copy()
+    return NoiseModel(values, np.zeros(count))
 
 
 def marked(world, stated):

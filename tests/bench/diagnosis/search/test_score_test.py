@@ -11,15 +11,20 @@ from bench.diagnosis.evaluation.surrogate_residuals import draw_surrogates
 from bench.diagnosis.search.candidate_directions import CandidateDirection, DirectionSet
 from bench.diagnosis.search.explained_variance import compute_explained_squares, group_directions
 from bench.diagnosis.search.score_test import (
+    ScoreTest,
     compute_calibrated_scores,
     estimate_tail_p_value,
-    score_candidates,
 )
 from bench.diagnosis.search.whitened_products import InnerProducts, WhiteningDesign
 from tests.bench.diagnosis.explained_samples import correlated, covariance_of, linear_fit
 
 SIGMA = np.array([0.5, 2.0])
 RUNS, SAMPLES, Q, STATES, K = 3, 14, 2, 2, 5
+
+
+def score_candidates(at, residual, directions, seen, noise, surrogate=None):
+    """Score every effect once, with a new test."""
+    return ScoreTest(at, directions, seen, noise).compute_scores(residual, surrogate)
 
 
 def problem(seed=0, holes=0.0):
