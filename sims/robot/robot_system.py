@@ -110,11 +110,13 @@ class RobotSystem(System):
 
     @classmethod
     def is_free(cls, effect: type[Effect]) -> bool:
-        """Return whether a coefficient of an effect is a parameter; then it cannot be a cause."""
-        members = getattr(effect, "members", ())
-        return effect.name in cls.freed_parameters or any(
-            m.name in cls.freed_parameters for m in members
-        )
+        """Return whether a coefficient of an effect is a parameter; then it cannot be a cause.
+
+        The mass of a payload is also one of a body whose mass is free.
+        """
+        names = {effect.name, *(member.name for member in getattr(effect, "members", ()))}
+        names |= {name.replace("payload@", "mass.scale@") for name in names}
+        return not cls.freed_parameters.isdisjoint(names)
 
     @classmethod
     def effect(cls, name: str) -> type[Effect] | None:

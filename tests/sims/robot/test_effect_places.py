@@ -156,13 +156,22 @@ def test_a_place_that_does_not_exist_lists_those_that_do(rail):
         ("kp@m_shoulder", ["actuator.stiffness@m_shoulder"]),
     ],
 )
-def test_what_is_free_is_no_cause(word, names):
+def test_free_parameters_are_not_causes(word, names):
     kind = make_robot_simulator(made(ARM), [word])
     assert [p.name for p in kind.parameters] == names
     there = effects.list_effects_for(kind.system)
     assert not there.keys() & {*names, f"{names[0].partition('@')[0]}@*"}
     # A file may still name it: the extended simulator of a log for which it was not free.
     assert kind.system.effect(names[0]).name == names[0]
+
+
+def test_a_payload_is_not_proposed_on_a_body_whose_mass_is_free():
+    kind = make_robot_simulator(made(ARM), ["mass@fore"])
+    usual = effects.list_effects_for(make_robot_simulator(made(ARM)).system)
+    assert {"payload@fore", "payload@upper"} <= usual.keys()
+    there = effects.list_effects_for(kind.system)
+    assert "payload@fore" not in there
+    assert {"payload@upper", "mass.offset@fore"} <= there.keys()
 
 
 def test_a_family_contains_its_members_and_what_they_contain(arm):
