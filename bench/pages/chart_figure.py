@@ -226,7 +226,10 @@ def _draw_span(axis: Axes, span: AxisSpan) -> None:
 
 
 def _draw_rules(axis: Axes, rules: Sequence[ReferenceLine], horizontal: bool) -> None:
-    """Draw dashed lines with their texts, unless they are outside the panel."""
+    """Draw dashed lines with their texts, unless they are outside the panel.
+
+    In a horizontal figure, a text up the line would cross the rows: only its name is written.
+    """
     line: dict[str, Any] = {"color": CAPTION_GREY, "linewidth": 0.8, "linestyle": (0, (2, 2))}
     text: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7.5}
     for rule in rules:
@@ -240,7 +243,8 @@ def _draw_rules(axis: Axes, rules: Sequence[ReferenceLine], horizontal: bool) ->
                 "xy": (rule.value, 0),
                 "xycoords": ("data", "axes fraction"),
             }
-            axis.annotate(rule.says, xytext=(-9, 4), rotation=90, **position, **text)
+            says = rule.says.partition(":")[0] if horizontal else rule.says
+            axis.annotate(says, xytext=(-9, 4), rotation=90, **position, **text)
         else:
             axis.axhline(rule.value, **line)
             position = {"xy": (0, rule.value), "xycoords": ("axes fraction", "data")}

@@ -114,7 +114,7 @@ def draw_diagram(axes: Axes, diagram: DriveDiagram) -> None:
     axes.set(
         xlim=(-reach, reach),
         ylim=(-reach, reach),
-        xlabel=f"what it works against [{unit}]",
+        xlabel=f"load [{unit}]",
         ylabel=f"force of the motor [{unit}]",
     )
     axes.set_title("Drive and back-drive, at rest", fontsize=9, loc="left")

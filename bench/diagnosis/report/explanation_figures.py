@@ -333,7 +333,7 @@ def _where(report: DiagnosisReportData) -> Figure:
     channel_text = (
         f" of {sanitise(profiles[0].channel, LONGEST_NAME)}" if len(channels) == 1 else ""
     )
-    layout.heading(profiles_from, f"What the residual{channel_text} follows: means in bins")
+    layout.heading(profiles_from, f"Residual{channel_text} against other variables: means in bins")
     note = "residual: measured − simulated; bars: ±2 standard errors"
     figure.text(layout.across(profiles_from), layout.up(0.2), note, fontsize=8.5, va="center")
     grid = figure.add_gridspec(

@@ -55,7 +55,7 @@ EXTENDED_MODEL_MARKER: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "c
 _SPAN_FOR_LOG = 8.0
 """Minimum ratio of the largest to the smallest value for a logarithmic axis."""
 _FLOOR = "1: noise floor"
-_ALONE = "what noise alone gives"
+_WHITE_NOISE = "range for white noise"
 _WIDEST = 0.9
 """Maximum half-length of the bar for the noise about 1, so that it ends above 0."""
 _NEXT = 1.0
@@ -102,7 +102,7 @@ def select_gap_locations(places: Sequence[GapLocation]) -> list[GapLocation]:
 def draw_gap_location_panel(
     axis: Axes, places: Sequence[GapLocation], report: DiagnosisReportData
 ) -> None:
-    """Draw the RMS by run, channel and phase, with the range that noise alone would give.
+    """Draw the RMS by run, channel and phase, with the range for white noise.
 
     Args:
         axis: Axes to draw on.
@@ -114,7 +114,13 @@ def draw_gap_location_panel(
     noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
     floor = np.ones(len(rows))
     axis.errorbar(
-        floor, rows, xerr=noise, fmt="none", ecolor=CHANCE_LEVEL_GREY, elinewidth=7, label=_ALONE
+        floor,
+        rows,
+        xerr=noise,
+        fmt="none",
+        ecolor=CHANCE_LEVEL_GREY,
+        elinewidth=7,
+        label=_WHITE_NOISE,
     )
     axis.axvline(1.0, color=NEUTRAL_MARK, linewidth=1.0, linestyle=":", label=_FLOOR)
     before_values = [p.before for p in places]
@@ -165,7 +171,7 @@ def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:
     """Return handles and labels of a legend in reading order."""
     handles, labels = axis.get_legend_handles_labels()
     by_label = dict(zip(labels, handles, strict=True))
-    order = ("before", "simulated (tuned)", "after", _FLOOR, _ALONE)
+    order = ("before", "simulated (tuned)", "after", _FLOOR, _WHITE_NOISE)
     present = [name for name in order if name in by_label]
     return [by_label[name] for name in present], present
 
