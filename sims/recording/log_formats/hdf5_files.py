@@ -118,7 +118,9 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _items(group: Any) -> list[tuple[str, Any]]:
     """Return the members of a group; empty if it is not a group."""
-    return list(group.items()) if hasattr(group, "items") else []
+    members = group.items() if hasattr(group, "items") else []
+    # h5py returns a name that is not UTF-8 as bytes.
+    return [(name, member) for name, member in members if isinstance(name, str)]
 
 
 def _groups(file: Any) -> list[str]:
