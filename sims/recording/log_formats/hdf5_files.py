@@ -81,7 +81,8 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
         datasets: dict[str, Any] = {}
         own.visititems(lambda name, one: datasets.update({name: one}))
         for name, one in datasets.items():
-            if not hasattr(one, "dtype"):
+            # A name that is not UTF-8 comes as bytes.
+            if not hasattr(one, "dtype") or not isinstance(name, str):
                 continue
             wide = one.ndim > 1 and one.shape[1] > MAX_COLUMNS
             if one.dtype.kind not in "fiub" or one.ndim not in (1, 2) or wide:
