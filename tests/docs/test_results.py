@@ -59,7 +59,12 @@ def told(heading, below=PAGE):
 def told_always(heading, below=PAGE):
     """Return the names of `told` without optional keys."""
     rows = tables(section(below, heading))[0][1:]
-    return [name for row in rows if "left out where" not in row[-1] for name in quoted(row[0])]
+    return [
+        name
+        for row in rows
+        if not re.search("left out where|absent if", row[-1])
+        for name in quoted(row[0])
+    ]
 
 
 def written_out(names, **placeholders):
