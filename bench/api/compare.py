@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from bench.api.comparison_options import ComparisonOptions, StudyOptions
 from bench.benchmark.figures import comparison_figures, comparison_view
+from bench.benchmark.problem.availability import leave_out_missing_problems
 from bench.benchmark.problem.experiment import Experiment, list_experiment_names, load_experiment
 from bench.benchmark.problem.model_file_simulator import complete_robot_experiment
 from bench.benchmark.problem.robot_experiment import make_robot_experiment
@@ -115,7 +117,8 @@ def sweep(experiment: ExperimentSource, options: StudyOptions) -> list[Compariso
     """Run one by one the experiments of a ``[sweep]`` or of an ``experiments`` list.
 
     Args:
-        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`. Problems of a
+            suite that cannot run on this machine are left out, with a warning.
         options: Keyword arguments, the attributes of `bench.api.comparison_options.StudyOptions`;
             all experiments share the salt, so that they have the same targets.
 
@@ -126,7 +129,10 @@ def sweep(experiment: ExperimentSource, options: StudyOptions) -> list[Compariso
         InputError: An argument is invalid; the message is one line, and nothing has been run then.
     """
     shared = ComparisonOptions(**vars(options))
-    studies = begin_studies(build_experiment(experiment, shared), shared)
+    chosen, missing = leave_out_missing_problems(build_experiment(experiment, shared))
+    for name, reason in missing.items():
+        warnings.warn(f"{name} is left out: {reason}", stacklevel=2)
+    studies = begin_studies(chosen, shared)
     with pdf_figures(options.pdf):
         results = [_report(one, one.run(options.jobs, options.progress)) for one in studies]
         if len(studies) > 1:

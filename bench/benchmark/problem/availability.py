@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 from bench.benchmark.problem.experiment import Experiment, expand_sweep
 from bench.benchmark.problem.model_file_simulator import find_missing_model_file
+from bench.benchmark.problem.recorded_runs import find_recording
 from bench.core.plugin_registries import PartUnavailableError, simulators, tuners
 from bench.datasets import dataset_catalogue as datasets
 from bench.datasets.dataset_catalogue import DataSet
+from sims.core.simulator import InputError
 from sims.engines import ENGINE_MODULES, missing_packages
 
 
@@ -35,11 +37,42 @@ def availability(experiment: Experiment) -> Availability:
         return _together(experiment)
     data_set = _missing_data_set(experiment)
     skipped = "" if data_set else find_missing_model_file(experiment)
+    skipped = skipped or ("" if data_set else _missing_recording(experiment))
     return Availability(
         data_set,
         skipped or _missing_simulator(experiment) or _missing_engine(experiment),
         _missing_tuners(experiment),
     )
+
+
+def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str, str]]:
+    """Leave out the problems of a suite that cannot run on this machine.
+
+    Args:
+        suite: experiment; one that is not a suite is returned unchanged.
+
+    Returns:
+        The suite without these problems, and the reason for each of them by name.
+
+    Raises:
+        InputError: no problem can run on this machine.
+    """
+    if not (suite.suite and suite.experiments):
+        return suite, {}
+    kept, reasons = [], {}
+    for file in suite.experiments:
+        for problem in expand_sweep(suite.chosen(experiments=(file,))):
+            missing = availability(problem)
+            if missing.data_set:
+                reasons[problem.name] = missing.data_set.advice
+            elif missing.skipped:
+                reasons[problem.name] = missing.skipped
+            elif file not in kept:
+                kept.append(file)
+    if not kept:
+        needs = "; ".join(f"{name} {reason}" for name, reason in reasons.items())
+        raise InputError(f"{suite.suite}: no problem can run here: {needs}")
+    return suite.chosen(experiments=tuple(kept)), reasons
 
 
 def _together(experiment: Experiment) -> Availability:
@@ -75,6 +108,17 @@ def _missing_data_set(experiment: Experiment) -> DataSet | None:
         if found and datasets.find(kind, path) is None:
             return found
     return None
+
+
+def _missing_recording(experiment: Experiment) -> str:
+    """Return why the recording of an experiment cannot be read here; empty if it can."""
+    if not experiment.recording:
+        return ""
+    try:
+        find_recording(experiment.recording.path)
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 def _missing_engine(experiment: Experiment) -> str:

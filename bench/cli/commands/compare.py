@@ -54,14 +54,17 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_compare)
 
 
-def _begin_or_resume(options: argparse.Namespace) -> list[Study]:
+def _begin_or_resume(options: argparse.Namespace, say: PrintLine) -> list[Study]:
     """Begin or resume the study, or the studies of a sweep.
+
+    Problems of a suite that cannot run here are printed with what they need.
 
     Raises:
         InputError: Options are given that would change a study to be resumed.
     """
     from bench.api.compare import begin_studies, build_experiment
     from bench.api.comparison_options import ComparisonOptions
+    from bench.benchmark.problem.availability import leave_out_missing_problems
     from bench.studies.study import list_study_folders, resume_study
     from sims.core.argument_checks import check_options
     from sims.core.simulator import InputError
@@ -78,6 +81,9 @@ def _begin_or_resume(options: argparse.Namespace) -> list[Study]:
         return [resume_study(part, options.plugin) for part in list_study_folders(options.resume)]
     comparison = check_options(ComparisonOptions, values)
     chosen = build_experiment(options.experiment, comparison)
+    chosen, missing = leave_out_missing_problems(chosen)
+    for name, reason in missing.items():
+        say(f"skipped: {name}: {reason}")
     with prefix_errors_with_option("--out", options.out):
         return begin_studies(chosen, comparison)
 
@@ -87,7 +93,7 @@ def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
     # Connect to the cluster first, so that an unreachable scheduler leaves no folder.
     pool = make_cluster_pool(options.cluster)
-    studies = _begin_or_resume(options)
+    studies = _begin_or_resume(options, say)
     answers = []
     for study in studies:
         if len(studies) > 1:

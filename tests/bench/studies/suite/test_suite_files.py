@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.benchmark.problem.availability import leave_out_missing_problems
 from bench.benchmark.problem.experiment import expand_sweep, load_experiment
+from bench.benchmark.problem.suite_version import compute_problem_hash
 from bench.benchmark.problem.tuning_problem import TuningProblem
 from bench.core.plugin_registries import tuners
 from bench.studies.archive_bundle import verify_archive, write_bundle
@@ -46,8 +48,7 @@ def copy_suite(folder):
     ("file", "old", "new"),
     [
         ("pushed-slider.toml", "x = 0.001", "x = 0.002"),
-        ("measured-swing.toml", "negligible_error = 0.01", "negligible_error = 0.02"),
-        ("recordings/swing.csv", "\n1,", "\n1, "),
+        ("stiff-pendulum.toml", "q = 0.001", "q = 0.002"),
     ],
 )
 def test_a_changed_problem_is_refused(tmp_path, file, old, new):
@@ -57,6 +58,45 @@ def test_a_changed_problem_is_refused(tmp_path, file, old, new):
     path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(InputError, match="a changed problem needs a new version"):
         expand_sweep(load_experiment(str(suite)))
+
+
+def test_the_hash_of_a_problem_covers_its_model_and_its_recording(tmp_path):
+    problem = tmp_path / "mine.toml"
+    problem.write_text('model = "arm.xml"\n[recording]\npath = "log.csv"\n')
+    hashes = set()
+    for name in ("arm.xml", "log.csv", "log.toml"):
+        (tmp_path / name).write_text("first")
+    hashes.add(compute_problem_hash(problem, frozenset()))
+    for name in ("arm.xml", "log.csv", "log.toml"):
+        (tmp_path / name).write_text("second")
+        hashes.add(compute_problem_hash(problem, frozenset()))
+    assert len(hashes) == 4
+
+
+@pytest.fixture
+def without_data_sets(tmp_path, monkeypatch):
+    for name in ("SIMGAP_DATA", "SIMGAP_ROBOTS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "nothing"))
+    monkeypatch.chdir(tmp_path)
+
+
+def test_problems_without_their_data_are_left_out_with_the_reason(without_data_sets):
+    suite = load_experiment("suite")
+    kept, reasons = leave_out_missing_problems(suite)
+    assert set(reasons) == {"robot-so101", "measured-swing", "measured-servo"}
+    assert "run `simgap download so101`" in reasons["robot-so101"]
+    assert "run `simgap download pendulum_free_swing`" in reasons["measured-swing"]
+    assert "set SIMGAP_DATA" in reasons["measured-servo"]
+    assert len(kept.experiments) == len(suite.experiments) - 3
+    small = load_experiment("suite-small")
+    assert leave_out_missing_problems(small) == (small, {})
+
+
+def test_a_suite_without_any_data_is_refused(without_data_sets):
+    suite = load_experiment("suite").chosen(experiments=("suite/measured-swing.toml",))
+    with pytest.raises(InputError, match="no problem can run here: measured-swing needs"):
+        leave_out_missing_problems(suite)
 
 
 def test_words_of_a_problem_may_change(tmp_path):
