@@ -52,6 +52,11 @@ class BenchCache:
     """
 
     def __init__(self, robot: RobotModel, limit: int = CACHE_BYTES) -> None:
+        """Start with the robot's own model and no batch; batches are made on first request.
+
+        Meshes and textures are stripped once here, so that each of the batches takes less
+        memory.
+        """
         self._limit = limit
         self._own = _Variant(strip_assets(robot))
         self._series: dict[SeriesJoints, _Variant] = {}
@@ -98,6 +103,11 @@ class BenchCache:
             raise RefusedModelError(said) from None
 
     def _variant(self, series: SeriesJoints) -> _Variant:
+        """Return the model with these joints in series, and mark it as most recently used.
+
+        Without joints in series, this is the robot's own model, which is never dropped from
+        the cache.
+        """
         if not series:
             return self._own
         variant = self._series.pop(series, None) or _Variant(

@@ -106,6 +106,13 @@ class _Contexts:
     def __init__(
         self, bench: MujocoBatch, compiled: CompiledForces, losses: Array, steps: int
     ) -> None:
+        """Write one context per batch element: addresses and sizes for the compiled callback.
+
+        Entries in `shared` are the same for all elements; those in `own` belong to one
+        element (`lane`). `self._arrays` keeps all of them alive, because the callback holds
+        only their addresses. The table of contexts has one row of 64-bit integers per
+        element.
+        """
         program = compiled.program_layout
         places = compiled.addresses
         joints = places.velocities.size

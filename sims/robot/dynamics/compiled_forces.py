@@ -123,6 +123,13 @@ class _Tracing:
     """
 
     def __init__(self, system: RobotSystem, inputs: tuple[str, ...]) -> None:
+        """Make graph inputs for everything that effects may read, and snapshots from them.
+
+        Effects are called with these snapshots instead of numbers, which records their
+        arithmetic. There are two instants: the beginning of a step, and its middle with the
+        predicted state (midpoint rule). Inputs of kind MOMENT change in each step; those of
+        kind LANE are constant for a batch element.
+        """
         graph = ExpressionGraph()
         joints = len(system.coordinates)
         self._graph = graph
@@ -160,6 +167,13 @@ class _Tracing:
         return self._programs[key]
 
     def _composed(self, effects: Sequence[Sequence[Effect]]) -> _Program:
+        """Trace all given effects, and emit one list of instructions for their outputs.
+
+        The three groups of `effects` are forces, dry frictions and effects with hidden
+        states. Outputs are the total force and the friction limit of each joint, and the
+        hidden states after the step. The order of `groups` fixes the order of the input
+        registers, see `_Program.written`.
+        """
         before: Counter[type[Effect]] = Counter()
         asked: list[list[_Asked]] = []
         for group in effects:
@@ -232,6 +246,12 @@ class CompiledForces:
     """
 
     def __init__(self, forces: EffectForces, program: _Program, run_by: CompiledKernel) -> None:
+        """Allocate registers (n, L) for L batch elements, and write everything that stays constant.
+
+        Constant are the step length, the servo stiffness and the coefficients. Instructions
+        that depend only on them, from `first` to `moment`, run once here; the rest runs in
+        each step.
+        """
         self.has_dry_friction = forces.has_dry_friction
         self.addresses = forces.addresses
         self.loaded = forces.loaded

@@ -123,6 +123,12 @@ class EffectForces:
         stiffness: Array,
         step: float,
     ) -> None:
+        """Sort the effects into forces, dry frictions and effects with hidden states.
+
+        Left out are effects that a batch handles otherwise: those written into model
+        fields, those whose force depends only on time (precomputed), and those in series
+        with joints.
+        """
         self.system = system
         self.felt = felt
         self.addresses = addresses

@@ -109,6 +109,11 @@ class LinearisationPoints:
         drives: Sequence[int] = (),
         held: float = LINEARISATION_INTERVAL_SECONDS,
     ) -> None:
+        """Choose the points of the motion, and prepare the batch (fields, effects, state).
+
+        Also integrate the hidden states of the effects along the motion, since each point
+        needs them.
+        """
         self.motion, self.acting = motion, acting
         self._bench, self._system = bench, system
         self._outputs = tuple(outputs)

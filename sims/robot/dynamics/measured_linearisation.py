@@ -126,6 +126,12 @@ class MeasuredLinear(RunLinearisation):
         nearby: MeasuredLinear | None = None,
         is_alike: bool = True,
     ) -> None:
+        """Linearise about the given motion, and compute its readings and the step of each sample.
+
+        Difference quotients are held for one sample interval, but not for less than
+        `LINEARISATION_INTERVAL_SECONDS` or more than `LONGEST_HELD`. `knots` (T,) are the
+        numbers of the steps at the samples.
+        """
         self._given, self._measured, self._nearby = trajectory, measured or {}, nearby
         if nearby is not None and is_alike:
             self.quotients = nearby._tangent.quotients
@@ -160,6 +166,11 @@ class MeasuredLinear(RunLinearisation):
         return Trajectory(self._motion.x, self._motion.v, self._motion.afloat)
 
     def _nominal(self) -> RobotMotion:
+        """Return the given motion with the commands of the run, in place of a simulated motion.
+
+        Commands, activations and joints in series come from a simulation, or from the
+        motion of `nearby`.
+        """
         motion = self._near() or super()._nominal()
         given = self._given or self._from_samples(motion)
         # Joints in series are not measured, so they keep the simulated motion.

@@ -92,6 +92,11 @@ class MidpointPredictor:
     """
 
     def __init__(self, batch: Any, positions: Places, velocities: Places, loaded: Mask) -> None:
+        """Bind MuJoCo's fields of joint states and joint forces, for the first L elements.
+
+        `self._last` (2, L, D) holds the transmission loads at the beginning of the previous
+        step.
+        """
         self._batch = batch
         self._ends = forces_are_at_step_end(batch.model)
         self._loaded, self._any = loaded, bool(loaded.any())

@@ -63,6 +63,7 @@ class JointAddresses:
     """
 
     def __init__(self, robot: RobotModel, series: bool = False, both: bool = False) -> None:
+        """Collect the addresses of the selected hinge and slide joints, in file order."""
         singles = [joint for joint in robot.joints if joint.has_one_coordinate]
         own = [joint for joint in singles if joint.name not in robot.series]
         second = [robot.joint(name) for name in robot.series]
@@ -162,6 +163,11 @@ class MujocoBatch:
         settings: Mapping[str, float],
         count: int = BATCH_SIZE,
     ) -> None:
+        """Compile the model, create MuJoCo's batch, and expand the model fields that effects write.
+
+        Expanded fields have separate values for each batch element. `self._stated` keeps
+        the values of the model file, which are restored before other effects are written.
+        """
         import mujoco
         from mujoco import batch
 
@@ -234,6 +240,11 @@ class MujocoBatch:
 
     @staticmethod
     def _derives(field: str) -> bool:
+        """Return whether MuJoCo must recompute derived constants after a field changed.
+
+        An example is body_mass, from which MuJoCo derives the inverse weights of bodies and
+        joints.
+        """
         return any(
             field in native.fields and native.changes_derived_constants
             for native in MODEL_FIELD_EFFECTS.values()

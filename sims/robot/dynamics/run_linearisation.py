@@ -68,6 +68,12 @@ class RunLinearisation:
     def __init__(
         self, simulator: SystemSimulator, theta: Array, scenario: Scenario, x: Array, v: Array
     ) -> None:
+        """Simulate the run, and prepare the tangent linear model about its motion.
+
+        `self._names` are the channels that observe MuJoCo's sensors: drive forces (tau.)
+        and sensors (s.). `self._built` is the number of batch elements that the preparation
+        took; it is part of the cost.
+        """
         assert isinstance(simulator, RobotSimulator), "a robot"
         self._simulator = simulator
         self._clock = float(scenario.times[0])
@@ -140,6 +146,12 @@ class RunLinearisation:
         )
 
     def _neighbourhood(self) -> TangentModel:
+        """Make the tangent linear model about the motion of the run.
+
+        `sizes` are the typical forces (N or N m) of the joints of the file, the joints in
+        series and the floating bodies, in this order. They determine the finite differences
+        of forces.
+        """
         simulator = self._simulator
         outputs = [("sensordata", simulator.get_sensor_address(name)) for name in self._names]
         bench = simulator.make_linearisation_batch(self._work.acting)
@@ -268,6 +280,12 @@ class RunLinearisation:
         return [self._known[key]._replace(owner=owner)]
 
     def _springs(self, name: str, joint: int | None) -> bool:
+        """Return whether an effect is a spring about zero, equal to a joint stiffness.
+
+        In MuJoCo a joint stiffness acts about the rest position qpos_spring. Only where
+        this is zero can the change be computed from the effect's force, which is cheaper
+        than a changed model.
+        """
         if name not in SPRING_EFFECTS or joint is None:
             return False
         simulator = self._simulator

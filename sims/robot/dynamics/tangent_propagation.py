@@ -103,6 +103,12 @@ class TangentModel:
     def __init__(
         self, at: LinearisationPoints, sizes: Array, quotients: DifferenceQuotients | None = None
     ) -> None:
+        """Compute the unperturbed steps at the linearisation points, and the quotients if none fit.
+
+        `self._share` (S,) is the position of each step between two points: 0 at the earlier
+        point, 1 at the later one. `self._earlier` and `self._later` (S,) are the indices of
+        these points.
+        """
         self._at, self._motion = at, at.motion
         self._sizes = sizes
         self._steps = len(at.motion.controls)
@@ -132,6 +138,13 @@ class TangentModel:
         return int(self._base.shape[1])
 
     def _quotients(self) -> DifferenceQuotients:
+        """Compute the matrices A, B and C of (1) by forward differences at all points.
+
+        `moves` lists the displacements as (quantity, index, size). The quantities are q
+        position, v velocity, a activation, w hidden state of an effect, p and r
+        displacement and velocity of floating bodies, f force, u control. `found` has the
+        quotients of states and readings by z, f, u.
+        """
         size = self._motion.x.shape[1]
         afloat = self._sizes.size - size
         na, nu = self._motion.act.shape[1], self._motion.controls.shape[1]

@@ -264,6 +264,7 @@ class SpecElements:
     """The elements of a spec by their numbers in the compiled model."""
 
     def __init__(self, spec: Any, robot: RobotModel) -> None:
+        """Index the joints, bodies and actuators of a spec, which is compiled to number them."""
         self.spec = spec
         # Elements have numbers only after compilation.
         spec.compile()

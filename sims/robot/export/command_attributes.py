@@ -37,6 +37,12 @@ class _Actuator:
     """The fields of one actuator, and its properties."""
 
     def __init__(self, fields: Fields, robot: RobotModel, place: str) -> None:
+        """Read the fields of the actuator with this name, and the properties that (1) and (2) need.
+
+        `gain` and `bias` are views, so that writing to them changes `fields`. `direct`
+        means without activation dynamics, `fixed` with a constant gain, `clamped` with a
+        limited activation.
+        """
         import mujoco
 
         self.id = robot.actuator(place).id
@@ -108,6 +114,7 @@ _NOT_LINEAR = "its actuator is not a gain and a bias of one control"
 
 
 def _gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    """Write an input gain into the actuator: scale its gain (1), and its control range (2)."""
     actuator, (a,) = _Actuator(fields, robot, cause.place), cause.coefficients
     scaled = actuator.single and actuator.fixed and (actuator.direct or actuator.filtered)
     if not scaled:
@@ -122,6 +129,10 @@ def _gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableRe
 
 
 def _bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    """Write an input bias into the actuator: shift its force (1), and its control range (2).
+
+    `share` is the factor 1 + a of an input gain that is in the fields already.
+    """
     actuator, (b,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if not actuator.linear:
         return _NOT_LINEAR
@@ -134,6 +145,10 @@ def _bias(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableRe
 
 
 def _saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    """Write a saturation of the input at ±s as a narrower control range of the actuator (2).
+
+    A saturation s of zero or less has no effect, as in the simulation.
+    """
     actuator, (s,) = _Actuator(fields, robot, cause.place), cause.coefficients
     if s <= 0:
         return None
@@ -149,6 +164,10 @@ def _saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unstat
 
 
 def _delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    """Write an input delay in seconds into the actuator's delay and history buffer.
+
+    The returned text begins with +, which marks a note about a cause that was written.
+    """
     actuator, (delay,) = _Actuator(fields, robot, cause.place), cause.coefficients
     step = float(fields["opt.timestep"][0])
     if delay == 0:
@@ -169,6 +188,11 @@ def _delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableR
 
 
 def _lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
+    """Write a first-order lag of the input as an exact activation filter (FILTEREXACT) of MuJoCo.
+
+    `lag` is the time constant in seconds. The returned text begins with +, which marks a note
+    about a cause that was written.
+    """
     import mujoco
 
     actuator, (lag,) = _Actuator(fields, robot, cause.place), cause.coefficients

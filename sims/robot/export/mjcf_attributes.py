@@ -89,6 +89,12 @@ class FieldAddress(NamedTuple):
 def _polynomial(
     first: str, others: str, address: str = "id"
 ) -> Callable[[Fields, Any], list[float]]:
+    """Return a reader of a polynomial attribute: its linear coefficient, then the others.
+
+    MuJoCo stores the linear coefficient in the field `first` and the others in the field
+    `others`. `address` names the attribute of `where` with the row in these fields.
+    """
+
     def read(fields: Fields, where: Any) -> list[float]:
         at = getattr(where, address)
         return [fields[first][0, at], *fields[others][0, at]]
@@ -263,6 +269,7 @@ def list_all_attributes(model: Any, element: ModelElement, wanted: Fields) -> di
 
 
 def _same(one: Any, other: Any, tolerance: float) -> bool:
+    """Return whether two arrays are equal to within `tolerance` times the largest entry."""
     one, other = np.asarray(one, dtype=float), np.asarray(other, dtype=float)
     if one.shape != other.shape:
         return False

@@ -33,6 +33,7 @@ class MjcfDocument:
     """
 
     def __init__(self, text: bytes, path: Path) -> None:
+        """Parse the text of the outer file, and read all files that it includes."""
         self.path = path
         self.main = XmlText(text, path)
         self.root = self.main.root
@@ -40,6 +41,10 @@ class MjcfDocument:
         self._include(self.root)
 
     def _include(self, root: XmlElement) -> None:
+        """Read the included files below an element, and those that they include in turn.
+
+        All names are relative to the folder of the outer file, as in MuJoCo.
+        """
         for tag in root.walk():
             name = tag.attributes.get("file")
             if tag.name != "include" or not name:
@@ -104,6 +109,10 @@ class MjcfDocument:
             self._body(body, bodies, joints)
 
     def _within(self, tag: XmlElement, bodies: list[XmlElement], joints: list[XmlElement]) -> None:
+        """Append the bodies and joints directly within a body to the two lists, in document order.
+
+        A frame only groups its contents, so they count as contents of the body.
+        """
         for child in self.children(tag):
             if child.name == "body":
                 bodies.append(child)
@@ -130,6 +139,10 @@ class MjcfDocument:
         return named
 
     def _directories(self, folder: Path) -> None:
+        """Write absolute mesh and texture folders, so that the document can be stored elsewhere.
+
+        `folder` is the folder of the model file; the stated directories are relative to it.
+        """
         stated: dict[str, str] = {}
         compilers = self.find_elements("compiler")
         for compiler in compilers:
@@ -151,6 +164,11 @@ class MjcfDocument:
         return self.main.to_text().decode()
 
     def _settle(self, root: XmlElement) -> None:
+        """Prepare each include element for writing, included files first.
+
+        A changed file is inserted in place of its include element, between two comments. An
+        unchanged file stays included, with its absolute path.
+        """
         for tag in root.walk():
             inner = self._included.get(tag)
             if inner is None:

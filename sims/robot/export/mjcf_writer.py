@@ -50,6 +50,11 @@ class MjcfWriter:
     """
 
     def __init__(self, document: MjcfDocument, model: Any, wanted: Fields) -> None:
+        """Map the elements of the document to the model, and read the unit of its angles.
+
+        MJCF uses degrees unless a compiler element states radians; the last one takes
+        precedence.
+        """
         self.document, self.model, self.wanted = document, model, wanted
         self.tags = document.map_to_compiled_ids(model)
         self.degrees = True
@@ -78,6 +83,7 @@ class MjcfWriter:
             tag.new |= values
 
     def _option(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
+        """Write global options, such as gravity, into the last option element or a new one."""
         options, values = self.document.find_elements("option"), format_attributes(statement.values)
         if options:
             _add_comments(options[-1], comments)
@@ -99,6 +105,12 @@ class MjcfWriter:
     def _inertial(
         self, body: XmlElement, statement: AttributeStatement, comments: Sequence[str]
     ) -> None:
+        """Write mass, centre of mass and inertia into the (perhaps new) inertial of a body.
+
+        Only attributes whose value changes are written, or all of them if the statement
+        insists on it. Other forms of the inertial's orientation are removed, because new
+        principal moments come with their own quaternion.
+        """
         values = format_attributes(statement.values)
         for child in self.document.children(body):
             if child.name == "inertial":
@@ -126,6 +138,11 @@ class MjcfWriter:
         return list_all_attributes(self.model, element, copy_model_fields(self.model))
 
     def _joint(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
+        """Return the attributes of a joint as text, with hinge angles in the document's unit.
+
+        The attribute springdamper would override stiffness and damping, so it is set to
+        zero with them.
+        """
         values = format_attributes(statement.values)
         hinge = tag.get_attribute("type") in (None, "hinge")
         for name in ANGLE_ATTRIBUTES & set(statement.values) if hinge and self.degrees else ():
@@ -208,6 +225,7 @@ def format_attributes(values: Mapping[str, Values]) -> dict[str, str]:
 
 
 def _text(name: str, values: tuple[float, ...]) -> str:
+    """Format the numbers of an attribute for MJCF: word, true or false, integer or list."""
     if name in ENUM_ATTRIBUTES or name == "interp":
         return get_enum_word(name, values[0])
     if name in FLAG_ATTRIBUTES:

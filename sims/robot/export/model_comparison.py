@@ -80,6 +80,11 @@ def find_first_difference(one: Any, other: Any, tolerance: float) -> str | None:
 
 
 def _differ(one: Any, other: Any, tolerance: float) -> bool:
+    """Return whether two fields of compiled models differ in shape or in value.
+
+    Floating-point numbers may differ by `tolerance` times the largest entry of both arrays;
+    infinities of equal sign are equal. All other types must be identical.
+    """
     one, other = np.asarray(one), np.asarray(other)
     if one.shape != other.shape:
         return True
@@ -91,6 +96,7 @@ def _differ(one: Any, other: Any, tolerance: float) -> bool:
 
 
 def _shown(one: Any, other: Any) -> str:
+    """Format the largest difference of two fields as "value and value", or both shapes."""
     one, other = np.asarray(one), np.asarray(other)
     if one.shape != other.shape:
         return f"{one.shape} and {other.shape}"

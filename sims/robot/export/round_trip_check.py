@@ -132,6 +132,11 @@ def _without_contacts(model: Any) -> None:
 
 
 def _compare(found: Any, wanted: Any, name: str) -> None:
+    """Check that a reloaded model equals the wanted one in its fields and in its motion.
+
+    Raises:
+        RuntimeError: a field or the motion differs, so the written file would mislead the user.
+    """
     differs = find_first_difference(found, wanted, EQUAL_NUMBERS_TOLERANCE)
     if differs:
         raise RuntimeError(f"{name} is not as it was meant: {differs}")
@@ -139,6 +144,11 @@ def _compare(found: Any, wanted: Any, name: str) -> None:
 
 
 def _compare_motion(found: Any, wanted: Any, name: str) -> None:
+    """Check that two models move alike in a short test simulation from the same pose.
+
+    Raises:
+        RuntimeError: the positions differ by more than `MOTION_TOLERANCE`.
+    """
     # A URDF states a joint's zero as a turned frame, so that its reference pose is another one.
     pose = displace_reference_pose(wanted)
     one, other = simulate_test_motion(found, pose), simulate_test_motion(wanted, pose)

@@ -52,6 +52,7 @@ class UrdfWriter:
     """
 
     def __init__(self, robot: RobotModel, recording: str) -> None:
+        """Parse the URDF of the robot, and index its links and joints by name."""
         self.robot, self.recording = robot, recording
         self.markup = XmlText(robot.path.read_bytes(), robot.path)
         top = self.markup.root.children
@@ -87,6 +88,11 @@ class UrdfWriter:
         return self.markup.to_text().decode()
 
     def _dynamics(self, cause: FittedCause, attribute: str) -> str | None:
+        """Add a cause to the damping or the friction in the dynamics element of its joint.
+
+        A missing element is added. The result is None, or the reason why the URDF cannot
+        state the cause.
+        """
         joint = self.joints.get(cause.place)
         if joint is None:
             return _NO_JOINT
@@ -121,6 +127,10 @@ class UrdfWriter:
         return found or None
 
     def _mass(self, cause: FittedCause) -> str | None:
+        """Scale mass and inertia tensor of each link in the body, by (1).
+
+        The result is None, or the reason why the URDF cannot state the cause.
+        """
         inertials = self._inertials(cause)
         if inertials is None:
             return "a link of the body states no inertial"
@@ -132,6 +142,12 @@ class UrdfWriter:
         return None
 
     def _tensor(self, cause: FittedCause) -> str | None:
+        """Scale the inertia tensor of the body's only link by 1 + c; its mass stays.
+
+        A body of several links is refused: its tensor includes the distances between the
+        links, which no change of the links' own tensors would scale. The result is None, or
+        the reason for a refusal.
+        """
         inertials = self._inertials(cause)
         if inertials is None or len(inertials) > 1:
             return "the body is not one link with an inertial"
@@ -141,6 +157,10 @@ class UrdfWriter:
         return None
 
     def _offset(self, cause: FittedCause) -> str | None:
+        """Move the centre of mass of each link in the body by the same vector in metres, by (2).
+
+        The result is None, or the reason why the URDF cannot state the cause.
+        """
         inertials = self._inertials(cause)
         if inertials is None:
             return "a link of the body states no inertial"
@@ -159,6 +179,10 @@ class UrdfWriter:
         return None
 
     def _zero(self, cause: FittedCause) -> str | None:
+        """Move the zero of a joint by c (rad or m): turn or move its origin, by (3).
+
+        The result is None, or the reason why the URDF cannot state the cause.
+        """
         joint = self.joints.get(cause.place)
         if joint is None:
             return _NO_JOINT
@@ -175,6 +199,10 @@ class UrdfWriter:
         return None
 
     def _axis(self, cause: FittedCause) -> str | None:
+        """Rotate the axis of a joint by a rotation vector in radians, given in the joint's frame.
+
+        The result is None, or the reason why the URDF cannot state the cause.
+        """
         joint = self.joints.get(cause.place)
         if joint is None:
             return _NO_JOINT
@@ -184,6 +212,12 @@ class UrdfWriter:
         return None
 
     def _length(self, cause: FittedCause) -> str | None:
+        """Lengthen a link: move its joint away from the joint of the parent body, by (4).
+
+        `carrier` is the parent body in the compiled model, and `axes` are the axes of the
+        parent link in it. The result is None, or the reason why the URDF cannot state the
+        cause.
+        """
         body, model = self.robot.body(cause.place), self.robot.compiled
         joints = [tag for tag in self.joints.values() if _names(tag, "child") == body.name]
         if not joints:
@@ -196,6 +230,13 @@ class UrdfWriter:
         return None
 
     def _payload(self, cause: FittedCause) -> str | None:
+        """Add a point mass to a link: new mass, centre of mass, and inertia tensor by (5).
+
+        The coefficients are the mass `more` in kg and its offset from the body's centre of
+        mass in m. The tensor is computed in the axes of the link about the common centre of
+        mass `middle`, and written in the axes of the inertial. The result is None, or the
+        reason why the URDF cannot state the cause.
+        """
         body = self.robot.body(cause.place)
         link = self.links.get(body.name)
         inertial = _child(link, "inertial") if link else None
@@ -287,6 +328,7 @@ def _has_mass(inertial: XmlElement) -> bool:
 
 
 def _scale(inertial: XmlElement, name: str, attributes: tuple[str, ...], factor: float) -> None:
+    """Multiply stated attributes of an inertial's child element (mass, inertia) by a factor."""
     child = _child(inertial, name)
     for attribute in attributes:
         value = child.get_attribute(attribute) if child else None

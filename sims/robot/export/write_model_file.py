@@ -211,6 +211,7 @@ class MjcfEditor:
     def __init__(
         self, robot: RobotModel, applied: ModifiedModel, recording: str, text: bytes
     ) -> None:
+        """Compile the unchanged document, which is the reference for later comparisons."""
         self.robot, self.applied, self.recording, self.text = robot, applied, recording, text
         self.folder = robot.path.resolve().parent
         self.original = compile_mjcf(self._document().to_text())
@@ -250,6 +251,10 @@ class MjcfEditor:
         return text
 
     def _written(self, statements: Sequence[AttributeStatement]) -> str:
+        """Return the text of the document with the statements, their comments and a heading.
+
+        A statement without a cause of its own keeps a value that would change otherwise.
+        """
         document = self._document()
         writer = MjcfWriter(document, self.original, self.applied.target_values)
         for statement in statements:

@@ -80,6 +80,7 @@ class XmlText:
     """
 
     def __init__(self, text: bytes, path: Path) -> None:
+        """Parse the text with Expat, which gives the byte position of each element."""
         self.text, self.path = text, path
         self._open: list[XmlElement] = []
         self._top: XmlElement | None = None
@@ -104,6 +105,10 @@ class XmlText:
         raise NotEditableError(f"{self.path.name} has a document type")
 
     def _begin(self, name: str, attributes: dict[str, str]) -> None:
+        """Add an element to the tree at its start tag (called by the parser).
+
+        Until its end tag is parsed, `inside` and `end` are the end of the start tag.
+        """
         tag = XmlElement(name, attributes, self._parser.CurrentByteIndex)
         tag.inside = tag.end = self._end_of(tag.begin)
         if self._open:
@@ -143,6 +148,10 @@ class XmlText:
         return self._written(0, len(self.text), [self.root])
 
     def _written(self, begin: int, end: int, tags: list[XmlElement]) -> bytes:
+        """Return the text between two byte positions, with changed elements replaced.
+
+        `tags` are the elements directly within this range, in document order.
+        """
         parts, at = [], begin
         for tag in tags:
             if tag.has_changes or tag.text is not None:
