@@ -49,6 +49,7 @@ class BatchEngine:
         patience: float = np.inf,
         jobs: int = 1,
     ) -> None:
+        """Check the settings; an infinite `turn` or `patience` means no limit."""
         if not (is_plausible_number(time_step) and time_step > 0):
             raise InputError(
                 "engine batch: time_step must be a positive number of seconds, found"

@@ -298,6 +298,10 @@ class _FolderLogs:
         channels: Sequence[str],
         inputs: Sequence[str],
     ) -> None:
+        """Find the file of each signal, and read the needed columns of each file once.
+
+        An extra column without a stated file is searched for in the files of the signals.
+        """
         self._time, self._rate, self._second = sources.time, sources.rate, sources.second
         self._channels, self._inputs = channels, inputs
         self._sources = {name: sources.signals[name] for name in (*channels, *inputs)}
@@ -404,6 +408,11 @@ class _FolderLogs:
         log = self._logs[signal]
 
         def read_column(name: str) -> Array:
+            """Return the rows of the run from one column of the log.
+
+            Raises:
+                InputError: the column is shorter than the column of stamps.
+            """
             values = log.get_column(name)
             if rows.rows.size and rows.rows[-1] >= values.size:
                 raise InputError(

@@ -106,6 +106,7 @@ class Table:
     def __init__(
         self, path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str]
     ) -> None:
+        """Name the expected columns; `gaps` are those whose cells may be empty."""
         self.path = path
         self.wanted = ["run", "t", *inputs, *channels, *extra]
         self.gaps = {*channels, *extra}
@@ -220,6 +221,11 @@ class Table:
         return values
 
     def _check(self, name: str, cell: str, record: int) -> None:
+        """Check that a cell holds a finite number.
+
+        Raises:
+            InputError: the cell does not; the message states its row and column.
+        """
         if not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell))):
             missing = name in self.inputs and not cell.strip()
             more = "; an input has no missing samples" if missing else ""

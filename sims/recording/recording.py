@@ -89,6 +89,7 @@ class Run:
     memory: float = INPUT_HISTORY_SECONDS
 
     def __repr__(self) -> str:
+        """Return a summary in one line: name, number of samples, duration and use."""
         # Without this, a notebook cell that ends in a run would print all of its samples.
         seconds = self.times[-1] - self.times[0] if self.times.size else 0.0
         use = "held out" if self.held_out else "for fitting"
@@ -165,6 +166,7 @@ class Recording:
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
+        """Return a summary in one line: table, system, number of runs, and channels."""
         first = self.runs[0] if self.runs else None
         channels = ", ".join(first.channels) if first else "none"
         runs = f"{len(self.runs)} runs, {len(self.held_out())} of them held out"

@@ -373,6 +373,7 @@ def _known(path: Path, where: str, given: Iterable[str], allowed: Iterable[str])
 
 
 def _system(path: Path, meta: Mapping[str, Any]) -> str:
+    """Return the name of the system that a description states."""
     system = meta.get("system")
     if not isinstance(system, str):
         raise make_error(path, "", 'system = "NAME"', system)
@@ -444,6 +445,18 @@ def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
 
 
 def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
+    """Check the table of one channel or input, and compute its conversion to SI units.
+
+    Args:
+        path: path of the description, for messages.
+        kind: channel or input.
+        name: name of the signal.
+        value: table from the description.
+        unit: SI unit of the signal.
+
+    With scale s and offset o of the log, and the conversion of the unit x -> g x + b, a value x
+    of the log becomes g (s x + o) + b.
+    """
     where, usual = f"{kind} {name}", f'unit = "{unit}"'
     own = check_table(path, where, value, f"a table with {usual}")
     # Noise of an input is not allowed, because simulations cannot use it.
@@ -502,6 +515,7 @@ def _noises(
 
 
 def _noise(path: Path, name: str, value: Any) -> float:
+    """Check the stated standard deviation of a channel's noise, in the unit of the column."""
     where = f"channels.{name}.noise"
     noise = check_finite(path, where, value)
     if noise <= 0:
@@ -546,6 +560,7 @@ def _begins(
 
 
 def _run(path: Path, name: str, value: Any, declared: DeclaredSignals) -> RunMetadata:
+    """Check the table of one run: its constants, its initial state, and whether it is held out."""
     where = f"runs.{name}"
     own = check_table(path, where, value)
     allowed = [c.name for c in declared.constants]
@@ -578,6 +593,7 @@ def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> di
 def _possible(
     path: Path, where: str, constants: Mapping[str, float], declared: DeclaredSignals
 ) -> None:
+    """Check that constants are physically possible, such as a positive mass."""
     for c in declared.constants:
         if c.name in constants and (wanted := c.wanted(constants[c.name])):
             value = constants[c.name]

@@ -88,6 +88,12 @@ def _exists(path: Path | str) -> InputError:
 
 
 def _table(runs: Sequence[Run], digits: int) -> str:
+    """Return the text of the CSV table with all runs.
+
+    Args:
+        runs: runs with the same signals; those of the first determine the columns.
+        digits: number of significant digits.
+    """
     inputs, channels = list(runs[0].inputs), list(runs[0].channels)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -123,6 +129,7 @@ def _table(runs: Sequence[Run], digits: int) -> str:
 def _signals(
     run: Run, inputs: list[str], channels: list[str], extra: list[str]
 ) -> tuple[tuple[list[str], Mapping[str, Array], str], ...]:
+    """Return expected names, signals of the run, and a word for each kind of column."""
     return (
         (inputs, run.inputs, "input"),
         (channels, run.channels, "channel"),
@@ -131,6 +138,7 @@ def _signals(
 
 
 def _cells(values: Array, digits: int) -> list[str]:
+    """Format a column of the table; a missing sample (NaN) becomes an empty cell."""
     # repr gives the shortest text that is read back as the same number; a missing sample is an
     # empty cell.
     shortest = repr if digits >= _EXACT else f"{{:.{digits}g}}".format
@@ -156,6 +164,10 @@ def _of(recording: Recording, beside: Path) -> dict[str, Any]:
 
 
 def _description(recording: Recording, declared: DeclaredSignals, beside: Path) -> str:
+    """Return the text of the description in TOML: units, constants, and what is known of each run.
+
+    `beside` is the folder of the recording; a model file is stated relative to it.
+    """
     import tomli_w
 
     units = {c.name: c.unit for c in (*declared.inputs, *declared.channels)}

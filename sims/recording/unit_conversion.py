@@ -105,6 +105,7 @@ def _plain(unit: str) -> bool:
 
 @lru_cache(maxsize=1)
 def _registry() -> Any:
+    """Return pint's registry of units, in which an angle has its own dimension."""
     # Imported here: it takes a second, and most recordings are in SI units.
     import pint
 

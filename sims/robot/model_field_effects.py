@@ -167,6 +167,11 @@ def _add_quadratic(fields: Fields, robot: RobotModel, place: str, c: Array) -> N
 
 
 def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the dry friction of a joint by (1), in N m or N.
+
+    Where the friction increases (`rubs`), it also becomes stiff, so that the joint hardly creeps
+    at rest; with `friction_form` soft, the file's solver parameters remain.
+    """
     column = robot.joint(place).velocity
     loss = fields["dof_frictionloss"]
     # A reduced friction keeps the solver parameters of the file.
@@ -202,6 +207,12 @@ def _offset_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 
 
 def _scale_stiffness(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale the stiffness of a position servo by 1 + c (2).
+
+    MuJoCo computes the servo force as gainprm[0] u + biasprm[1] l + biasprm[2] l', with the
+    control u, the length l and its rate l'. The gain is scaled too where it is the same
+    stiffness.
+    """
     number = robot.actuator(place).id
     gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
     bias[:, 1] *= compute_factor(c[0])
@@ -210,6 +221,12 @@ def _scale_stiffness(fields: Fields, robot: RobotModel, place: str, c: Array) ->
 
 
 def _scale_damping(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale the damping of a servo by 1 + c (2).
+
+    MuJoCo computes the servo force as gainprm[0] u + biasprm[1] l + biasprm[2] l', with the
+    control u, the length l and its rate l'. The gain is scaled too where it is the same
+    damping, as in a velocity servo.
+    """
     number = robot.actuator(place).id
     gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
     bias[:, 2] *= compute_factor(c[0])
@@ -265,6 +282,11 @@ def _move_zero(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
 
 
 def _turn_axis(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Turn the axis of a joint by the rotation vector c in rad (6), where c is not zero.
+
+    `vector` (n, 3) holds the rotation vectors of these n elements. The rotation follows
+    Rodrigues' formula; the result is normalised because MuJoCo expects a unit vector.
+    """
     number = robot.joint(place).id
     turned = np.flatnonzero(c.any(axis=0))
     axis = fields["jnt_axis"][turned, number]
@@ -293,6 +315,12 @@ def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array)
 
 
 def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add a point mass to a body (7), in the batch elements whose payload is not zero.
+
+    The coefficients are the mass in kg and its offset from the file's centre of mass in m, in
+    the body frame. MuJoCo stores principal moments and their axes, so the tensor is composed in
+    the body frame, changed, and decomposed again into eigenvalues and eigenvectors.
+    """
     number = robot.body(place).id
     loaded = np.flatnonzero(c[0])
     point = robot.compiled.body_ipos[number] + c[1:, loaded].T
@@ -338,6 +366,10 @@ def _quaternions(matrices: Array) -> Array:
 
 
 def _limit_force(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Restrict the force range of an actuator to [-c, c] (5), in batch elements with c > 0.
+
+    `free` marks elements whose actuator has no force range yet; theirs starts from ±infinity.
+    """
     number = robot.actuator(place).id
     limited, ranges = fields["actuator_forcelimited"], fields["actuator_forcerange"]
     limits = c[0] > 0

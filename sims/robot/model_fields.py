@@ -55,7 +55,15 @@ def _center(robot: RobotModel, place: str) -> list[list[ModelField]]:
 
 
 def _servo(term: int) -> Find:
+    """Return a finder of the fields that hold a gain of a servo.
+
+    `term` is the index in the actuator's bias: 1 for the stiffness, 2 for the damping. The bias
+    holds the negative gain. MuJoCo's gain field holds the same number where the control
+    multiplies it.
+    """
+
     def find(robot: RobotModel, place: str) -> list[list[ModelField]]:
+        """Return the bias field with the servo's gain, and the gain field if it is the same."""
         number = robot.actuator(place).id
         found = [ModelField("actuator_biasprm", (number, term), -1)]
         if gain_pulls(robot, number, term):

@@ -231,6 +231,13 @@ class RobotModel:
         return tuple(self._actuator(i) for i in range(getattr(model, "nactuator", model.nu)))
 
     def _actuator(self, i: int) -> Actuator:
+        """Describe actuator number i: its joint, kind of motion, control range and force range.
+
+        An actuator on the tendon that couples a joint to others counts as driving that
+        joint. Otherwise an actuator on a tendon has no joint, but a list of joints that it
+        moves. `motion` is hinge or slide, which gives the unit of the force; None if the
+        tendon moves joints of both kinds.
+        """
         import mujoco
 
         model = self.compiled
@@ -360,6 +367,16 @@ class RobotModel:
         return found
 
     def _named(self, kind: str, name: str, known: Mapping[str, Any]) -> Any:
+        """Return an element of the robot by name.
+
+        Args:
+            kind: word for the element in the message, such as joint.
+            name: name from the user.
+            known: all elements of this kind by name.
+
+        Raises:
+            InputError: the robot has no such element; the message lists the known names.
+        """
         if name not in known:
             error = make_unknown_name_error(
                 f"{kind} of {self.path.name}", name, list(known) or ["none"]
@@ -382,6 +399,7 @@ def cache_per_robot(
 
     @wraps(function)
     def asked(robot: RobotModel, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        """Return the result stored in the robot, or call the function and store its result."""
         key = (function, *args, *kwargs.items())
         if key not in robot.function_cache:
             robot.function_cache[key] = function(robot, *args, **kwargs)

@@ -96,6 +96,11 @@ class RobotSimulator(SystemSimulator):
     free: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Create the simulator, and check that no number of the model is a parameter twice.
+
+        A coefficient may be freed in the model itself (`free`) or belong to a given effect,
+        but not both.
+        """
         super().__init__(*args, **kwargs)
         twice = [effect.name for effect in self.effects if self.system.is_free(type(effect))]
         if twice:
@@ -107,6 +112,10 @@ class RobotSimulator(SystemSimulator):
         self._floating = FloatingJoints.from_robot(self.robot)
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+        """Return MuJoCo as the engine, with checked settings of the time step and the integrator.
+
+        Other engines are refused, since a model file describes a robot for MuJoCo.
+        """
         if name not in (None, "mujoco"):
             raise InputError(f"robot {self.name} steps in MuJoCo; it has no engine '{name}'")
         for setting in settings:
@@ -434,6 +443,18 @@ class RobotSimulator(SystemSimulator):
         more: Sequence[str] = (),
         series: SeriesJoints = (),
     ) -> BatchResult:
+        """Simulate a batch of n elements over all steps, and return its states and readings.
+
+        Effects are evaluated in MuJoCo's callback if they can be compiled, otherwise between steps.
+
+        Args:
+            start: initial states, and the active effects.
+            given: controls, forces and activations over the steps.
+            derived: whether masses or armatures change, from which MuJoCo derives constants.
+            asked: whether an effect depends on the state, so that it is evaluated in each step.
+            more: additional fields of MuJoCo's data to record.
+            series: joints in series that effects add to the robot.
+        """
         n = len(start.x)
         # A single simulation uses a small batch, so that constants need not be derived for a whole
         # one.
@@ -485,6 +506,7 @@ class RobotSimulator(SystemSimulator):
         return BatchResult(x, v, done, given.activations, bench.failed, (hidden[0], hidden[1]))
 
     def _bench(self, derived: bool, count: int, series: SeriesJoints = ()) -> MujocoBatch:
+        """Return the batch for this time step and integrator, from the robot's cache."""
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         settings = engine.numerics.to_model_options()

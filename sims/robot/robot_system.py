@@ -71,6 +71,7 @@ class RobotSystem(System):
     _placed: ClassVar[dict[str, tuple[type[Effect], ...]]]
 
     def __init_subclass__(cls) -> None:
+        """Give the system of each robot caches of its own."""
         super().__init_subclass__()
         # These caches must not be shared with other robots, or with the same robot with free
         # parameters.

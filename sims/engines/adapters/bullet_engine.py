@@ -111,6 +111,13 @@ class BulletEngine:
         largest_step: float,
         native_settings: Mapping[str, float] | None = None,
     ) -> None:
+        """Choose how batch elements are integrated: native contact, exact impacts, or a joint.
+
+        With `native_settings`, Bullet's own contact and air damping move a ball. Otherwise
+        a system that bounces gets impacts at their exact times, and any other system is a
+        body on a joint. If the system has no world for Bullet, or Bullet is missing, only
+        the reason is stored.
+        """
         self.largest_step = largest_step
         self._rollout: RolloutFunction | None = None
         protocol = BulletWorldModule if system.bounces else BulletJointWorldModule
@@ -153,6 +160,7 @@ class _BulletMover:
     """Free ball; see `sims.engines.external.ball_rollout.BallBody`."""
 
     def __init__(self, world: bullet_world.PersistentBulletWorld) -> None:
+        """Start without a body; NaN and -1 are values that must be set before the first step."""
         self._world = world
         self._client = self._body = -1
         self._mass = math.nan
@@ -274,6 +282,7 @@ class BulletNativeBall(_BulletMover):
     def __init__(
         self, world: bullet_world.PersistentBulletWorld, settings: Mapping[str, float]
     ) -> None:
+        """Read the air damping and the lateral friction of Bullet from the settings."""
         super().__init__(world)
         self.damping = settings["linear_damping"]
         self._lateral_friction = settings["lateral_friction"]

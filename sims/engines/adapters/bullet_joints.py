@@ -15,6 +15,7 @@ class BulletJoint:
     def __init__(
         self, world: bullet_world.PersistentBulletWorld, module: BulletJointWorldModule
     ) -> None:
+        """Take the load and gravity functions of the system's world module."""
         self._world = world
         self._load = module.load
         self._gravity = module.gravity

@@ -57,6 +57,7 @@ class PersistentBulletWorld:
     """
 
     def __init__(self, build: Callable[[int, Mapping[str, float]], int]) -> None:
+        """Store the build function; Bullet is connected when the body is first requested."""
         self._build = build
         self._client = -1
         self._body = -1
@@ -66,6 +67,7 @@ class PersistentBulletWorld:
     def __reduce__(
         self,
     ) -> tuple[type[PersistentBulletWorld], tuple[Callable[[int, Mapping[str, float]], int]]]:
+        """Pickle the build function alone, because a connection to Bullet cannot be copied."""
         # A copy of a simulator, also in another process, gets its own world.
         return PersistentBulletWorld, (self._build,)
 

@@ -63,6 +63,7 @@ class CompiledWorld:
     """
 
     def __init__(self, model: Callable[[Mapping[str, float]], str]) -> None:
+        """Store the function that writes the MJCF; nothing is compiled before the first use."""
         self._compile = model
         self._built_for: dict[str, float] | None = None
         self._model: Any = None
@@ -98,6 +99,7 @@ class MujocoJoint:
     """Body on one hinge or guide; see `sims.engines.external.joint_rollout.JointBody`."""
 
     def __init__(self, world: CompiledWorld, module: MujocoJointWorldModule) -> None:
+        """Take the load and gravity functions of the system's world module."""
         self._world = world
         self._load = module.load
         self._gravity = module.gravity

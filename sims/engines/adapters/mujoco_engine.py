@@ -110,6 +110,13 @@ class MujocoEngine:
         stiffness: float | None = None,
         threads: int = 1,
     ) -> None:
+        """Choose how batch elements are integrated, with one world and rollout function per thread.
+
+        With `stiffness`, MuJoCo's own soft contact moves a ball. Otherwise a system that
+        bounces gets impacts at their exact times, and any other system is a body on a
+        joint. If the system has no world for MuJoCo, or MuJoCo is missing, only the reason
+        is stored.
+        """
         self.largest_step = largest_step
         self._worlds: list[CompiledWorld] = []
         self._rollouts: list[RolloutFunction] = []

@@ -61,6 +61,12 @@ class _BatchRunner:
     def __init__(
         self, batch: IntegrationBatch, max_phase: float, patience: float, jobs: int
     ) -> None:
+        """Convert the batch to the contiguous arrays that the kernel reads.
+
+        If all elements have the same steps, one row of steps is stored for all of them.
+        `_spans` (L,) is the longest step of each element in seconds, `_planned_counts` (L,)
+        its number of steps that are not zero.
+        """
         self._kernel = get_kernel()
         self._jobs = jobs
         self._batch = batch
@@ -150,6 +156,10 @@ class _BatchRunner:
         threads = min(self._jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
 
         def run(part: BatchArrays) -> None:
+            """Run one thread's part of the elements, with program buffers of its own.
+
+            `width` is the number of elements that the kernel steps side by side.
+            """
             width = _width(program, part)
             prepared = program.prepare(width)
             self._kernel.integrate(function, prepared.arrays, part, prepared.block, width)

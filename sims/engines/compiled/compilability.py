@@ -67,6 +67,10 @@ def get_force_program(
 def _get_tracer(
     batch: IntegrationBatch, elements: Indices, names: InputNames
 ) -> SystemTracer | None:
+    """Return the tracer of a system, or None if the system cannot be traced.
+
+    The system is traced once for each set of input names, checked against NumPy, and cached.
+    """
     key = type(batch.system), names
     if key not in _tracers:
         _tracers[key] = None
@@ -87,6 +91,10 @@ def _is_traceable(
     elements: Indices,
     names: InputNames,
 ) -> bool:
+    """Return whether an effect can be traced and then gives the same numbers as with NumPy.
+
+    The answer is cached; a failure is reported once.
+    """
     key = type(batch.system), names, type(effect)
     if key not in _effects:
         _effects[key] = False

@@ -83,12 +83,14 @@ class ExpressionGraph:
     def _get_or_make(
         self, key: tuple[object, ...], make: Callable[[], ExpressionNode]
     ) -> ExpressionNode:
+        """Return the node with this key, so that equal expressions share one node."""
         if key not in self._nodes:
             self._nodes[key] = make()
         return self._nodes[key]
 
 
 def _compute_constant(operation: str, values: list[float]) -> float:
+    """Apply an operation to constants, with NumPy's result for overflow and division by zero."""
     with np.errstate(all="ignore"):
         if operation == "where":
             return values[1] if values[0] else values[2]

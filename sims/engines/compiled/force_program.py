@@ -77,6 +77,8 @@ class PreparedProgram(NamedTuple):
             return tuple(runners)
 
         def make_checked(runner: Callable[[], None]) -> Callable[[], None]:
+            """Wrap a runner so that it raises the exceptions of array functions afterwards."""
+
             def run() -> None:
                 runner()
                 self.raise_error()
@@ -158,6 +160,12 @@ class SystemTracer:
     """
 
     def __init__(self, system: System, names: InputNames) -> None:
+        """Make graph inputs for time, state, inputs and parameters, and trace the system's force.
+
+        Time, state and inputs change in each evaluation (MOMENT), parameters only between
+        batch elements (LANE). `e`, `mu` and `speed` are restitution, friction coefficient
+        and normal speed of an impact.
+        """
         graph = ExpressionGraph()
         self.graph = graph
         self._system = system
@@ -215,6 +223,11 @@ class SystemTracer:
         return self._effects[kind]
 
     def _compose(self, effects: Sequence[Effect]) -> _ProgramNodes:
+        """Combine the traced system and effects into the inputs and outputs of one program.
+
+        Forces and limits of dry friction are added up. Contact effects change the
+        restitution `e` and the friction coefficient `mu` one after the other.
+        """
         force: Any = self._force
         limit: Any = None
         e: Any = self.e

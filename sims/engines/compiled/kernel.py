@@ -136,6 +136,12 @@ class CompiledKernel:
         self, function: int, program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers,
         w: int, spans: FloatArray, max_phase: float, divisions: FloatArray,
     ) -> None:  # fmt: skip
+        """Pack all sizes and array addresses into one array, and call the compiled function.
+
+        `function` is the number of the kernel's function, and `w` the number of slots, each
+        of which holds one batch element at a time. The order of the arguments is that of
+        `kernel_entry`.
+        """
         # The compiled code does not check array bounds.
         check_array_layout(program, arrays, block, w, spans, divisions)
         element_count, dimensions = arrays.x.shape
@@ -244,6 +250,11 @@ def _get_machine_code(offsets: Mapping[str, int] | None) -> bytes:
 
 
 def _build(offsets: Mapping[str, int] | None) -> bytes:
+    """Compile the kernel's machine code with numba, and tell the user why this takes time.
+
+    `offsets` are the positions of fields in MuJoCo's data, for the callback; None for the
+    kernel of the batch engine.
+    """
     if offsets is None:
         _report(f"compiling the batch engine, once after an install: about {_COMPILE_SECONDS} s")
     else:
@@ -254,6 +265,7 @@ def _build(offsets: Mapping[str, int] | None) -> bytes:
 
 
 def _report_wait() -> None:
+    """Tell the user that another process is compiling, so that this one waits for its result."""
     _report(
         "another process compiles the batch engine, once after an install:"
         f" {_COMPILE_SECONDS} s at most"

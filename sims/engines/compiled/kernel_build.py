@@ -184,7 +184,14 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
     word = ir.IntType(64)
 
     def make_pointer_function(kind: Any, target: Any) -> Any:
+        """Make a numba function that converts an integer address to a pointer.
+
+        `kind` is the type of the numbers for numba, and `target` the same type for LLVM.
+        """
+
         def to_pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
+            """Return the types of the conversion for numba, and the generator of its LLVM code."""
+
             def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
                 return builder.inttoptr(values[0], target.as_pointer())
 
@@ -193,6 +200,11 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
         return numba.extending.intrinsic(to_pointer)
 
     def call_external(context: Any, address: Any, part: Any, w: Any) -> Any:  # noqa: ARG001
+        """Call the function at an address with two integers, from compiled code (numba intrinsic).
+
+        It returns the types for numba, and a function that generates the LLVM code.
+        """
+
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
             function = ir.FunctionType(ir.VoidType(), [word, word])
             builder.call(builder.inttoptr(values[0], function.as_pointer()), values[1:])

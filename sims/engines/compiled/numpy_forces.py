@@ -65,6 +65,10 @@ class NumpyForces:
         out: IntTable,
         r: Array,
     ) -> None:
+        """Make the C callback with which the compiled instructions call the array functions.
+
+        `_snapshots` caches, by the number of slots, arrays that are views of the registers.
+        """
         self.error: BaseException | None = None
         self._system = system
         self._names = names
@@ -100,6 +104,7 @@ class NumpyForces:
             self._r[self._rows[OUT_LIMIT:]] = np.nan
 
     def _evaluate_forces(self, width: int) -> None:
+        """Write total force and friction limit of the first `width` slots into the registers."""
         moment, coefficients = self._view(width)
         force = self._system.force(moment)
         limit: Any = 0.0
@@ -112,6 +117,7 @@ class NumpyForces:
         self._r[self._rows[OUT_LIMIT], :width] = np.broadcast_to(limit, (width, 1))[:, 0]
 
     def _evaluate_impact(self, width: int) -> None:
+        """Write restitution and friction coefficient, with effects, into the registers."""
         _, coefficients = self._view(width)
         e, mu, speed = (self._read(row, 1, width) for row in (IN_E, IN_MU, IN_SPEED))
         for effect, c in zip(self._effects, coefficients, strict=True):

@@ -128,6 +128,7 @@ class TracedArray(NDArrayOperatorsMixin):
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, index: Any) -> TracedArray:
+        """Return selected elements as a traced array, also if it is a single element."""
         _check_index(index)
         found = self.nodes[index]
         if isinstance(found, ExpressionNode):
@@ -148,6 +149,11 @@ class TracedArray(NDArrayOperatorsMixin):
         raise NotTraceableError("it turns what it is given into an array of its own")
 
     def __array_ufunc__(self, ufunc: Any, method: str, *args: Any, **kwargs: Any) -> TracedArray:
+        """Trace a NumPy ufunc; NumPy calls this method for an operation on a traced array.
+
+        Sums, maxima and minima along an axis are traced too; other methods and options are
+        not.
+        """
         if method == "reduce" and ufunc.__name__ in {"add", "maximum", "minimum"}:
             axis = kwargs.get("axis", 0)
             result = args[0]._reduce(ufunc.__name__, axis, bool(kwargs.get("keepdims")))
@@ -165,6 +171,10 @@ class TracedArray(NDArrayOperatorsMixin):
         return target
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        """Trace a NumPy function that is not a ufunc; NumPy calls this method.
+
+        Functions that only rearrange elements work on the array of nodes itself.
+        """
         name = func.__name__
         if name in RESHAPING_FUNCTIONS:
             return _wrap_result(self.graph, func(*_unwrap_arguments(self.graph, args), **kwargs))
@@ -177,6 +187,10 @@ class TracedArray(NDArrayOperatorsMixin):
         return TracedArray(self.graph, nodes, self.mask)
 
     def _reduce(self, operation: str, axis: Any, keepdims: bool) -> TracedArray:
+        """Apply an operation with two operands to the elements along an axis, from first to last.
+
+        An axis of None means all elements.
+        """
         if axis is None:
             whole = self.reshape(-1)._reduce(operation, 0, False)
             return whole.reshape((1,) * self.ndim) if keepdims else whole
@@ -204,6 +218,14 @@ def _to_nodes(graph: ExpressionGraph, value: Any) -> Any:
 
 
 def _apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -> TracedArray:
+    """Apply a NumPy function to traced arrays and numbers, element by element.
+
+    Some functions are first expressed by others, such as square by a product and > by <, so
+    that the interpreter needs fewer operations.
+
+    Raises:
+        NotTraceableError: arithmetic with truth values alone, or an operation that is not known.
+    """
     if name == "positive":
         return TracedArray(graph, _to_nodes(graph, args[0]))
     if name == "square":
@@ -241,6 +263,7 @@ def _unwrap_arguments(graph: ExpressionGraph, args: Any) -> list[Any]:
     """Return arguments with traced arrays, and numbers next to them in lists, as nodes."""
 
     def bare(arg: Any) -> Any:
+        """Return the nodes of one argument; an argument without traced arrays is unchanged."""
         if isinstance(arg, TracedArray):
             return arg.nodes
         if isinstance(arg, list | tuple) and any(isinstance(part, TracedArray) for part in arg):
@@ -261,6 +284,7 @@ def _graph_of(*args: Any) -> ExpressionGraph:
 
 
 def _where(condition: Any, *values: Any) -> TracedArray:
+    """Trace numpy.where(condition, x, y), a choice between two numbers for each element."""
     if len(values) != 2:
         raise NotTraceableError("numpy.where with a condition alone is not traced")
     graph = _graph_of(condition, *values)
@@ -268,6 +292,7 @@ def _where(condition: Any, *values: Any) -> TracedArray:
 
 
 def _clip(x: Any, low: Any, high: Any) -> TracedArray:
+    """Trace numpy.clip as a maximum and a minimum; a limit may be None."""
     graph = _graph_of(x, low, high)
     result = x
     if low is not None:
@@ -290,6 +315,7 @@ def _sum(x: TracedArray, axis: Any = None, keepdims: bool = False, **_: Any) -> 
 
 
 def _norm(x: TracedArray, ord: Any = None, axis: Any = None, keepdims: bool = False) -> TracedArray:  # noqa: A002
+    """Trace numpy.linalg.norm as the root of the sum of squares (Euclidean or Frobenius norm)."""
     if ord is not None:
         raise NotTraceableError("numpy.linalg.norm of a kind of its own is not traced")
     squares = _apply_elementwise(x.graph, "multiply", (x, x)).sum(axis, keepdims)

@@ -164,6 +164,7 @@ class BallRollout:
     """
 
     def __init__(self, ball: BallWithImpacts, element: ElementWork) -> None:
+        """Set the ball to its initial state; it rests if it lies still on the ground."""
         self._ball = ball
         self._forces = ElementForces(element, 1)
         self._short_flights = 0
@@ -337,6 +338,10 @@ class BallRollout:
         return 2.0 * gap / (math.sqrt(discriminant) - rate)
 
     def _apply_impact(self) -> None:
+        """Compute one impact with the engine's contact solver, when the ball touches the ground.
+
+        After the last impact the ball rests; then it slides or lies on the ground.
+        """
         speed = -self.v[2]
         self.w = None  # contact changes the velocity, so the engine's state must be set again
         restitution, friction, is_last = self._compute_impact(max(speed, 0.0), -self.a[2])
@@ -375,6 +380,7 @@ class BallRollout:
         return 0.0, total, True
 
     def _begin_rest(self) -> None:
+        """Put the ball on the ground without normal velocity, in continuous contact from now on."""
         self.rests = True
         # Slightly inside the ground, so that the engine's contact acts from the first step on.
         x, y, z = self.x

@@ -40,6 +40,11 @@ class ElementForces:
     """
 
     def __init__(self, element: ElementWork, states: int) -> None:
+        """Write the element's parameters into the registers, and find the offsets of numbers.
+
+        A register holds one number for each of the `states`. The offsets are positions of
+        first numbers in the flat memory of all registers.
+        """
         prepared = element.program.prepare(states)
         rows, flags = prepared.arrays.rows, prepared.arrays.flags
         r = prepared.block.r

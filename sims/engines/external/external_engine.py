@@ -145,6 +145,11 @@ def integrate_batch(
             work.append((i, element, timing[3]))
 
     def integrate_share(k: int) -> None:
+        """Integrate every n-th element from the k-th on with rollout k of n, in its own thread.
+
+        A failed element stays NaN, and the world is discarded, because it may be in any
+        state.
+        """
         for i, element, rows in work[k :: len(rollouts)]:
             trajectory = rollouts[k](element)
             if not is_finite(trajectory):
@@ -195,6 +200,15 @@ def _compute_timing(steps: Array, every: int) -> tuple[Indices, Array, Indices, 
 def _make_element(
     batch: IntegrationBatch, i: int, moving: Indices, steps: Array, recorded_steps: Indices
 ) -> ElementWork:
+    """Collect everything that a rollout needs of batch element i, with the program of its forces.
+
+    Args:
+        batch: the whole batch.
+        i: number of the element.
+        moving: indices of the steps that are not zero.
+        steps: lengths of these steps in seconds.
+        recorded_steps: numbers of the steps after which the state is recorded.
+    """
     acting = [(effect, c[:, i : i + 1]) for effect, c in batch.effects]
     effects = tuple((effect, c) for effect, c in acting if c.any())
     forces = [(e, c) for e, c in effects if isinstance(e, Force | Friction | Contact)]
@@ -221,6 +235,7 @@ def _make_element(
 
 
 def _list_numbers(element: ElementWork) -> list[Array]:
+    """Return all numbers of an element, to check that they are finite before a rollout."""
     return [
         element.theta,
         element.x,

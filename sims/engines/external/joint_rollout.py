@@ -141,6 +141,10 @@ class LinearisedForces:
     """
 
     def __init__(self, joint: JointBody, element: ElementWork, inertia: float) -> None:
+        """Start with zero forces; both states of a step are evaluated in one call.
+
+        `inertia` is the inertia at the joint, in kg m^2 on a hinge or kg on a guide.
+        """
         self._joint = joint
         self._forces = ElementForces(element, 2)
         self._inertia = inertia

@@ -60,6 +60,11 @@ def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Traj
     gx, gy, gz = get_gravity(element)
 
     def compute_force(t: float, x: Vector, v: Vector) -> Vector:
+        """Compute the force in addition to gravity, which the engine applies itself.
+
+        The force program includes gravity, so that it is subtracted. All values are per
+        unit mass.
+        """
         if not forces.acts:
             return 0.0, 0.0, 0.0
         fx, fy, fz = forces.evaluate(t, x, v)

@@ -112,6 +112,7 @@ class LogFile:
         raise self._none(name)
 
     def _none(self, name: str) -> InputError:
+        """Return the error for a column that does not exist, or that holds text."""
         if name in self.texts:
             return InputError(f"{self.path}: column '{name}': expected numbers, found text")
         there = ", ".join(self.list_columns()) or "none"

@@ -40,6 +40,11 @@ class MessageTable:
     """
 
     def __init__(self, wanted: Collection[str] = ()) -> None:
+        """Start with no messages; the wanted names are compared in lower case.
+
+        `_stamps` and `_written` hold the times of the messages in seconds: from their
+        headers, and when they were written to the log.
+        """
         # A column named run may number the runs of the log.
         self._wanted = {name.strip().lower() for name in (*wanted, "run")} if wanted else set()
         self._stamps = array("d")
@@ -149,6 +154,11 @@ def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
 def _message_numbers(
     path: str, message: Mapping[str, Any], depth: int
 ) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of a message with their names, except its time stamp.
+
+    A field with one number for each of the message's names, such as the joints of a JointState,
+    is named by them: ``position.elbow``. `depth` counts the levels of nested messages.
+    """
     names = message.get("name") or message.get("names") or message.get("joint_names") or ()
     for field, value in message.items():
         # The stamp is the column of times.

@@ -48,6 +48,7 @@ def is_numeric_type(kind: Any) -> bool:
 
 
 def _is_list(kind: Any) -> bool:
+    """Return whether an Arrow type is a list, of any of the three kinds in a Parquet table."""
     import pyarrow
 
     types = pyarrow.types

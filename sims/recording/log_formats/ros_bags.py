@@ -91,6 +91,11 @@ def _unknown_topic(bag: Path, topic: str, topics: list[str]) -> InputError:
 
 @contextmanager
 def _opened(bag: Path) -> Iterator[Any]:
+    """Open a bag for reading with rosbags, and turn its many kinds of errors into one.
+
+    Raises:
+        InputError: rosbags is not installed, or the bag cannot be read.
+    """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore

@@ -234,6 +234,11 @@ class _CellKind:
     """Cells of one column and the kind of numbers that they hold."""
 
     def __init__(self, cells: Any, separator: str) -> None:
+        """Find out whether commas in a column are decimal commas or thousands separators.
+
+        If most of the sampled cells with a comma are not numbers, the column holds lists or
+        text, and its commas have no meaning. `filled` are the cells that are not empty.
+        """
         import pandas
 
         self.cells = cells

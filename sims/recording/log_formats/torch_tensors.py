@@ -96,6 +96,11 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
 
 
 def _tensors(path: Path, archive: zipfile.ZipFile) -> tuple[dict[str, Array], dict[str, list[str]]]:
+    """Read all tensors of one or two dimensions in an archive, and its lists of texts, by name.
+
+    Raises:
+        InputError: the archive has no single pickle program, or one that is too large.
+    """
     programs = [name for name in archive.namelist() if name.endswith("/data.pkl")]
     if len(programs) != 1:
         raise InputError(f"{path}: expected one data.pkl in the archive, found {len(programs)}")

@@ -54,7 +54,7 @@ class BenchCache:
     def __init__(self, robot: RobotModel, limit: int = CACHE_BYTES) -> None:
         """Start with the robot's own model and no batch; batches are made on first request.
 
-        Meshes and textures are stripped once here, so that each of the batches takes less
+        Elements without influence on the motion are removed here, so that batches take less
         memory.
         """
         self._limit = limit

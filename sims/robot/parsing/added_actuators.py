@@ -90,6 +90,18 @@ def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[st
 
 
 def _check(spec: Any, source: str, where: str, name: str, table: Mapping[str, Any]) -> None:
+    """Check the table of an added actuator: its joint, kind, name and gains.
+
+    Args:
+        spec: a mujoco.MjSpec with the joints and actuators of the file.
+        source: beginning of error messages.
+        where: place of the table in the recording's description.
+        name: name of the new actuator.
+        table: entries of the table.
+
+    Raises:
+        InputError: the model cannot have this actuator.
+    """
     for key in ("joint", "kind"):
         if key not in table:
             raise InputError(f"{source}: {where} states no {key}")
@@ -131,6 +143,7 @@ def _single(joint: Any) -> bool:
 
 
 def _add(spec: Any, name: str, table: Mapping[str, Any]) -> None:
+    """Add an actuator to the spec from its checked table, with the gains of (2) to (5)."""
     import mujoco
 
     actuator = spec.add_actuator(
@@ -155,6 +168,11 @@ def _add(spec: Any, name: str, table: Mapping[str, Any]) -> None:
 
 
 def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
+    """Make an actuator a PID servo, (4) or (5).
+
+    With kd, a gain on the rate of the error, the actuator has two controls: the set point and
+    its rate.
+    """
     import mujoco
 
     if not hasattr(actuator, "set_to_pid"):

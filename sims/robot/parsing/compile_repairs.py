@@ -65,6 +65,12 @@ class CompileRepairs:
         raise self.files.make_mujoco_error(said)
 
     def _mended(self, spec: Any, said: str) -> bool:
+        """Repair the element that MuJoCo's message names, and return whether anything was changed.
+
+        `said` is the message. It is the only information about the reason, so its text is
+        searched. False means that the message fits no known repair, and that the user must
+        change the file.
+        """
         found = re.search(r"Element name '(.*?)', id", said)
         name = found[1] if found else ""
         if "balanceinertia" in said:
@@ -77,6 +83,11 @@ class CompileRepairs:
         return bool(MESH_ERROR_PATTERN.search(why)) and remove_mesh(spec, name, why, self.left)
 
     def _balance(self, spec: Any) -> bool:
+        """Replace principal moments that violate the triangle inequality A + B >= C, in all bodies.
+
+        Returns whether any body was changed; no rigid body can have moments that violate
+        it.
+        """
         before = len(self.balanced)
         for body in spec.bodies:
             moments, axes = _moments(body)
@@ -87,6 +98,11 @@ class CompileRepairs:
         return len(self.balanced) > before
 
     def _weigh(self, spec: Any, name: str) -> bool:
+        """Give a moving body the default mass and the least moments, where it has less.
+
+        Returns whether the body was changed. `carries` is whether other bodies are attached
+        to it.
+        """
         for body in [body for body in spec.bodies if body.name == name]:
             mass, (moments, axes) = float(np.nan_to_num(body.mass)), _moments(body)
             light, thin = (
@@ -139,6 +155,10 @@ def _moments(body: Any) -> tuple[Array, Array | None]:
 
 
 def _state(body: Any, moments: Array, axes: Array | None) -> None:
+    """Write principal moments in kg m^2 into a body of the spec, about the given axes.
+
+    Without axes, they are about the axes of the body's inertial frame.
+    """
     if axes is None:
         body.inertia = moments
     else:

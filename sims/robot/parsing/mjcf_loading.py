@@ -133,6 +133,7 @@ def _measured(files: ModelFileReader, element: Element, times: float) -> None:
 
 
 def _size(word: str) -> float:
+    """Return the magnitude of a number in an attribute; zero if the text is not a number."""
     try:
         return abs(float(word))
     except ValueError:  # MuJoCo itself reports what it expects.
@@ -159,6 +160,14 @@ def _named(element: Element) -> Iterator[str]:
 
 
 def _read(files: ModelFileReader, folder: str, name: str, strip: bool) -> bool:
+    """Return whether an asset file exists, and read it into the digest of the model.
+
+    Args:
+        files: reader of the model file.
+        folder: folder of the assets, relative to the model file.
+        name: name as in the model file; it may have the backslashes of Windows.
+        strip: whether folders in the name are ignored (attribute strippath).
+    """
     plain = name.replace("\\", "/")
     path = files.path.parent / folder / (PurePosixPath(plain).name if strip else plain)
     if not is_file(path):

@@ -83,6 +83,16 @@ def _robot(
     engine: Mapping[str, Any],
     warnings: list[str],
 ) -> RobotModel:
+    """Repair, complete and compile a parsed model file, and make the robot from it.
+
+    Args:
+        files: reader of the model file.
+        root: root element; it is changed in place.
+        kind: format of the file.
+        actuators: actuators that the recording adds, by name.
+        engine: time step and integrator that the recording sets.
+        warnings: list to which MuJoCo's warnings are appended while it compiles.
+    """
     source, notes = str(files.path), element_names.rename_invalid_names(root)
     mends = CompileRepairs(files, OmittedShapes(source))
     if kind == "urdf":
@@ -128,6 +138,11 @@ def _robot(
 
 
 def _check(files: ModelFileReader, model: Any) -> None:
+    """Check that a compiled model can be simulated: it moves, its time step and numbers are sane.
+
+    Raises:
+        InputError: nothing moves, the time step is out of range, or a number is huge or not finite.
+    """
     if model.njnt == 0:
         raise InputError(f"{files.path}: it has no joint that moves")
     step = float(model.opt.timestep)
@@ -173,6 +188,11 @@ def _fused(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
 
 
 def _said_of(aliases: Mapping[str, str]) -> list[str]:
+    """Return a note about links that MuJoCo fused into the body that carries them, or no note.
+
+    `aliases` maps the fused link to that body. The user needs the note, because effects act on
+    the whole body.
+    """
     groups: dict[str, list[str]] = {}
     for alias, name in aliases.items():
         groups.setdefault(name, []).append(alias)

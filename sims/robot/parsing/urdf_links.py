@@ -92,6 +92,13 @@ def _raise_moments(tensor: Element, entries: Sequence[float]) -> str:
 
 
 def _said(points: list[str], raised: list[str], inferred: list[str]) -> list[str]:
+    """Return the notes about repaired inertials of links, one for each kind of repair.
+
+    Args:
+        points: links with a mass and no moments of inertia.
+        raised: links with moments that were not positive, with the values before and after.
+        inferred: links without an inertial, whose mass follows from their collision shapes.
+    """
     notes = []
     if points:
         least = f"{inertia_repair.MIN_MOMENT:g} kg m^2"

@@ -72,6 +72,7 @@ def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
 
 
 def _no_macros(files: ModelFileReader, root: Element) -> None:
+    """Reject a file with unexpanded xacro macros, and tell the user how to expand them."""
     for element in root.iter():
         macros = [value for value in element.attrib.values() if "${" in value or "$(" in value]
         if element.tag.startswith("xacro:") or macros:
@@ -93,6 +94,11 @@ def _unread(root: Element) -> list[str]:
 
 
 def _links(files: ModelFileReader, root: Element) -> dict[str, Element]:
+    """Return the links by name.
+
+    Raises:
+        InputError: a link has no name, or two links have the same name.
+    """
     links: dict[str, Element] = {}
     for link in find_children(root, "link"):
         name = link.get("name")
@@ -233,6 +239,11 @@ def read_velocity_limits(root: Element) -> dict[str, float]:
 
 
 def _limits(joints: Sequence[Element]) -> list[str]:
+    """Remove limits that are meaningless, and return notes about the limits of joints.
+
+    Removed are limits of joints without one degree of freedom, effort limits that are not
+    positive, position limits of continuous joints, and position ranges that are empty.
+    """
     unstated, empty, clamped = [], [], []
     for joint in joints:
         name, kind = joint.get("name") or "", joint.get("type")
@@ -282,6 +293,11 @@ def stiffen_mimics(spec: Any) -> None:
 
 
 def _mimics(joints: Sequence[Element]) -> list[str]:
+    """Remove mimic elements that MuJoCo cannot represent, and return notes about all of them.
+
+    A mimic joint follows another joint: q = multiplier q_other + offset. Both must have one
+    degree of freedom. `tied` lists the mimics that stay, `loose` those that are removed.
+    """
     kinds = {joint.get("name"): joint.get("type") for joint in joints}
     tied, loose = [], []
     for joint in joints:

@@ -128,6 +128,11 @@ class _LineTrackingTreeBuilder:
     """XML tree under construction by a parser."""
 
     def __init__(self, files: ModelFileReader, path: Path, parser: Any, above: int) -> None:
+        """Set the handlers of the parser, which call this object for each tag.
+
+        `above` is the number of lines of the file above the parsed text; it is added to
+        line numbers.
+        """
         self.files, self.path, self.parser, self.above = files, path, parser, above
         self.open: list[Element] = []
         self.top: Element | None = None
@@ -147,6 +152,7 @@ class _LineTrackingTreeBuilder:
         return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
 
     def begin(self, name: str, attributes: dict[str, str]) -> None:
+        """Add an element to the tree at its start tag, and store its file and line for messages."""
         element = Element(name, attributes)
         self.files.places[element] = self.here
         if self.open:
@@ -179,6 +185,11 @@ def resolve_includes(files: ModelFileReader, root: Element) -> None:
 
 
 def _with_included(files: ModelFileReader, parent: Element) -> list[Element]:
+    """Return the children of an element, with include elements replaced by the included children.
+
+    Raises:
+        InputError: an included file is not stated, absent, or included twice.
+    """
     children: list[Element] = []
     for child in parent:
         if child.tag != "include":

@@ -115,6 +115,10 @@ def observable_axes(robot: RobotModel, body: str) -> tuple[int, ...]:
 
 
 def _observable(model: Any, number: int) -> tuple[int, ...]:
+    """Return the observable axes of body `number` of a compiled model, see `observable_axes`.
+
+    `axes` collects, in world coordinates, the hinge axes between the body and the world.
+    """
     import mujoco
 
     hinge, slide = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)

@@ -61,6 +61,7 @@ class LazyDefaultRecording:
         self._name = f"_made_{name}"
 
     def __get__(self, _instance: object, owner: Any) -> DefaultRecording:
+        """Return the default recording of the robot, created on first access."""
         # The value is stored in the class itself, since an inherited value belongs to another
         # robot.
         if self._name not in vars(owner):
@@ -89,6 +90,10 @@ def make_default_recording(robot: RobotModel) -> DefaultRecording:
 
 
 def _commands(robot: RobotModel, joints: Sequence[Joint]) -> list[ExcitationCommand]:
+    """Make the commands of all actuators on the joints, or forces at the joints if there are none.
+
+    Each command oscillates about a holding value that balances gravity in the reference pose.
+    """
     holding, forces = _at_pose(robot, joints)
     driven = {joint.name: joint for joint in joints}
     commands = []

@@ -111,6 +111,12 @@ def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
 
 
 def _force_of(effect: type[Force]) -> Callable[[Force, Array, StateSnapshot], Array]:
+    """Make the `force` method of an effect at one joint from that of the registered effect.
+
+    The registered effect is written for a system with one coordinate. The new method passes it
+    the state of its joint alone, and writes the result into that joint's column.
+    """
+
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the force (L, D) along the joint of the effect."""
         joint = cast(int, self.coordinate)
@@ -147,6 +153,12 @@ def make_shared_effects(
 
 
 def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
+    """Make the `force` method of an effect that all drives share, such as a supply that sags.
+
+    The effect acts on each drive's joint, and depends on the sum of all drives' absolute
+    forces.
+    """
+
     def force(self: Force, c: Array, moment: StateSnapshot) -> Array:
         """Compute the forces (L, D) along the joints, each from the total load of the supply."""
         robot = cast(RobotSnapshot, moment)
@@ -161,6 +173,12 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
 
 
 def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, StateSnapshot], Array]:
+    """Make the `limit` method of a dry friction at one joint from that of the registered effect.
+
+    The registered effect is written for a system with one coordinate, so it receives that joint
+    alone.
+    """
+
     def limit(self: Friction, c: Array, moment: StateSnapshot) -> Array:
         """Compute the friction limit (L, 1) of the effect's joint."""
         alone = cast(RobotSnapshot, moment).get_joint_snapshot(cast(int, self.coordinate))
@@ -178,6 +196,13 @@ def _has(spot: EffectPlace, c: Coefficient) -> bool:
 def _taking(
     drive: str, inertia: float, number: int, bounds: tuple[float, float]
 ) -> Callable[[Effect, Array, str, Array], Array]:
+    """Make the `taking` method, which starts a flexible joint at the values of a fitted armature.
+
+    When a flexible joint replaces the armature effect `drive`, the fitted armature is the
+    inertia of the rotor. The coefficient with index `number` becomes its share of the joint
+    inertia, within `bounds`.
+    """
+
     def taking(_: Effect, c: Array, simpler: str, given: Array) -> Array:
         """Convert the inertia of an armature effect to the rotor's share of the joint inertia."""
         if simpler != drive:
@@ -198,6 +223,12 @@ def _tried(c: Coefficient) -> Coefficient:
 
 
 def _act_of(effect: type[HiddenStateEffect]) -> Callable[..., tuple[Array, Array]]:
+    """Make the `act` method of an effect with a hidden state at one joint.
+
+    The registered effect is written for a system with one coordinate. The new method passes it
+    the state of its joint alone, and writes the force into that joint's column.
+    """
+
     def act(
         self: HiddenStateEffect, c: Array, moment: StateSnapshot, state: HiddenState
     ) -> tuple[Array, Array]:
@@ -256,6 +287,15 @@ def _made(
     coefficients: Sequence[Coefficient],
     changed: Mapping[str, Any],
 ) -> type[Effect]:
+    """Create a subclass of an effect that acts at one place, or at all of them.
+
+    Args:
+        effect: registered effect.
+        name: name of the new class, such as ``drag.linear@elbow``.
+        place: name of the place; empty for an effect of the world.
+        coefficients: coefficients with units and ranges for this place.
+        changed: attributes and methods that differ from those of `effect`.
+    """
     contains = tuple(f"{other}@{place}" for other in effect.contains) if place else ()
     body = {
         "name": name,

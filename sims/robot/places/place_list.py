@@ -210,6 +210,10 @@ def _stated_of_body(robot: RobotModel, body: int) -> dict[str, float]:
 
 
 def _stated(robot: RobotModel, dof: int, joint: int) -> dict[str, float]:
+    """Return the numbers that the model file specifies at a joint, by effect.
+
+    `dof` is the address of its velocity and `joint` its number in the compiled model.
+    """
     model = robot.compiled
     return {
         "drag.linear": float(model.dof_damping[dof]),
