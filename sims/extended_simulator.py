@@ -252,6 +252,7 @@ def _name(path: Path, value: Any) -> str:
 
 
 def _observe(path: Path, value: Any) -> list[str]:
+    """Check the list of observed channels in the file; it must not be empty."""
     wanted = "a list of channel names"
     observe = check_name_list(path, "observe", value, wanted)
     if not observe:
@@ -265,6 +266,7 @@ def _constants(path: Path, value: Any) -> dict[str, float]:
 
 
 def _effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
+    """Read the coefficients of all effects in the file, by effect and coefficient."""
     coefficients = {}
     # The order matters: a signal passes the effects one after another.
     for name, numbers in check_table(path, "effects", value).items():
@@ -279,6 +281,7 @@ def _numbers(path: Path, where: str, value: Any) -> dict[str, FittedValue]:
 
 
 def _number(path: Path, where: str, value: Any) -> FittedValue:
+    """Read a fitted number with its unit, and its interval where the file states one."""
     given = check_table(path, where, value, "a table with value and unit")
     fitted = _real(path, f"{where}.value", given.get("value"))
     low, high = (
@@ -289,6 +292,7 @@ def _number(path: Path, where: str, value: Any) -> FittedValue:
 
 
 def _text(path: Path, where: str, value: Any) -> str:
+    """Check that an entry is a text that is not empty."""
     result = check_text(path, where, value, "a text")
     if not result:
         raise make_error(path, where, "a text", value)
@@ -342,6 +346,7 @@ def _class_of(
         observe: Sequence[str] | None = None,
         **settings: Any,
     ) -> None:
+        """Create the simulator with the fitted constants and effects of the file."""
         # Engine, sensors and constants may be changed; the effects are fixed.
         stated = {**extended.constants, **(constants or {})}
         chosen = {**_engine(extended), **settings}

@@ -146,6 +146,12 @@ class OwnSimulator(SystemSimulator):
     levels: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Check a user's class, and make a system from its declaration.
+
+        Engines and effects work with systems, so the system describes the simulator to
+        them. The first sentence of the class docstring is its description, unless it states
+        `says`.
+        """
         _check(cls)
         forced = {*cls.coordinates, *cls.rates}
         # Other states are appended to the rates, because engines pass two vectors only.
@@ -168,6 +174,11 @@ class OwnSimulator(SystemSimulator):
         super().__init_subclass__(**kwargs)
 
     def __setattr__(self, name: str, value: object) -> None:
+        """Set an attribute, unless the base class already uses this name.
+
+        Raises:
+            InputError: the name is taken.
+        """
         # Otherwise a user's `self.engine = ...` would break the base class far from its cause.
         if name in _TAKEN and name in self.__dict__:
             raise InputError(
@@ -232,6 +243,11 @@ class OwnSimulator(SystemSimulator):
         raise NotImplementedError
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
+        """Return the engine that calls the user's `step`, with the given or declared time step.
+
+        Raises:
+            InputError: an engine is named, or a setting is unknown or not positive.
+        """
         if name is not None:
             raise InputError(f"simulator {self.name} steps itself; it has no engine '{name}'")
         step = dict(settings).pop("time_step", self.time_step)
@@ -253,6 +269,11 @@ _TAKEN = ("channels", "columns", "constant_values", "effects", "engine", "fixed"
 
 
 def _check(cls: type[OwnSimulator]) -> None:
+    """Check the declaration of a user's simulator when its class is created.
+
+    Raises:
+        InputError: the declaration is incomplete or contradictory; the message names the fault.
+    """
     if not isinstance(getattr(cls, "name", None), str) or cls.name == OwnSimulatorSystem.name:
         raise InputError(f'class {cls.__name__}: expected name = "..."')
     if not cls.channels or not cls.parameters:
@@ -282,6 +303,7 @@ class BulletWorld:
     """
 
     def __init__(self) -> None:
+        """Connect to a new Bullet world without a window."""
         self._engine = import_pybullet()
         self._client: int = self._engine.connect(self._engine.DIRECT)
         # Not `__del__`, which may run after the interpreter has unloaded the module.

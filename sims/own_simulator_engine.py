@@ -43,7 +43,9 @@ class SteppableSimulator(Protocol):
         theta: Mapping[str, float],
         constants: Mapping[str, float],
         initial: Mapping[str, float],
-    ) -> None: ...
+    ) -> None:
+        """Start a run in the given initial state; see `own_simulator.OwnSimulator.reset`."""
+        ...
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None: ...
 
@@ -97,6 +99,16 @@ class OwnSimulatorEngine:
         return Trajectories(result, result, result)
 
     def _run(self, lanes: IntegrationBatch, lane: int) -> Array | None:
+        """Simulate one batch element with the user's simulator.
+
+        Args:
+            lanes: the whole batch.
+            lane: number of the element.
+
+        Returns:
+            (N, D) recorded states, at the start and after every `steps_per_sample` steps. None if a
+            parameter, constant or initial state is not finite.
+        """
         system = lanes.system
         world = self.world
         names = [p.name for p in system.parameters]
@@ -226,6 +238,10 @@ class _LevelLimits:
     """Limits of the levels of one batch element."""
 
     def __init__(self, lanes: IntegrationBatch, lane: int, world: SteppableSimulator) -> None:
+        """Select the effects that limit a level of this element, with coefficients (K, 1, 1).
+
+        An effect without a place limits the first level of the system.
+        """
         self.acting = []
         for effect, c in lanes.effects:
             own = c[:, lane : lane + 1]
@@ -249,6 +265,11 @@ class _Forces:
     """Forces of the effects on one batch element."""
 
     def __init__(self, lanes: IntegrationBatch, lane: int, world: SteppableSimulator) -> None:
+        """Select the forces and dry frictions of this element, with coefficients (K, 1, 1).
+
+        `_last` holds velocity, forces and step of the previous step for (1); None at the
+        first step.
+        """
         here = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
         acting = [(effect, c) for effect, c in here if c.any()]
         self.forces = [(effect, c) for effect, c in acting if isinstance(effect, Force)]

@@ -74,6 +74,7 @@ class SystemSimulator(Simulator):
         fixed: Mapping[str, float | Sequence[float]] | None = None,
         **settings: Any,
     ) -> None:
+        """Create engine and effects, and append the effects' coefficients to the parameters."""
         super().__init__(constants, observe)
         self._declared = self.system()
         self.engine = self._engine(engine, settings)
@@ -101,6 +102,7 @@ class SystemSimulator(Simulator):
         self.parameters = (*self.system.parameters, *extra)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Copy the declaration of the system to the new simulator class."""
         super().__init_subclass__(**kwargs)
         # The declaration is copied from the system.
         system = cls.system
@@ -116,6 +118,11 @@ class SystemSimulator(Simulator):
         return make_engine(name or self.default_engine, self.system, settings)
 
     def _effect(self, named: str | type[Effect]) -> Effect:
+        """Return an effect by name or class, if the system and the engine support it.
+
+        Raises:
+            InputError: the effect is unknown or not supported; the message states the reason.
+        """
         effect = library.find_effect(named, self.system) if isinstance(named, str) else named
         # Effects at a place are made by the system itself and need no check.
         if effect.of:

@@ -270,6 +270,7 @@ def _list(place: str, value: Any, hint: Any) -> Any:
 
 
 def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value has the annotated type, or can be converted to it."""
     try:
         _fitted("", value, hint)
     except _MismatchError:

@@ -121,6 +121,11 @@ def write_new_files(contents: Mapping[Path, Content]) -> None:
 
 
 def _place(partial: Path, path: Path) -> None:
+    """Give a complete file its final name, unless a file with this name exists.
+
+    Raises:
+        FileExistsError: another process has created the file in the meantime.
+    """
     try:
         # Unlike a rename, this fails if the file was created in the meantime.
         os.link(partial, path)
@@ -191,6 +196,7 @@ def get_first_line(error: BaseException) -> str:
 
 
 def _beside(path: Path, keep_ending: bool = False) -> Path:
+    """Return the temporary name next to a file, under which it is written before it is renamed."""
     # The name contains the process id, so that two processes do not write to the same file.
     if keep_ending:
         return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")

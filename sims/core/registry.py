@@ -62,6 +62,7 @@ class Registry(Generic[T]):
     """
 
     def __init__(self, kind: str, group: str, base: type[T]) -> None:
+        """Start without parts; installed parts are imported on first request."""
         self.kind, self.group, self.base = kind, group, base
         self._added: dict[str, AddedPart[T]] = {}
         self._announced: dict[str, AddedPart[T]] = {}

@@ -32,6 +32,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
+        """Make the message safe for one line of a terminal: shorten and escape it."""
         # Names and cells from a user's file may contain anything; escape characters that would
         # break the line or a terminal.
         escaped = [
@@ -116,6 +117,11 @@ class Parameter:
     says: str = ""
 
     def __post_init__(self) -> None:
+        """Check that bounds, nominal value and training range are consistent.
+
+        Raises:
+            InputError: one of them is not; the message names the parameter.
+        """
         # The order matters: each check relies on the previous ones.
         low, high = self.bounds
         if not (np.isfinite([low, high]).all() and low < high):
@@ -222,6 +228,11 @@ class Scenario:
     off: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Check times, inputs and switches, and store read-only copies.
+
+        Raises:
+            InputError: times do not increase, or a signal does not have one value for each of them.
+        """
         # Read-only copies, because batch elements and methods share scenarios.
         times = make_read_only(self.times)
         row = times.ndim == 1 and times.size > 0
@@ -270,6 +281,7 @@ class UnitCube:
     """
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
+        """Compute the bounds of the cube for (1), as logarithms for log-scaled parameters."""
         self.parameters = tuple(parameters)
         self._log = np.array([p.log for p in self.parameters])
         self._any_log = bool(self._log.any())
@@ -287,6 +299,7 @@ class UnitCube:
         return len(self.parameters)
 
     def _scaled(self, theta: Array) -> Array:
+        """Return parameters (..., dim) with logarithms of those that are log-scaled."""
         if not self._any_log:
             return theta
         # Use the logarithm of 1 for linear parameters, because that of a negative number warns.
@@ -411,6 +424,15 @@ class Simulator(ABC):
     def _constants(
         self, known: Mapping[str, float], given: Mapping[str, float]
     ) -> dict[str, float]:
+        """Return the constants with their given values, after checking their limits.
+
+        Args:
+            known: default values of all constants.
+            given: values that differ, from the user or a scenario.
+
+        Raises:
+            InputError: a constant is unknown, not finite, or outside its limits.
+        """
         values = self._checked("constant", known, given)
         for c in self.constants:
             value = values[c.name]
@@ -427,6 +449,16 @@ class Simulator(ABC):
     def _checked(
         self, kind: str, known: Mapping[str, Any], given: Mapping[str, Any]
     ) -> dict[str, Any]:
+        """Return known values, replaced by the given ones.
+
+        Args:
+            kind: word for these values in messages: constant, initial state or input.
+            known: default values by name.
+            given: values that replace them.
+
+        Raises:
+            InputError: a name is unknown, or a value is not finite.
+        """
         for name, value in given.items():
             if name not in known:
                 raise make_unknown_name_error(

@@ -29,6 +29,7 @@ def render_effects_table() -> str:
 
 
 def _rows(effect: type[Effect]) -> list[str]:
+    """Return the rows of one effect in the Markdown table, one for each of its coefficients."""
     head = f"`{effect.name}` ({effect.hook}): {effect.says}"
     rows = []
     for c in effect.coefficients:
@@ -39,6 +40,11 @@ def _rows(effect: type[Effect]) -> list[str]:
 
 
 def _range(c: Coefficient, place: int) -> str:
+    """Format the plausible range of a coefficient for one kind of system.
+
+    `place` is the index of the kind in `SYSTEM_KINDS`. A dash means that the effect does not exist
+    on this kind of system, and (*) that the unit is that of another quantity, such as an input.
+    """
     unit = c.units[place]
     if unit is None:
         return "–"

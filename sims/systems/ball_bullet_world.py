@@ -96,6 +96,7 @@ def build_native(client: int, constants: Mapping[str, float], settings: Mapping[
 
 
 def _ground_and_ball(client: int, constants: Mapping[str, float]) -> tuple[int, int]:
+    """Create level ground and a ball in an empty Bullet world; return both body ids."""
     p = bullet_world.import_pybullet()
     p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
     plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=client)

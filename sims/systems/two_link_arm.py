@@ -208,6 +208,7 @@ class TwoLinkArm(OwnSimulator):
         self.__dict__.pop("_world", None)
 
     def __getstate__(self) -> dict[str, Any]:
+        """Return the state for pickling without the Bullet world, which cannot be copied."""
         # A copy gets a world of its own.
         return {
             name: value
@@ -216,6 +217,7 @@ class TwoLinkArm(OwnSimulator):
         }
 
     def _pace(self, seconds: float) -> None:
+        """Set the step length in seconds, and with it the joint friction, if the length changes."""
         # Bullet turns a motor's force into an impulse when the motor is set, so a motor holds for
         # one length of step.
         if seconds != self._step:

@@ -133,6 +133,10 @@ class BallDetector:
     """
 
     def __init__(self, background: RgbImage, sigma: float, shadows: bool) -> None:
+        """Precompute what every frame is compared with: grey and squared background, and threshold.
+
+        `level` is the difference, in grey levels, from which a pixel counts as changed.
+        """
         self.background = background
         self.sigma = sigma
         self.shadows = shadows

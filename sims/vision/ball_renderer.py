@@ -60,6 +60,7 @@ class BallScene:
     def __init__(
         self, camera: PinholeCamera, look: SceneAppearance, radius: float, rng: np.random.Generator
     ) -> None:
+        """Render the background once, and create the ball's mesh."""
         self.camera = camera
         self.look = look
         self.radius = radius
@@ -109,6 +110,7 @@ class BallScene:
         )
 
     def _body(self, shape: int, colour: tuple[float, float, float], **size: object) -> int:
+        """Create a body that is only drawn; `size` are the arguments of Bullet's shape."""
         p = bullet_world.import_pybullet()
         visual = p.createVisualShape(
             shape,

@@ -110,6 +110,11 @@ class _FrameCache:
         self._kept: list[tuple[float, RgbImage]] | None = None
 
     def __iter__(self) -> Iterator[tuple[float, RgbImage]]:
+        """Yield time and picture of each frame, and store the frames in the first full pass.
+
+        More than `_HELD` bytes of pictures are not stored, and the film is read again in
+        each pass.
+        """
         if self._kept is not None:
             yield from self._kept
             return

@@ -80,6 +80,7 @@ class FilmedBall(Simulator):
         film: str = "projected",
         **settings: Any,
     ) -> None:
+        """Create the simulator of the ball, and check that its film can be tracked."""
         super().__init__(constants, observe)
         if film not in FILM_MODES:
             raise InputError(

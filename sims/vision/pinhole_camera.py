@@ -61,6 +61,11 @@ class PinholeCamera:
     size: tuple[int, int] = (100, 100)
 
     def __post_init__(self) -> None:
+        """Check that the camera can show a picture.
+
+        Raises:
+            InputError: a number is not finite or out of range.
+        """
         numbers = [
             self.azimuth,
             self.distance,

@@ -71,6 +71,7 @@ def _divided(points: list[Array], faces: list[tuple[int, int, int]]) -> list[tup
     numbers: dict[tuple[int, int], int] = {}
 
     def middle(i: int, j: int) -> int:
+        """Return the index of an edge's midpoint on the unit sphere; add it if missing."""
         # Two faces share an edge and its midpoint.
         edge = min(i, j), max(i, j)
         if edge not in numbers:

@@ -65,6 +65,11 @@ def write_video(
 
 
 def _encode(path: Path, frames: Iterable[RgbImage], times: Array, crf: int) -> None:
+    """Encode frames as H.264 with their own times in s; the same frames give the same file.
+
+    `crf` is the constant rate factor of x264: larger numbers mean smaller files and less
+    quality.
+    """
     av = import_package("av")
     ticks = np.rint((times - times[0]) * _TICKS).astype(int)
     rate = Fraction(30)
@@ -121,6 +126,7 @@ class VideoFile:
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
+        """Check the frame rate, and that the file can be opened as a video."""
         require_file(path)
         if fps is not None and not _FRAMES[0] <= fps <= _FRAMES[1]:
             wanted = f"more than 0, from {_FRAMES[0]:g} to {_FRAMES[1]:g}"
@@ -154,6 +160,11 @@ class VideoFile:
         self._judge(count, stated, broken, dropped)
 
     def _open(self) -> Any:
+        """Open the file with PyAV.
+
+        Raises:
+            InputError: the file cannot be read, or contains no moving pictures.
+        """
         av = import_package("av")
         try:
             file = av.open(str(self.path))

@@ -115,8 +115,8 @@ class BulletEngine:
 
         With `native_settings`, Bullet's own contact and air damping move a ball. Otherwise
         a system that bounces gets impacts at their exact times, and any other system is a
-        body on a joint. If the system has no world for Bullet, or Bullet is missing, only
-        the reason is stored.
+        body on a joint. If the system has no world for Bullet, only the reason is
+        stored.
         """
         self.largest_step = largest_step
         self._rollout: RolloutFunction | None = None

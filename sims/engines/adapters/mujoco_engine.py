@@ -114,8 +114,7 @@ class MujocoEngine:
 
         With `stiffness`, MuJoCo's own soft contact moves a ball. Otherwise a system that
         bounces gets impacts at their exact times, and any other system is a body on a
-        joint. If the system has no world for MuJoCo, or MuJoCo is missing, only the reason
-        is stored.
+        joint. If the system has no world for MuJoCo, only the reason is stored.
         """
         self.largest_step = largest_step
         self._worlds: list[CompiledWorld] = []
