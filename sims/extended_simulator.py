@@ -393,7 +393,7 @@ def check_not_extended(kind: type[SystemSimulator]) -> None:
 
 
 def _coefficients(extended: ExtendedSimulator, kind: type[SystemSimulator]) -> list[FittedValue]:
-    """Return all coefficients in the simulator's order."""
+    """Return all coefficients in the order of the simulator's parameters; zero if not stated."""
     values = []
     for name, numbers in extended.effects.items():
         effect = library.find_effect(name, kind.system)

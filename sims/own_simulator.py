@@ -101,7 +101,10 @@ class _NotDeclaredError(InputError):
 
 
 def _ask(effect: type[Effect], system: type[OwnSimulatorSystem]) -> None:
-    """Evaluate the effect once, so that a missing quantity of the system raises an error."""
+    """Evaluate an effect once, which fails if the system lacks a quantity that it needs.
+
+    So a missing quantity is reported before a simulation starts.
+    """
     # Coefficients and states are zero: only the requested quantities matter, not the result.
     one = np.ones((1, 1))
     d = len(system.coordinates)

@@ -250,7 +250,7 @@ class _LevelLimits:
         self.world = world
 
     def keep(self) -> None:
-        """Limit the levels."""
+        """Limit the levels after a step, such as that of a tank which overflows at its rim."""
         if not self.acting:
             return
         seen = self.world.observe()

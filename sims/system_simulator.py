@@ -199,7 +199,19 @@ class SystemSimulator(Simulator):
     def _simulated(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """Simulate at least one batch element with checked arguments."""
+        """Simulate a batch of at least one element, from inputs to sensors.
+
+        The steps are: time grid, effects on inputs, integration by the engine, effects on
+        sensors.
+
+        Args:
+            theta: (L, P) parameters, including the effects' coefficients.
+            scenarios: L scenarios, which may be the same object.
+            initial: (L,) initial states that replace those of the scenarios, by name.
+
+        Returns:
+            (L, T, C) observations; NaN after the end of shorter runs and for failed elements.
+        """
         acting = self._acting(theta)
         runs = group_scenarios(scenarios)
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]

@@ -208,7 +208,11 @@ def _expected(place: str, value: Any, hint: Any) -> Any:
 
 
 def _one_of(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value to one of several types."""
+    """Convert a value to the first of several types that accepts it.
+
+    Raises:
+        _MismatchError: no type accepts it; the error names a wrong entry of a list or dict.
+    """
     inside = []
     for kind in get_args(hint):
         try:

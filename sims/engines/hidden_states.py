@@ -77,7 +77,11 @@ class AugmentedSystem(System):
         return pad_force(self.base_system.weight(self.get_base_snapshot(moment)), moment)
 
     def force(self, moment: StateSnapshot) -> Array:
-        """Return the force (L, D) of system and hidden-state effects on all coordinates."""
+        """Return the force (L, D) on the system's coordinates and on the hidden states.
+
+        The engine divides forces by the inertia. So the force on a hidden state is the
+        inertia times its rate, which gives the rate as its acceleration.
+        """
         plain = self.get_base_snapshot(moment)
         own = len(self.base_system.coordinates)
         total = self.base_system.force(plain)
@@ -171,7 +175,11 @@ def integrate_with_hidden_states(engine: Engine, batch: IntegrationBatch) -> Tra
 def _augment_batch(
     batch: IntegrationBatch, effects: Sequence[tuple[HiddenStateEffect, Array]]
 ) -> IntegrationBatch:
-    """Return the batch for the augmented system."""
+    """Return the batch of a system whose coordinates include the effects' hidden states.
+
+    Parameters get the effects' coefficients as further columns, and x and v the initial hidden
+    states.
+    """
     kinds = tuple(type(effect) for effect, _ in effects)
     system = make_augmented_system(type(batch.system), kinds)()
     inputs = {name: values[:, :1] for name, values in batch.inputs.items()}

@@ -389,7 +389,10 @@ class _FolderLogs:
         }, notes
 
     def _sample_times(self, run: str, rows_of: Mapping[Path, _LogRows]) -> Array:
-        """Return the times (T,) of a run's rows, in s."""
+        """Return the times (T,) of a run in seconds: all instants at which a signal has a sample.
+
+        Instants of inputs before the first or after the last measurement are left out.
+        """
 
         def stamps_of(names: Sequence[str]) -> list[Array]:
             return [rows_of[self._logs[name].path].stamps for name in names]

@@ -126,7 +126,11 @@ def expand_families(
 def _members(
     robot: RobotModel, effect: str, numbers: Mapping[str, FittedValue]
 ) -> list[FittedCause]:
-    """Return the causes of one effect family."""
+    """Return the causes of an effect family, one for each place.
+
+    A number with the key ``coefficient@place`` belongs to that place; a number without a place
+    belongs to all of them.
+    """
     by_place: dict[str, dict[str, FittedValue]] = {}
     for key, number in numbers.items():
         coefficient, _, place = key.partition("@")

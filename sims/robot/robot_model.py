@@ -321,7 +321,7 @@ class RobotModel:
         return tuple(rows)
 
     def _unit(self, sensor: int) -> str:
-        """Return the unit of a sensor; 1 if unknown."""
+        """Return the SI unit of a sensor by its number; 1 if MuJoCo does not determine it."""
         import mujoco
 
         model, of = self.compiled, mujoco.mjtSensor

@@ -92,7 +92,10 @@ class RobotReference:
 
 
 def make_robot_reference(kind: type[RobotSimulator]) -> RobotReference:
-    """Make the reference to the robot of a simulator."""
+    """Make the reference with which an extended simulator finds and checks its robot again.
+
+    Time step and integrator are stated only where they differ from the model file.
+    """
     from sims.robot.integrator_settings import read_integrator_settings
 
     robot = kind.robot

@@ -513,7 +513,14 @@ class RobotSimulator(SystemSimulator):
         return bench_cache(self.robot).bench(series, derived, count, settings)
 
     def _shown(self, made: BatchResult, work: RobotRunBatch, times: Array, steps: int) -> Array:
-        """Compute the recorded observations (n, T, C), including sensor effects."""
+        """Compute the recorded observations (n, T, C) of one run, including sensor effects.
+
+        Args:
+            made: states and readings of the batch; failed elements become NaN.
+            work: the n batch elements of the run.
+            times: (T,) sample times in seconds since the start.
+            steps: number of steps of the run; the batch may have more.
+        """
         columns = []
         for channel in self.channels:
             values, slopes = self._signal(made, channel.name, steps)

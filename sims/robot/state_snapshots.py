@@ -125,7 +125,11 @@ class RobotSnapshot(StateSnapshot):
         )
 
     def get_joint_snapshot(self, joint: int) -> JointSnapshot:
-        """Return the snapshot of one joint."""
+        """Return the state of one joint in the form of a system with one coordinate.
+
+        Effects are written for such systems. The set point is NaN without a position servo
+        whose input is known.
+        """
         one = slice(joint, joint + 1)
         inputs = {
             name: self.inputs[name] for name in self.drives.get(joint, ()) if name in self.inputs

@@ -191,7 +191,11 @@ class BallDetector:
         return spot._replace(colour=tuple(here.tolist()), contrast=contrast, is_ghost=ghost)
 
     def find_missing_shadow(self, picture: RgbImage) -> Mask:
-        """Return the mask where the picture lacks a shadow of the background image."""
+        """Find where the background image has a shadow that the picture lacks, as a mask.
+
+        The background is a median over frames, so that a ball that rests long leaves its
+        shadow in it. Such places are lighter in the picture than in the background.
+        """
         cv2 = import_package("cv2")
         mask = (self._difference(picture) > self.level).astype(np.uint8)
         lighter = (self._even(picture, mask) > 1).astype(np.uint8)
@@ -309,7 +313,18 @@ class BallDetector:
         u0: int,
         v0: int,
     ) -> BallDetection | None:
-        """Fit a circle in windows that begin at (u0, v0); None if too few rays agree."""
+        """Fit a circle to the edge points along rays, in turn with finding the edge again.
+
+        Args:
+            windows: (2, height, width) differences from the background around the region: of
+                brightness, and of the worst colour.
+            start: first estimate of centre and radius in pixels, in the window.
+            u0: first column of the window in the picture.
+            v0: first row of the window in the picture.
+
+        Returns:
+            The detection in the picture; None if too few rays agree on a circle.
+        """
         u, v, radius = start
         on_it = np.empty(0, bool)
         rest = np.empty(0)
@@ -449,7 +464,7 @@ def _inside(picture: RgbImage, spot: BallDetection) -> Array:
 
 
 def _around(picture: RgbImage, spot: BallDetection) -> Array:
-    """Return the median colour (3,) around a detection."""
+    """Return the median colour (3,) on a circle around a detection, in grey levels."""
     cos, sin = _directions()
     height, width = picture.shape[:2]
     away = _AROUND * spot.radius

@@ -165,7 +165,11 @@ def _find_longest_shot(survey: background_model.FrameSurvey, notes: list[str]) -
 
 
 def _finder(pictures: list[RgbImage]) -> BallDetector:
-    """Make a detector with the better treatment of shadows and a background without the ball."""
+    """Make a detector from a background without the ball, estimated from some pictures.
+
+    It treats shadows in the way with which more round objects are found: as shadow, or as part
+    of the ball.
+    """
     plain = background_model.compute_median_background(pictures)
     every = max(1, len(pictures) // _FEW)
     # Two passes: objects hidden by the first background are detected with the second.

@@ -121,7 +121,12 @@ class _BatchRunner:
             self._step(program, arrays)
 
     def _step(self, program: ForceProgram | NumpyForceProgram, arrays: BatchArrays) -> None:
-        """Integrate elements in steps."""
+        """Integrate elements in steps, after dividing the steps where an element moves fast.
+
+        `parts` (n,) is the number of parts of each step. Elements without events whose
+        steps are not divided run in lockstep, which is faster; the others run in slots that
+        take the next element when one is finished.
+        """
         elements = arrays.order
         all_parts = np.ceil(self._batch.system.fastest * self._spans / self._max_phase)
         all_parts = np.clip(all_parts, 1.0, MAX_STEP_DIVISIONS)
@@ -221,7 +226,11 @@ def _get_ground_parameters(batch: IntegrationBatch) -> Array:
 
 
 def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
-    """Return groups of elements (n,) with the same active effects, and these effects."""
+    """Group the elements by their active effects, since each group needs its own program.
+
+    Returns:
+        Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).
+    """
     hooks = (Force, Friction, Contact)
     there: list[tuple[Effect, Array]] = [(e, c) for e, c in batch.effects if isinstance(e, hooks)]
     on = [is_active(c)[:, 0] for _, c in there]

@@ -69,7 +69,11 @@ def _write(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def _hold_lock(path: Path, report_wait: Callable[[], None]) -> Iterator[None]:
-    """Hold an exclusive lock between processes, if the operating system supports it."""
+    """Hold an exclusive lock between processes, so that only one of them compiles.
+
+    If another process has the lock, `report_wait` is called before waiting. Without fcntl
+    (Windows) there is no lock, and several processes may compile.
+    """
     try:
         import fcntl
     except ImportError:

@@ -154,7 +154,16 @@ def _check(
 def _evaluate(
     program: ForceProgram | NumpyForceProgram, parameters: Array, states: Sequence[Array]
 ) -> list[Array]:
-    """Return force and friction limit at states, and contact parameters of two impacts."""
+    """Evaluate a program at some states and two impact speeds, to compare it with NumPy.
+
+    Args:
+        program: traced program, or the program that evaluates with NumPy.
+        parameters: (P,) parameters of the batch element.
+        states: time, positions, velocities and inputs, each as one vector.
+
+    Returns:
+        Forces and, if any, friction limits at each state, then restitution and friction of impacts.
+    """
     prepared = program.prepare(1)
     (_, _, rows, out, flags), r = prepared.arrays, prepared.block.r
     run_lane, run_moment, run_impact = prepared.make_runners()

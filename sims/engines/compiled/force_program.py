@@ -274,7 +274,7 @@ class _ProgramNodes(NamedTuple):
 
 
 def _write_program(nodes: _ProgramNodes) -> ForceProgram:
-    """Return the composed expressions as a program."""
+    """Write traced expressions as instructions, with the registers of their inputs and outputs."""
     outputs = [*nodes.force, *nodes.limit, *nodes.impact]
     written = emit_instructions(nodes.inputs, outputs)
     limit = written.place[nodes.limit[0]] if nodes.limit else -1

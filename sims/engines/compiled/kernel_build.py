@@ -177,7 +177,11 @@ def _emit(numba: Any, function: Any, space: dict[str, Any], pointers: int) -> tu
 
 
 def _make_intrinsics(numba: Any) -> dict[str, Any]:
-    """Return functions that numba itself does not have: addresses as pointers and functions."""
+    """Define functions that numba lacks: pointers from addresses, and a call of an address.
+
+    An intrinsic is a function whose LLVM code is generated here. The compiled kernel uses them
+    to read arrays of other libraries, and to call Python through a C callback.
+    """
     from llvmlite import ir
 
     types = numba.types
@@ -221,7 +225,7 @@ def _make_intrinsics(numba: Any) -> dict[str, Any]:
 
 
 def _get_argument_types(numba: Any) -> dict[str, Any]:
-    """Return the compiler's types by the names of the annotations."""
+    """Return numba's types by the names of annotations, derived from example values."""
     whole, whole_table = (np.zeros((1,) * k, dtype=np.int64) for k in (1, 2))
     row, table, box = (np.zeros((1,) * k) for k in (1, 2, 3))
     examples = {

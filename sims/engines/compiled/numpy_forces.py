@@ -88,7 +88,11 @@ class NumpyForces:
         )
 
     def _evaluate(self, part: int, width: int) -> None:
-        """Evaluate a part of the program for the first `width` slots."""
+        """Evaluate one part of the program for the first `width` slots (called by machine code).
+
+        Part 0 has nothing to evaluate, part 1 computes forces, and the last part computes
+        impacts.
+        """
         # An exception cannot pass through machine code; the caller raises it afterwards.
         if self.error is None:
             try:
@@ -128,7 +132,11 @@ class NumpyForces:
         self._r[self._rows[OUT_MU], :width] = mu[:, 0]
 
     def _view(self, width: int) -> tuple[StateSnapshot, list[Array]]:
-        """Return snapshot and coefficients (K, W, 1) as views of the registers."""
+        """Return snapshot and coefficients (K, W, 1) of the first W = `width` slots.
+
+        They are views of the registers, so that they show the present values in every
+        evaluation.
+        """
         if width not in self._snapshots:
             names = self._names
             first = int(self._rows[IN_P])

@@ -228,7 +228,10 @@ class BallRollout:
         return states
 
     def _advance_stepwise(self, step: float, count: int) -> tuple[float, ...]:
-        """Advance by `count` steps that evaluate the forces; return the state."""
+        """Advance by `count` steps of `step` seconds, with forces in each; return the state.
+
+        A step in which the ball reaches the ground is divided at the impacts.
+        """
         for _ in range(count):
             # A resting ball that is pulled upward takes off.
             if self.rests and self.lift > 0.0:
@@ -277,7 +280,11 @@ class BallRollout:
         return self.w
 
     def _advance_freely(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
-        """Advance under gravity alone, or at rest; return the state after each count."""
+        """Advance under gravity alone, or at rest, by each number of steps in `counts`.
+
+        No force has to be evaluated, so that the engine runs on its own. Returns the state
+        after each count.
+        """
         self._prepare_step(step)
         ax, ay, az = self.a
         x = 0.5 * step * ax
@@ -293,7 +300,11 @@ class BallRollout:
         return states
 
     def _advance_with_forces(self, step: float) -> None:
-        """Advance by one step, in flight or at rest, under all forces."""
+        """Advance by one step of `step` seconds under all forces, in flight or at rest.
+
+        It applies the force of (4), which gives the velocity of (3) second order in the
+        step.
+        """
         half = 0.5 * step
         wx, wy, wz = self._prepare_step(step)
         x, y, z = self.v

@@ -152,7 +152,11 @@ class LinearisedForces:
         self.weight = self.limit = self._velocity = self._force = self._slope = 0.0
 
     def linearise(self, t: float, x: float, v: float) -> None:
-        """Evaluate all forces at this state and linearise them in the velocity."""
+        """Evaluate all forces at a state, and their slope by the velocity as a difference quotient.
+
+        The half steps (1) and (3) then find the force at other velocities without
+        evaluating it again.
+        """
         # The second velocity is farther from zero, where forces may be discontinuous.
         change = math.copysign(VELOCITY_STEP, v)
         force, changed = self._forces.evaluate_at_velocities(t, x, (v, v + change))
@@ -360,7 +364,11 @@ def _compute_transition_force(
 
 
 def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) -> Trajectory:
-    """Integrate with forces that are evaluated at each step."""
+    """Integrate a joint by (1) to (4), with forces that are evaluated in each step.
+
+    It is used where forces depend on the state; `inertia` is in kg m^2 or kg. A failed
+    integration is NaN throughout.
+    """
     forces = LinearisedForces(joint, element, inertia)
     x = float(element.x[0])
     v = float(element.v[0])

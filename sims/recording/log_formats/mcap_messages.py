@@ -64,7 +64,11 @@ def read_messages(path: Path, topic: str) -> Iterator[tuple[Any, int]]:
 
 
 def _decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
-    """Return the function that decodes the messages of a channel."""
+    """Return the function that decodes the messages of a channel, JSON or Protobuf.
+
+    Raises:
+        InputError: the package for Protobuf is not installed, or the channel has no schema.
+    """
     if encoding == "json":
         return json.loads
     try:

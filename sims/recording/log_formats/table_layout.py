@@ -188,7 +188,14 @@ def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
 def _header(
     line: str, separator: str, width: int, columns: Sequence[int]
 ) -> tuple[str, ...] | None:
-    """Return the column names in a line; None if it is not a header."""
+    """Return the column names in a line; None if the line is not a header.
+
+    Args:
+        line: line before the first row of numbers.
+        separator: separator of the rows.
+        width: number of cells in a row.
+        columns: positions of the columns with numbers, which must have names.
+    """
     comment = COMMENT.match(line)
     # `%time,field.data` of rostopic begins with a name, `% t q1` of Matlab with a comment.
     marked = comment is not None and not re.match(r"%\w", line.strip())

@@ -101,7 +101,11 @@ def _names(layout: Layout) -> list[str]:
 
 
 def _cells(path: Path, layout: Layout) -> list[Any]:
-    """Read the text cells of each column."""
+    """Read the cells of each column as text, without comments and lines before the first row.
+
+    Raises:
+        InputError: rows have different numbers of cells, or the text cannot be decoded.
+    """
     import pandas
 
     separator = r"\s+" if layout.separator == " " else layout.separator
@@ -313,7 +317,13 @@ class _CellKind:
         raise self._fault(path, layout, name, int(bad[0]), "a number")
 
     def _decimal_points(self, path: Path, layout: Layout, name: str) -> Any:
-        """Return the cells with decimal points instead of decimal commas."""
+        """Return the cells with decimal points instead of decimal commas.
+
+        Points before groups of three digits are removed if some cell has both marks.
+
+        Raises:
+            InputError: points without commas leave the meaning of a cell open.
+        """
         grouped = self.filled.str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")
         if self.filled.str.contains(r"\..*,", regex=True).any():
             texts = self.series.str.replace(r"\.(?=\d{3}(\D|$))", "", regex=True)

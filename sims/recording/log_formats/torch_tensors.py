@@ -147,7 +147,13 @@ def _is_container(value: Any) -> bool:
 
 
 def _numbers(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor) -> Array:
-    """Read the numbers of a tensor."""
+    """Read the numbers of a tensor from its storage in the archive.
+
+    Element (i, j) is the number at offset + i stride_0 + j stride_1 of the storage.
+
+    Raises:
+        InputError: the tensor holds no numbers, is too large, or exceeds its storage.
+    """
     kind = _TYPES.get(tensor.storage.kind)
     if kind is None:
         raise InputError(f"{path}: expected tensors of numbers, found {tensor.storage.kind}")
@@ -221,7 +227,10 @@ _NUMBERS_AND_TEXTS = (
 
 
 def _build(name: str, stack: list[Any]) -> None:
-    """Carry out one step that takes values from the stack and builds an object from them."""
+    """Carry out one instruction of the pickle program that builds an object from the stack.
+
+    Only containers and tensors are built; nothing is imported or called.
+    """
     if name in ("TUPLE", "LIST", "DICT", "APPENDS", "SETITEMS"):
         place = max(i for i, value in enumerate(stack) if value is _MARK)
         values = stack[place + 1 :]

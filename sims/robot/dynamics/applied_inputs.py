@@ -40,7 +40,10 @@ class _LruCache:
         self._bytes = 0
 
     def get(self, key: tuple[object, ...], make: Callable[[], Array]) -> Array:
-        """Return the cached array, or make and cache it."""
+        """Return the array cached under a key; otherwise compute it with `make` and cache it.
+
+        If the cache exceeds `CACHE_BYTES`, all older arrays are dropped.
+        """
         if key not in self._kept:
             made = make()
             self._bytes += made.nbytes
@@ -189,7 +192,12 @@ def _given(
     seen: Mask,
     cuts: Array,
 ) -> Array:
-    """Compute the applied inputs (N, S) of requests, with steps subdivided at `cuts`."""
+    """Compute the input that each request applies over each step, (N, S) for N batch elements.
+
+    Delays and filters act within a step. `cuts` are the times in a step, as shares of its length,
+    at which it is divided for them. With the cuts of `STEP_SUBDIVISION` the parts are combined to
+    one value per step; with fewer cuts, the first part is returned.
+    """
     acting = _together(asked)
     of = np.repeat(np.arange(len(asked)), [one.lanes.size for one in asked])
     runs = ScenarioGroups(tuple(_alone(scenario, one.name) for one in asked), of)

@@ -98,7 +98,11 @@ class BatchInputs(NamedTuple):
 
     @classmethod
     def concatenate(cls, parts: Sequence[BatchInputs]) -> BatchInputs:
-        """Concatenate the inputs of several runs; shorter runs repeat their last inputs."""
+        """Join the inputs of several runs, so that one batch simulates all of them.
+
+        All runs then have as many steps as the longest; shorter ones repeat their last
+        inputs, and the additional steps are ignored afterwards.
+        """
         if len(parts) == 1:
             return parts[0]
         steps = max(part.controls.shape[1] for part in parts)

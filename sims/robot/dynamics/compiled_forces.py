@@ -211,7 +211,14 @@ class _Tracing:
         return _Program(written, places[0], places[1], after_all)
 
     def _of(self, effect: Effect, number: int) -> _Asked:
-        """Return the traced form of an effect, for its given occurrence in a program."""
+        """Return an effect with graph inputs for its coefficients and its hidden state.
+
+        `number` counts earlier occurrences of the same class in a program, each with inputs
+        of its own.
+
+        Raises:
+            NotTraceableError: the effect has attributes, which a compiled program would freeze.
+        """
         kind = type(effect), number
         if kind not in self._asked:
             if getattr(effect, "__dict__", None):
@@ -334,7 +341,15 @@ class CompiledForces:
         self._r[self._states] = np.concatenate(begun, axis=1).T
 
     def compute(self, k: int, look: JointStates) -> tuple[Array, Array]:
-        """Compute forces and friction limits over step k, see `EffectForces.compute`."""
+        """Run the program for step k of all batch elements; see `EffectForces.compute`.
+
+        Args:
+            k: number of the step.
+            look: states of the joints at the beginning of the step.
+
+        Returns:
+            Forces (L, D) and limits of dry friction (L, D), in N or N m.
+        """
         r = self._r
         for rows, values in zip(self._motion, look, strict=True):
             r[rows] = values.T
@@ -354,7 +369,11 @@ class CompiledForces:
 
 
 def compile_forces(forces: EffectForces) -> CompiledForces | None:
-    """Compile effect forces; return None if an effect cannot be compiled."""
+    """Compile the forces of effects into instructions, so that MuJoCo's callback can evaluate them.
+
+    The result is None if there is nothing to compile, if an effect cannot be traced, or if the
+    program would be too large; then the caller evaluates `forces` with NumPy.
+    """
     run_by = get_kernel()
     groups = [[effect for effect, _ in group] for group in _groups(forces)]
     if not any(groups):
@@ -375,7 +394,10 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
 def _compiles(
     tracing: _Tracing, forces: EffectForces, effect: Effect, run_by: CompiledKernel
 ) -> bool:
-    """Return whether an effect can be compiled; if not, report it once."""
+    """Return whether an effect can be traced, and then gives the same numbers as with NumPy.
+
+    Each class of effects is tested once; a failure is reported on standard error.
+    """
     kind = type(effect)
     if kind not in tracing.known:
         tracing.known[kind] = False

@@ -221,7 +221,10 @@ def compute_effect_forces(forces: Sequence[tuple[Force, Array]], moment: RobotSn
 def compute_friction_limits(
     frictions: Sequence[tuple[Friction, Array]], moment: RobotSnapshot
 ) -> Array:
-    """Compute the total limits (L, D) of dry friction."""
+    """Add up the limits of dry friction of all effects, (L, D) in N or N m.
+
+    MuJoCo's solver then finds the friction force within these limits.
+    """
     limit = np.zeros_like(moment.x)
     for effect, c in frictions:
         joint = effect.coordinate

@@ -208,7 +208,10 @@ class LinearisationPoints:
         return np.concatenate(accelerations), np.concatenate(readings)
 
     def _readings(self, n: int) -> Array:
-        """Return readings (n, O) of the present state of the batch."""
+        """Read the O outputs from the first n elements of the batch, (n, O).
+
+        To readings of drive forces, the forces that effects exert in the drive are added.
+        """
         bind = self._bench.batch.bind
         rows = [bind(name)[:n, column, None] for name, column in self._outputs]
         if not rows:
@@ -222,7 +225,17 @@ class LinearisationPoints:
     def _placed(
         self, moved: Mapping[str, tuple[int, float]], acting: ActiveEffects
     ) -> Iterator[tuple[int, Places | None]]:
-        """Place the points in the batch, part by part; yield number and indices of elements."""
+        """Place the points in the elements of the batch, as many at a time as it has elements.
+
+        Args:
+            moved: displacements for a difference quotient, index and size by quantity: q position,
+                v velocity, a activation, w hidden state, p and r displacement and velocity of
+                floating bodies, f force, u control.
+            acting: active effects.
+
+        Yields:
+            Number n of elements in use, and their indices (None if all are in use).
+        """
         motion, places, floating = self.motion, self._places, self._floating
         count = self._bench.count
         self.seen += self.numbers.size
@@ -320,7 +333,10 @@ class LinearisationPoints:
 
     @contextmanager
     def with_batch(self, bench: MujocoBatch) -> Iterator[None]:
-        """Evaluate the points with another batch with equal coordinates."""
+        """Use another batch of the robot within a `with` block, such as one with other masses.
+
+        Its coordinates must be the same as those of the own batch.
+        """
         own = self._bench, self._fresh
         if bench is not self._bench:
             self._bind(bench)
@@ -343,7 +359,11 @@ class LinearisationPoints:
 
     @contextmanager
     def limited_forces(self) -> Iterator[None]:
-        """Read the forces with limits at stiff servos, instead of the outputs."""
+        """Read the limited forces of stiff servos within a `with` block, not the outputs.
+
+        They show at which points a force limit is reached, where the linear model is not
+        valid.
+        """
         own = self._outputs, self._drives
         self._outputs = self._bench.force_limits.outputs
         self._drives = np.full(len(self._outputs), -1)
@@ -354,7 +374,10 @@ class LinearisationPoints:
             self._outputs, self._drives = own
 
     def compute_mass_matrices(self) -> Array:
-        """Compute the inertia matrices (N, E, E) at each point."""
+        """Compute the inertia matrix (N, E, E) at each point, by MuJoCo's composite-body algorithm.
+
+        The E rows are those of the joints and of the floating bodies.
+        """
         import mujoco
 
         self._bench.write_effects(_repeated(self.acting, self._bench.count))

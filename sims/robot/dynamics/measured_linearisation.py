@@ -350,7 +350,11 @@ class MeasuredLinear(RunLinearisation):
 
     @cached_property
     def _composed(self) -> Array:
-        """State changes (T - 1, Z, E + nu) per constant force or control over an interval."""
+        """State changes (T - 1, Z, E + nu) at the end of each interval between samples.
+
+        They are per unit of a generalised force or a control that is constant over the
+        interval.
+        """
         tangent = self._tangent
         of, quotients = tangent.looked_at, tangent.quotients
         by = np.concatenate([quotients.forces, quotients.controls], axis=2)
@@ -412,7 +416,7 @@ class MeasuredLinear(RunLinearisation):
         return result
 
     def moved(self, deviations: Array) -> Trajectory:
-        """Return the motion with deviations (S + 1, Z) of states added."""
+        """Return the motion plus deviations (S + 1, Z) of its states, such as a smoother's."""
         # The motion is not changed where the linear model diverges.
         deviations = np.where(np.abs(deviations) < FARTHEST, deviations, 0.0)
         own, motion = len(self._simulator.addresses.positions), self._motion

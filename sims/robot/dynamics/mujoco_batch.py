@@ -340,7 +340,12 @@ class MujocoBatch:
         return result
 
     def _switched(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
-        """Yield consecutive parts of all steps, while actuators that are off are switched off."""
+        """Yield the steps in consecutive parts, and switch actuators on or off before each part.
+
+        Within a part no switch changes. An actuator is switched off by a force range of
+        zero. `off` (n, S, K) says which of the K actuators are off; None means that all are
+        on.
+        """
         if off is None or not off.any():
             yield from self._parts(n, steps)
             return

@@ -293,7 +293,12 @@ class RunLinearisation:
         return bool(rest == 0.0)
 
     def _driven(self, added: Sequence[EffectWithCoefficients]) -> dict[int, list[Perturbation]]:
-        """Return the changes of applied inputs by input effects, by number of the effect."""
+        """Return the changes of controls by added input effects, by number of the effect.
+
+        Input effects act before the robot, so their changes are computed exactly and only
+        propagated to first order. `rows` lists the effects at one place each as (number,
+        effect, coefficients), one batch element for each.
+        """
         rows: list[tuple[int, Effect, Array]] = []
         for number, (effect, c) in enumerate(added):
             for one, k in effect.parts(c[:, None, None]):
@@ -369,7 +374,14 @@ class RunLinearisation:
 
 
 def _on(channel: str, own: ActiveEffects, more: Sequence[ActiveEffects]) -> ActiveEffects:
-    """Return the sensor effects on a channel: those of the motion, then the additional ones."""
+    """Return the sensor effects on a channel: those of the run, then the additional ones.
+
+    Args:
+        channel: name of the channel.
+        own: effects that are active in the run.
+        more: additional effects for each batch element; the result has coefficients (K, L, 1) that
+            are zero in all other elements.
+    """
     acting = [(e, c) for e, c in own if isinstance(e, Sensor) and e.signal in ("", channel)]
     added: dict[str, tuple[Effect, Array]] = {}
     for lane, parts in enumerate(more):

@@ -120,7 +120,10 @@ def _filtering(sensors: ActiveEffects) -> Iterator[tuple[NDArray[np.intp], Activ
 
 
 def _at(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
-    """Interpolate values (L, S + 1) at times (L, T)."""
+    """Interpolate values (L, S + 1), given at the ends of steps, at times (L, T) in seconds.
+
+    With slopes, the cubic Hermite polynomial (1) is used, otherwise a straight line.
+    """
     place = instants / step
     nearest = np.rint(place)
     near = np.abs(place - nearest) < TIME_TOLERANCE_SHARE

@@ -44,7 +44,12 @@ class ForceLimits(NamedTuple):
 
 
 def stiff_force_limits(model: Any) -> ForceLimits:
-    """Return the force limits of stiff servos at joints of a MuJoCo model."""
+    """Find the force limits of stiff servos, at which a linearised motion jumps.
+
+    An implicit integrator takes the servo's damping into account within the step. At its force
+    limit the servo loses this damping, which changes the state abruptly. Other integrators have
+    no such limits, so that the result is empty.
+    """
     import mujoco
 
     kinds = mujoco.mjtIntegrator

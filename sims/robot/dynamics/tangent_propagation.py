@@ -347,7 +347,11 @@ class TangentModel:
 
     @cached_property
     def defects(self) -> Array:
-        """Differences (S, Z) between the motion and the model's step from each of its states."""
+        """Differences (S, Z) between the motion and the model's own step, the defect of each step.
+
+        The model starts each step from the state of the motion. The defect is zero for a
+        simulated motion, and not zero for a measured one.
+        """
         motion, joints = self._motion, self._motion.x.shape[1]
         base, _ = self._every_step
         result = np.zeros_like(base)

@@ -198,7 +198,12 @@ def _element(cause: FittedCause) -> Transmission:
 def _write(
     wanted: Fields, robot: RobotModel, cause: FittedCause, series: Mapping[str, Transmission]
 ) -> str | None:
-    """Apply a cause to the fields; `series` contains the elements in series not yet written."""
+    """Write a cause into the model fields; return None or a reason.
+
+    A reason that begins with + is a note about a cause that was written; otherwise the cause
+    cannot be stated in a model file. `series` are the elements in series, by place, that are
+    not yet written.
+    """
     # A coupling is an element of the robot, which has been added before.
     if cause.effect == COUPLED:
         return None
@@ -231,7 +236,14 @@ def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
 
 
 def _compiled(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
-    """Return a spec that compiles to the wanted fields, and the compiled model."""
+    """Change a copy of the robot's spec until it compiles to the wanted fields.
+
+    Several rounds are needed, because MuJoCo derives some fields from others during
+    compilation.
+
+    Returns:
+        The changed mujoco.MjSpec, and the compiled model.
+    """
     spec, model = robot.spec.copy(), robot.compiled
     by_id = SpecElements(spec, robot)
     tolerance = 0.0
@@ -328,7 +340,10 @@ def _in_frames(body: Any, position: Sequence[float]) -> Array:
 
 
 def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
-    """Convert values to the form of a spec attribute: a number, or an array of its length."""
+    """Convert values to the form of a spec attribute: a number, or an array padded with zeros.
+
+    Angles of a hinge are converted to degrees if the spec's compiler uses degrees.
+    """
     import mujoco
 
     if name in ANGLE_ATTRIBUTES and element.type == mujoco.mjtJoint.mjJNT_HINGE:

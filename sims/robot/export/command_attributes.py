@@ -211,7 +211,12 @@ def _lag(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableRea
 
 
 def _force(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:
-    """Write a constant force at a joint, as a spring rest position or an actuator bias."""
+    """Write a constant force at a joint into the model, in N or N m.
+
+    A joint with a linear spring gets another rest position: force = stiffness times
+    displacement. Otherwise an actuator of the joint gets a bias, if no force limit would clip
+    it. The result is None, a note that begins with +, or the reason why neither is possible.
+    """
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
     stated = robot.compiled.ntendon - len(robot.coupled)

@@ -62,7 +62,12 @@ class MjcfWriter:
             self.degrees = compiler.attributes.get("angle", "degree") == "degree"
 
     def write(self, statement: AttributeStatement, comments: Sequence[str]) -> None:
-        """Write a statement about an element, with comments."""
+        """Write the attributes of one element into the document, and comments before the element.
+
+        Args:
+            statement: element with the attributes and values that it needs.
+            comments: reasons for the change, in sentences.
+        """
         element = statement.element
         if element.kind == "option":
             self._option(statement, comments)
@@ -152,7 +157,12 @@ class MjcfWriter:
         return values
 
     def _actuator(self, tag: XmlElement, statement: AttributeStatement) -> dict[str, str]:
-        """Return the attributes of an actuator, as its shortcut if possible, else ``general``."""
+        """Return the attributes of an actuator as text, and keep its element name if possible.
+
+        Names such as position or motor are shortcuts for a general actuator. If the
+        shortcut cannot state the wanted values, the element becomes ``general`` with all
+        the attributes that it needs.
+        """
         changed = statement.values
         before = {} if statement.insisted else self._before(statement.element)
         own = _shortcut(

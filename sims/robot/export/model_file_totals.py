@@ -132,7 +132,18 @@ def _name(effect: type[Effect]) -> str:
 def _totals(
     robot: RobotModel, effect: type[Effect], count: int, stated: Fields, after: Fields
 ) -> list[Total | None]:
-    """Return the totals of one effect."""
+    """Return what the numbers of the file become with one effect, for each of its coefficients.
+
+    An example is a damping of 0.1 in the file and an effect of 0.2: the total is 0.3. The
+    result is None where the file has no such number.
+
+    Args:
+        robot: robot with the model file.
+        effect: effect at one place.
+        count: number of coefficients.
+        stated: fields of the model file.
+        after: fields with the effect.
+    """
     if _name(effect) not in _TOTALS:
         return [None] * count
     reading = _TOTALS[_name(effect)]

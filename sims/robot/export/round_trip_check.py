@@ -80,7 +80,11 @@ def _check_mjcf(done: WrittenModelFiles, path: Path) -> None:
 
 
 def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> None:
-    """Compare a written URDF with the model file with the causes that a URDF can contain."""
+    """Check that a written URDF loads as the model with all causes that a URDF can express.
+
+    Raises:
+        RuntimeError: fields, inertia tensors or the motion differ.
+    """
     from sims.robot.export.urdf_writer import UrdfWriter
     from sims.robot.parsing.read_model_file import read_robot
 

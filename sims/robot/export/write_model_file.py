@@ -135,7 +135,14 @@ def _fix_base(document: MjcfDocument) -> None:
 
 
 def _couple(document: MjcfDocument, applied: ModifiedModel) -> None:
-    """Add tendons, and let actuators drive them instead of their joints."""
+    """Write the couplings of joints: a fixed tendon for each, which the joint's actuators drive.
+
+    The length of the tendon is q + c q_first, with the coefficient c and the preceding joint
+    q_first.
+
+    Raises:
+        NotEditableError: the text lacks a joint or an actuator of the compiled model.
+    """
     robot, model = applied.robot, applied.model
     tags = [child for tag in document.find_elements("actuator") for child in document.children(tag)]
     if len(tags) != len(robot.actuators):
@@ -156,7 +163,11 @@ def _couple(document: MjcfDocument, applied: ModifiedModel) -> None:
 
 
 def _joint(second: Any) -> str:
-    """Render a joint in series as an element that does not depend on the file's default classes."""
+    """Render a joint in series as an MJCF element, with all attributes stated.
+
+    The file's default classes then have no influence on it. `plays` is whether its range is
+    limited, which represents backlash.
+    """
     kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
     plays = str(second.limited).endswith("TRUE")
     attributes = {

@@ -163,7 +163,11 @@ class XmlText:
         return tag.inside if self._closed(tag) else self._end_of(tag.end)
 
     def _tag(self, tag: XmlElement) -> bytes:
-        """Return the text of an element with its changes."""
+        """Return the text of an element with its comments, changed attributes and new elements.
+
+        Raises:
+            NotEditableError: new elements belong into an element with a self-closing tag.
+        """
         indent = self._indent(tag.begin)
         comments = [self._comment(text) + self._newline + indent for text in tag.before]
         if tag.text is not None:

@@ -124,7 +124,7 @@ def _with_world(
 
 
 def _named(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
-    """Give each joint a unique name."""
+    """Give each joint a unique name, which MuJoCo requires, and return notes about the changes."""
     seen: set[str] = set()
     notes = []
     for joint in joints:

@@ -149,7 +149,11 @@ def _swing(joint: Joint, start: float) -> float:
 def _command(
     robot: RobotModel, actuator: Actuator, joint: Joint, holding: float, force: float
 ) -> ExcitationCommand:
-    """Make the command of an actuator."""
+    """Make a sinusoidal command of an actuator that moves its joint within all limits.
+
+    `holding` is the force (N or N m) that holds the reference pose, and `force` the amplitude
+    of a force that would move the joint. Position and velocity servos receive a motion instead.
+    """
     model = robot.compiled
     start = float(model.qpos0[joint.position])
     swing = _swing(joint, start)

@@ -85,7 +85,11 @@ def make_world_effect(effect: type[Effect]) -> type[Effect]:
 
 
 def make_placed_effect(effect: type[Effect], spot: EffectPlace) -> type[Effect]:
-    """Make the class of an effect at one place."""
+    """Make the class of a registered effect at one joint, actuator, body or channel.
+
+    It has the units and plausible ranges that apply there, and methods that read and write only
+    the coordinate or the signal of that place.
+    """
     tilts = spot.tilts if effect.name == "joint.axis" else None
     shown = [c for c in effect.coefficients if tilts is None or c.name in tilts]
     coefficients = [_of_spot(effect, c, spot) for c in shown]
@@ -318,7 +322,11 @@ def _everywhere(c: Coefficient) -> Coefficient:
 
 
 def _of_spot(effect: type[Effect], c: Coefficient, spot: EffectPlace) -> Coefficient:
-    """Give a coefficient the unit and the plausible range that apply at a place."""
+    """Give a coefficient the unit, plausible range and limits that apply at a place.
+
+    Ranges of forces are scaled with the typical force of the joint. If the file specifies a
+    value, the coefficient is a difference from it, limited so that the total is not negative.
+    """
     i = 2 if spot.kind == "hinge" else 1
     unit, (low, high) = c.units[i], c.plausible[i]
     least = c.least

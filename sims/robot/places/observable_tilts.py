@@ -56,7 +56,10 @@ def _unit(vector: Array) -> Array:
 
 
 def _forces(model: Any, joints: tuple[Joint, ...]) -> Array:
-    """Return bias forces and inertia matrices in random states, as one vector."""
+    """Return bias forces and inertia matrices in fixed random states, as one vector.
+
+    If a change of the model changes none of these numbers, it changes no motion.
+    """
     import mujoco
 
     data = mujoco.MjData(model)
