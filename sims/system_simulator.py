@@ -404,7 +404,7 @@ def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
 
 
 def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:
-    """Return the states with these names as columns (L, D)."""
+    """Return the states with these names as columns, (L, D) for L = `count` batch elements."""
     if not names:
         return np.empty((count, 0))
     columns = [np.broadcast_to(states[name], (count,)) for name in names]
@@ -430,7 +430,11 @@ def _names_effect(value: object) -> bool:
 
 
 def _row(name: str, value: Any) -> tuple[float, ...]:
-    """Return the coefficients of a fixed effect as a tuple."""
+    """Return the coefficients of a fixed effect as a tuple of numbers.
+
+    Raises:
+        InputError: a coefficient is not a finite number.
+    """
     several = isinstance(value, list | tuple)
     values = tuple(value) if several else (value,)
     if not all(map(is_plausible_number, values)):

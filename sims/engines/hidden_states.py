@@ -41,7 +41,7 @@ class AugmentedSystem(System):
 
     @classmethod
     def get_base_snapshot(cls, moment: StateSnapshot) -> StateSnapshot:
-        """Return the state snapshot without hidden coordinates."""
+        """Return the state of the original system, without hidden coordinates."""
         own = len(cls.base_system.coordinates)
         theta = moment.theta[:, : len(cls.base_system.parameters)]
         x, v = moment.x[:, :own], moment.v[:, :own]
@@ -49,7 +49,10 @@ class AugmentedSystem(System):
 
     @classmethod
     def split_coefficients(cls, theta: Array) -> list[Array]:
-        """Return the coefficients (K, L, 1) of each effect."""
+        """Return the coefficients (K, L, 1) of each effect with hidden states.
+
+        They are stored in the columns of `theta` after the system's own parameters.
+        """
         coefficients = []
         place = len(cls.base_system.parameters)
         for effect in cls.effects:

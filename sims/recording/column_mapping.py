@@ -222,7 +222,7 @@ def list_mapped_files(description: Path) -> list[Path]:
 
 
 def _named(tables: Any, word: str) -> list[str]:
-    """Return the values of a key in nested tables, at any depth."""
+    """Collect all texts under the key `word` in nested tables, such as all stated file names."""
     if not isinstance(tables, dict):
         return []
     own = [tables[word]] if isinstance(tables.get(word), str) else []

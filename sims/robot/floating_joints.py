@@ -99,7 +99,7 @@ class FloatingJoints:
         return units
 
     def states(self, model: Any) -> dict[str, float]:
-        """Return the default states of the model file, by name."""
+        """Return initial states by name: poses from the model file, and velocities of zero."""
         positions, velocities = self.names()
         poses = model.qpos0[self.positions].tolist()
         return dict(zip(positions, poses, strict=True)) | dict.fromkeys(velocities, 0.0)
@@ -170,7 +170,7 @@ class FloatingJoints:
 
     @cached_property
     def _own(self) -> tuple[FloatingJoint, ...]:
-        """Layout of each joint's numbers."""
+        """Where the pose numbers and the velocities of each joint are, in order."""
         own, end, first = [], 0, 0
         for axes in map(_axes, self.joints):
             end += len(axes + TURN)
@@ -185,7 +185,7 @@ def _axes(joint: Joint) -> tuple[str, ...]:
 
 
 def _product(one: Array, other: Array) -> Array:
-    """Compute Hamilton products (n, 4) of quaternions."""
+    """Compute the Hamilton products (n, 4) of `one` and `other`, quaternions (w, x, y, z)."""
     a, u = one[:, :1], one[:, 1:]
     b, v = other[:, :1], other[:, 1:]
     real = a * b - np.sum(u * v, axis=1, keepdims=True)

@@ -81,7 +81,11 @@ def compile_batch_model(robot: RobotModel) -> Any:
 
 
 def make_batch_spec(robot: RobotModel) -> Any:
-    """Make the mujoco.MjSpec of `compile_batch_model`."""
+    """Make the mujoco.MjSpec of `compile_batch_model`, with all fields that effects may change.
+
+    MuJoCo omits computations whose numbers are zero or simple in the file. Here no body counts
+    as simple, and gravity compensation is always computed.
+    """
     spec = robot.spec.copy()
     for body in spec.bodies:
         body.simple = False
@@ -161,6 +165,7 @@ def _add_dof(field: str) -> FieldWriter:
 
 
 def _add_quadratic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the quadratic damping of a joint, force = -c |v| v, by (1)."""
     # The first number of the polynomial multiplies |v| v.
     column = fields["dof_dampingpoly"][:, robot.joint(place).velocity]
     column[:, 0] = add_to_stated(column[:, 0], c[0])
@@ -181,28 +186,33 @@ def _add_friction(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
 
 def _add_spring(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the linear stiffness of a joint by (1), in N m/rad or N/m."""
     column = fields["jnt_stiffness"]
     number = robot.joint(place).id
     column[:, number] = add_to_stated(column[:, number], c[0])
 
 
 def _add_cubic(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the cubic stiffness of a joint, in N m/rad^3 or N/m^3."""
     # The second number of the polynomial multiplies x^3. It has no lower limit, since a spring may
     # soften.
     fields["jnt_stiffnesspoly"][:, robot.joint(place).id, 1] += c[0]
 
 
 def _scale_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale mass and inertia of a body by 1 + c (2), as if its density changed."""
     number = robot.body(place).id
     fields["body_mass"][:, number] *= compute_factor(c[0])
     fields["body_inertia"][:, number] *= compute_factor(c[0])[:, None]
 
 
 def _scale_inertia(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Scale the inertia of a body by 1 + c (2), with the same mass."""
     fields["body_inertia"][:, robot.body(place).id] *= compute_factor(c[0])[:, None]
 
 
 def _offset_mass(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Move the centre of mass of a body by c (3 numbers, m) in the body frame (3)."""
     fields["body_ipos"][:, robot.body(place).id] += c.T  # (3)
 
 
@@ -252,12 +262,14 @@ def gain_pulls(robot: RobotModel, number: int, term: int) -> bool:
 
 
 def _scale_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
+    """Scale the file's gravity by 1 + c, in addition to any tilt of gravity."""
     gravity = fields["opt.gravity"]
     # The tilt that another effect added is not scaled.
     gravity += c[0][:, None] * robot.compiled.opt.gravity
 
 
 def _tilt_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:  # noqa: ARG001
+    """Tilt gravity by adding g c_x along x and g c_y along y (4), with the magnitude g."""
     size = float(np.linalg.norm(robot.compiled.opt.gravity))
     fields["opt.gravity"][:, :2] += size * c.T  # (4)
 
@@ -309,6 +321,7 @@ def _scale_length(fields: Fields, robot: RobotModel, place: str, c: Array) -> No
 
 
 def _compensate_gravity(fields: Fields, robot: RobotModel, place: str, c: Array) -> None:
+    """Add c to the gravity compensation of a body (1 means weightless) where c is not zero."""
     column = fields["body_gravcomp"]
     number = robot.body(place).id
     column[:, number] = np.where(c[0], add_to_stated(column[:, number], c[0]), column[:, number])
@@ -342,7 +355,14 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
 
 
 def compute_point_inertias(arms: Array) -> Array:
-    """Return J(d) (L, 3, 3) of (7) for vectors (L, 3)."""
+    """Return J(d) = |d|^2 1 - d d' of (7), the inertia tensors of unit masses at d.
+
+    Args:
+        arms: (L, 3) vectors d from the reference point, in m.
+
+    Returns:
+        (L, 3, 3) tensors in m^2.
+    """
     squares = np.sum(arms**2, axis=1)[:, None, None]
     result: Array = squares * np.eye(3) - arms[:, :, None] * arms[:, None, :]
     return result

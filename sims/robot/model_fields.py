@@ -50,6 +50,7 @@ def _body(name: str) -> Find:
 
 
 def _center(robot: RobotModel, place: str) -> list[list[ModelField]]:
+    """Return the three fields of a body's centre of mass."""
     number = robot.body(place).id
     return [[ModelField("body_ipos", (number, axis))] for axis in range(3)]
 
@@ -74,6 +75,7 @@ def _servo(term: int) -> Find:
 
 
 def _force_range(robot: RobotModel, place: str) -> list[list[ModelField]]:
+    """Return both ends of an actuator's force range, which one positive limit determines."""
     number = robot.actuator(place).id
     ends = [ModelField("actuator_forcerange", (number, end), (-1, 1)[end]) for end in (1, 0)]
     return [ends]

@@ -445,6 +445,7 @@ def filters() -> tuple[int, int]:
 
 
 def _axes(count: int) -> list[str]:
+    """Return name endings for the numbers of a sensor: axes, quaternion entries, or indices."""
     named = {3: "xyz", 4: "wxyz"}
     return list(named[count]) if count in named else [str(k) for k in range(count)]
 

@@ -387,7 +387,16 @@ class RobotSimulator(SystemSimulator):
         return last
 
     def _activations(self, one: ActivationFilter, controls: Array, begun: Array) -> Array:
-        """Return the activations (n, S + 1) of a filter."""
+        """Integrate an activation filter over the steps, as MuJoCo's integrator does.
+
+        Args:
+            one: the filter.
+            controls: (n, S) controls over the steps.
+            begun: (n,) activations at the beginning.
+
+        Returns:
+            (n, S + 1) activations at the beginnings of steps, and at the end.
+        """
         engine = self.engine
         assert isinstance(engine, RobotEngine)
         fourth = is_fourth_order(int(engine.numerics.to_model_options()["integrator"]))

@@ -62,7 +62,7 @@ Thousands of simulations share the same commands.
 
 
 def _digest(times: Array, signal: Array) -> bytes:
-    """Compute the digest of a signal and its sample times."""
+    """Compute a digest of a signal and its sample times, which is a key of the cache."""
     digest = hashlib.blake2b(times.tobytes(), digest_size=16)
     digest.update(signal.tobytes())
     return digest.digest()
@@ -152,7 +152,11 @@ def _alone(scenario: Scenario, name: str) -> Scenario:
 
 
 def _by_kinds(passed: ActiveEffects, n: int) -> Iterator[tuple[Places, ActiveEffects]]:
-    """Group batch elements by their active effects."""
+    """Group n batch elements by the effects that act on them, without elements on which none acts.
+
+    Yields: Indices of a group's elements, and the effects with the coefficients of these
+    elements.
+    """
     there = np.array([(c != 0).any(axis=(0, 2)) for _, c in passed], dtype=bool).reshape(-1, n)
     kinds, of = np.unique(there, axis=1, return_inverse=True)
     for number, kind in enumerate(kinds.T):

@@ -293,7 +293,7 @@ class CompiledForces:
 
     @property
     def input_values(self) -> Array:
-        """Applied inputs (S, U, L)."""
+        """Applied inputs (S, U, L) over S steps: U inputs of L batch elements."""
         if not self._of.felt:
             return np.zeros((1, 0, self._r.shape[1]))
         return self._felt
@@ -443,7 +443,7 @@ def _effects(forces: EffectForces) -> list[tuple[Effect, Array]]:
 
 
 def _alone(forces: EffectForces, effect: Effect) -> EffectForces:
-    """Return the forces of one of the effects only."""
+    """Return the forces of one effect without the others, to test whether it can be compiled."""
     own = tuple(pair for pair in _effects(forces) if pair[0] is effect)
     return EffectForces(
         forces.system, own, forces.felt, forces.addresses, forces.stiffness, forces.step

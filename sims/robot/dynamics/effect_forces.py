@@ -211,7 +211,12 @@ def compute_drive_effect_forces(acting: ActiveEffects, moment: RobotSnapshot) ->
 
 
 def compute_effect_forces(forces: Sequence[tuple[Force, Array]], moment: RobotSnapshot) -> Array:
-    """Compute the total force (L, D) of effects."""
+    """Add up the forces of all effects, (L, D) in N or N m.
+
+    Args:
+        forces: effects with their coefficients (K, L, 1).
+        moment: state at which the effects are evaluated.
+    """
     total = np.zeros_like(moment.x)
     for effect, c in forces:
         total = total + effect.force(c, moment)

@@ -141,6 +141,7 @@ class LinearisationPoints:
         self._fresh = bench.batch.state.copy()
 
     def _bind(self, bench: MujocoBatch) -> None:
+        """Bind the fields of MuJoCo's data that are read, before MuJoCo's first call."""
         for name in ("qacc", *TRANSMISSION_FORCE_FIELDS, *dict(self._outputs)):
             bench.batch.bind(name)
 

@@ -233,7 +233,7 @@ class TangentModel:
 
     @cached_property
     def accelerations(self) -> Array:
-        """Mean accelerations (S, E) over each step."""
+        """Mean accelerations (S, E) over each step, from the velocities at its ends."""
         motion = self._motion
         result: Array = np.diff(motion.velocities, axis=0)[: self._steps] / motion.step
         return result
@@ -387,7 +387,7 @@ class TangentModel:
 
     @staticmethod
     def _numbered(changes: Sequence[Perturbation], count: int) -> Mask:
-        """Return which owners (n,) change model parameters."""
+        """Return which of `count` owners change model parameters, as a mask (count,)."""
         numbered = np.zeros(count, dtype=bool)
         numbered[[change.owner for change in changes if change.forces is not None]] = True
         return numbered

@@ -176,6 +176,7 @@ def _note(robot: RobotModel, cause: FittedCause) -> str | None:
 
 
 def _is_in_series(cause: FittedCause) -> bool:
+    """Return whether a cause is an effect that adds a joint in series, such as a flexible gear."""
     return cause.effect in library.list_names() and is_series_effect(
         library.get_effect(cause.effect)
     )
@@ -191,6 +192,7 @@ def _in_series(causes: Sequence[FittedCause]) -> dict[str, Transmission]:
 
 
 def _element(cause: FittedCause) -> Transmission:
+    """Make the element in series with a joint from the coefficients of a cause."""
     numbers = {name: np.array([number.value]) for name, number in cause.numbers.items()}
     return make_series_element(library.get_effect(cause.effect), numbers)
 
@@ -357,7 +359,10 @@ def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -
 
 
 def _explicit(body: Any) -> None:
-    """Make the compiler use the inertial that was set."""
+    """Make MuJoCo's compiler use the mass and principal moments that were set for a body.
+
+    Otherwise a full inertia tensor or an orientation from the file would take precedence.
+    """
     import mujoco
 
     body.explicitinertial = True

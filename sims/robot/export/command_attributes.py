@@ -82,7 +82,7 @@ class _Actuator:
         return self._of("actuator_dyntype") in kinds and not self.clamped
 
     def shift(self, force: float) -> None:
-        """Add a constant to the force."""
+        """Add a constant force in N or N m to the force that the actuator computes."""
         import mujoco
 
         if self._of("actuator_biastype") == int(mujoco.mjtBias.mjBIAS_NONE):
@@ -92,7 +92,7 @@ class _Actuator:
         self.bias[0] += force
 
     def limits(self) -> tuple[float, float]:
-        """Return the lower and upper limit of the control."""
+        """Return the lower and upper limit of the control; infinite if there is none."""
         if not self.fields["actuator_ctrllimited"][0, self.control]:
             return -np.inf, np.inf
         low, high = self.fields["actuator_ctrlrange"][0, self.control]
@@ -242,12 +242,14 @@ def _force(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableR
 
 
 def _step(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+    """Write a time step in seconds as the option of the model file."""
     (step,) = cause.coefficients
     fields["opt.timestep"][0] = step
     return None
 
 
 def _integrator(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableReason:  # noqa: ARG001
+    """Write MuJoCo's number of an integrator as the option of the model file."""
     (number,) = cause.coefficients
     fields["opt.integrator"][0] = int(number)
     return None

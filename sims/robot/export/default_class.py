@@ -137,6 +137,7 @@ def render_model_using_class(
 
 
 def _comment(text: str) -> str:
+    """Render text as an XML comment."""
     # Two hyphens would end an XML comment early.
     safe = text.replace("--", "- -")
     return f"<!-- {safe} -->"

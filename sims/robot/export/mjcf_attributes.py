@@ -96,6 +96,7 @@ def _polynomial(
     """
 
     def read(fields: Fields, where: Any) -> list[float]:
+        """Return the coefficients of the element at the address in `where`, lowest order first."""
         at = getattr(where, address)
         return [fields[first][0, at], *fields[others][0, at]]
 

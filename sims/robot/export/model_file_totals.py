@@ -53,6 +53,7 @@ def _strength(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:  # n
 
 
 def _limit(f: Fields, robot: RobotModel, place: str) -> Sequence[float]:
+    """Return the upper force limit of an actuator in a list of one; infinite if none."""
     number = robot.actuator(place).id
     limited = f["actuator_forcelimited"][0, number]
     return [f["actuator_forcerange"][0, number, 1]] if limited else [np.inf]

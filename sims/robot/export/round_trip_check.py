@@ -71,7 +71,7 @@ def check_written_files(
 
 
 def _check_mjcf(done: WrittenModelFiles, path: Path) -> None:
-    """Compare a written MJCF with the intended model."""
+    """Compile a written MJCF, and check that it equals the intended model."""
     import mujoco
 
     with capture_mujoco_warnings():
@@ -130,6 +130,7 @@ def _tensors(model: Any) -> Array:
 
 
 def _without_contacts(model: Any) -> None:
+    """Switch off contacts in a compiled model, so that only joints and actuators are compared."""
     import mujoco
 
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

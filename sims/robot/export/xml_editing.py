@@ -118,6 +118,7 @@ class XmlText:
         self._open.append(tag)
 
     def _end(self, name: str) -> None:  # noqa: ARG002
+        """Store where the content of an element ends, at its end tag (called by the parser)."""
         tag = self._open.pop()
         if not self._closed(tag):
             tag.end = self._parser.CurrentByteIndex
@@ -211,6 +212,7 @@ class XmlText:
         return b"".join([*parts, text[at:]])
 
     def _comment(self, text: str) -> bytes:
+        """Render text as an XML comment, with the line ends of the file."""
         # Two hyphens would end a comment early, and so would a hyphen at its end.
         safe = re.sub(r"-(?=-)", "- ", text)
         return f"<!-- {safe} -->".encode().replace(b"\n", self._newline)

@@ -137,6 +137,7 @@ def _check(spec: Any, source: str, where: str, name: str, table: Mapping[str, An
 
 
 def _single(joint: Any) -> bool:
+    """Return whether a joint of a spec has one degree of freedom."""
     import mujoco
 
     return joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

@@ -282,7 +282,7 @@ def _sizes(hulls: Iterable[Hull]) -> Array:
 
 
 def _gather(values: Integers, begins: Integers, sizes: Integers) -> Lists:
-    """Copy lists out of an array, given their begins and sizes."""
+    """Copy lists of the given begins and sizes out of a flat array."""
     ends = np.cumsum(sizes)
     places = np.repeat(begins - ends + sizes, sizes) + np.arange(ends[-1] if ends.size else 0)
     return Lists(values[places], sizes.copy())

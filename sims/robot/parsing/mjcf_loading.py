@@ -155,6 +155,7 @@ def _model(files: ModelFileReader, element: Element) -> None:
 
 
 def _named(element: Element) -> Iterator[str]:
+    """Return the names of the files that an asset refers to; a texture may have six."""
     keys = TEXTURE_FILE_ATTRIBUTES if element.tag == "texture" else ("file",)
     return (element.attrib[key] for key in keys if element.get(key))
 

@@ -84,7 +84,7 @@ def _no_macros(files: ModelFileReader, root: Element) -> None:
 
 
 def _unread(root: Element) -> list[str]:
-    """Remove elements that MuJoCo does not read."""
+    """Remove elements that MuJoCo does not read, and return a note about them."""
     tags = sorted(
         {child.tag for child in root if child.tag not in (*READ_ELEMENTS, *VISUAL_ELEMENTS)}
     )
@@ -142,7 +142,11 @@ def _named(files: ModelFileReader, joints: Sequence[Element]) -> list[str]:
 
 
 def _end(files: ModelFileReader, joint: Element, tag: str) -> str:
-    """Return the name of a joint's parent or child link."""
+    """Return the name of the link at one end of a joint; `tag` is parent or child.
+
+    Raises:
+        InputError: the joint does not state this link.
+    """
     ends = find_children(joint, tag)
     name = ends[0].get("link") if ends else None
     if not name:
@@ -183,7 +187,10 @@ def _joined(
 
 
 def _held(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
-    """Return whether a link is fused to the world."""
+    """Return whether only fixed joints are between a link and the root, so that it never moves.
+
+    `above` maps a link to its parent link and the joint between them.
+    """
     while name in above:
         name, joint = above[name]
         if joint.get("type") != "fixed":

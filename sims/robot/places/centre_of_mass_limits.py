@@ -78,7 +78,7 @@ def _points(model: Any, data: Any, number: int) -> Iterator[Array]:
 
 
 def _fixed_to(model: Any, number: int) -> list[int]:
-    """Return a body and the bodies that are rigidly attached to it."""
+    """Return the numbers of a body and of all bodies that are rigidly attached below it."""
     found = [number]
     for child in range(number + 1, model.nbody):
         if model.body_parentid[child] in found and not model.body_jntnum[child]:
@@ -150,7 +150,7 @@ def _at_start(robot: RobotModel) -> tuple[Any, Any]:
 
 @lru_cache(maxsize=8)
 def _started(model: Any) -> Any:
-    """Compute the kinematics of a model in its reference pose."""
+    """Return MuJoCo's data with the poses of all bodies in the reference pose of the model."""
     import mujoco
 
     data = mujoco.MjData(model)

@@ -54,5 +54,6 @@ def _ancestors(model: Any, body: int) -> list[int]:
 
 
 def _dofs_of(model: Any, body: int) -> range:
+    """Return the velocity addresses of a body's own joints; empty if it has none."""
     first = int(model.body_dofadr[body])
     return range(first, first + int(model.body_dofnum[body])) if first >= 0 else range(0)

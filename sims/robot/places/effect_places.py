@@ -265,7 +265,7 @@ def make_effect_family(effect: type[Effect], members: Sequence[type[Effect]]) ->
     instances = tuple(member() for member in members)
 
     def parts(_: Effect, c: Array) -> ActiveEffects:
-        """Return the members with their coefficients."""
+        """Return the effect at each place, with its share of the coefficients."""
         if shared:
             return tuple((one, c) for one in instances)
         return tuple((one, c[i * count : (i + 1) * count]) for i, one in enumerate(instances))

@@ -51,6 +51,7 @@ def observable_tilts(robot: RobotModel, name: str) -> tuple[int, ...]:
 
 
 def _unit(vector: Array) -> Array:
+    """Return the vector scaled to length 1."""
     result: Array = vector / np.linalg.norm(vector)
     return result
 
