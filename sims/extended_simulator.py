@@ -261,6 +261,7 @@ def _observe(path: Path, value: Any) -> list[str]:
 
 
 def _constants(path: Path, value: Any) -> dict[str, float]:
+    """Read the known constants in the file, by name."""
     given = check_table(path, "constants", value)
     return {name: _real(path, f"constants.{name}", number) for name, number in given.items()}
 
@@ -276,6 +277,7 @@ def _effects(path: Path, value: Any) -> dict[str, dict[str, FittedValue]]:
 
 
 def _numbers(path: Path, where: str, value: Any) -> dict[str, FittedValue]:
+    """Read a table of fitted numbers with their units, by name."""
     given = check_table(path, where, value)
     return {name: _number(path, f"{where}.{name}", number) for name, number in given.items()}
 

@@ -150,6 +150,7 @@ class OwnSimulatorEngine:
         return np.array(rows)
 
     def _row(self, system: System) -> list[float]:
+        """Return the present reading of each channel of the user's simulator."""
         seen = self.world.observe()
         return [observed(self.world, seen, c.name) for c in system.channels]
 
@@ -267,8 +268,8 @@ class _Forces:
     def __init__(self, lanes: IntegrationBatch, lane: int, world: SteppableSimulator) -> None:
         """Select the forces and dry frictions of this element, with coefficients (K, 1, 1).
 
-        `_last` holds velocity, forces and step of the previous step for (1); None at the
-        first step.
+        `_last` holds velocity, forces and length of the previous step, from which (1) estimates
+        the simulator's own force; None at the first step.
         """
         here = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
         acting = [(effect, c) for effect, c in here if c.any()]
@@ -321,6 +322,7 @@ class _Forces:
         return friction
 
     def _state(self, seen: Mapping[str, float], names: Sequence[str]) -> Array:
+        """Return the named numbers in the observation `seen` as an array (1, D)."""
         values = [observed(self.world, seen, name) for name in names]
         state: Array = np.array([values])
         return state

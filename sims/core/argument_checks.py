@@ -79,6 +79,7 @@ def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Check and convert the arguments by their annotations, then call the function."""
         bound = bind_checked(function.__name__, signature, get_hints(function), args, kwargs)
         return function(*bound.args, **bound.kwargs)
 

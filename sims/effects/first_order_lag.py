@@ -22,7 +22,8 @@ _SMALLEST = 1e-12
 def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
     """Return the remaining weight of an old value at the end of each step and in its mean.
 
-    The weights are exp(-h / T), and m of (3).
+    For a step of length h and the time constant T, the weights are exp(-h / T), and its mean over
+    the step, m = (1 - exp(-h / T)) T / h of (3).
 
     Args:
         steps: (L, S) lengths h in seconds.

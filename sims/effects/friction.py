@@ -250,7 +250,7 @@ def _transmitted(drive: Array, against: Array) -> Array:
 
 
 def _stribeck_factor(speed: Array, scale: Array) -> Array:
-    """Return the remaining fraction (L, 1) of the extra friction of (2) at a speed."""
+    """Return exp(-(v / scale)^2) (L, 1), the share of Stribeck's extra friction (2) at a speed."""
     ratio = speed / np.maximum(scale, _SMALLEST)
     left: Array = np.exp(-np.square(ratio))
     return left

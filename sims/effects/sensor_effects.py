@@ -230,7 +230,10 @@ def _smooth_step(instant: Array, now: Array) -> Array:
 
 
 def _lagged(signal: Signal, lag: Array) -> Array:
-    """Return the values (L, S) of (4) at the end of each step; `lag` (L, 1) is in seconds."""
+    """Return a signal (L, S) after a first-order lag (4), at the end of each step.
+
+    The signal counts as linear within a step. `lag` (L, 1) is the time constant in seconds.
+    """
     decay, mean = compute_lag_response(signal.steps, lag)
     old = shift_by_one_step(signal.values, signal.start)
     # (4) of sims.effects.first_order_lag without its first term, which is the recursion

@@ -101,7 +101,9 @@ class ServoMotionProfile(Input):
 
 
 def _apply_acceleration_limit(signal: Signal, most: Array) -> Array:
-    """Return means (L, S) of (3) over each step, with accelerations of at most `most` (L,).
+    """Return the set point limited in acceleration (3), as means (L, S) over each step.
+
+    `most` (L,) is the limit c of the acceleration, in units of the set point per s^2.
 
     The speed w at the end of a step is chosen such that the remaining distance is sufficient for
     stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.

@@ -243,6 +243,7 @@ def _wrap_effect(effect: type[Effect]) -> type[Effect]:
 
 
 def _get_base_snapshot(moment: StateSnapshot) -> StateSnapshot:
+    """Return the state as the original system sees it, without hidden states of effects."""
     assert isinstance(moment.system, AugmentedSystem)
     return moment.system.get_base_snapshot(moment)
 

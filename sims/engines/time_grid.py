@@ -520,7 +520,9 @@ def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array
 
 
 def _linear_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
-    """Return the integral A(t) of (1) of a linearly interpolated signal.
+    """Return the integral A(t) (1) of a signal that is interpolated linearly between samples.
+
+    The difference of A over a step, divided by its length, is the mean that the engine applies.
 
     Args:
         times: (T,) sample times, s.
@@ -535,7 +537,9 @@ def _linear_integral(times: Array, values: Array, area: Array, t: Array) -> Arra
 
 
 def _held_integral(times: Array, values: Array, area: Array, t: Array) -> Array:
-    """Return the integral A(t) of (1) of a held signal.
+    """Return the integral A(t) (1) of a signal that is held between samples.
+
+    The difference of A over a step, divided by its length, is the mean that the engine applies.
 
     Args:
         times: (T,) sample times, s.

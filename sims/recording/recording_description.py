@@ -585,6 +585,7 @@ def _constants(path: Path, where: str, value: Any, declared: DeclaredSignals) ->
 
 
 def _numbers(path: Path, where: str, value: Any, allowed: Collection[str]) -> dict[str, float]:
+    """Check a table of finite numbers, whose names must be among the allowed ones."""
     given = dotted(check_table(path, where, value), allowed)
     _known(path, where, given, allowed)
     return {name: check_finite(path, f"{where}.{name}", number) for name, number in given.items()}

@@ -82,6 +82,7 @@ def check_absent(paths: Iterable[Path]) -> None:
 
 
 def _exists(path: Path | str) -> InputError:
+    """Make the error for a recording that exists already and would be overwritten."""
     return InputError(
         f"{path}: exists already; recordings are never overwritten, name another file"
     )
@@ -198,6 +199,7 @@ def _stated(noise: Mapping[str, float], name: str) -> dict[str, float]:
 
 
 def _marks(run: Run) -> dict[str, Any]:
+    """Return what a description states of one run: use, constants and initial state."""
     marks: dict[str, Any] = {"held_out": True} if run.held_out else {}
     marks |= dict(run.constants)
     return {**marks, "initial": dict(run.initial)} if run.initial else marks

@@ -122,7 +122,7 @@ class FloatingJoints:
         return FloatingState(pose, rate)
 
     def displace(self, pose: Array, number: int, by: float) -> Array:
-        """Displace poses along one degree of freedom, by (1).
+        """Displace poses along one degree of freedom, by (1): add to a position, or rotate.
 
         Args:
             pose: (n, P) poses.
@@ -145,7 +145,10 @@ class FloatingJoints:
         return result
 
     def displaced(self, pose: Array, moves: Array) -> Array:
-        """Return poses (n, P) after small displacements (n, F), by (1)."""
+        """Displace poses (n, P) by small displacements (n, F) by (1), in m and rad.
+
+        Positions move along the axes of the world; rotations are about the axes of the body.
+        """
         result = pose.copy()
         for axes, turn, first in self._own:
             place = slice(turn.start - len(axes), turn.start)

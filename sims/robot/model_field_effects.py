@@ -145,12 +145,12 @@ def write_friction_form(fields: Fields, robot: RobotModel, lanes: Any, dofs: Any
 
 
 def add_to_stated(stated: Any, c: Any) -> Any:
-    """Add a coefficient to a value by (1); a negative value in the file may remain."""
+    """Add a coefficient to a value, at least zero (1); a negative value of the file may remain."""
     return np.maximum(stated + c, np.minimum(stated, 0.0))
 
 
 def compute_factor(c: Any) -> Any:
-    """Return the factor 1 + c of (2)."""
+    """Return the factor 1 + c of (2), at least `MIN_FACTOR`."""
     return np.maximum(1.0 + c, MIN_FACTOR)
 
 

@@ -105,6 +105,7 @@ class BallScene:
         return (picture + 0.5).clip(0, 255).astype(np.uint8)
 
     def _place(self, body: int, position: ArrayLike) -> None:
+        """Move a body of the scene to a position in m, without rotation."""
         bullet_world.import_pybullet().resetBasePositionAndOrientation(
             body, position, (0, 0, 0, 1), physicsClientId=self._client
         )

@@ -93,7 +93,10 @@ def fit_circle(points: Array, start: tuple[float, float, float | None] | None) -
 
 
 def _step(normal: Array) -> tuple[float, float, float] | None:
-    """Return (du, dv, dR) of (2) from its weighted products (4, 4); None if they are singular."""
+    """Solve the Gauss-Newton equations (2) for (du, dv, dR); None if they are singular.
+
+    `normal` (4, 4) holds the weighted sums of products of the rows (n_u, n_v, 1, rest).
+    """
     (xx, xy, mx, p), (_, yy, my, q), (_, _, total, r), _ = normal.tolist()
     if total <= 0:
         return None

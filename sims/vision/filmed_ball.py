@@ -125,6 +125,7 @@ class FilmedBall(Simulator):
 
 
 def _camera(constants: Mapping[str, float]) -> PinholeCamera:
+    """Make the camera from the simulator's constants, with a square picture."""
     size = round(constants["pixels"])
     place = (constants["camera_azimuth"], constants["camera_distance"], constants["camera_height"])
     return PinholeCamera(*place, target=(0.0, 0.0, constants["camera_aim"]), size=(size, size))

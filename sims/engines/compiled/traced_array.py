@@ -274,6 +274,7 @@ def _unwrap_arguments(graph: ExpressionGraph, args: Any) -> list[Any]:
 
 
 def _wrap_result(graph: ExpressionGraph, result: Any) -> Any:
+    """Return arrays of nodes, also several in a list or tuple, as traced arrays."""
     if isinstance(result, list | tuple):
         return type(result)(_wrap_result(graph, part) for part in result)
     return TracedArray(graph, to_node_array(result))
@@ -305,6 +306,7 @@ def _clip(x: Any, low: Any, high: Any) -> TracedArray:
 
 
 def _fill_like(x: TracedArray, value: float) -> TracedArray:
+    """Return a traced array of the same shape as x, with one constant in every place."""
     nodes = np.empty(x.shape, dtype=object)
     nodes[...] = x.graph.make_constant(value)
     return TracedArray(x.graph, nodes)

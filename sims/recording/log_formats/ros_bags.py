@@ -85,6 +85,7 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
 
 
 def _unknown_topic(bag: Path, topic: str, topics: list[str]) -> InputError:
+    """Make the error for a topic that a bag lacks; it lists the existing topics."""
     names = ", ".join(topics) or "none"
     return InputError(f"{bag}: unknown topic '{topic.lstrip('/')}'; there are: {names}")
 

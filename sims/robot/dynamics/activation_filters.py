@@ -64,7 +64,7 @@ class ActivationFilter(NamedTuple):
         return clipped
 
     def activations(self, controls: Array, begun: Array, step: float, fourth: bool) -> Array:
-        """Compute activations at the beginnings of steps, by (1) or (2).
+        """Compute activations at the beginnings of steps, by Euler's method (1) or exactly (2).
 
         Args:
             controls: (n, S) controls of the steps.

@@ -226,7 +226,11 @@ class MeasuredLinear(RunLinearisation):
     # -- the model from sample to sample
 
     def interval_maps(self) -> IntervalMaps:
-        """Compose the steps between samples into the maps of (3) and (4)."""
+        """Compose the steps between samples into the linear maps (3), and the readings (4).
+
+        The maps give the deviation at the next sample from that at a sample, which a Kalman
+        smoother needs. The integration error of each step is composed in the same way.
+        """
         tangent, size = self._tangent, self._tangent.state_size
         forces = tangent.quotients.forces.shape[2]
         intervals = self.knots.size - 1
@@ -394,7 +398,7 @@ class MeasuredLinear(RunLinearisation):
         return result
 
     def propagated(self, begun: Array, forces: Array) -> Array:
-        """Return deviations (S + 1, Z) at all steps by (2), from those at samples.
+        """Propagate deviations at samples to all steps, (S + 1, Z), by the linear model (2).
 
         Args:
             begun: δ (T, Z) at the samples.

@@ -177,7 +177,9 @@ class TangentModel:
     def perturb_model_numbers(
         self, owner: int, acting: ActiveEffects, change: float, bench: MujocoBatch
     ) -> Perturbation:
-        """Return the change by other model parameters, as in (2), per unit of `change`.
+        """Return the change of motion by other model parameters, per unit of `change`.
+
+        By (2), another acceleration at the same state acts like the force M da.
 
         Args:
             owner: number of the effect candidate.

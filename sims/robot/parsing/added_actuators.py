@@ -144,7 +144,7 @@ def _single(joint: Any) -> bool:
 
 
 def _add(spec: Any, name: str, table: Mapping[str, Any]) -> None:
-    """Add an actuator to the spec from its checked table, with the gains of (2) to (5)."""
+    """Add an actuator to the spec from its checked table: motor, position, velocity or PID."""
     import mujoco
 
     actuator = spec.add_actuator(
