@@ -152,7 +152,7 @@ class OwnSimulator(SystemSimulator):
         """Check a user's class, and make a system from its declaration.
 
         Engines and effects work with systems, so the system describes the simulator to
-        them. The first sentence of the class docstring is its description, unless it states
+        them. The first paragraph of the class docstring is its description, unless it states
         `says`.
         """
         _check(cls)

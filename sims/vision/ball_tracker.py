@@ -240,13 +240,20 @@ def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 
 def _same(a: Circle, b: Circle) -> bool:
-    """Return whether two circles are the same object at rest."""
+    """Return whether two circles are the same object at rest.
+
+    Their centres may differ by 0.3 radii and half a pixel, and their radii by a factor of 1.4.
+    """
     apart = abs(a[0] - b[0]) + abs(a[1] - b[1])
     return apart < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
 
 
 def _others(path: TrackedPath, others: Sequence[TrackedPath], notes: list[str]) -> None:
-    """Add a note if a second object moves at the same time as the ball."""
+    """Add a note if a second object of similar size moves at the same time as the ball.
+
+    It must appear in at least 8 frames and a quarter of the ball's frames, and travel more than its
+    diameter. The user then knows that the tracker may have chosen the wrong object.
+    """
     frames = set(path.frames)
     for other in others:
         shared = len(frames & set(other.frames))

@@ -116,7 +116,7 @@ def _step(normal: Array) -> tuple[float, float, float] | None:
 
 
 def find_inliers(fitted: CircleFit) -> NDArray[np.bool_]:
-    """Return which of the points are on the circle, as a mask (n,)."""
+    """Return which points are on the circle, within 0.7 pixels or 10 % of its radius, (n,)."""
     (_, _, radius), rest = fitted
     tolerance = max(0.7, 0.1 * radius)
     result: NDArray[np.bool_] = np.abs(rest) < tolerance

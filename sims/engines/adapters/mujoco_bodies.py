@@ -167,6 +167,7 @@ class MujocoMover:
         self._w = self._data.qvel
         self._force = self._data.qfrc_applied
         self._no_contact = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        # Width, midpoint and power of the impedance are MuJoCo's defaults.
         self._model.geom_solimp[:] = _IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0
         self._step = mujoco.mj_step
         self._inverse_step = math.nan

@@ -139,6 +139,7 @@ def _check(
     constants = [values[first] for values in batch.constants.values()]
     parameters = np.concatenate([batch.theta[first], *constants, *coefficients], axis=1)[0]
     inputs = np.array([values[first[0], 0] for values in batch.inputs.values()])
+    # The initial state, and another one at an arbitrary later time.
     states = [
         np.concatenate([[t], batch.x[first[0]] + shift, batch.v[first[0]] - 2.0 * shift, inputs])
         for t, shift in ((0.0, 0.0), (0.37, 0.1))

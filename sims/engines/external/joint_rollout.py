@@ -366,8 +366,8 @@ def _compute_transition_force(
 def _integrate_stepwise(joint: JointBody, element: ElementWork, inertia: float) -> Trajectory:
     """Integrate a joint by (1) to (4), with forces that are evaluated in each step.
 
-    It is used where forces depend on the state; `inertia` is in kg m^2 or kg. A failed
-    integration is NaN throughout.
+    It is used unless the forces are those of the inputs and linear damping alone. `inertia` is in
+    kg m^2 or kg. A failed integration is NaN throughout.
     """
     forces = LinearisedForces(joint, element, inertia)
     x = float(element.x[0])

@@ -105,9 +105,9 @@ class TangentModel:
     ) -> None:
         """Compute the unperturbed steps at the linearisation points, and the quotients if none fit.
 
-        `self._share` (S,) is the position of each step between two points: 0 at the earlier
-        point, 1 at the later one. `self._earlier` and `self._later` (S,) are the indices of
-        these points.
+        `self._share` (S,) is the time from its linearisation point to each step, as a share of the
+        regular distance between points. `self._earlier` and `self._later` (S,) are the indices of
+        the points between which the quotients of each step are interpolated.
         """
         self._at, self._motion = at, at.motion
         self._sizes = sizes

@@ -240,8 +240,7 @@ def _is_in_frame(robot: RobotModel, cause: FittedCause) -> bool:
 def _compiled(robot: RobotModel, wanted: Fields) -> tuple[Any, Any]:
     """Change a copy of the robot's spec until it compiles to the wanted fields.
 
-    Several rounds are needed, because MuJoCo derives some fields from others during
-    compilation.
+    Several rounds are needed, because a change may also modify values that should stay.
 
     Returns:
         The changed mujoco.MjSpec, and the compiled model.
