@@ -108,6 +108,9 @@ def expand_families(
 ) -> list[FittedCause]:
     """Expand effect families to causes at one place each.
 
+    A family is one effect at all places of a kind, such as ``friction.coulomb@*``. A model file
+    states numbers for each place, so it needs the members.
+
     Args:
         robot: robot whose places a family has if its coefficients name no places.
         causes: coefficients by ``effect@place``. Those of a family have keys ``coefficient@PLACE``,

@@ -152,7 +152,10 @@ def _needs_shapes(model: Any) -> bool:
 
 
 def _state_inertials(spec: Any, model: Any) -> None:
-    """Write the masses and inertias of the compiled model into a spec."""
+    """Write the masses and inertias of the compiled model into a spec.
+
+    The masses then no longer depend on geoms, which can be removed without changing the motion.
+    """
     import mujoco
 
     for compiler in (spec.compiler, *(body.compiler for body in spec.bodies)):

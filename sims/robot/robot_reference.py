@@ -71,6 +71,9 @@ class RobotReference:
     def make_simulator(self) -> type[RobotSimulator]:
         """Make the simulator of the robot.
 
+        The file is read again, and its digest must be that of the file to which the causes
+        were fitted.
+
         Raises:
             InputError: the model file is missing, cannot be read or has changed.
         """

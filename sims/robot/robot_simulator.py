@@ -319,6 +319,9 @@ class RobotSimulator(SystemSimulator):
     def compute_controls(self, work: RobotRunBatch, steps: int) -> BatchInputs:
         """Compute the inputs of the batch elements of one run over all steps.
 
+        They are the controls of the actuators, the generalised forces on the joints that do
+        not depend on the state, and the activations of the filters before actuators.
+
         Args:
             work: batch elements of the run.
             steps: number of steps.
@@ -365,6 +368,10 @@ class RobotSimulator(SystemSimulator):
         self, one: ActivationFilter, work: RobotRunBatch, controls: Array
     ) -> Array:
         """Return the activation (n,) of a filter at the start of a run.
+
+        It is the value that the recording states; otherwise the result of the filter for
+        the known commands before the run; otherwise that of a filter that has settled at
+        the first command.
 
         Args:
             one: the filter.
@@ -430,6 +437,10 @@ class RobotSimulator(SystemSimulator):
         self, work: RobotRunBatch, given: BatchInputs, more: Sequence[str] = ()
     ) -> BatchResult:
         """Step the batch elements of one run.
+
+        It finds out what the effects need (derived constants, evaluation in each step,
+        joints in series), and simulates all elements together; they must have the same
+        joints in series.
 
         Args:
             work: batch elements of the run.

@@ -212,6 +212,9 @@ class RobotSystem(System):
 def make_robot_system(robot: RobotModel, free: Sequence[str] = ()) -> type[RobotSystem]:
     """Make the system of a robot.
 
+    The system tells tuners and effects what the robot has: coordinates, inputs, channels and
+    initial states, by the names of its joints and actuators.
+
     Args:
         robot: robot as read from its model file.
         free: numbers to tune, such as ``damping@*`` or ``mass.scale@forearm``.

@@ -48,6 +48,10 @@ def find_active_elements(
 ) -> Mask:
     """Find the batch elements in which a selected effect is active.
 
+    It is called to decide which batch elements can be simulated together, for example those in
+    which an effect depends on the state. An effect with only zero coefficients counts as
+    absent.
+
     Args:
         acting: effects with their coefficients (K, L, 1).
         count: number L of batch elements.

@@ -79,6 +79,9 @@ def compute_inputs_over_steps(
 ) -> dict[str, Array]:
     """Compute the applied inputs of n batch elements over S steps.
 
+    An applied input is the command after all input effects (gain, delay, lag and so on). MuJoCo
+    holds a control over a step, so that each value is a mean over the step.
+
     Args:
         step: step length in seconds.
         scenario: scenario of the run.

@@ -46,7 +46,10 @@ _PROBE = """
 def step_in_callback(
     bench: MujocoBatch, controls: Array, forces: Array, compiled: CompiledForces, record: list[str]
 ) -> dict[str, Array] | None:
-    """Step n batch elements S times as `MujocoBatch.step_with_forces`.
+    """Step n batch elements S times, with effect forces computed in MuJoCo's callback.
+
+    The result equals that of `MujocoBatch.step_with_forces`, which returns to Python in each
+    step and is used if this function returns None.
 
     Args:
         bench: the batch, with initial states and effects in its model.

@@ -416,6 +416,9 @@ def _compiles(
 def _check(tracing: _Tracing, forces: EffectForces, run_by: CompiledKernel) -> None:
     """Compare an effect's program with numpy at random states.
 
+    Positions, velocities and loads are random numbers of different sizes, with a fixed seed, so
+    that the answer is the same in each process.
+
     Raises:
         NotTraceableError: the results differ.
     """

@@ -41,7 +41,10 @@ def make_snapshot(
     carried: Array,
     stiffness: Array | None = None,
 ) -> RobotSnapshot:
-    """Make a snapshot of batch elements.
+    """Make a snapshot of batch elements, the state at which effects are evaluated.
+
+    The system of a robot has neither parameters nor constants: all its numbers are in MuJoCo's
+    model.
 
     Args:
         system: system of the robot.
@@ -63,6 +66,9 @@ def compute_time_dependent_forces(
     system: RobotSystem, acting: ActiveEffects, t: Array, size: int, lanes: int
 ) -> Array:
     """Compute the forces (L, S, D) of effects that depend on time alone.
+
+    They are known before the simulation and applied as generalised forces, so that the batch
+    needs no evaluation of effects in each step.
 
     Args:
         system: system of the robot.

@@ -28,6 +28,9 @@ def advance_state(
 ) -> HiddenState:
     """Advance a hidden state by one exponential Rosenbrock-Euler step (1).
 
+    With w the hidden state and r its rate, w(t + h) = w + h phi(z) r(w), phi(z) = (e^z - 1) /
+    z, z = h dr/dw. The derivative dr/dw is a difference quotient.
+
     Args:
         effect: effect with the hidden state.
         c: (K, L, 1) coefficients of the effect.
@@ -51,6 +54,9 @@ def integrate_state(
     effect: HiddenStateEffect, c: Array, moment: RobotSnapshot, step: float
 ) -> HiddenState:
     """Integrate a hidden state along a known motion.
+
+    The motion is not changed by the effect, as in a linearisation. If the rate is linear in the
+    state at all times, which is tested at three points, the steps are computed at once.
 
     Args:
         effect: effect at its place.

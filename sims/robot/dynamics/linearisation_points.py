@@ -192,6 +192,9 @@ class LinearisationPoints:
     ) -> tuple[Array, Array]:
         """Compute accelerations (N, E) and readings (N, O) at each point.
 
+        E are all joints and floating bodies, and O the outputs that are read. No step is
+        made, so that the accelerations are those at the state itself.
+
         Args:
             acting: effects whose elements are in the model.
             more: (N, E) additional forces; none by default.
@@ -401,6 +404,9 @@ class LinearisationPoints:
     def compute_drive_reading_changes(self, effect: Effect, c: Array, read: Array) -> Array:
         """Compute the changes of drive readings (N, O) by an effect in a drive.
 
+        Such an effect is a force at an actuator, for example that of a supply that sags. A sensor
+        of the drive force shows it at once, before the motion changes.
+
         Args:
             effect: effect in a drive.
             c: coefficients (K, 1, 1).
@@ -421,6 +427,9 @@ class LinearisationPoints:
 
     def compute_effect_force(self, effect: Effect, c: Array) -> Array:
         """Compute the forces (S, D) of an effect in the middle of each step.
+
+        The effect is evaluated along the unperturbed motion, at all steps at once. Dry
+        friction is the force within its limit that the motion determines.
 
         Args:
             effect: effect with a force, a friction or a hidden state.
@@ -514,7 +523,10 @@ def friction_damping(robot: RobotModel, dof: int) -> tuple[float, float]:
 
 
 def _looked_at(motion: RobotMotion, every: int) -> tuple[Places, Places]:
-    """Choose the linearisation points.
+    """Choose the steps at which the model is linearised, one after every `every` steps.
+
+    A new sequence of points begins where a piecewise constant command jumps, or where an
+    actuator is switched, since the state changes quickly there.
 
     Args:
         motion: the motion.

@@ -371,7 +371,11 @@ class MeasuredLinear(RunLinearisation):
     def _read_directly(
         self, read: Array, sensors: Sequence[ActiveEffects], predicted: Array
     ) -> Array:
-        """Compute the direct changes ψ (T, C, K) of readings.
+        """Compute the direct changes ψ (T, C, K) of readings by K candidates, in (4).
+
+        They do not pass through the motion, such as the bias of a sensor. Sensor effects
+        may be nonlinear, so they are applied to the predicted readings and the readings
+        without them are subtracted.
 
         Args:
             read: (S, O, K) direct changes of readings by effects in the model.
@@ -441,6 +445,9 @@ class MeasuredLinear(RunLinearisation):
 
 def quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:
     """Interpolate by quintic Hermite polynomials, and extrapolate linearly.
+
+    The polynomial of fifth degree between two samples has the given value, first and second
+    derivative at both ends. It is extrapolated since a motion has one step more than its run.
 
     Args:
         times: (T,) sample times, ascending.

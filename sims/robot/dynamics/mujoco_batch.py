@@ -255,6 +255,9 @@ class MujocoBatch:
     ) -> tuple[Array, Array]:
         """Set the initial states of the first n batch elements.
 
+        Recordings do not contain the state of joints in series, such as the deflection of a
+        flexible gear. So their equilibrium is computed.
+
         Args:
             positions: (n, D) positions of the joints of the file.
             velocities: (n, D) velocities of the joints of the file.
@@ -305,7 +308,9 @@ class MujocoBatch:
         off: Mask | None = None,
         before_call: Callable[[int], None] | None = None,
     ) -> dict[str, Array]:
-        """Step n batch elements S times.
+        """Step n batch elements S times with given controls and forces, without effects in between.
+
+        Failed elements are marked in `failed`; their recorded numbers have no meaning.
 
         Args:
             controls: (n, S, nu) controls.

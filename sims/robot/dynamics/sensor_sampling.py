@@ -90,6 +90,8 @@ def apply_effects_to_readings(
 def find_sample_steps(step: float, times: Array, count: int) -> NDArray[np.intp] | None:
     """Find the steps at whose ends the samples are taken.
 
+    If all samples are at ends of steps, values can be read without interpolation.
+
     Args:
         step: step length in seconds.
         times: (T,) sample times in seconds since the start.

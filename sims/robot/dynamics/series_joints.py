@@ -110,6 +110,9 @@ def group_by_joint(added: SeriesJoints) -> dict[str, list[str]]:
 def group_by_series_joints(acting: ActiveEffects, count: int) -> dict[SeriesJoints, list[int]]:
     """Group batch elements by their effects in series with joints.
 
+    Elements with other joints in series need another model, so that they cannot share a batch.
+    The result maps the joints in series to the numbers of the batch elements.
+
     Args:
         acting: effects with their coefficients (K, L, 1).
         count: number L of batch elements.
@@ -130,6 +133,9 @@ def group_by_series_joints(acting: ActiveEffects, count: int) -> dict[SeriesJoin
 
 def add_series_joints(robot: RobotModel, added: SeriesJoints) -> RobotModel:
     """Add joints in series to a robot, without changing element names.
+
+    The second joint is in the same body, with the axis and position of the first one. All its
+    numbers are zero; `write_elements` sets them for each batch element.
 
     Args:
         robot: robot as read from its model file.
@@ -250,7 +256,10 @@ def combine_elements(elements: Sequence[SeriesElement]) -> SeriesElement:
 def write_elements(
     fields: Mapping[str, Any], robot: RobotModel, place: str, made: SeriesElement
 ) -> None:
-    """Write elements in series (L,) into model fields.
+    """Write the numbers of elements in series, of L batch elements, into model fields.
+
+    An element is a spring with a damper (3), a gap with rigid flanks (4), or a gap with
+    compliant flanks (5). The drive's armature is its share of the joint's inertia.
 
     Args:
         fields: model fields of the batch elements.
@@ -309,6 +318,10 @@ def prepare_flanks_for_file(
     robot: RobotModel, made: Mapping[str, SeriesElement], model: Any = None
 ) -> RobotModel:
     """Set the joint limits that represent flanks, for writing a model file.
+
+    A gap is a joint limit of ± half its width. Limits must be set before the model is compiled,
+    and those of compliant flanks depend on the compiled inertia (6), so that the function is
+    called twice.
 
     Args:
         robot: robot of `add_series_joints`.

@@ -243,7 +243,10 @@ class TangentModel:
     # -- propagation over time
 
     def propagate(self, changes: Sequence[Perturbation], count: int) -> tuple[Array, Array]:
-        """Propagate changes along the motion, added up for each owner.
+        """Propagate changes along the motion by (2), added up for each owner.
+
+        An owner is the candidate to which a change belongs; all n owners are propagated in
+        one matrix product per step.
 
         Args:
             changes: changes with owners from 0 to `count` - 1.
@@ -396,6 +399,9 @@ class TangentModel:
 
     def propagate_initial_state(self) -> tuple[Array, Array]:
         """Compute the responses to each initial position and velocity.
+
+        The first D columns are unit changes of the positions, the others those of the
+        velocities. There are no forces, so that dz_{t+1} = A_t dz_t.
 
         Returns:
             Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O).

@@ -108,7 +108,9 @@ class ModifiedModel:
 def apply_causes(
     robot: RobotModel, causes: Mapping[str, Mapping[str, FittedValue]], recording: str = ""
 ) -> ModifiedModel:
-    """Apply causes to a robot's model.
+    """Apply fitted causes to a copy of a robot's model, and explain each change in a comment.
+
+    Causes that no model file can state, such as a sensor's bias, become notes.
 
     Args:
         robot: robot as read from its model file; it is not changed.
@@ -296,6 +298,9 @@ class SpecElements:
 
 def set_attributes(element: Any, statement: AttributeStatement) -> None:
     """Set the attributes of a statement in an element of a spec.
+
+    Values from MuJoCo's compiled model are converted to the form that the spec expects:
+    enumerations, flags, integers, degrees.
 
     Args:
         element: element of a mujoco.MjSpec; it is changed in place.

@@ -229,6 +229,9 @@ def find_differing_statements(
 ) -> list[AttributeStatement]:
     """Find the attributes in which two sets of model fields differ.
 
+    The result is what has to be written into a model file so that it compiles to the wanted
+    fields.
+
     Args:
         model: compiled model with the elements.
         found: present fields.

@@ -200,6 +200,9 @@ def _shortcut(
 ) -> dict[str, str] | None:
     """Return the gains of an actuator shortcut as attributes.
 
+    A position actuator has force = kp (u - l) - kv l', and a velocity actuator kv (u - l'). The
+    wanted values fit only if gain and bias have these relations.
+
     Args:
         name: name of the shortcut, such as ``position``.
         stated: all attribute values that the actuator should have.

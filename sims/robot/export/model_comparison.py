@@ -61,6 +61,8 @@ def _library() -> Any:
 def find_first_difference(one: Any, other: Any, tolerance: float) -> str | None:
     """Find the first field in which two compiled models differ.
 
+    It compares all numeric fields and options. Names and other texts are ignored.
+
     Args:
         one: a mujoco.MjModel.
         other: another mujoco.MjModel.

@@ -175,6 +175,9 @@ def displace_reference_pose(model: Any) -> Array:
 def simulate_test_motion(model: Any, pose: Array | None = None) -> Array:
     """Simulate a test motion (S, nq) with nonzero controls.
 
+    Each actuator has a constant control within its range, different for each actuator, so that
+    swapped actuators change the motion.
+
     Args:
         model: the mujoco.MjModel.
         pose: initial pose (nq,); that of `displace_reference_pose` by default.

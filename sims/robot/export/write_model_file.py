@@ -72,6 +72,9 @@ def write_model_files(
 ) -> WrittenModelFiles:
     """Write causes into the robot's own model file.
 
+    An MJCF keeps its text and gets changed attributes. If this is impossible, or for a URDF,
+    MuJoCo writes the MJCF; a URDF is written in addition, with the causes that it can state.
+
     Args:
         robot: robot as read from its model file.
         causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
@@ -236,6 +239,9 @@ class MjcfEditor:
     def to_text(self) -> str:
         """Return the text with all wanted attributes.
 
+        Attributes are written, the text is compiled, and attributes that still differ are
+        written again, for at most `MAX_CORRECTION_ROUNDS` rounds.
+
         Raises:
             NotEditableError: the edited text does not compile to the wanted model.
         """
@@ -280,7 +286,7 @@ class MjcfEditor:
 
 
 def compile_mjcf(text: str) -> Any:
-    """Compile an MJCF text.
+    """Compile an MJCF text without printing MuJoCo's warnings.
 
     Raises:
         NotEditableError: MuJoCo rejects the text.

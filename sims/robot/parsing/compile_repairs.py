@@ -42,6 +42,9 @@ class CompileRepairs:
     def compile(self, spec: Any) -> tuple[Any, Any]:
         """Compile a spec, and repair what MuJoCo rejects.
 
+        MuJoCo reports one error at a time. So the spec is compiled again after each repair;
+        the number of attempts is limited by two for each body, mesh and texture.
+
         Args:
             spec: a mujoco.MjSpec; it must not be used afterwards.
 

@@ -32,7 +32,7 @@ class MeshLookup:
     found: dict[str, str] = field(default_factory=dict)
 
     def find(self, name: str) -> tuple[str | None, str]:
-        """Find the file of a mesh.
+        """Find the file of a mesh of a URDF, whose URI often names a ROS package.
 
         Args:
             name: file name or URI in the URDF.

@@ -65,6 +65,8 @@ class OmittedShapes:
 def determines_mass(spec: Any, geom: Any, body: Any) -> bool:
     """Return whether the mass of a moving body is computed from a geom.
 
+    Such a geom must not be removed, because the body would lose its mass.
+
     Args:
         spec: the mujoco.MjSpec.
         geom: geom of the body.
@@ -94,6 +96,8 @@ def is_moving_body(body: Any) -> bool:
 def remove_mesh(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
     """Remove a mesh that MuJoCo rejects, and the geoms that use it.
 
+    The robot then moves as before, without this shape in contacts or pictures.
+
     Args:
         spec: the mujoco.MjSpec.
         name: name of the mesh.
@@ -113,6 +117,8 @@ def remove_mesh(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
 
 def remove_texture(spec: Any, name: str, why: str, left: OmittedShapes) -> bool:
     """Replace a texture that MuJoCo rejects by a single colour.
+
+    A texture has no influence on the motion.
 
     Args:
         spec: the mujoco.MjSpec.

@@ -58,6 +58,9 @@ class MissingFiles:
     def remove_from_spec(self, spec: Any, left: OmittedShapes) -> None:
         """Remove elements with missing files from a spec.
 
+        The file was loaded with placeholders for the missing files; these are removed
+        before compilation.
+
         Args:
             spec: the mujoco.MjSpec; it is changed in place.
             left: record of omitted shapes.
@@ -114,7 +117,10 @@ def load_referenced_files(files: ModelFileReader, root: Element) -> MissingFiles
 
 
 def _measured(files: ModelFileReader, element: Element, times: float) -> None:
-    """Reject counts and sizes that would exhaust the memory."""
+    """Reject counts and sizes that would exhaust the memory.
+
+    `times` is the product of all counts above the element, since nested replicates multiply.
+    """
     for key, value in element.items():
         numbers = (
             [_size(word) for word in value.split()]

@@ -38,7 +38,7 @@ def get_link_mass(link: Element) -> float:
 def repair_inertials(
     files: ModelFileReader, links: Mapping[str, Element], held: set[str]
 ) -> list[str]:
-    """Repair masses and moments of inertia.
+    """Repair masses and moments of inertia of links that MuJoCo would reject.
 
     Args:
         files: reader of the model file.

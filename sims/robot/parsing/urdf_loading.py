@@ -38,7 +38,7 @@ MuJoCo raises its time constant, in s, to two time steps.
 
 
 def repair_urdf(files: ModelFileReader, root: Element) -> list[str]:
-    """Repair a URDF in place.
+    """Repair a URDF in place, so that MuJoCo reads it and nothing is ignored without a note.
 
     Args:
         files: reader of the model file.

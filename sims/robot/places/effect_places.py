@@ -420,7 +420,11 @@ def _takes(effect: type[Effect], place: EffectPlace) -> bool:
 def _acts_at(
     effect: type[Effect], spot: EffectPlace, found: Mapping[str, Sequence[EffectPlace]]
 ) -> bool:
-    """Return whether a place has the quantity that an effect changes."""
+    """Return whether a place has the quantity that an effect changes.
+
+    `found` lists all places by kind. An actuator effect needs a joint with an actuator, for
+    example, and a servo effect a position servo.
+    """
     if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[spot.kind]) is None:
         return False
     if effect.at == "joint" and effect.needs == "input":

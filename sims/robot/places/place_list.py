@@ -86,6 +86,9 @@ def list_places(
 ) -> dict[str, list[EffectPlace]]:
     """List the places of a robot by kind: joint, actuator, body, channel.
 
+    A place is where an effect can act. Each has the units and the typical sizes that scale the
+    plausible ranges of effects, and what the model file states there.
+
     Args:
         robot: robot whose places are listed.
         channels: names and units of the channels that it can observe.
