@@ -178,7 +178,7 @@ def write_extended(extended: ExtendedSimulator, path: Path) -> None:
 
 
 def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> str:
-    """Format the content of the file.
+    """Format an extended simulator as the text of its file, in TOML.
 
     Args:
         extended: Extended simulator.
@@ -208,7 +208,7 @@ def format_extended(extended: ExtendedSimulator, folder: Path | None = None) -> 
 
 
 def read_extended(path: Path) -> ExtendedSimulator:
-    """Read and check a file.
+    """Read and check the file of an extended simulator.
 
     Raises:
         InputError: The file is missing, malformed, or has another format.

@@ -167,7 +167,7 @@ def _fault(world: SteppableSimulator, error: Exception) -> InputError:
 
 
 def observed(world: SteppableSimulator, seen: Mapping[str, float], name: str) -> float:
-    """Return one value of the result of `observe`.
+    """Return one number from what the user's `observe` returned, checked.
 
     Args:
         world: Simulator.
@@ -209,6 +209,8 @@ def _unobserved(world: SteppableSimulator, seen: object, name: str) -> InputErro
 
 def inertia_of(world: SteppableSimulator) -> float | Array:
     """Return the current generalised inertia of a simulator.
+
+    It is needed to find the dry friction that stops the motion (2).
 
     Returns:
         A number, which applies to every coordinate, or a matrix (D, D).

@@ -293,7 +293,7 @@ class SystemSimulator(Simulator):
         sensors: ActiveEffects,
         clock: Array,
     ) -> Array:
-        """Return the sensor readings of a simulation.
+        """Return the sensor readings of a simulation, after the sensor effects.
 
         Args:
             motion: Result of the engine.

@@ -145,7 +145,7 @@ def _bind(
     args: Sequence[object],
     kwargs: Mapping[str, object],
 ) -> inspect.BoundArguments:
-    """Return the arguments by name.
+    """Return the arguments of a call by name, with errors that a user understands.
 
     Raises:
         InputError: An argument is unknown or missing, or there are too many.
@@ -170,6 +170,9 @@ def _bind(
 
 def _fitted(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to the type of its annotation.
+
+    `place` names the argument or its entry in messages, such as ``runs[2]``. The result may
+    differ from the value, for example a list in place of a single entry.
 
     Raises:
         _MismatchError: The value does not match.
@@ -325,7 +328,10 @@ _WORDS: Mapping[Any, str] = {
 
 
 def _words(hint: Any) -> str:
-    """Describe in words what an annotation expects."""
+    """Describe in words what an annotation expects.
+
+    The words follow "expected" in a message, for example "a list (a number each)".
+    """
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return str(inner[1].words)

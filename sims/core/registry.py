@@ -79,6 +79,8 @@ class Registry(Generic[T]):
     def get(self, name: str) -> type[T]:
         """Return the class registered as `name`.
 
+        Installed parts are imported here, at their first use.
+
         Raises:
             InputError: The name is unknown.
             PartUnavailableError: The part cannot be imported, or needs a missing package.
@@ -222,6 +224,8 @@ def _qualified(part: type) -> tuple[str, str]:
 
 def _name_of(part: type, where: str) -> str:
     """Check the declaration of a class, and return its name.
+
+    A name is part of commands and files, so it must be plain.
 
     Args:
         part: Class to register.

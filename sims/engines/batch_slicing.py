@@ -11,7 +11,11 @@ from sims.engines.ground_contact import Indices
 
 
 def slice_batch(batch: IntegrationBatch, i: Indices) -> IntegrationBatch:
-    """Return the part of a batch with the elements i (n,)."""
+    """Return the part of a batch with the elements i (n,).
+
+    Engines use it to simulate some elements separately. All elements in their order give the
+    batch itself, and steps that all elements share are not copied.
+    """
     if i.size == len(batch.x) and (i[1:] > i[:-1]).all():
         return batch
     if batch.steps.strides[0] == 0:  # steps shared by all elements stay shared

@@ -89,6 +89,8 @@ class ScenarioGroups:
 def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> ScenarioGroups:
     """Group scenarios with the same times and inputs.
 
+    Inputs and time steps are computed once for each group, not for each batch element.
+
     Args:
         scenarios: Scenario of each batch element.
         by_initial: Whether grouped scenarios must also state the same initial states.

@@ -336,6 +336,9 @@ class _FolderLogs:
     def join(self, run: str, run_rows: Mask | None, linear: frozenset[str]) -> CsvRun:
         """Join the logs of one run into a table.
 
+        The logs of a run may have different stamps. The table has a row for each of them; a
+        channel is empty where its log has no sample, and an input is held or interpolated.
+
         Args:
             run: Name of the run.
             run_rows: Mask of the run's rows; None for all rows.
@@ -497,6 +500,8 @@ class _FolderLogs:
 
 def _find_file(folder: Path, column: str, files: Sequence[str]) -> str:
     """Return the first of some files that has a column.
+
+    Extra columns need not state their file.
 
     Raises:
         InputError: No file has it.

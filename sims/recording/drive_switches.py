@@ -73,6 +73,9 @@ class DriveSwitch(NamedTuple):
 def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...]:
     """Read the switch columns from a description.
 
+    While a drive is off, for example after an emergency stop, its actuator exerts no force. The
+    keys ``enable`` and ``disable`` of an actuator name the column that says when.
+
     Args:
         path: Path of the description, for messages.
         meta: Content of the description.

@@ -100,6 +100,9 @@ class Run:
     def part(self, rows: slice, name: str = "") -> Run:
         """Return a part of the run as a run of its own.
 
+        It is used to divide a long run into segments, for example. Inputs before the part remain
+        known as its history.
+
         Args:
             rows: Samples of the part.
             name: Name of the part; that of the run if empty.

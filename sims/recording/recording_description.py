@@ -500,7 +500,11 @@ def _hold(path: Path, name: str, column: _Column) -> bool:
 def _noises(
     path: Path, channels: Mapping[str, _Column], declared: DeclaredSignals
 ) -> dict[str, float]:
-    """Return the noise of each channel where stated, SI units."""
+    """Return the noise of each channel where stated, SI units.
+
+    The standard deviation is stated in the unit of the column. Values beyond plausible sizes
+    are refused, since the unit is probably wrong.
+    """
     sizes = {channel.name: channel.scale for channel in declared.channels}
     noises = {}
     for name, column in channels.items():

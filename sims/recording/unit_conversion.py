@@ -40,6 +40,8 @@ IDENTITY_SCALE = UnitScale(1.0, 0.0)
 def compute_unit_scale(unit: str, target: str) -> UnitScale:
     """Return the conversion from `unit` to `target`.
 
+    The conversion is value * gain + offset; the offset is needed for temperatures.
+
     Args:
         unit: Unit of the values.
         target: Unit to convert them to.

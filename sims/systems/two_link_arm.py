@@ -181,7 +181,9 @@ class TwoLinkArm(OwnSimulator):
                 self._heun(torques, seconds / _FRICTION_SUBSTEPS)
 
     def _heun(self, torques: tuple[float, float], seconds: float) -> bool:
-        """Take the mean of two of Bullet's steps.
+        """Make one step of Heun's method, (2) and (3), from two steps of Bullet.
+
+        Bullet's step is of first order; the mean is of second order.
 
         Returns:
             Whether a joint with dry friction came to rest or changed its direction.

@@ -72,6 +72,9 @@ class BallTrack:
 def track_ball(frames: Iterable[tuple[float, RgbImage]]) -> BallTrack:
     """Track the ball that moves in front of a fixed camera.
 
+    The steps are: find cuts, estimate the background, detect round objects in each frame, link
+    them to paths, and choose the path of the ball.
+
     Args:
         frames: Time in seconds and picture (height, width, 3) of each frame; iterated three times.
 

@@ -59,6 +59,9 @@ class TrackedPath:
     def predict(self, frame: int) -> tuple[float, float, float]:
         """Predict the position in a frame by linear extrapolation.
 
+        With a single detection there is no velocity; then the ball may be up to 4 radii and
+        10 pixels away.
+
         Args:
             frame: Number of the frame.
 
@@ -175,7 +178,7 @@ def link_detections(pictures: Sequence[Sequence[BallDetection]]) -> list[Tracked
 
 
 def _continued(live: Sequence[TrackedPath], frame: int, spots: Sequence[BallDetection]) -> set[int]:
-    """Append each detection to the path that it fits best.
+    """Append each detection in a frame to the path that it fits best, nearest pairs first.
 
     Args:
         live: Paths that may continue.

@@ -39,7 +39,10 @@ from sims.engines.compiled.interpreter import run_instructions
 
 
 def fly_elements(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers) -> None:
-    """Integrate elements on which only a constant force acts.
+    """Integrate elements on which only a constant force acts, in closed form.
+
+    Between impacts with the ground they move on parabolas, so that no steps are needed. Each
+    element is loaded into slot 0 of the buffers.
 
     Args:
         program: program of the system and its effects.
@@ -58,6 +61,9 @@ def fly_elements(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
 
 def record_flight(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers) -> None:
     """Record the states of the element at all sample times.
+
+    The element in slot 0 moves on a parabola up to its next impact with the ground, and bounces
+    there.
 
     Args:
         program: program of the system and its effects.
@@ -81,7 +87,9 @@ def record_flight(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffe
 def record_arc(
     program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, record: int, time: float
 ) -> None:
-    """Record the state on the present parabola at a time.
+    """Record the state of slot 0 on its present parabola at a time, by (1) and (2).
+
+    The record is position, velocity and acceleration, D numbers each.
 
     Args:
         program: program of the system and its effects.

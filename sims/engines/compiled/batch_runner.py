@@ -89,7 +89,10 @@ class _BatchRunner:
         self._v = np.ascontiguousarray(batch.v, dtype=np.float64)
 
     def integrate(self, elements: Indices, effects: Sequence[tuple[Effect, Array]]) -> None:
-        """Integrate some elements.
+        """Integrate elements that have the same active effects, and write their records.
+
+        Elements of uniform systems without forces or friction by effects fly in closed
+        form; others are stepped.
 
         Args:
             elements: (n,) indices of the elements.

@@ -41,7 +41,10 @@ _RESTITUTION, _FRICTION = 0.6, 0.2
 def get_force_program(
     batch: IntegrationBatch, elements: Indices, effects: Sequence[Effect]
 ) -> ForceProgram | NumpyForceProgram:
-    """Return the program for some elements.
+    """Return the program that computes the forces of a system and its effects.
+
+    It is compiled from a trace of their functions if possible; otherwise it calls them with
+    NumPy, which is slower.
 
     Args:
         batch: whole batch.

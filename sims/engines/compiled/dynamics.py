@@ -146,7 +146,10 @@ def begin_step_1d(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
 def compute_acceleration(
     program: ProgramArrays, block: BlockBuffers, w: int, row_of_result: int, friction_row: int
 ) -> None:
-    """Compute the accelerations within the present step.
+    """Compute the accelerations of all slots within the present step, with dry friction.
+
+    A slot is a column of the buffers that holds one batch element. The force program runs for
+    all slots together; friction is then computed by the number of coordinates.
 
     Args:
         program: program of the system and its effects.

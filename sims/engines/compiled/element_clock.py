@@ -40,6 +40,8 @@ def load_element(
 ) -> None:
     """Load an element into a slot, at the beginning of its run.
 
+    A slot is a column of the buffers. It takes the next element when its element has finished.
+
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
@@ -124,7 +126,7 @@ def record_and_check_remaining(
 def record_state(
     program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, record: int
 ) -> None:
-    """Record the element's state.
+    """Record position, velocity and acceleration of the element in slot i.
 
     Args:
         program: program of the system and its effects.
@@ -143,7 +145,9 @@ def record_state(
 
 
 def next_step(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
-    """Advance the element to its next planned step.
+    """Begin the next planned step of the element in slot i, with the inputs of that step.
+
+    A planned step is one of the batch's steps; it may be divided at events such as impacts.
 
     Args:
         program: program of the system and its effects.

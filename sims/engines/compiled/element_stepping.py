@@ -93,7 +93,10 @@ from sims.engines.compiled.interpreter import nan_maximum, run_instructions
 
 
 def step_block(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int) -> None:
-    """Make all steps of all elements.
+    """Make all steps of all elements, in w slots that are refilled as elements finish.
+
+    Each slot has its own time and step length, so that impacts and reversals of one element do
+    not delay others.
 
     Args:
         program: program of the system and its effects.

@@ -272,6 +272,9 @@ def schedule_event(block: BlockBuffers, i: int, seconds: float, event: int) -> N
 def handle_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int) -> None:
     """Apply the event to which the step led.
 
+    An event is an impact with the ground, a standstill of a body with dry friction, or its
+    break-away. The step was shortened to end there.
+
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
@@ -290,6 +293,9 @@ def handle_event(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
 
 def shift_time(block: BlockBuffers, i: int, seconds: float) -> float:
     """Move the element's clock, at most by one step.
+
+    An event is known only up to rounding when a step ends at it; the clock is corrected by the
+    rest.
 
     Args:
         block: buffers of the slots.
@@ -312,6 +318,9 @@ def handle_impact(
     program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, k: int
 ) -> None:
     """Apply the impact to which a step led up to rounding.
+
+    The remaining distance to the ground is removed by a time correction (10), then the velocity
+    changes.
 
     Args:
         program: program of the system and its effects.
@@ -351,7 +360,7 @@ def clip_to_non_positive(rate: float) -> float:
 def compute_rebound_velocity(
     program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, i: int, pull: float
 ) -> None:
-    """Compute the velocity after an impact.
+    """Compute the velocity after an impact, from restitution and friction with effects.
 
     Args:
         program: program of the system and its effects.
@@ -397,6 +406,9 @@ def compute_rebound_velocity(
 
 def is_bouncing_over(block: BlockBuffers, i: int, rebound_speed: float, down: float) -> bool:
     """Return whether bouncing is finished after an impact.
+
+    Without this, a ball would bounce infinitely often in finite time. Bouncing ends at a flight
+    shorter than `MIN_FLIGHT_SECONDS`, or after `MAX_SHORT_FLIGHTS` short ones.
 
     Args:
         block: buffers of the slots.

@@ -205,7 +205,10 @@ class SystemTracer:
         return self._programs[key]
 
     def trace_effect(self, effect: Effect) -> EffectProgram:
-        """Return the traced effect.
+        """Return an effect's force and friction limit as expressions of the graph.
+
+        Each class of effects is traced once: its functions are called with traced arrays,
+        which record the operations.
 
         Raises:
             NotTraceableError: the effect cannot be traced.

@@ -170,6 +170,9 @@ def evaluate_exponential(r: FloatArray, o: int, a: int, w: int) -> None:
 def run_instructions(code: IntTable, first: int, last: int, r: FloatArray, w: int) -> None:
     """Run instructions first to last - 1 on the registers.
 
+    An instruction is (operation, row of the result, rows of up to three arguments). It is
+    applied to all slots in use, the columns of the registers.
+
     Args:
         code: (n, 5) instructions.
         first: index of the first instruction.

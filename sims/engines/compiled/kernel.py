@@ -232,7 +232,11 @@ def _load(offsets: Mapping[str, int] | None = None) -> Callable[..., None]:
 
 
 def _get_machine_code(offsets: Mapping[str, int] | None) -> bytes:
-    """Return the machine code: from the cache, or compiled."""
+    """Return the machine code: from the cache, or compiled.
+
+    Compilation takes about 20 s, so the code is stored in the user's cache. If the cache cannot
+    be written, each process compiles again.
+    """
     folder = code_cache.get_cache_folder()
     name = "stepping" if offsets is None else "callback"
     path = folder / f"{name}-{_key(offsets)}.bin"

@@ -133,6 +133,9 @@ def _names_of(module: ModuleType, keep: Collection[str] = ()) -> dict[str, Any]:
 def _compile_functions(numba: Any, modules: Sequence[ModuleType]) -> dict[str, Any]:
     """Compile all functions of some modules, callees first.
 
+    A function must be compiled after the functions that it calls, so they are sorted
+    topologically.
+
     Returns:
         The compiled functions and all other names of the modules.
     """

@@ -89,6 +89,9 @@ def compile_llvm(text: str, name: str) -> MachineCode:
 def load_machine_code(code: MachineCode, pointers: int = 1) -> Callable[..., None]:
     """Load the machine code of a function.
 
+    The code was compiled earlier, perhaps by another process. Only llvmlite is needed to load
+    it.
+
     Args:
         code: machine code.
         pointers: number of pointer arguments of the function.

@@ -33,6 +33,9 @@ def step_in_lockstep(
 ) -> None:
     """Make all steps of all elements, w at a time.
 
+    All w elements have the same steps and no events, so that no clock for each element is
+    needed. This is the fastest way.
+
     Args:
         program: program of the system and its effects.
         arrays: batch of elements.
@@ -64,6 +67,8 @@ def step_in_lockstep(
 
 def accept_step(program: ProgramArrays, block: BlockBuffers, w: int, h: float) -> None:
     """Accept the step of h seconds just tried.
+
+    The result of the step becomes the state of all slots.
 
     Args:
         program: program of the system and its effects.

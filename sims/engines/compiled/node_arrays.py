@@ -70,6 +70,8 @@ def make_constant_nodes(graph: ExpressionGraph, value: Any) -> Any:
 def apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -> Any:
     """Apply an operation elementwise to arrays of nodes.
 
+    The arrays are broadcast as in NumPy.
+
     Args:
         graph: graph that contains the nodes.
         name: name of the operation.

@@ -126,7 +126,7 @@ class BallWithImpacts(BallBody, Protocol):
 
 
 def integrate_ball(ball: BallWithImpacts, element: ElementWork) -> Trajectory:
-    """Integrate one batch element.
+    """Integrate one batch element, a ball, with impacts at their exact times.
 
     Args:
         ball: ball in an engine.
@@ -192,6 +192,9 @@ class BallRollout:
     def advance_leg(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
         """Advance by each number of steps in `counts`.
 
+        A leg is a part of the run with constant step length and inputs. Without forces in
+        addition to gravity, many steps are made in one call of the engine.
+
         Args:
             step: step size in seconds.
             counts: numbers of steps.
@@ -246,6 +249,9 @@ class BallRollout:
 
     def advance_with_impacts(self, remaining: float) -> None:
         """Advance by a step that contains impacts.
+
+        The engine flies to each impact in a step of its own, the impact is computed, and
+        the rest of the step follows.
 
         Args:
             remaining: length of the step in seconds.

@@ -178,7 +178,7 @@ def is_finite(path: Trajectory) -> bool:
 
 
 def _compute_timing(steps: Array, every: int) -> tuple[Indices, Array, Indices, Indices]:
-    """Return the timing of one element.
+    """Return which steps of one element have a length, and when its state is recorded.
 
     Args:
         steps: (S,) step sizes in seconds; zero where the element waits.

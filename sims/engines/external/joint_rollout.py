@@ -104,7 +104,10 @@ class JointBody(Protocol):
 
 
 def integrate_joint(joint: JointBody, element: ElementWork) -> Trajectory:
-    """Integrate one batch element.
+    """Integrate one batch element, a body on a hinge or guide.
+
+    If the drive depends on the inputs alone and the other forces equal a linear damping, the
+    engine runs on its own while the inputs are constant; otherwise forces are set in each step.
 
     Args:
         joint: body in an engine.

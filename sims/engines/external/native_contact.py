@@ -45,7 +45,7 @@ class NativeContactBall(BallBody, Protocol):
 
 
 def integrate_native_ball(ball: NativeContactBall, element: ElementWork) -> Trajectory:
-    """Integrate one batch element.
+    """Integrate one batch element, a ball, with the engine's own contact model.
 
     Args:
         ball: ball in an engine.

@@ -47,6 +47,9 @@ class AngleScale(NamedTuple):
 def read_calibration(path: Path) -> dict[str, MotorRange]:
     """Read the ranges of all motors from a calibration file.
 
+    The file states which positions of a motor, in encoder counts, are the ends of the
+    normalised range.
+
     Raises:
         InputError: The file is not a calibration file of LeRobot; the message is one line.
     """

@@ -238,7 +238,10 @@ def _table(path: Path) -> LogFile:
 
 
 def _archive(path: Path) -> LogFile:
-    """Read the arrays of a NumPy archive, one row per sample."""
+    """Read the arrays of a NumPy archive (.npz), one row per sample.
+
+    Arrays of texts may name the entries of the others, for example the joints.
+    """
     columns: dict[str, Array] = {}
     texts = []
     names: dict[str, list[str]] = {}

@@ -71,7 +71,11 @@ class MessageTable:
                 column.append(value)
 
     def columns(self) -> dict[str, Array]:
-        """Return all columns (T,) by name, ordered by time stamp."""
+        """Return all columns (T,) by name, ordered by time stamp.
+
+        A number that a message lacks is NaN. The table is empty afterwards, since columns
+        are released.
+        """
         rows = len(self._stamps)
         stamps = np.array(self._stamps)
         # Header stamps of zero were not filled in: use the times of writing instead.
@@ -133,7 +137,11 @@ def _to_float(number: Any) -> float:
 
 
 def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
-    """Iterate over the numbers of a message with their names."""
+    """Iterate over the numbers of a message with their names.
+
+    `path` is the name of the value so far, and `depth` the number of messages around it. Texts
+    and long lists, such as images, are left out.
+    """
     if isinstance(value, bool | int | float | np.number | np.bool_):
         yield path, _to_float(value)
         return
