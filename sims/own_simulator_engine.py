@@ -99,11 +99,7 @@ class OwnSimulatorEngine:
         return Trajectories(result, result, result)
 
     def _run(self, lanes: IntegrationBatch, lane: int) -> Array | None:
-        """Simulate one batch element with the user's simulator.
-
-        Args:
-            lanes: the whole batch.
-            lane: number of the element.
+        """Simulate one batch element, given by its number, with the user's simulator.
 
         Returns:
             (N, D) recorded states, at the start and after every `steps_per_sample` steps. None if a

@@ -162,9 +162,8 @@ class SystemTracer:
     def __init__(self, system: System, names: InputNames) -> None:
         """Make graph inputs for time, state, inputs and parameters, and trace the system's force.
 
-        Time, state and inputs change in each evaluation (MOMENT), parameters only between
-        batch elements (LANE). `e`, `mu` and `speed` are restitution, friction coefficient
-        and normal speed of an impact.
+        Time, state and inputs change in each evaluation, parameters only between batch elements.
+        `e`, `mu` and `speed` are restitution, friction coefficient and normal speed of an impact.
         """
         graph = ExpressionGraph()
         self.graph = graph

@@ -224,7 +224,7 @@ def _apply_elementwise(graph: ExpressionGraph, name: str, args: Sequence[Any]) -
     that the interpreter needs fewer operations.
 
     Raises:
-        NotTraceableError: arithmetic with truth values alone, or an operation that is not known.
+        NotTraceableError: arithmetic with booleans alone, or an operation that is not known.
     """
     if name == "positive":
         return TracedArray(graph, _to_nodes(graph, args[0]))

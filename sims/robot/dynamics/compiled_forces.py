@@ -127,8 +127,8 @@ class _Tracing:
 
         Effects are called with these snapshots instead of numbers, which records their
         arithmetic. There are two instants: the beginning of a step, and its middle with the
-        predicted state (midpoint rule). Inputs of kind MOMENT change in each step; those of
-        kind LANE are constant for a batch element.
+        predicted state (midpoint rule). Time, states and inputs change in each step; the servo
+                                         stiffness is constant for a batch element.
         """
         graph = ExpressionGraph()
         joints = len(system.coordinates)
