@@ -102,8 +102,8 @@ class OwnSimulatorEngine:
         """Simulate one batch element, given by its number, with the user's simulator.
 
         Returns:
-            (N, D) recorded states, at the start and after every `steps_per_sample` steps. None if a
-            parameter, constant or initial state is not finite.
+            (N, C) readings of all channels, at the start and after each `steps_per_sample` steps.
+            None if a parameter, constant or initial state is not finite.
         """
         system = lanes.system
         world = self.world
