@@ -46,6 +46,12 @@ class AffinityController:
         return 0
 
     def _pin(self, now: float) -> int:
+        """Pin this side to the processor that it uses now, until `now` plus `_REMEASURE_SECONDS`.
+
+        Returns processor number + 1, the flag for the other side; 0 (no change) if the processor is
+        unknown or its number does not fit into the flag, which is one byte (255 means any
+        processor).
+        """
         processor = _processor()
         if self._home is None or not 0 <= processor < 254:
             return 0

@@ -175,6 +175,10 @@ def make_mounts_read_only() -> None:
 
 
 def _mount(kind: str, mount_point: str, flags: int, options: str) -> None:
+    """Call mount(2); `kind` is the type of the file system, which also serves as its source.
+
+    Raises an OSError if the kernel refuses.
+    """
     filesystem = kind.encode()
     flags_argument = ctypes.c_ulong(flags)
     check_result(
@@ -262,6 +266,16 @@ def restrict_file_access(readable: Iterable[str], writable: Iterable[str]) -> No
 
 
 def _allow(rules: int, path: str, rights: int) -> None:
+    """Add a Landlock rule that gives a process `rights` on a file, or on a folder and its content.
+
+    A path that does not exist or cannot be opened is skipped: it then remains forbidden.
+
+    Args:
+        rules: file descriptor of the Landlock rule set.
+        path: file or folder.
+        rights: bits of the Landlock access rights; those that only apply to folders are removed
+            for a file, because the kernel would refuse the rule.
+    """
     try:
         descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
     except OSError:

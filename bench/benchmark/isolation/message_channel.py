@@ -110,6 +110,10 @@ class MessageChannel:
     """
 
     def __init__(self, reading: int, writing: int) -> None:
+        """Store the descriptors, and prepare polling.
+
+        Polling is needed so that every read and write can have a deadline.
+        """
         self._reading, self._writing = reading, writing
         self._buffer = bytearray(_BUFFER)
         self._view = memoryview(self._buffer)
@@ -164,6 +168,11 @@ class MessageChannel:
         self.send(kind, json.dumps(document).encode(), flags=flags)
 
     def _write(self, message: bytes, deadline: float) -> None:
+        """Write the whole message, in several parts if the pipe is full.
+
+        Raises TimeoutError at the deadline (a time of `perf_counter`), PeerClosedError if the other
+        side has closed the pipe.
+        """
         unsent = memoryview(message)
         while unsent:
             try:
@@ -211,6 +220,11 @@ class MessageChannel:
         return memoryview(body)
 
     def _read(self, into: memoryview, deadline: float) -> int:
+        """Read the bytes that are available into `into`, at least one, and return their number.
+
+        Raises TimeoutError if nothing arrives before the deadline, PeerClosedError if the pipe is
+        closed.
+        """
         # `poll` comes before `readv`, because a blocking read could not stop at the deadline.
         if not self._incoming.poll(_milliseconds(deadline)):
             raise TimeoutError

@@ -76,6 +76,11 @@ class IsolatedTuner:
         tuned: TunerSpec,
         state: Mapping[str, NDArray[Any]] | None = None,
     ) -> None:
+        """Send the specification of the tuner to its process, then the weights if there are any.
+
+        The tuner has been built when the process has answered. Message kinds: B builds, L loads
+        weights.
+        """
         self.child = child
         child.wait_until_ready()
         started = perf_counter()
@@ -124,6 +129,13 @@ class IsolatedSteps:
     def __init__(
         self, child: IsolatedProcess, task: Task, stream: NDArray[np.uint32], seconds: float
     ) -> None:
+        """Prepare the run; the process gets the task with the first `next`.
+
+        `_deadline` is the end of the whole run, `_farewell` the seconds allowed for closing the
+        tuner. `_waits` is True while the process waits for an evaluation. `_limit` is the maximum
+        size of a proposal message in bytes: 8 per float64, for all points of the budget and a
+        recommendation.
+        """
         self._child, self._task, self._stream = child, task, stream
         self._deadline = perf_counter() + seconds
         self._farewell = min(seconds, _CLOSE_TIMEOUT_SECONDS)
@@ -132,6 +144,10 @@ class IsolatedSteps:
         self._limit = min(MAX_PROPOSAL_BYTES, 8 * task.dim * (task.budget + 2))
 
     def __next__(self) -> Array | Proposal:
+        """Send the task to the process, which starts the tuner, and return the first proposal.
+
+        The budget is limited to 2^62, so that it fits into an int64.
+        """
         task = self._task
         parts = pack_arrays(
             {
@@ -166,6 +182,16 @@ class IsolatedSteps:
         return self._asked()
 
     def _asked(self) -> Array | Proposal:
+        """Receive the tuner's answer: points to simulate (A), or the end of its run (S).
+
+        A message has n points (n, dim), after one recommended point (dim,) if its flags are 1.
+        Anything else ends the process, because code of a tuner may send any bytes.
+
+        Raises:
+            StopIteration: the tuner has stopped; the value is its reason.
+            RunEndedError: the message is not valid, the process failed, or the time limit was
+                reached.
+        """
         message = self._child.receive(max(self._limit, MAX_TEXT_BYTES), self._deadline)
         if message.kind == b"S":
             raise StopIteration(message.to_text())

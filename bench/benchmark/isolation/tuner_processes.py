@@ -83,6 +83,12 @@ class ForkServerClient:
     """Client of the fork server that starts tuner processes; see `isolation.fork_server`."""
 
     def __init__(self) -> None:
+        """Start the fork server in a new interpreter, which imports the modules that tuners need.
+
+        The server runs in an empty scratch folder (`_folder`, locked while in use) and searches no
+        current folder for modules. `_loaded` are the modules that it has already imported;
+        processes that it forks start fast, because they inherit these modules.
+        """
         self._place: scratch_folders.LockedFolder | None = scratch_folders.create_locked_folder()
         self._folder = self._place.path
         self._loaded: set[str] = set()
@@ -229,6 +235,11 @@ class IsolatedProcess:
     def __init__(
         self, server: ForkServerClient, control: socket.socket, channel: MessageChannel
     ) -> None:
+        """Store the connections to a process.
+
+        `channel` carries the messages of the tuner. `control` is the socket to its supervisor, the
+        parent process that reports its exit code, and kills it when the socket is closed.
+        """
         self._server, self._control, self.channel = server, control, channel
         self._open = True
         self.seals: list[str] = []
@@ -360,6 +371,12 @@ class IsolatedProcess:
         return RunEndedError("crashed", f"the tuner's process broke the pipe: {violation}")
 
     def _gone(self) -> RunEndedError | KilledExternallyError:
+        """Return the error for a process that has closed its pipe, after waiting for its exit code.
+
+        A kill from outside by SIGKILL or SIGTERM, such as by the kernel when memory is exhausted,
+        gives KilledExternallyError, and the run is repeated; every other end is a crash of the
+        tuner.
+        """
         code = self.end(kill=False)
         if code in _EXTERNAL_KILL_SIGNALS:
             return KilledExternallyError(f"the tuner's process was killed by signal {-code}")

@@ -154,6 +154,7 @@ def load_class(description: dict[str, Any], base: type[Any] = Tuner) -> type[Any
 
 
 def _load_plugin_file(path: str) -> Any:
+    """Execute a plugin file as a module, and return the module."""
     stem = os.path.splitext(os.path.basename(path))[0]
     spec = importlib.util.spec_from_file_location(f"simgap_plugin_{stem}", path)
     if spec is None or spec.loader is None:
@@ -171,6 +172,11 @@ def make_generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
 
 
 def _tune(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
+    """Run the tuner on the task of a message, and exchange its proposals for evaluations.
+
+    At the end it sends S with the tuner's reason for stopping, or K after the harness closed the
+    run.
+    """
     arrays = unpack_arrays(message.body)
     task = Task(
         dim=arrays["start"].size,
@@ -250,6 +256,12 @@ class _RemoteTrainingSimulator:
         self._read_properties(channel.receive(_LIMIT))
 
     def _read_properties(self, answer: Message) -> dict[str, NDArray[Any]]:
+        """Store the properties of the training simulator from an answer, and return its arrays.
+
+        Every answer contains these properties. `used` and `budget` are the numbers of simulations
+        so far and allowed. An answer of kind X is a refusal by the harness; it is raised here as
+        the exception that a local simulator would raise.
+        """
         if answer.kind == b"X":
             refusal = answer.to_document()
             kinds = {"budget": BudgetExceededError, "value": ValueError}
@@ -266,6 +278,19 @@ class _RemoteTrainingSimulator:
         return rng.uniform(self.training[0], self.training[1], size=(n, self.dim))
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
+        """Simulate points with the harness; see `methods.tuner.TrainingSimulator.simulate`.
+
+        The state of the random generator travels with the request, because the harness draws
+        scenarios and noise from it; the advanced state comes back, so that a training has the same
+        random numbers as in the harness's process.
+
+        Args:
+            rng: random generator.
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C) of T samples and C channels.
+        """
         state = rng.bit_generator.state
         is_sendable = state["bit_generator"] == "PCG64"
         # A generator of another type seeds a new PCG64 generator, which can be sent.
@@ -295,6 +320,10 @@ class _RemoteTrainingCallback:
 
 
 def _fit(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
+    """Train the tuner on the harness's training simulator, and send its weights (message L).
+
+    Progress is reported to the harness if the flags of the message ask for it.
+    """
     arrays = unpack_arrays(message.body)
     tuner.watch = _RemoteTrainingCallback(channel) if message.flags else None
     tuner.fit(_RemoteTrainingSimulator(channel, 0), make_generator(arrays), int(arrays["budget"]))
