@@ -56,6 +56,11 @@ class RandomisedSimulator:
     """
 
     def __init__(self, problem: RandomisableProblem) -> None:
+        """Build the simulator with one more effect for every effect named in the [nuisance] table.
+
+        `ranges` are the bounds from which each coefficient is drawn, by ``effect.coefficient``. The
+        coefficients become parameters of the simulator after the tuned ones.
+        """
         self._problem = problem
         experiment = problem.experiment
         ranges = dict(experiment.nuisance)

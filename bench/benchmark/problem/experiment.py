@@ -262,6 +262,11 @@ class Experiment:
     tuners: tuple[TunerEntry, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check all values of the experiment that can be checked without its simulator.
+
+        Raises:
+            InputError: a value is not valid, or two values contradict each other.
+        """
         who = f"experiment {self.name}"
         for what in ("targets", "seeds", "budget"):
             count = getattr(self, what)
@@ -548,6 +553,11 @@ def _beside(name: str, experiment: Path) -> str:
 
 
 def _expanded(experiment: Experiment, path: Path) -> list[Experiment]:
+    """Expand a sweep to one experiment for each combination of values.
+
+    An experiment without a sweep is returned alone. Each combination is named
+    ``NAME[key=value,...]``. `path` is only used in error messages.
+    """
     if not experiment.sweep or experiment.experiments:
         return [experiment]
     document = experiment.document()

@@ -58,6 +58,10 @@ def expand_documents(
 
 
 def _check(path: Path, where: str, values: Sequence[Any]) -> None:
+    """Raise an error for a key of a sweep that has no values, or the same value twice.
+
+    `where` is the key in the file, for the message.
+    """
     if not values:
         raise make_error(path, where, "at least one value", values)
     texts = [_text(path, where, value) for value in values]

@@ -106,6 +106,14 @@ def find_model(path: str, name: str) -> Path:
 
 
 def _packaged(path: str, name: str) -> Path:
+    """Find a model file inside an installed Python package, given as ``package://NAME/FILE``.
+
+    `path` is this address, and `name` the experiment that needs the file.
+
+    Raises:
+        InputError: the address is not of this form.
+        PartUnavailableError: the package is not installed, or has no such file.
+    """
     package, _, inside = path.removeprefix(PACKAGE_SCHEME).partition("/")
     if not (package.isidentifier() and inside):
         wanted = f"{PACKAGE_SCHEME}NAME/FILE of an installed package"

@@ -62,6 +62,11 @@ def load_recorded_runs(path: str, simulator: Simulator) -> RecordedRuns:
 
 
 def _side(recording: Recording, runs: tuple[Run, ...], simulator: Simulator) -> ObservedRuns:
+    """Convert runs of a recording to scenarios and observations, for one side: fitting or held out.
+
+    The observations of all runs are stacked to (T, C): T samples of all runs together, C channels
+    in the order of the simulator.
+    """
     names = [channel.name for channel in simulator.channels]
     observed = [np.stack([run.channels[name] for name in names], axis=1) for run in runs]
     # Without runs the array has no rows, but it still needs a column per channel.

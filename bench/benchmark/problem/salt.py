@@ -72,6 +72,10 @@ class TargetStreams:
     """
 
     def __init__(self, salt: str, *names: str | int) -> None:
+        """Prepare the streams; `names` are the experiment, then the range and number of the target.
+
+        `_one` is the stream that all quantities share when the salt is public.
+        """
         self._salt, self._names = salt, names
         self._public = salt in ("", PUBLIC_SALT)
         experiment, *which = names

@@ -148,6 +148,10 @@ def redraws_of(experiment: Experiment, drawn: Sequence[Target]) -> Redraws:
 
 
 def _diverging(experiment: Experiment, failed: int, draws: int) -> InputError:
+    """Make the error for an experiment too many of whose targets diverge when they are simulated.
+
+    `failed` of `draws` simulations diverged.
+    """
     return InputError(
         f"experiment {experiment.name}: the simulation of {failed} of {draws} targets drawn "
         f"diverges (not finite, or beyond {DIVERGENCE_LIMIT:g} times a channel's typical "

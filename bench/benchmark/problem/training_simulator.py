@@ -73,6 +73,11 @@ class CountedTrainingSimulator:
     def __init__(
         self, problem: TrainingProblem, budget: int, nuisance: RandomisedSimulation | None = None
     ) -> None:
+        """Store the sizes that a tuner may know before its first simulation.
+
+        `dim` is the number of parameters, `training` (2, dim) the training range in the unit cube,
+        `scale` (C,) the scale of each channel, `lengths` the number of samples of each scenario.
+        """
         self._problem = problem
         self._nuisance = nuisance
         self.dim = problem.cube.dim

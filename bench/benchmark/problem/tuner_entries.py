@@ -64,6 +64,10 @@ def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
 
 
 def _listed(path: Path, where: str, item: Any) -> TunerEntry:
+    """Parse one element of a list of tuners: a name, or a table with the key ``tuner``.
+
+    The label, under which results are listed, is the key ``label``, or else the name of the tuner.
+    """
     if isinstance(item, str):
         return TunerEntry(item, item)
     if not isinstance(item, dict):
@@ -76,6 +80,10 @@ def _listed(path: Path, where: str, item: Any) -> TunerEntry:
 
 
 def _entry(path: Path, where: str, label: str, value: Any) -> TunerEntry:
+    """Parse the table of one tuner; a table without the key ``tuner`` uses its label as the name.
+
+    `path` and `where` (file and key) are for error messages, `value` is the table.
+    """
     hints = {key: hint for key, hint in get_type_hints_of(TunerEntry).items() if key != "label"}
     own = check_entries(path, where, value, hints)
     for key in ("seeds", "budget"):

@@ -57,6 +57,15 @@ class TuningProblem:
     """
 
     def __init__(self, experiment: Experiment, salt: str | None = None) -> None:
+        """Build the simulators, and read the recording if the experiment has one.
+
+        Args:
+            experiment: experiment that neither sweeps over values nor names other experiments.
+            salt: salt from which targets are drawn; None for that of the experiment.
+
+        Raises:
+            InputError: a part of the experiment does not fit its simulator.
+        """
         if experiment.sweep:
             swept = ", ".join(experiment.sweep)
             remedy = "run those that bench.benchmark.problem.experiment.expand_sweep gives"
@@ -100,6 +109,11 @@ class TuningProblem:
     def _simulator(
         self, kind: type[Simulator], observe: Sequence[str], settings: Mapping[str, Any]
     ) -> Simulator:
+        """Build a simulator; a setting that it does not accept becomes an error of the experiment.
+
+        It is called for the tuned simulator, and for the one that makes the targets if this is
+        another.
+        """
         experiment = self.experiment
         try:
             return kind(constants=experiment.fixed, observe=observe, **settings)
@@ -134,6 +148,11 @@ class TuningProblem:
         self.world.close()
 
     def _channel(self, name: str) -> int:
+        """Return the index of an observed channel.
+
+        Raises:
+            InputError: no channel has this name.
+        """
         names = [c.name for c in self.channels]
         if name not in names:
             raise make_unknown_name_error("channel", name, names)
