@@ -268,6 +268,7 @@ def _package(kind: type, path: Path) -> Any:
 
 
 def _untold(kind: type) -> InputError:
+    """Make the error for a class whose source code cannot be found, so that it cannot be hashed."""
     return InputError(
         f"class {kind.__qualname__} of {kind.__module__}: expected a class of a module, a plugin "
         "file or a notebook's cell, found one whose source cannot be told; define it there under "

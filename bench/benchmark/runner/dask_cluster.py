@@ -74,6 +74,7 @@ class ClusterPool:
     """
 
     def __init__(self, address: str) -> None:
+        """Connect to the scheduler, and check that the workers have the code of this process."""
         try:
             from distributed import Client
         except ImportError:
@@ -97,6 +98,10 @@ class ClusterPool:
         self._check()
 
     def _check(self) -> None:
+        """Raise an error unless there are workers, all with the code and packages of this process.
+
+        Other code could give other results, and the id of a run states the code of this process.
+        """
         threads = self._client.nthreads()
         if not threads:
             raise InputError(
@@ -228,6 +233,12 @@ class ClusterPool:
         )
 
     def _submit(self, call: Call, seconds: float) -> Any:
+        """Submit one call to the cluster, and return its future.
+
+        The files that its arguments refer to are sent with it. The workers may have no common file
+        system, so the content of files such as trained weights is sent. `seconds` is the time limit
+        of the call.
+        """
         function, arguments = call
         travelling = [argument for argument in arguments if isinstance(argument, Transferable)]
         paths = [path for argument in travelling for path in argument.list_files()]

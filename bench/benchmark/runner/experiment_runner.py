@@ -386,6 +386,11 @@ class _LazyCalls(Sequence[Call]):
         return len(self._places)
 
     def __getitem__(self, i: Any) -> Any:
+        """Return the call that executes the planned run number `i` of those still to be run.
+
+        The run's request is completed here with what is known after the plan was made: how to build
+        the tuner in isolation, the folders it must not see, and the file of its trained weights.
+        """
         results = self._results
         order = results.plan[self._places[i]].request
         order = replace(

@@ -183,6 +183,11 @@ def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> 
 
 
 def _make_untrusted_code_error(label: str, file: object) -> InputError:
+    """Make the error for a tuner whose code has been loaded into this process.
+
+    This process has the true parameters. Such a tuner could read the true parameters, so its
+    results would prove nothing.
+    """
     return InputError(
         f"tuner {label}: the code of {file} runs in this process, where the truths are: a "
         "simulator or effect in it is used here, or it was loaded by hand; put the tuner into a "
@@ -347,6 +352,12 @@ def _inspect(question: dict[str, str], label: str) -> list[dict[str, Any]]:
 
 
 def _request_inspection(question: dict[str, str], files: list[str]) -> Any:
+    """Start an isolated process, ask it one question about a plugin, and return its answer.
+
+    `question` names a plugin file, or an installed part by kind and name. `files` are the files
+    that the process may read. The answer is not validated yet: code of the plugin may have written
+    it.
+    """
     child = get_fork_server().start_process(
         f"{__name__}:serve_inspection", files, modules=[__name__]
     )
@@ -425,6 +436,12 @@ _REGISTRY_OF: dict[str, Registry[Any]] = {"tuner": tuners, "diagnoser": diagnose
 
 
 def _told(kind: str, part: Any) -> dict[str, Any]:
+    """Describe a registered class by plain values, for the harness.
+
+    `kind` is its kind, such as "tuner". The harness cannot load the code of a tuner or diagnoser,
+    so it needs its properties and the hash of its source from here. Other kinds have a name and a
+    first paragraph only.
+    """
     known = {"kind": kind, "name": part.name, "says": (part.__doc__ or "").split("\n\n")[0]}
     if kind not in _ISOLATED_REGISTRIES:
         return known

@@ -62,6 +62,11 @@ class _Experiment:
     """Sizes of an experiment from which its needs are computed."""
 
     def __init__(self, experiment: Experiment) -> None:
+        """Build the problem to read its sizes, and select the tuners that can run on this machine.
+
+        `samples` and `steps` are the numbers of samples and of time steps of one evaluation.
+        `learned` is True if at least one of these tuners must be trained.
+        """
         problem = TuningProblem(experiment)
         self.channels = len(problem.channels)
         self.dim = problem.cube.dim

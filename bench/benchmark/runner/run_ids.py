@@ -166,6 +166,13 @@ class RunIds:
     """Identifiers of an experiment's runs."""
 
     def __init__(self, experiment: Experiment) -> None:
+        """Hash what all runs of the experiment share.
+
+        Tuners and targets are hashed when they are first used.
+
+        `_world` is the common hash. `_entries` and `_targets` cache the hashes by label of the
+        tuner and by name of the target.
+        """
         self._experiment = experiment
         self._world = compute_digest(
             select_relevant_keys(experiment, RUN_IRRELEVANT_KEYS),

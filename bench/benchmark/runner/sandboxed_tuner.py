@@ -71,6 +71,10 @@ def list_active_isolation_layers() -> tuple[str, ...]:
 
 
 def _find_active_layers() -> tuple[str, ...]:
+    """Start an isolated process, and return the names of the isolation layers that it has applied.
+
+    The process is used for nothing else: only a real start shows what the kernel permits.
+    """
     child = get_fork_server().start_process("bench.benchmark.isolation.tuner_server:serve_requests")
     try:
         child.wait_until_ready()
@@ -120,6 +124,10 @@ def make_tuner_spec(entry: TunerEntry) -> TunerSpec:
 
 
 def _file_of(module: str) -> str:
+    """Return the source file of a module of a package that the fork server may import in advance.
+
+    Empty for modules of other packages, such as plugins: locating them could execute their code.
+    """
     top = module.partition(".")[0]
     if top not in _PRELOADABLE_PACKAGES:
         return ""
@@ -145,6 +153,11 @@ def find_preloadable_packages(file: str) -> tuple[str, ...]:
 
 
 def _imported(file: str) -> list[str]:
+    """List the modules that a source file imports anywhere, without executing it.
+
+    Relative imports are left out. A file that cannot be read or parsed gives an empty list; its
+    error is reported when the tuner is built.
+    """
     try:
         tree = ast.parse(Path(file).read_bytes())
     # A deeply nested file can exceed the limits of the parser.

@@ -55,6 +55,10 @@ def _main_module_left_out() -> Iterator[None]:
         original, thread = spawn.get_preparation_data, threading.get_ident()
 
         def without_main(name: str) -> dict[str, Any]:
+            """Return multiprocessing's preparation data for a new process, without the main module.
+
+            Other threads get the unchanged data, because they did not ask for this replacement.
+            """
             data: dict[str, Any] = original(name)
             if threading.get_ident() == thread:
                 for key in _MAIN_MODULE_KEYS:

@@ -108,6 +108,12 @@ class _RunRecord:
     """Record of a run while it is running."""
 
     def __init__(self, task: Task) -> None:
+        """Begin with no simulation; the start of the task is the recommendation for k = 0.
+
+        `_recommended` has one point (dim,) for each number of simulations k = 0, 1, .... `_best` is
+        the point with the lowest loss so far. The lists of seconds have one pair (number of points,
+        seconds) for each batch.
+        """
         self.used = 0
         self._dim = task.dim
         self._proposals: list[Array] = []

@@ -222,6 +222,16 @@ def _train(
     anew: bool,
     earlier_requests: list[str],
 ) -> TrainingResult:
+    """Train the tuner of a request, or read its weights from the cache; see `train_or_load`.
+
+    Args:
+        experiment: configuration of the experiment.
+        lesson: the request: entry of the tuner, seed, and how to build the tuner in isolation.
+        watch: gets the losses of each epoch; None for none.
+        anew: train even if the cache has the weights.
+        earlier_requests: hashes of the simulations requested before an external kill; the repeated
+            training must make the same requests.
+    """
     entry, seed = lesson.entry, lesson.seed
     name = compute_training_key(experiment, entry, seed)
     path = get_weights_folder() / f"{name}.npz"
@@ -267,6 +277,10 @@ class _ReplayCheckedSimulator(CountedTrainingSimulator):
         earlier_requests: list[str],
         nuisance: RandomisedSimulator | None = None,
     ) -> None:
+        """Store the hashes of the requests before a kill, which the repeated training must repeat.
+
+        `_before` is extended with each new request, and `_place` is the index of the next one.
+        """
         super().__init__(problem, budget, nuisance)
         self._before, self._place = earlier_requests, 0
 

@@ -112,6 +112,7 @@ class InProcessPool:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Close the cached problem of this process at the end of the comparison."""
         from bench.benchmark.runner.worker_tasks import close_problem
 
         # A notebook may redefine a simulator under the same name before the next comparison.
@@ -189,6 +190,10 @@ class LocalPool:
     """
 
     def __init__(self, jobs: int) -> None:
+        """Set the number of threads of numerical libraries to one.
+
+        Workers start with the first calls. Variables that the user has set are kept.
+        """
         # Workers inherit the variables; numerical libraries read them when they are loaded.
         for name in THREAD_COUNT_VARIABLES:
             os.environ.setdefault(name, "1")
@@ -264,12 +269,22 @@ class _WorkerSlot:
     """
 
     def __init__(self, plugins: list[Plugin]) -> None:
+        """Start the worker process, which loads the plugins first.
+
+        `_futile` counts consecutive restarts after which no call has ended. `given` are the calls
+        that were assigned to this worker, by future.
+        """
         self._plugins = plugins
         self._futile = 0
         self.given: dict[Future[Any], _AssignedCall] = {}
         self._start()
 
     def _start(self) -> None:
+        """Start a new process in its own pebble pool.
+
+        `_births` is the pipe through which processes of this pool report that they have started,
+        and `_born` counts these reports.
+        """
         from pebble import ProcessPool
 
         # A forked process would inherit the parent's memory with the true parameters.
@@ -344,6 +359,12 @@ class _WorkerSlot:
         return self._born > 1 and any(future.running() for future in self.given)
 
     def _renew(self) -> None:
+        """Replace a lost worker process.
+
+        Raises:
+            InputError: too many processes died in turn without finishing a call. Without
+                this limit, a worker that cannot start would be restarted forever.
+        """
         self._futile += 1
         if self._futile > _MAX_IMMEDIATE_DEATHS:
             hint = "what they say stands above, if anything"

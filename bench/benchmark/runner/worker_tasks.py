@@ -195,6 +195,17 @@ class _ReplayCheckedEvaluator:
         self._evaluate, self._before, self._place = evaluate, earlier_requests, 0
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Simulate points and compute their losses, if the request equals the one before a kill.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C) and losses (n,).
+
+        Raises:
+            RunEndedError: the repeated run asks for other points than the first one.
+        """
         if self._place == len(self._before):
             self._before.append(points)
         elif not np.array_equal(self._before[self._place], points):
