@@ -61,6 +61,11 @@ class Comparison:
     """
 
     def __init__(self, folder: Path) -> None:
+        """Open a comparison for reading: its configuration is read, but no plan and no runs.
+
+        `plugins` are the plugin files of the configuration. `secret` is the salt from which hidden
+        targets are drawn; it stays None here, because only `begin` and `resume` need it.
+        """
         self.folder = folder
         self.configuration = read_configuration(folder)
         self.plugins = self.configuration.plugins
@@ -228,6 +233,11 @@ class Comparison:
             self.results.run_sink.close()
 
     def _begun(self) -> ExperimentRun:
+        """Return the problem, plan and stored runs, which only a comparison that can be run has.
+
+        Raises:
+            InputError: the comparison was opened for reading (`results` is None).
+        """
         if self.results is None:
             raise InputError(
                 f"{self.folder}: this study is read-only; resume it to run what is missing"
@@ -262,6 +272,12 @@ class Comparison:
         )
 
     def _ends(self) -> list[RunEnd]:
+        """List how every run ended, for `simgap status`.
+
+        A finished comparison has one table of statuses. In an unfinished one they are in its
+        segments (the journal and its parts), which are checked against the plan; a planned run that
+        has not ended has no status.
+        """
         if not self._under_way:
             return [_end(status.run, status) for status in self._stored()]
         planned, experiment = read_plan(self.folder), self.configuration.experiment

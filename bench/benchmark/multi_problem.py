@@ -263,6 +263,11 @@ class ComparisonCollection:
         }
 
     def _joint_figure(self) -> Figure:
+        """Draw the runtime distribution over all problems.
+
+        It is the share of solved targets against the number of simulations. The tuners are ordered
+        by mean rank. An `Experiment` of all tuners is made for their styles only.
+        """
         order = list(self.mean_ranks.mean().sort_values(kind="stable").index)
         experiment = Experiment(
             "all",

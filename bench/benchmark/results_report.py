@@ -164,6 +164,10 @@ def build_tables(
 
 
 def _break_even(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
+    """Build the table of break-even targets for all priced thresholds and ranges.
+
+    It says from how many targets on the training of a learned tuner costs less than a search.
+    """
     parts = [
         build_break_even_table(experiment, kind, level, by_tuner)
         for level, ranges in statistics.tuning_costs.items()
@@ -175,6 +179,11 @@ def _break_even(experiment: str, statistics: ComparisonStatistics) -> pd.DataFra
 
 
 def _who_wins(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame:
+    """Build the table of the fastest tuner by duration of one simulation, per threshold and range.
+
+    A training is shared by `TARGETS_PER_TRAINING` targets. Each row has the bounds of the duration
+    in seconds, and the tuner that needs the least time between them.
+    """
     lines = [
         (experiment, kind, level, *line)
         for level, ranges in statistics.tuning_costs.items()

@@ -178,6 +178,10 @@ def check_references_allowed(
 def _draw_chart_figure(
     view: ComparisonView, name: str, behind: Sequence[ReferenceResult]
 ) -> Figure:
+    """Draw the figure called `name`, one of `CHARTS`, with the same panels as on the report page.
+
+    `behind` are the results of other comparisons; they are drawn in grey behind those of `view`.
+    """
     chart, layout = CHARTS[name](view), _LAYOUTS[name]
     panels = select_first_panels(chart.panels, (chart.side_by_side, layout.rows))
     columns = len({panel.facets[chart.side_by_side] for panel in panels}) if layout.rows else 0

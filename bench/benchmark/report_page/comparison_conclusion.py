@@ -70,6 +70,10 @@ def write_conclusion(view: ComparisonView) -> list[str]:
 
 
 def _conclude_range(view: ComparisonView, kind: str) -> str:
+    """Write one sentence with the verdicts on all tuners of a range after all simulations.
+
+    `kind` is the range of the targets. Tuners that share the smallest error are not listed here.
+    """
     standings, title = headline.standings(view.statistics, kind), _format_title(view, kind)
     if not standings:
         return f"{title}: no target has an error that decides."
@@ -95,6 +99,12 @@ def write_running_times(results: ComparisonReportData) -> list[str]:
 
 
 def _format_running_times(results: ComparisonReportData, kind: str) -> str:
+    """Write a sentence with the expected running time (ERT) of the best tuners of a range.
+
+    The ERT is the expected number of simulations until the error stays below the reference
+    threshold (`reference_level`). The text is empty if none of the best tuners has reached the
+    threshold.
+    """
     view, table = results.view, results.tables["ert"]
     statistics, level = view.statistics, view.statistics.reference_level
     ranking = statistics.ranking[statistics.ranking["range"] == kind]
@@ -118,6 +128,11 @@ def _format_running_times(results: ComparisonReportData, kind: str) -> str:
 
 
 def _format_running_time(view: ComparisonView, row: Mapping[Any, Any]) -> str:
+    """Format the expected running time (ERT) of one tuner.
+
+    The text has its 95 % interval, the successful runs and the simulations of a training. `row` is
+    a row of the table of ERT; an interval without an upper limit ends with ∞.
+    """
     high = format_number(row["high"]) if np.isfinite(row["high"]) else "∞"
     interval = f"95 % {format_number(row['low'])} to {high}"
     simulations, _ = view.stored.costs.get(str(row["tuner"]), (0.0, 0.0))

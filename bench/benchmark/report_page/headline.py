@@ -68,6 +68,11 @@ def _in_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
 
 
 def _standing(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> Standing:
+    """Sort the tuners of one range by their verdict after `k` simulations.
+
+    `part` are the rows of the ranking for this range and this number of simulations.
+    """
+
     def named(*verdicts: str) -> pd.DataFrame:
         return part[part["verdict"].isin(verdicts)]
 
@@ -85,6 +90,11 @@ def _standing(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> S
 
 
 def _error(statistics: ComparisonStatistics, median: float) -> str:
+    """Format the median error of the best tuner in the unit of the statistics.
+
+    An error at or below the negligible error (`floor`) is given as an upper limit, because smaller
+    differences have no meaning. A median that is not finite means that half of the targets failed.
+    """
     if not np.isfinite(median):
         return "it failed on half of the targets"
     text = f"{median * statistics.unit:.2g}"

@@ -52,6 +52,11 @@ class ComparisonStatistics:
         statuses: pd.DataFrame,
         costs: Mapping[str, tuple[float, float]],
     ) -> None:
+        """Select the deciding metric, its curves and thresholds.
+
+        Other statistics are computed when they are used. `floor` is the error below which tuners
+        count as equal. `_curves` and `_medians` cache the results of other metrics by name.
+        """
         self.metric, self.runs, in_widths = select_primary_metric(runs)
         self._statuses, self._budget, self._costs = statuses, experiment.budget, costs
         self._rows = self._laid_out(self.runs)
@@ -215,6 +220,10 @@ class ComparisonStatistics:
         return {level: self._prices(level) for level in self.levels[:PRICED_LEVEL_COUNT]}
 
     def _prices(self, level: float) -> dict[str, dict[str, TuningCost]]:
+        """Compute what each tuner costs to reach an error threshold, by range and then by tuner.
+
+        Costs are the simulations, the seconds in the tuner and in the simulator, and the training.
+        """
         in_tuner = self._rows.build_cumulative_seconds("tuner_seconds")
         in_simulator = self._rows.build_cumulative_seconds("simulator_seconds")
         ranges = self.curves.keys["range"]

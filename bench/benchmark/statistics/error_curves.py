@@ -93,6 +93,12 @@ class RunRowTable:
     """
 
     def __init__(self, runs: pd.DataFrame, statuses: pd.DataFrame, budget: int) -> None:
+        """Assign a matrix row to every run, and a matrix column to every number of simulations k.
+
+        For R runs: `_codes` is the matrix row of each table row, `keys` (R rows) has tuner, target
+        and seed, `used` (R,) is the last k of each run, and `failed` (R,) marks runs with a failed
+        status.
+        """
         self._runs, self._budget = runs, budget
         # The matrices of all metrics use the same row and column indices.
         codes, names = pd.factorize(runs["run"])

@@ -105,6 +105,16 @@ class ThresholdEffort:
 def _per_success(
     spent: Array, successes: NDArray[np.int64], picked: NDArray[np.int64] | None
 ) -> Array:
+    """Divide the total effort by the number of successes; infinite without a success.
+
+    Args:
+        spent: (targets,) effort of all runs of each target, in simulations or seconds.
+        successes: (targets,) number of runs of each target that reached the threshold.
+        picked: (..., n) indices of the used targets, such as bootstrap resamples; None for all.
+
+    Returns:
+        (...) effort per success.
+    """
     if picked is not None:
         spent, successes = spent[picked], successes[picked]
     total, count = spent.sum(axis=-1), successes.sum(axis=-1)

@@ -159,6 +159,7 @@ def _beyond(value: Any) -> bool:
 
 
 def _arrow(column: ColumnSpec) -> pa.DataType:
+    """Return the Arrow type in which the cells of a column are stored."""
     import pyarrow as pa
 
     types = {str: pa.large_string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
@@ -210,6 +211,10 @@ def check_cells(
 
 
 def _check_texts(column: ColumnSpec, values: pa.Array) -> None:
+    """Raise an error for the first text cell that is not one of the column's words, or is empty.
+
+    Empty cells are only refused in columns that must always have a value.
+    """
     import pyarrow as pa
     from pyarrow import compute
 

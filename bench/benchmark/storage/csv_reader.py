@@ -41,6 +41,7 @@ class CsvTable:
     """
 
     def __init__(self, path: Path, columns: Columns | ColumnResolver, remedy: str) -> None:
+        """Read and check the whole file; a wrong cell becomes an error that names its line."""
         self._path, self._remedy = path, remedy
         self._text = self._read()
         self._header = self._fields(next(self._records(), (1, ""))[1])
@@ -62,6 +63,11 @@ class CsvTable:
         return InputError(f"{self._path}{place}: {says}; {self._remedy}")
 
     def _read(self) -> str:
+        """Read the file as text, without the byte order mark that Excel writes at the beginning.
+
+        Raises:
+            InputError: the file is missing, empty or not UTF-8.
+        """
         wrong = f"{self._path}: not a complete comparison"
         try:
             data = self._path.read_bytes()
@@ -77,6 +83,10 @@ class CsvTable:
             raise InputError(f"{self._path}, line {line}: {says}; {self._remedy}") from None
 
     def _checked(self, there: Columns) -> pa.Table:
+        """Convert the cells of the declared columns from text to their types, and check them.
+
+        `there` are the declared columns that the file has.
+        """
         import pyarrow as pa
 
         texts = self._texts()
@@ -117,6 +127,10 @@ class CsvTable:
                 raise InputError(f"{self._path}, line {number}: {says}; {self._remedy}")
 
     def _fields(self, record: str) -> list[str]:
+        """Split one CSV record into its cells.
+
+        A record is a line, or several lines if a quoted cell has line breaks.
+        """
         try:
             return next(csv.reader([record], strict=True), [])
         except csv.Error as error:

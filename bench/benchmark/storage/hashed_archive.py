@@ -88,6 +88,10 @@ def write_archive(
 
 
 def _entry(path: str) -> zipfile.ZipInfo:
+    """Make the header of a file in the zip archive, with fixed time, permissions and system.
+
+    The bytes of the archive then depend on the content of the files only.
+    """
     entry = zipfile.ZipInfo(path, _EPOCH)
     entry.create_system = 3  # Always Unix, so that the bytes do not depend on this machine.
     entry.external_attr = (stat.S_IFREG | 0o644) << 16
@@ -196,6 +200,14 @@ def _top(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
 
 
 def _manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
+    """Read and validate the manifest of an archive, the list of its files with their hashes.
+
+    `packed` is the opened archive, and `top` its only folder. The size is checked first, because an
+    archive of unknown origin could contain a manifest that fills the memory.
+
+    Raises:
+        InputError: the manifest is too large, or does not follow its schema.
+    """
     entry = packed.getinfo(f"{top}/{MANIFEST_FILE}")
     if entry.file_size > _MANIFEST_BYTES:
         raise _refused(archive, f"{MANIFEST_FILE} has {entry.file_size} bytes")

@@ -120,6 +120,11 @@ def check_table(folder: Path) -> None:
 
 
 def _spectra(folder: Path, experiment: Experiment, remedy: str) -> pd.DataFrame | None:
+    """Read and check identifiability.csv; None if the comparison has no such file.
+
+    The file has the directions of the parameter space of each target, in order of number. Targets
+    must be those of the experiment, and the directions of a target must be numbered 1, 2, ....
+    """
     path = folder / "identifiability.csv"
     if not path.exists():
         return None

@@ -195,6 +195,11 @@ def _place(name: str) -> Path:
 
 
 def _read(name: str, folder: Path) -> ReferenceResult:
+    """Read the table, configuration and environment of a reference comparison from its folder.
+
+    Raises:
+        InputError: one of the three files is missing or damaged.
+    """
     path = folder / "environment.json"
     try:
         environment = json.loads(path.read_text(encoding="utf-8"))

@@ -48,6 +48,12 @@ class RunJournal:
     """
 
     def __init__(self, folder: Path, part_runs: int = RUNS_PER_PART) -> None:
+        """Lock the folder against other processes, and recover all runs that it contains.
+
+        `_index` are the plan indices of the runs in each finished part. `_records` are the runs in
+        the current journal, and `_number` is the number of this journal. A journal of `part_runs`
+        runs is converted to a part.
+        """
         self.folder = folder / SEGMENTS_FOLDER
         try:
             self.folder.mkdir(exist_ok=True)
@@ -79,6 +85,11 @@ class RunJournal:
             raise
 
     def _read_parts(self) -> None:
+        """Read the statuses of the runs in all parts; the rows of the runs stay on disk.
+
+        Raises:
+            InputError: a part is damaged, or a run is in two parts.
+        """
         for path in list_segments(self.folder, "parquet"):
             statuses = read_part_statuses(path)
             check_no_duplicate_runs(path, statuses, self.statuses)
@@ -125,6 +136,7 @@ class RunJournal:
             self._make_part()
 
     def _make_part(self) -> None:
+        """Convert the full journal to a compressed Parquet part, and begin the next journal."""
         import pyarrow as pa
         from pyarrow import parquet
 
@@ -203,6 +215,7 @@ class RunJournal:
 
 
 def _placed(place: int, rows: pa.Table) -> pa.Table:
+    """Add the column ``place``, the index of the run in the plan, by which rows are sorted."""
     import numpy as np
     import pyarrow as pa
 

@@ -103,6 +103,7 @@ class RunsTable(NamedTuple):
             raise self._unreadable(error) from None
 
     def _batches(self) -> Iterator[pa.Table]:
+        """Yield the rows of the Parquet file in batches of at most `_BATCH_ROWS` rows."""
         import pyarrow as pa
         from pyarrow import parquet
 
@@ -111,6 +112,7 @@ class RunsTable(NamedTuple):
                 yield pa.Table.from_batches([batch])
 
     def _unreadable(self, error: Exception) -> InputError:
+        """Make the one-line error for a file that is missing, or is not a Parquet file."""
         missing = isinstance(error, FileNotFoundError)
         what = (
             "no such file" if missing else f"expected a Parquet file, found {get_first_line(error)}"
