@@ -84,6 +84,7 @@ def list_tuners() -> list[JsonDocument]:
     from bench.core.plugin_registries import tuners as registry
 
     def told(kind: Any) -> JsonDocument:
+        """Return the properties of one tuner class, `kind`, that only tuners have."""
         return {
             "learned": bool(kind.learned),
             "stochastic": bool(kind.stochastic),
@@ -108,6 +109,10 @@ def list_systems() -> list[JsonDocument]:
 
 
 def _declared(kind: Any) -> JsonDocument:
+    """Return what a system declares: parameters, constants, inputs, states and observed channels.
+
+    `kind` is the class of the system; a parameter has its bounds, its training range and its unit.
+    """
     parameters = [
         {
             "name": p.name,
@@ -144,6 +149,11 @@ def list_effects() -> list[JsonDocument]:
 
 
 def _acting(effect: Any) -> JsonDocument:
+    """Return the properties of one effect: how it acts, and the range of each of its coefficients.
+
+    A coefficient has an entry in ``on`` for each kind of system to which it can be applied, because
+    its unit and plausible range depend on the kind: a point mass, a linear or a rotary coordinate.
+    """
     from sims.core.system import SYSTEM_KINDS
 
     coefficients = [

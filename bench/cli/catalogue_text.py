@@ -53,6 +53,7 @@ def _experiment(each: JsonDocument) -> list[str]:
 
 
 def _system(each: JsonDocument) -> list[str]:
+    """Format a system: its description, then a line for each of its declared quantities."""
     result = [f"{each['name']}: {_format_sentence(each)}"]
     if each["skipped"]:
         return result

@@ -24,6 +24,7 @@ class InterruptHandler:
         return self._asked
 
     def __enter__(self) -> InterruptHandler:
+        """Handle Ctrl-C from now on, unless another handler is set or this is no main thread."""
         # Python handles signals in the main thread only.
         self._answers = threading.current_thread() is threading.main_thread()
         # Keep ignoring SIGINT if it is ignored, as for background jobs of a shell.

@@ -195,6 +195,7 @@ class _Parser(argparse.ArgumentParser):
     """Parser that reports errors in one line, like all other user errors."""
 
     def error(self, message: str) -> NoReturn:
+        """Raise a usage error with a one-line message; argparse would print its usage and exit."""
         from sims.core.simulator import (
             InputError,  # its message is printable, whatever the user typed
         )

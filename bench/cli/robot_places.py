@@ -66,6 +66,7 @@ def list_places(model: Path) -> JsonDocument:
 
 
 def _joints(robot: RobotModel) -> Iterator[str]:
+    """Yield a line for each joint of a robot: kind, and range of motion and effort if limited."""
     for joint in robot.joints:
         limits = "" if joint.range is None else _range(joint.range, joint.unit)
         effort = "" if joint.effort is None else f", effort {joint.effort:g} {joint.force_unit}"
@@ -73,6 +74,7 @@ def _joints(robot: RobotModel) -> Iterator[str]:
 
 
 def _actuators(kind: type[RobotSimulator]) -> Iterator[str]:
+    """Yield a line for each actuator of a robot: kind, the driven joint and the control range."""
     units = {channel.name: channel.unit for channel in kind.inputs}
     for a in kind.robot.actuators:
         limits = "" if a.range is None else _range(a.range, units.get(f"u.{a.name}", ""))

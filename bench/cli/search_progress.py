@@ -40,6 +40,11 @@ class SearchProgress:
     def __init__(
         self, clock: Callable[[], float] = time.monotonic, budget: float | None = None
     ) -> None:
+        """Begin with nothing done, no stage and no model found.
+
+        `_share` is the share of the search that is done, `_best` the effects of the best model so
+        far and the percentage of the gap that it closes, both as text.
+        """
         self._clock = clock
         self._budget = budget
         self._started = clock()
@@ -137,6 +142,11 @@ class SearchProgress:
         return f"{self._name}, {min(self._done, self._total)} of {self._total}"
 
     def _times(self) -> str:
+        """Format the elapsed time, and the remaining time while the search is running.
+
+        With a time budget the remaining time is an upper limit; otherwise it is an estimate, or
+        missing.
+        """
         elapsed = clock_text(self.elapsed())
         if not self._is_searching:
             return elapsed
@@ -184,6 +194,11 @@ class ProgressDisplay(SearchProgress):
         stream: TextIO | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Choose the form of the display; nothing is shown before the first event.
+
+        `_shown` is the live line now on the terminal, `_shown_at` the time of the last output, and
+        `_waiting` has permanent lines that are still to be printed.
+        """
         super().__init__(clock, budget)
         self._stream = sys.stderr if stream is None else stream
         self._live = self._stream.isatty()
@@ -198,6 +213,7 @@ class ProgressDisplay(SearchProgress):
         self._has_timer = False
 
     def __enter__(self) -> ProgressDisplay:
+        """Start the timer that redraws the live line, where signals can be used."""
         if not self._silent and _can_use_timer():
             signal.signal(signal.SIGALRM, lambda *_: self._update())
             # System calls of libraries continue after the signal.
@@ -207,6 +223,7 @@ class ProgressDisplay(SearchProgress):
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Stop the timer, erase the live line, print what is waiting, and show nothing any more."""
         if self._has_timer:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -288,6 +305,7 @@ class ProgressDisplay(SearchProgress):
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
+        """Mark the time in which stderr is written, so that the timer signal does not write too."""
         self._busy = True
         try:
             yield
@@ -322,6 +340,10 @@ class ProgressDisplay(SearchProgress):
             self._stream.flush()
 
     def _erase(self) -> None:
+        """Overwrite the live line with spaces; nothing to do without a terminal or a line.
+
+        Two more characters are overwritten, because a terminal echoes ^C at the end of the line.
+        """
         if self._live and self._shown:
             from tqdm.utils import disp_len
 

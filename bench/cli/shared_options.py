@@ -151,6 +151,11 @@ def parse_non_negative_int(text: str) -> int:
 
 
 def _whole(text: str, least: int) -> int:
+    """Parse a whole number from `least` to MAX_INTEGER, for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: the text is not such a number.
+    """
     from sims.core.value_limits import MAX_INTEGER, truncate_text
 
     try:

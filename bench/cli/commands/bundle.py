@@ -36,6 +36,15 @@ def add_bundle_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_bundle(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap bundle`: pack a result folder into one archive.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code (0).
+    """
     from bench.studies.archive_bundle import write_bundle
 
     archived = write_bundle(options.run, options.out, options.recordings)

@@ -25,6 +25,15 @@ def add_check_arguments(check: argparse.ArgumentParser) -> None:
 
 
 def _run_check(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap check`: run the conformance checks of a part, such as a tuner of a plugin.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a check failed.
+    """
     from bench.conformance.run_checks import run_suite
     from bench.core.plugin_registries import load_plugins
 

@@ -89,6 +89,18 @@ def _begin_or_resume(options: argparse.Namespace, say: PrintLine) -> list[Study]
 
 
 def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap compare`: run one or several comparisons, one after the other.
+
+    The comparisons of a sweep also get a joint report. After an interrupt the remaining ones are
+    not begun.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and the largest exit code of its comparisons.
+    """
     from bench.studies.study import report_jointly
 
     # Connect to the cluster first, so that an unreachable scheduler leaves no folder.

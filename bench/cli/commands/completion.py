@@ -27,6 +27,7 @@ def add_completion_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _completion(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap completion`: print the completion script of the named shell."""
     from bench.cli.main import build_parser
 
     script = build_completion_script(build_parser(), options.shell)

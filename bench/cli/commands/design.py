@@ -31,6 +31,19 @@ def add_design_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_design(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap design`: explain recordings, then propose the next recording.
+
+    The proposal is written to a file of commands (`options.out`), which must not exist yet. The
+    search shows its progress on stderr, and Ctrl-C ends it with what it has.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if there is no
+        proposal.
+    """
     from bench.api.design import DesignOptions, design
     from bench.cli.interrupt_handler import InterruptHandler
     from bench.cli.search_progress import ProgressDisplay

@@ -39,6 +39,15 @@ def add_diff_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_diff(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap diff`: print the differences between two result folders of the same kind.
+
+    Args:
+        options: parsed arguments of the command; `fail_on` says which differences are a failure.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND for a failure.
+    """
     from sims.recording.recording_writer import check_absent, write_files
 
     if options.out is not None:

@@ -44,6 +44,17 @@ def add_download(parser: argparse.ArgumentParser) -> None:
 
 
 def _download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap download`: download the named data sets that are not on this machine yet.
+
+    Without a name it lists all data sets and downloads nothing.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code (0).
+    """
     from bench.datasets import dataset_catalogue
 
     chosen = (
@@ -116,6 +127,7 @@ def _how_found(data_set: DataSet, out: Path) -> str:
 
 
 def _lines(data_set: DataSet) -> list[str]:
+    """Format a data set for the list: size, licence, place, title, experiments and source."""
     folder = data_set.folder()
     state = f"in {folder}" if folder else f"not here: run `{data_set.command}`"
     needed = ", ".join(_experiments(data_set))
@@ -144,6 +156,10 @@ def _experiments(data_set: DataSet) -> list[str]:
 
 
 def _document(data_set: DataSet, out: Path | None = None) -> JsonDocument:
+    """Convert a data set to a JSON document, with the address and hash of each file.
+
+    `out` is the folder that the user named for downloads; None for the default folder.
+    """
     return {
         "name": data_set.name,
         "title": data_set.title,

@@ -194,6 +194,7 @@ def _run_explain_batch(options: argparse.Namespace, say: PrintLine) -> CommandRe
     finished = 0
 
     def done(row: LogResult) -> None:
+        """Print the result of one log (recording) as soon as it is explained."""
         nonlocal finished
         finished += 1
         causes = [format_cause(cause) for cause in row.causes]

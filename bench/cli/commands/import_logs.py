@@ -33,6 +33,18 @@ def add_import_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _import(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap import`: write a description of log files, from which simgap reads them.
+
+    Everything that was guessed is printed, because the user should confirm it. The log files
+    themselves are not copied.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code (0).
+    """
     from bench.api.recordings import ImportRequest, import_logs
 
     result = import_logs(**collect_options(options, ImportRequest))

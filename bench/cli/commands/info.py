@@ -16,6 +16,7 @@ def add_info_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _info(options: argparse.Namespace, say: PrintLine) -> CommandResult:  # noqa: ARG001
+    """Execute `simgap info`: print what a bug report should say about this machine."""
     information = collect_info()
     for line in _format_info(information):
         say(line)
@@ -81,6 +82,10 @@ def _revision() -> str | None:
 
 
 def _processors() -> int | None:
+    """Return the number of processors that this process may use; None if unknown.
+
+    It can be smaller than that of the machine, for example in a job of a cluster.
+    """
     import os
 
     if hasattr(os, "sched_getaffinity"):
@@ -141,6 +146,7 @@ def _extra(marker: str) -> str:
 
 
 def _version(package: str) -> str | None:
+    """Return the version of an installed package; None if it is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:

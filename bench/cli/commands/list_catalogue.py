@@ -33,6 +33,16 @@ def add_schema_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap list`: print one section of the catalogue, or the places of a robot.
+
+    Args:
+        options: parsed arguments of the command; `what` is the section, None for all of them, which
+            needs ``--json``. `model` is the robot's model file, for the section places only.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code (0).
+    """
     from bench.cli import catalogue
     from bench.cli.catalogue_text import format_documents
     from bench.cli.main import build_parser
@@ -62,6 +72,7 @@ def _list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
 
 def _schema(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap schema`: print the JSON schema of a document that simgap writes."""
     from bench.schemas import load_schema
 
     found = load_schema(options.name)

@@ -43,6 +43,18 @@ def add_plot_arguments(plot: argparse.ArgumentParser) -> None:
 
 
 def _plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap plot`: write tables, figures and report of finished results again.
+
+    Several comparisons together give one joint result, which needs the folder `options.out`.
+    Results named with ``--behind`` are drawn in grey behind them.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code (0).
+    """
     from bench.benchmark.runner.plugin_discovery import load_plugins_for_experiment
     from bench.benchmark.storage.reference_results import find_reference
     from bench.studies.study import list_study_folders, open_study

@@ -37,6 +37,10 @@ class _SystemAction(argparse.Action):
         values: Any,
         _option: str | None = None,
     ) -> None:
+        """Store the system that argparse found; a second one is an error.
+
+        `values` is None or empty if the argument is missing at this place of the command line.
+        """
         if values and namespace.system:
             parser.error(f"unexpected argument '{values}'")
         namespace.system = values or namespace.system
@@ -56,6 +60,7 @@ class _ValuesAction(argparse._ExtendAction):
         values: Any,
         option: str | None = None,
     ) -> None:
+        """Store the values; a last word that cannot be a value becomes the system."""
         words = list(values)
         if len(words) > 1 and not namespace.system and not _is_value(words[-1]):
             namespace.system = words.pop()
@@ -147,6 +152,17 @@ def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap simulate`: simulate a recording, and write it with its true parameters.
+
+    The true parameters are in a separate file, so that the recording can be explained without them.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code (0).
+    """
     from bench.api.recordings import simulate
     from bench.cli.key_value_args import build_simulation_spec_args
     from bench.core.plugin_registries import load_plugins
@@ -188,6 +204,20 @@ def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 
 
 def _inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap inspect`: print what a recording contains, and what looks wrong in it.
+
+    It checks times, data quality, drives that do nothing and sign or unit conventions. With
+    ``--fix`` it writes a corrected description, with ``--check`` it says which parameters the data
+    determine.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if the data do not
+        determine a parameter that should be fitted.
+    """
     from bench.core.plugin_registries import load_plugins
     from bench.figures.recording_figure import write_recording_figure
     from bench.logs import robot_summary, signal_statistics

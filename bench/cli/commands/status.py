@@ -32,6 +32,16 @@ def add_status_arguments(status: argparse.ArgumentParser) -> None:
 
 
 def _status(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap status`: print how far a study is, or without one the isolation layers.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a study is not
+        complete.
+    """
     from bench.studies.study import list_study_folders, open_study
 
     if options.run is None:

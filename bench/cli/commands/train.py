@@ -63,6 +63,18 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap train`: train a learned tuner for each seed, before a comparison needs it.
+
+    The weights are stored in the cache, where `simgap compare` finds them. The losses of each epoch
+    are drawn, unless all weights were in the cache already.
+
+    Args:
+        options: parsed arguments of the command.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code (0).
+    """
     from bench.api.train import LossRecorder, run_training, select_training
     from bench.benchmark.runner.experiment_runner import count_seeds
     from bench.benchmark.runner.resource_checks import check_training_size

@@ -25,6 +25,16 @@ def add_verify_arguments(verify: argparse.ArgumentParser) -> None:
 
 
 def _verify(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+    """Execute `simgap verify`: check that an archive, explanation or comparison is consistent.
+
+    Args:
+        options: parsed arguments of the command; `run` is the file of an archive, or a folder.
+        say: prints one line of text.
+
+    Returns:
+        The JSON document of the command, and its exit code; EXIT_PROBLEMS_FOUND if a number does
+        not follow from the others.
+    """
     from bench.studies.archive_bundle import VERDICT_FILE, verify_archive, verify_explanation
     from bench.studies.study import list_study_folders
     from bench.studies.verification import verify_comparison
