@@ -241,6 +241,7 @@ def load_experiment_plugins(
 
 
 def _cluster(address: str | None) -> Pool | None:
+    """Connect to the Dask cluster at an address; None without one, for worker processes here."""
     if address is None:
         return None
     from bench.benchmark.runner.dask_cluster import ClusterPool
@@ -340,6 +341,10 @@ class ComparisonResult:
 
     @cached_property
     def _labels(self) -> comparison_view.AxisLabels:
+        """Labels of axes in figures: names and units of the parameters and channels.
+
+        The problem is built to read them, which takes time, so the labels are cached.
+        """
         problem = TuningProblem(self.experiment)
         try:
             return comparison_view.make_axis_labels(problem)
@@ -478,12 +483,14 @@ class ComparisonResult:
         return best.reset_index(drop=True)
 
     def __repr__(self) -> str:
+        """Return one line: the experiment, the number of runs, how many failed, and the folder."""
         failed = int((~self.statuses["status"].isin(("done", "converged"))).sum())
         unit = "answers" if self.experiment.diagnosis else "runs"
         runs = f"{len(self.statuses)} {unit}, {failed} of them failed or skipped"
         return f"<comparison {self.experiment.name}: {runs}; {self.folder}>"
 
     def _repr_html_(self) -> str:
+        """Return the summary as an HTML table, which a notebook shows for this object."""
         html: str = (
             self.summary()
             .head(_ROWS)

@@ -263,6 +263,15 @@ def list_named_sets(answer: Answer) -> list[tuple[str, ...]]:
 
 
 def _named(given: object) -> NamedCause:
+    """Convert one cause of a diagnoser's answer to a `NamedCause`.
+
+    `given` is the name of an effect, or a mapping with the key ``effect`` and optionally
+    ``alternatives``, ``coefficients`` and ``p_value``. It may come from a plugin, so it can be
+    anything.
+
+    Raises:
+        InputError: it has another form, which the message states.
+    """
     if isinstance(given, str):
         given = {"effect": given}
     if not isinstance(given, Mapping) or not isinstance(given.get("effect"), str):
@@ -285,6 +294,11 @@ def _list(what: str, given: object, most: int) -> list[Any]:
 
 
 def _probability(given: object) -> float | None:
+    """Convert a p-value of a diagnoser's answer; None stays None (no p-value given).
+
+    Raises:
+        InputError: it is not a number from 0 to 1; NaN is refused too.
+    """
     if given is None:
         return None
     value = float(given) if isinstance(given, int | float | np.floating) else math.nan
@@ -300,6 +314,11 @@ def _read_intervals(what: str, given: object) -> dict[str, tuple[float | None, f
 
 
 def _interval(what: str, given: object) -> tuple[float | None, float | None]:
+    """Convert a confidence interval of a diagnoser's answer to (low, high).
+
+    `given` is a pair, or a mapping with the keys ``low`` and ``high``. An end that is missing or
+    infinite becomes None: the interval is open on this side. `what` names the value in errors.
+    """
     if isinstance(given, Mapping):
         given = (given.get("low"), given.get("high"))
     ends = _list(what, given, 2)

@@ -42,6 +42,7 @@ def _sine(
     amplitude: float,
     frequency: float,
 ) -> Array:
+    """Compute amplitude sin(2 pi frequency t), with `frequency` in Hz, at times `t` (T,) in s."""
     signal: Array = amplitude * np.sin(_TAU * frequency * t)
     return signal
 
@@ -52,11 +53,19 @@ def _square(
     amplitude: float,
     frequency: float,
 ) -> Array:
+    """Compute a square wave: +amplitude in each first half period, -amplitude in each second one.
+
+    `frequency` is in Hz, `t` (T,) are times in s.
+    """
     half_periods = np.floor(2 * frequency * t)
     return np.where(half_periods % 2 == 0, amplitude, -amplitude)
 
 
 def _steps(t: Array, rng: np.random.Generator, amplitude: float, seconds: float) -> Array:
+    """Compute random levels, uniform within +-amplitude, each held for the given number of seconds.
+
+    `t` (T,) are times in s. `place` is the index of the level at each time.
+    """
     place = np.floor(t / seconds + _EDGE_TOLERANCE_SHARE).astype(int)
     levels: Array = rng.uniform(-amplitude, amplitude, size=place[-1] + 1)
     held: Array = levels[place]
@@ -70,6 +79,10 @@ def _chirp(
     low: float,
     high: float,
 ) -> Array:
+    """Compute a linear chirp: a sine whose frequency goes from `low` to `high` (Hz) until the end.
+
+    `t` (T,) are times in s from 0; their last value is the end of the sweep.
+    """
     # The phase is the integral of a frequency that increases linearly with time.
     periods = low * t + (high - low) * t * t / (2 * t[-1])
     signal: Array = amplitude * np.sin(_TAU * periods)
@@ -79,6 +92,11 @@ def _chirp(
 def _multisine(
     t: Array, rng: np.random.Generator, amplitude: float, low: float, high: float
 ) -> Array:
+    """Compute a sum of `_MULTISINE_COUNT` sines from `low` to `high` (Hz), with random phases.
+
+    The amplitude rises from zero at first, and the largest absolute value of the result is
+    `amplitude`. `t` (T,) are times in s.
+    """
     frequencies = np.geomspace(low, high, _MULTISINE_COUNT)
     phases = rng.uniform(0.0, _TAU, _MULTISINE_COUNT)
     total = np.sin(_TAU * frequencies * t[:, None] + phases).sum(axis=1)

@@ -69,6 +69,7 @@ def takes_options(
     """
 
     def decorate(function: Callable[[Options], Result]) -> Callable[P, Result]:
+        """Return the function that takes the fields of the options dataclass as its arguments."""
         signature, called = inspect.signature(options), name or function.__name__
 
         @wraps(function)
@@ -98,6 +99,10 @@ def with_options(
     def decorate(
         function: Callable[[Source, Options], Result],
     ) -> Callable[Concatenate[Source, P], Result]:
+        """Return the function that takes a source and the options' fields as keyword arguments.
+
+        `source` is the first parameter of the decorated function, such as the path of a recording.
+        """
         source, _ = inspect.signature(function).parameters.values()
         fields = inspect.signature(options).parameters.values()
         named = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in fields]
@@ -105,6 +110,7 @@ def with_options(
 
         @wraps(function)
         def call(*args: Any, **kwargs: Any) -> Result:
+            """Check the arguments, collect them in the options dataclass, and call the function."""
             hints = {**get_hints(options), source.name: get_hints(function)[source.name]}
             given = bind_checked(function.__name__, signature, hints, args, kwargs).arguments
             make: Callable[..., Options] = options

@@ -105,6 +105,13 @@ def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
 
 
 def _load(path: Path) -> None:
+    """Load one plugin file, and register every part that it defines under its name.
+
+    A TOML file is an extended simulator (the result of `simgap explain`); any other file is Python.
+
+    Raises:
+        InputError: the file cannot be loaded, or defines no part.
+    """
     if path.suffix == ".toml":
         simulators.register(load_extended(path, simulators.get), path)
         return
@@ -147,6 +154,11 @@ def _module_name(path: Path) -> str:
 
 
 def _run(path: Path) -> ModuleType:
+    """Execute a plugin file as a module, and return the module.
+
+    Raises:
+        InputError: there is no such file, or its code fails; Ctrl-C still interrupts it.
+    """
     if not path.is_file():
         raise InputError(f"plugin {path}: no such file")
     spec = importlib.util.spec_from_file_location(_module_name(path), path)

@@ -141,6 +141,7 @@ def _memory() -> float:
 
 
 def _files(place: Path) -> float:
+    """Return the number of files that can still be created (free inodes); infinite if unknown."""
     try:
         free = os.statvfs(place).f_favail
     except (AttributeError, OSError):
