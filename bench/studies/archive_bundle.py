@@ -115,6 +115,11 @@ def write_bundle(
 
 
 def _kind(folder: Path) -> str:
+    """Return whether a folder has an "explanation" or a "comparison", which may be a sweep.
+
+    Raises:
+        InputError: it is not a result folder, or a comparison in it is not finished.
+    """
     if (folder / VERDICT_FILE).is_file() and (folder / EXTENDED_MODEL_FILE).is_file():
         return "explanation"
     for part in list_study_folders(folder):
@@ -168,6 +173,11 @@ def _format_compare_command(folder: Path, name: str) -> str:
 
 
 def _list_recording_files(tables: Sequence[Path]) -> dict[str, Path]:
+    """List recordings for the archive: each CSV table, and its TOML description if it exists.
+
+    Returns:
+        Files on this machine, by their path in the archive.
+    """
     files = {}
     for table in tables:
         if not table.is_file():
@@ -274,6 +284,7 @@ def verify_archive(
 
 
 def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any]:
+    """Return what the manifest says about an archive, as the beginning of the JSON document."""
     manifest = unpacked.manifest
     return {
         "file": archive,
@@ -286,6 +297,7 @@ def _describe_archive(archive: Path, unpacked: UnpackedArchive) -> dict[str, Any
 
 
 def _format_result(doubts: Sequence[VerificationFailure], where: Path, say: PrintLine) -> None:
+    """Print the doubts (numbers that do not follow from others), at most 20 of them."""
     for doubt in doubts[:20]:
         say(f"DOES NOT FOLLOW  {where}/{doubt}")
     if len(doubts) > 20:
@@ -307,6 +319,17 @@ def verify_explanation(folder: Path, say: PrintLine) -> ExplanationVerification:
 
 
 def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerification:
+    """Check that the verdict and the extended model of an explanation agree.
+
+    The verdict must follow its schema, the extended model must load and have the same numbers, and
+    its errors on the recording are computed again if the recording is there. A failed check is a
+    doubt; a check that is not possible here, for example without the robot's model file, is listed
+    as unchecked.
+
+    Args:
+        folder: folder of the explanation.
+        say: prints one line of text.
+    """
     verification = ExplanationVerification([], [], [])
 
     def note(line: str) -> None:
@@ -341,6 +364,7 @@ def _verify_extended_model(folder: Path, say: PrintLine) -> ExplanationVerificat
 
 
 def _read_verdict(folder: Path, verification: ExplanationVerification) -> Verdict | None:
+    """Read the verdict of an explanation; add a doubt and return None if it is not valid."""
     try:
         document = json.loads((folder / VERDICT_FILE).read_text(encoding="utf-8"))
         violations = find_violations(document, "verdict")

@@ -30,6 +30,11 @@ def find_changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, A
 
 
 def _flat(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested tables, each with its path such as ``noise.q``.
+
+    `before` is the path of the table with its final dot. A tuple becomes a list, so that it equals
+    the list read from a file.
+    """
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flat(inner, f"{before}{key}.")

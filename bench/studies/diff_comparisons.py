@@ -102,6 +102,12 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
 
 
 def _target_columns(folder: Path) -> list[str]:
+    """List the columns of a comparison's runs that identify a target.
+
+    These are its true parameters and its start.
+
+    Empty if the table cannot be read; a later step reports the error.
+    """
     from pyarrow import parquet
 
     path = folder / "runs.parquet"
@@ -144,6 +150,11 @@ class ComparisonDiff:
         return frame
 
     def _lines(self) -> Iterator[dict[str, Any]]:
+        """Yield a row for each range, tuner and number of simulations that both comparisons have.
+
+        Errors are compared at `COMPARED_SIMULATION_COUNTS` and at the smaller one of the two
+        budgets.
+        """
         ranges = set(self.b.curves.keys["range"])
         budget = min(side.stored.experiment.budget for side in (self.a, self.b))
         checkpoints = sorted({k for k in COMPARED_SIMULATION_COUNTS if k < budget} | {budget})
@@ -156,6 +167,12 @@ class ComparisonDiff:
                     yield self._line(str(kind), tuner, k)
 
     def _line(self, kind: str, tuner: str, k: int) -> dict[str, Any]:
+        """Compare the errors of one tuner in one range after k simulations.
+
+        On shared targets the test is Wilcoxon's signed-rank test, otherwise the Mann-Whitney test;
+        both use the logarithm of each target's mean error over seeds. ``ratio`` is the change of
+        the error of b relative to a, and infinite errors count as failures.
+        """
         a, b = (side.index_errors(kind, tuner, k) for side in (self.a, self.b))
         shared = self.shared_targets
         both = [key for key in a.index if key in b.index and key[0] in shared]

@@ -169,6 +169,7 @@ class ExplanationDiff:
         raise InputError("--fail-on worse: is for comparisons; of explanations take change")
 
     def _held_out(self) -> list[dict[str, Any]]:
+        """List errors on held-out runs and the closed gap of both explanations; None if missing."""
         sides = [each.verdict.heldout for each in (self.a, self.b)]
         return [
             {"name": name, "a": getattr(sides[0], name, None), "b": getattr(sides[1], name, None)}
@@ -271,6 +272,7 @@ class ExplanationDiff:
 
 
 def _coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
+    """Return the coefficients of all causes of an explanation, by effect and coefficient name."""
     return {
         f"{cause.effect} {name}": value
         for cause in each.verdict.causes
@@ -279,6 +281,11 @@ def _coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
 
 
 def _beside(a: Mapping[str, FittedValue], b: Mapping[str, FittedValue]) -> list[dict[str, Any]]:
+    """Write the numbers of two explanations into one row per name.
+
+    A row has name and unit, and of each explanation value and 95 % interval (low, high). They are
+    None if this explanation does not have the number.
+    """
     rows = []
     for name in dict.fromkeys([*a, *b]):
         first, second = a.get(name), b.get(name)

@@ -142,6 +142,10 @@ def verify_comparison(
 
 
 def _salt(experiment: Experiment) -> str:
+    """Describe the salt of a comparison that has been verified: public, or committed beforehand.
+
+    Only a salt whose hash was published before the first run proves that nobody knew the targets.
+    """
     if not experiment.salt_sha256:
         return f"{CONFIGURATION_FILE}: a public salt: everybody could draw the targets beforehand"
     return (

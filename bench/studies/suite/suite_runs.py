@@ -139,6 +139,16 @@ def collect_suite_runs(folder: Path) -> SuiteRuns:
 
 
 def _collect_comparison(folder: Path, condition: str) -> SuiteRuns:
+    """Collect the runs of one comparison of a suite, with its cells and the cost of trainings.
+
+    Args:
+        folder: folder of the comparison.
+        condition: ``before`` or ``after`` the extension of a misspecified simulator, else empty.
+
+    Returns:
+        Errors are (R, K + 1) for R runs and the budget K: one column for each number of simulations
+        from 0 to K. A failed run has infinite errors.
+    """
     stored = read_comparison(folder, REQUIRED_RUN_COLUMNS)
     experiment = stored.experiment
     problem = folder.parent.name if condition else folder.name
@@ -214,6 +224,7 @@ def _count_parameters(experiment: Experiment) -> int:
 
 
 def _make_empty(skipped: pd.DataFrame) -> SuiteRuns:
+    """Return the result for a comparison without runs: only the tuners that were skipped."""
     return SuiteRuns(
         pd.DataFrame(columns=RUN_COLUMNS),
         np.empty((0, 1)),
