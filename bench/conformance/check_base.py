@@ -83,6 +83,10 @@ def check_global_random_state(look: str) -> Iterator[None]:
 
 
 def _random_states() -> dict[str, object]:
+    """Return the states of the global random generators of Python, numpy and torch (if loaded).
+
+    They are compared before and after a call, to see whether the call has used one of them.
+    """
     legacy: Any = np.random.get_state(legacy=True)  # noqa: NPY002
     states: dict[str, object] = {
         "random": random.getstate(),

@@ -121,6 +121,7 @@ def _bind_check(check: Check, subject: type, failed: set[Check]) -> Callable[[],
     """
 
     def made() -> None:
+        """Run the check as a pytest test; skip it if an earlier check that it needs has failed."""
         import pytest
 
         if (needed := failed_need(check, failed)) is not None:

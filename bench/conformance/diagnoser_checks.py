@@ -128,6 +128,11 @@ def _learned(kind: type[Diagnoser]) -> dict[str, Array]:
 
 
 def _train(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
+    """Train a diagnoser with a small budget on the slider, the system of the checks.
+
+    Returns:
+        Learned arrays by name, and the number of simulations used.
+    """
     simulator = type(_get_recording(False).simulator)
     assert issubclass(simulator, SystemSimulator)
     library = effects.list_effects_for(simulator.system)
@@ -192,6 +197,7 @@ def _answer(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
 
 
 def _copy_case_bytes(case: DiagnosisCase) -> list[bytes]:
+    """Copy the data and files of a case as bytes, to detect later whether they were changed."""
     arrays = [
         array.tobytes()
         for run in case.recording.runs

@@ -75,6 +75,13 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
 
 
 def _check_inertia(kind: type[OwnSimulator], given: float | Array) -> None:
+    """Check that an inertia is a positive number, or a symmetric positive definite matrix (D, D).
+
+    D is the number of coordinates. Any other inertia would give accelerations without meaning.
+
+    Raises:
+        CheckError: it is not.
+    """
     inertia = np.atleast_2d(given)
     sound = bool(np.isfinite(inertia).all()) and np.allclose(inertia, inertia.T)
     sound = sound and bool(np.linalg.eigvalsh(inertia).min() > 0)

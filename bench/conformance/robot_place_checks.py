@@ -53,6 +53,11 @@ def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
 
 
 def _refuses(effect: type[Effect], places: Sequence[str]) -> None:
+    """Check that the effect refuses a place that does not exist, and lists those that do.
+
+    Raises:
+        CheckError: it accepts the place, or its message does not list all `places`.
+    """
     try:
         make_arm_simulator(effect).system.effect(f"{effect.name}@nowhere")
     except InputError as error:

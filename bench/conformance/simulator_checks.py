@@ -114,6 +114,12 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     together = simulator.simulate(points.copy(), run)
 
     def compare(observations: Array, after: str) -> None:
+        """Raise an error unless observations equal those of the first call bit for bit.
+
+        Args:
+            observations: (n, T, C) observations of the same points and scenario.
+            after: what was different in this call, for the message.
+        """
         if not is_bitwise_equal(together, observations):
             what = f"{kind.__name__}.reset" if hasattr(kind, "reset") else kind.__name__
             difference = _first_difference(kind, together, observations)

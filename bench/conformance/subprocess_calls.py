@@ -17,6 +17,10 @@ CALL_TIMEOUT_SECONDS = 120.0
 
 @cache
 def _pool(workers: int, plugins: tuple[str, ...]) -> LocalPool:
+    """Return the pool with this number of workers and these plugins, which all checks share.
+
+    It is closed when Python exits; starting workers for every check would take too long.
+    """
     pool = LocalPool(workers)
     pool.load_plugins([Plugin(path) for path in plugins])
     atexit.register(pool.__exit__)

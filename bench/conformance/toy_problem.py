@@ -43,6 +43,7 @@ class ToyTrainingSimulator:
     """Training simulator of the toy problem; see `methods.tuner.TrainingSimulator`."""
 
     def __init__(self, dim: int) -> None:
+        """Set the sizes of the toy problem: two channels of 40 samples, and `dim` parameters."""
         self.dim, self.scale = dim, np.ones(2)
         self.lengths: tuple[int, ...] = (SAMPLE_TIMES.size,)
         self.scene = EMPTY_SCENE
@@ -159,6 +160,14 @@ def make_evaluate(task: Task, fails: Callable[[int], bool] = lambda _: False) ->
     simulated = 0
 
     def evaluate(points: Array) -> tuple[Array, Array]:
+        """Simulate points and compute their losses, as the harness of a comparison does.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, 40, 2) and losses (n,); NaN and infinite for simulations that fail.
+        """
         nonlocal simulated
         observations = simulate_toy_problem(points)
         for lane in observations:

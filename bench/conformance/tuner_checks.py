@@ -150,6 +150,7 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
     # A wrapper around the tuner, because the harness's loop clips what it records.
     class Watched(Tuner):
         def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
+            """Run the tuner unchanged, and copy its proposals and recommendations to `asked`."""
             steps = make_trained_tuner(kind, 2).tune(task, rng)
             try:
                 proposal = next(steps)
