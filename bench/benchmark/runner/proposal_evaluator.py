@@ -31,7 +31,7 @@ class ProposalEvaluator:
     def __init__(self, problem: TuningProblem, side: ObservedRuns) -> None:
         """Prepare factors that convert sums of squared errors to the loss (1) and to the RMSE (2).
 
-        `_missing` marks missing samples (T, C), None if there are none. `_per_sample` and
+        `_missing` marks missing samples (T, C), or is None. `_per_sample` and
         `_per_loss` (C,) are the factors 1/N_c of (2) and 1/(C N_c s_c^2) of (1). `_seen` collects
         the sums of squares (n, C) of all batches, from which `compute_rmse` looks up points.
         """

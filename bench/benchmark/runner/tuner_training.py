@@ -224,13 +224,10 @@ def _train(
 ) -> TrainingResult:
     """Train the tuner of a request, or read its weights from the cache; see `train_or_load`.
 
-    Args:
-        experiment: configuration of the experiment.
-        lesson: the request: entry of the tuner, seed, and how to build the tuner in isolation.
-        watch: gets the losses of each epoch; None for none.
-        anew: train even if the cache has the weights.
-        earlier_requests: hashes of the simulations requested before an external kill; the repeated
-            training must make the same requests.
+    The request names the tuner's entry and the seed, and how to build the tuner in isolation.
+    `watch` gets the losses of each epoch. `anew` trains even if the cache has the weights.
+    `earlier_requests` are hashes of the simulations requested before an external kill; the repeated
+    training must make the same requests.
     """
     entry, seed = lesson.entry, lesson.seed
     name = compute_training_key(experiment, entry, seed)
