@@ -141,6 +141,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def __getattr__(name: str) -> object:
+    """Import a public name when it is first used, so that ``import simgap`` is fast.
+
+    An old name gives a deprecation warning and the object of the new name.
+    """
     if name in _RENAMED:
         new = _RENAMED[name]
         warnings.warn(

@@ -218,6 +218,7 @@ class Tuner:
     watch: TrainingCallback | None = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Give a subclass without an own `name` one derived from its class name in snake case."""
         super().__init_subclass__(**kwargs)
         # The class's own name: a subclass of a named tuner is another tuner.
         if "name" not in cls.__dict__:
@@ -297,6 +298,11 @@ def from_callback(
     is_closing = False
 
     def objective(point: Array) -> Any:
+        """Pass a point to the harness, and wait for the value of its evaluation.
+
+        It runs in the optimiser's thread. When the run is closed it raises an exception that ends
+        the optimiser.
+        """
         if is_closing:
             raise _OptimiserStopped
         to_harness.append(np.array(point, dtype=np.float64))
@@ -307,6 +313,10 @@ def from_callback(
         return to_optimiser.pop()
 
     def work() -> None:
+        """Run the optimiser in its thread.
+
+        Its result is stored in `outcome`, and an error in `failure`.
+        """
         try:
             value_ready.acquire()
             if not is_closing:

@@ -113,6 +113,10 @@ class GaussianProcess:
         from scipy.optimize import minimize
 
         def objective(hyper: Array) -> tuple[float, Array]:
+            """Compute the negative log posterior of the hyper-parameters, and its gradient.
+
+            `hyper` (dim + 1,) are the logarithms of the length scales and of the noise.
+            """
             value, slope = self._evidence(hyper)
             # The priors are normal distributions of the logarithms.
             z = (hyper - self._centre) / self._width

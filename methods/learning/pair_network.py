@@ -141,6 +141,10 @@ def estimate_difference(
         return unit(x @ w[f"{layer}.weight"] + w[f"{layer}.bias"])
 
     def joined(a: Array, b: Array) -> Array:
+        """Compute the network's output (..., dim) for inputs of its first and second branch.
+
+        Eq. (1): both branches are concatenated, then follow one hidden and one linear layer.
+        """
         both = np.concatenate([branch(a, "proposed"), branch(b, "target")], axis=-1)
         hidden = branch(both, "joined")
         out: Array = hidden @ w["output.weight"] + w["output.bias"]  # (1)
@@ -295,6 +299,16 @@ def _loss(
         return torch.tanh(out) if design.bounded else out
 
     def objective(x: Any, seen: Any, y: Any) -> Any:
+        """Compute the mean squared error of the estimated parameter differences; see `_loss`.
+
+        All m (m - 1) / 2 pairs of the m simulations of a scenario are used. With `alone` (one
+        input), the network estimates the parameters y themselves from the target's side.
+
+        Args:
+            x: (n, m, D) input rows of the proposed side, for n scenarios of m simulations.
+            seen: (n, m, E) input rows of the target's side.
+            y: (n, m, dim) parameters.
+        """
         b = branch(seen, "target")
         if alone:
             # A proposed input of zero leaves the branch's bias.

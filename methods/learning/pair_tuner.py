@@ -119,6 +119,11 @@ class TrainedPairNetwork:
             row = self.read(task.observed[None], task.lengths, task.scene, hidden)[0]
 
         def difference(observations: Array) -> Array:
+            """Estimate target - simulation of the parameters (dim,) from one simulation (1, T, C).
+
+            If both sides do not have the same inputs, the missing samples of the target are filled
+            from the simulation first.
+            """
             if not np.isfinite(observations).all():
                 return np.full(task.dim, np.nan)
             proposed = self.proposed(observations, task.lengths, task.scene, hidden)[0]
@@ -255,6 +260,13 @@ class PairTuner(Tuner):
         watch = self.watch
 
         def fitted(stage: str, shown: TrainingData, noise: Array | None) -> TrainedPairNetwork:
+            """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
+
+            Args:
+                stage: name of this training, for the callback.
+                shown: simulations to train on, with noise.
+                noise: noise that is also added to the held-out simulations; None for none.
+            """
             look = None
             if watch is not None and apart is not None:
                 look = TrainingMonitor(

@@ -30,6 +30,12 @@ class PosteriorRounds:
     """
 
     def __init__(self, task: Task) -> None:
+        """Begin without simulations; the network is made with the first round's components.
+
+        `_trainer` and `_posterior` are objects of sbi. `_components` (N, P) are the P principal
+        components of the N residuals, `_centre` (N,) their mean, `_widths` (P,) the spread along
+        each component.
+        """
         self.mean: Array | None = None
         self._task = task
         self._trainer: Any = None
@@ -76,6 +82,16 @@ class PosteriorRounds:
         return features
 
     def _train(self, points: Array, features: Array, count: int) -> Array:
+        """Add one round of simulations, train the posterior, and draw `count` points (count, dim).
+
+        The posterior is that of a residual of zero, the features of a perfect simulation. It is
+        also the proposal of the next round, by which sbi weights the next simulations.
+
+        Args:
+            points: (n, dim) simulated points.
+            features: (n, P) scaled principal components of their residuals.
+            count: number of points to draw.
+        """
         import torch
         from sbi.inference import NPE
         from sbi.utils import BoxUniform

@@ -25,6 +25,7 @@ class DualAnnealing(Tuner):
         """Pass SciPy's points to the harness one by one."""
 
         def minimise(loss: Callable[[Array], float]) -> str:
+            """Minimise the loss over the unit cube with dual annealing; return why it stopped."""
             from scipy.optimize import dual_annealing
 
             bounds = [(0.0, 1.0)] * task.dim

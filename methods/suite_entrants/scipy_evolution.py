@@ -27,6 +27,7 @@ class DifferentialEvolution(Tuner):
         """Pass SciPy's points to the harness one by one."""
 
         def minimise(loss: Callable[[Array], float]) -> str:
+            """Minimise the loss by differential evolution in the unit cube; return why it stops."""
             from scipy.optimize import Bounds, differential_evolution
 
             box = Bounds(np.zeros(task.dim), np.ones(task.dim))

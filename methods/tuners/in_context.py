@@ -219,6 +219,13 @@ class InContextTransformer(Tuner):
         box = np.array(simulator.training, dtype=np.float64)
 
         def learned(stage: str, shown: TrainingData, noise: Array | None) -> TrainedHistoryNetwork:
+            """Train the network for one noise level; called by `NoiseMatchedNetworks.train`.
+
+            Args:
+                stage: name of this training, for the callback.
+                shown: simulations to train on, with noise.
+                noise: noise that is also added to the held-out simulations; None for none.
+            """
             read = InputFeatures.fit(shown, self.make_feature_config())
             watched = None
             if watch is not None and apart is not None:

@@ -118,6 +118,10 @@ class NeuralPosteriorEstimation(Tuner):
         )
 
     def _make_flow_builder(self) -> Callable[[Any, Any], Any]:
+        """Return sbi's function that builds the network: a masked autoregressive flow (MAF).
+
+        It is called with the training parameters and inputs, from which it takes sizes and scales.
+        """
         from sbi.neural_nets import posterior_nn
 
         builder: Callable[[Any, Any], Any] = posterior_nn(

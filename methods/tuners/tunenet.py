@@ -181,6 +181,13 @@ class BroydenSearch:
     """
 
     def __init__(self, task: Task) -> None:
+        """Begin at the start of the task, with slope -1 in every direction.
+
+        `_slope` (dim, dim) estimates dh/dx. `_last` is the last point with its estimate h,
+        `_residual` the estimate at `best`, and `_setbacks` counts the points since then that were
+        not better. `_fallback` is the middle of the training range, used if the first simulation
+        fails.
+        """
         self._slope = -np.eye(task.dim)
         self._fallback = task.training.mean(axis=0)
         self._last: tuple[Array, Array] | None = None
