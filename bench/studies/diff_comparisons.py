@@ -104,9 +104,8 @@ def load_side(folder: Path, metric: str | None = None) -> ComparisonSide:
 def _target_columns(folder: Path) -> list[str]:
     """List the columns of a comparison's runs that identify a target.
 
-    These are its true parameters and its start.
-
-    Empty if the table cannot be read; a later step reports the error.
+    These are its true parameters and its start. Empty if the table cannot be
+    read; a later step reports the error.
     """
     from pyarrow import parquet
 

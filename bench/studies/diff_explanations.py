@@ -283,8 +283,8 @@ def _coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
 def _beside(a: Mapping[str, FittedValue], b: Mapping[str, FittedValue]) -> list[dict[str, Any]]:
     """Write the numbers of two explanations into one row per name.
 
-    A row has name and unit, and of each explanation value and 95 % interval (low, high). They are
-    None if this explanation does not have the number.
+    A row has name and unit, and for each explanation the value and its 95 % interval (low, high).
+    An explanation without this number has None in all three columns.
     """
     rows = []
     for name in dict.fromkeys([*a, *b]):
