@@ -70,7 +70,12 @@ def fill_gaps(channel: Array, simulated: Array) -> Array:
 
 
 def _fitted(table: Array, values: Array) -> Array:
-    """Compute the numbers (3,) of (2) by iteratively reweighted least squares, Cauchy's weights."""
+    """Fit the numbers a, b, c (3,) of (2), the linear form of the camera's line, robustly.
+
+    The method is iteratively reweighted least squares with Cauchy's weights, so that a few wrong
+    samples do not spoil the fit. `table` (n, 3) has the regressors 1, x and -x y of n samples,
+    `values` (n,) the y.
+    """
     weights: Array = np.ones(len(table))
     numbers: Array = np.zeros(3)
     for _ in range(_ROUNDS):

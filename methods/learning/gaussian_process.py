@@ -109,7 +109,11 @@ class GaussianProcess:
         return k, -5.0 / 6.0 * (1.0 + root) * decay
 
     def _most_probable(self) -> Array:
-        """Maximise likelihood times prior by L-BFGS."""
+        """Return the most probable hyper-parameters (dim + 1,), found by L-BFGS.
+
+        These maximise likelihood times prior. They are searched within four standard deviations of
+        the prior.
+        """
         from scipy.optimize import minimize
 
         def objective(hyper: Array) -> tuple[float, Array]:
@@ -136,7 +140,11 @@ class GaussianProcess:
         return np.asarray(optimum.x)
 
     def _evidence(self, hyper: Array) -> tuple[float, Array]:
-        """Compute the negative log marginal likelihood (2.30) and its gradient (5.9)."""
+        """Compute the negative log marginal likelihood and its gradient (dim + 1,).
+
+        These are (2.30) and (5.9) of Rasmussen and Williams. Constant terms are left out, and mean
+        and variance have their most likely values for the given `hyper` (dim + 1,).
+        """
         from scipy.linalg import cho_solve
 
         n = len(self.values)
@@ -199,7 +207,11 @@ def _cholesky(matrix: Array, jitter: float) -> Array:
 
 
 def _compute_mean_and_variance(lower: Array, values: Array) -> tuple[float, float, Array]:
-    """Return the maximum-likelihood constant mean and variance, and K⁻¹(values - mean)."""
+    """Return the maximum-likelihood constant mean and variance, and K⁻¹(values - mean).
+
+    `lower` is the Cholesky factor (n, n) of K, the correlation of the n points with noise; `values`
+    (n,) are the function values there.
+    """
     from scipy.linalg import cho_solve
 
     weights = cho_solve((lower, True), np.ones(len(values)))

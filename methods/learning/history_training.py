@@ -107,7 +107,11 @@ def train_history_transformer(
 
 
 def _initial(named: dict[str, tuple[int, ...]], generator: torch.Generator) -> dict[str, Any]:
-    """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero."""
+    """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero.
+
+    `named` has the shape of each array. Layers whose output is added to another value (names that
+    begin with one of `_SUMMED`) get a smaller gain.
+    """
     import torch
 
     w: dict[str, Any] = {}
@@ -129,7 +133,12 @@ def _descend(
     rng: np.random.Generator,
     watched: HistoryValidationMonitor | None,
 ) -> None:
-    """Minimise the loss with Adam; the weights are changed in place."""
+    """Minimise the loss with Adam; the weights are changed in place.
+
+    The learning rate falls to zero along half a cosine. `w` are the weights, `material` the
+    training simulations, and `drawn` draws the histories of one batch. `watched` gets the losses on
+    training and held-out data after each epoch; None for none.
+    """
     import torch
 
     parts = material.to_tensors()
@@ -162,7 +171,13 @@ def _descend(
 def _loss(
     w: dict[str, Any], design: HistoryTransformerDesign, parts: list[Any], chosen: HistoryIndices
 ) -> Any:
-    """Compute the loss (1), or (2) if published, over scenarios and their histories."""
+    """Compute the mean squared error of the proposals: loss (1), or (2) if published.
+
+    (1) compares each proposal with the target's parameters, relative to the distance of the
+    simulation before; (2) compares it with the next point of the history. `parts` are input rows
+    without and with noise, and parameters, of one batch of scenarios; `chosen` are the indices of
+    the simulations that form each history and of its target.
+    """
     import torch
 
     shown, target, parameters = parts

@@ -134,7 +134,12 @@ def predict_proposals(
 
 
 def _compute_step_features(xp: Any, far: Any, tried: Any) -> tuple[Any, Any]:
-    """Compute the direction of each step and the slope (2); zeros for the first simulation."""
+    """Compute the direction of each step, and the slope (2): change of the difference per length.
+
+    Both are zero for the first simulation, which has no step before it. `xp` is numpy or torch,
+    `far` the projected differences d of (1) and `tried` the points e, both with one row per
+    simulation. The slope is returned as arsinh, because it can be very large.
+    """
     step = tried[..., 1:, :] - tried[..., :-1, :]
     length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _STILL**2)
     slope = (far[..., 1:, :] - far[..., :-1, :]) / length  # (2)
@@ -146,7 +151,12 @@ def _compute_step_features(xp: Any, far: Any, tried: Any) -> tuple[Any, Any]:
 
 
 def _causal_attention(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
-    """Compute the attention of each token (..., k, width) to itself and to earlier tokens."""
+    """Compute the attention of each token (..., k, width) to itself and to earlier tokens.
+
+    This is Eq. 1 of Vaswani et al. with a learned bias for each lag (number of tokens between two).
+    `xp` is numpy or torch, `w` the weights, `block` the number of the block, and `h` are the
+    tokens.
+    """
     count, width = h.shape[-2:]
     heard = _linear(w, f"heard{block}", h)
     query, key = heard[..., :width], heard[..., width : 2 * width]

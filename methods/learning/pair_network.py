@@ -244,7 +244,10 @@ def deterministic_training() -> Iterator[None]:
 
 
 def _data(rows: PairInputs, parameters: Array) -> tuple[Any, Any, Any]:
-    """Convert rows of both sides and parameters to tensors; equal sides share one tensor."""
+    """Convert input rows of both sides and parameters to float32 tensors.
+
+    If both sides have the same rows, they share one tensor, which saves memory.
+    """
     import torch
 
     def tensor(array: Array) -> Any:
@@ -340,7 +343,12 @@ def _run_optimiser(
     generator: torch.Generator,
     watched: PairValidationMonitor | None,
 ) -> None:
-    """Minimise (3) by gradient steps that change the weights in place."""
+    """Minimise the loss (3) by gradient descent; the weights are changed in place.
+
+    The method is Adam with a learning rate that falls along half a cosine, or as published plain
+    gradient descent with a rate that falls exponentially. `data` are the tensors of `_data`.
+    `watched` gets the losses on training and held-out data after each epoch; None for none.
+    """
     import torch
 
     x, seen, y = data

@@ -72,7 +72,12 @@ class EntropySearch(Tuner):
         )
 
     def _tune_as_published(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Search on a fixed grid, and stop when the estimate repeats."""
+        """Search on a fixed grid, and stop when the estimate repeats (algorithm 1 of the paper).
+
+        After each simulation the error is modelled by a Gaussian process. The estimate is the grid
+        point that most often has the smallest error in draws of the process; the next simulation is
+        at the point with the largest entropy term (1).
+        """
         grid = np.linspace(0.0, 1.0, self.grid)[:, None]
         if task.dim > 1:
             grid = generate_quasi_random_points(self.grid, rng.uniform(size=task.dim))
@@ -101,7 +106,11 @@ class EntropySearch(Tuner):
             proposal = grid[compute_entropy_terms(p).argmax()]  # (1)
 
     def _tune_refined(self, task: Task, rng: np.random.Generator) -> TunerGenerator:
-        """Search with new candidates for every simulation, without stopping."""
+        """Search with new candidates for every simulation, without stopping.
+
+        The first points are quasi-random; then each simulation is at the candidate with the largest
+        entropy term (1), where it is most uncertain whether the error has its minimum.
+        """
         design = generate_quasi_random_points(self.initial, rng.uniform(size=task.dim))
         points = np.empty((0, task.dim))
         losses = np.empty(0)

@@ -89,7 +89,14 @@ class TuneNetLeastSquares(TuneNet):
         return "the simulation reproduces the target"
 
     def _take_network_steps(self, run: EvaluationHistory, task: Task) -> SimulationGenerator[bool]:
-        """Take TuneNet's steps while they divide the loss; return whether they did to the end."""
+        """Take TuneNet's steps while each one reduces the loss enough.
+
+        A step pays if the loss falls below `pays` times the lowest one before; after `patience`
+        steps in a row that do not pay, the network is given up.
+
+        Returns:
+            True if the last step paid, so that least squares can trust the point reached.
+        """
         estimate = self.get_trained_network().select_for(task).make_estimator(task)
         search = BroydenSearch(task)
         guess = task.start

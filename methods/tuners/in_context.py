@@ -265,7 +265,15 @@ class InContextTransformer(Tuner):
         )
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Propose one point per iteration, until the proposal no longer changes."""
+        """Propose one point per iteration, until the proposal no longer changes.
+
+        The network proposes from the target and all successful simulations so far. After a failed
+        simulation the next point is half way back to the last successful one.
+
+        Args:
+            task: task of the target.
+            rng: not used.
+        """
         if self._prepared is None:
             raise RuntimeError("in_context has not been trained; call fit or restore first")
         network = self._prepared.select_for(task)
@@ -297,7 +305,11 @@ class InContextTransformer(Tuner):
 def _build_training_histories(
     read: InputFeatures, data: TrainingData, box: Array
 ) -> TrainingHistories:
-    """Build the training data: simulations without noise, targets with the sensor's noise."""
+    """Build the training data: simulations without noise, targets with the sensor's noise.
+
+    `box` (2, dim) are the corners of the training range; parameters are scaled to half widths from
+    its middle, as in the network's input.
+    """
     half = (box[1] - box[0]) / 2.0
     parameters = (data.parameters - box.mean(axis=0)) / half
     target = read.compute_rows(data)

@@ -164,7 +164,13 @@ class LeastSquares(Tuner):
     def _descend(
         self, run: EvaluationHistory, model: LinearModel, chosen: Mask
     ) -> SimulationGenerator[LinearModel]:
-        """Run Levenberg-Marquardt on the chosen samples until convergence or lack of progress."""
+        """Run Levenberg-Marquardt on the chosen samples until convergence or lack of progress.
+
+        It starts from the point of the linear model (point, residual, Jacobian). After each step
+        the Jacobian gets Broyden's update; it is computed again by finite differences when it is
+        outdated. `chosen` masks the residuals, for example to a short horizon at first, since a
+        long simulation can have many local minima.
+        """
         worthwhile = _FINAL_CONVERGENCE_SHARE if chosen.all() else _HORIZON_CONVERGENCE_SHARE
         damping = _Damping(self.damping)
         stalled = 0
@@ -334,7 +340,11 @@ class EvaluationHistory:
         return self.record(evaluation)
 
     def record(self, evaluation: Evaluation) -> Array:
-        """Record an evaluation, and return its residuals."""
+        """Record an evaluation of n points, and return its residuals (n, N).
+
+        The residuals of a failed simulation are NaN. The run is finished as soon as a loss is at
+        most `enough`.
+        """
         proposals, observations, losses = evaluation
         finite = np.isfinite(losses)
         residuals = np.where(finite[:, None], self.task.residuals(observations), np.nan)

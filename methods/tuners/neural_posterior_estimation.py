@@ -159,7 +159,13 @@ class NeuralPosteriorEstimation(Tuner):
         self._read = features
 
     def _rebuild_flow(self, arrays: dict[str, Array], inputs: int) -> Any:
-        """Rebuild a flow of the default design from its tensors, which determine its dimension."""
+        """Rebuild the trained normalising flow from its arrays, such as those of a weights file.
+
+        `inputs` is the number of input features; the number of parameters follows from the arrays.
+
+        Raises:
+            ValueError: the arrays are not those of a flow of the default design.
+        """
         import torch
 
         sizes = {a.size for name, a in arrays.items() if name.endswith("_transforms.0._shift")}

@@ -102,7 +102,16 @@ class TuneNet(PairTuner):
         return self.scenarios, max(self.each, 2 * (dim + 1))
 
     def tune(self, task: Task, rng: np.random.Generator) -> TunerGenerator:  # noqa: ARG002
-        """Run Algorithm 1, with one simulation per iteration."""
+        """Run Algorithm 1, with one simulation per iteration.
+
+        Each guess is the last one plus the network's estimate of the difference to the target (1),
+        or a step of Broyden's method (2) with `broyden`, which ends when the guess no longer
+        changes.
+
+        Args:
+            task: task of the target.
+            rng: not used.
+        """
         estimate = self.get_trained_network().select_for(task).make_estimator(task)
         search = BroydenSearch(task)
         guess = task.start

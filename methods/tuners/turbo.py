@@ -97,7 +97,17 @@ class TuRBO(Tuner):
     def _search_region(
         self, dim: int, rng: np.random.Generator, points: Array, losses: Array
     ) -> TunerGenerator:
-        """Search in one trust region until it has collapsed."""
+        """Search in one trust region until it has collapsed.
+
+        Its side length doubles after some successes in a row, and halves after some failures in a
+        row. A new region begins elsewhere when the length falls below `shortest`.
+
+        Args:
+            dim: number of parameters.
+            rng: random generator.
+            points: (n, dim) points simulated so far in this region.
+            losses: (n,) their losses.
+        """
         length = self.length
         success_count = 0
         failure_count = 0
@@ -125,7 +135,19 @@ class TuRBO(Tuner):
     def _sample_best_candidate(
         self, points: Array, losses: Array, length: float, rng: np.random.Generator
     ) -> Array:
-        """Return the best candidate of a Thompson sample of the process in the trust region."""
+        """Draw the next point (dim,) of a trust region by Thompson sampling.
+
+        A random function of the Gaussian process is drawn at candidates in the region, and the
+        candidate where it is largest (it models the negative loss) is chosen. The region is a box
+        around the best point with the sides (1). Without a successful simulation the point is
+        uniformly random.
+
+        Args:
+            points: (n, dim) simulated points.
+            losses: (n,) their losses; infinite for failed simulations.
+            length: side length of the region.
+            rng: random generator.
+        """
         import torch
 
         finite = np.isfinite(losses)
@@ -176,7 +198,11 @@ def _draw_sobol_points(rng: np.random.Generator, n: int, dim: int) -> Array:
 
 
 def _fit_gaussian_process(points: Array, values: Array) -> Any:
-    """Fit a Gaussian process with a scaled Matérn-5/2 kernel by its marginal likelihood."""
+    """Fit a Gaussian process with a scaled Matérn-5/2 kernel by its marginal likelihood.
+
+    `points` (n, dim) are in the unit cube, `values` (n,) have mean 0 and standard deviation 1.
+    Returns botorch's model, ready for prediction.
+    """
     import torch
     from botorch.exceptions.errors import ModelFittingError
     from botorch.fit import fit_gpytorch_mll
