@@ -293,7 +293,15 @@ class ComparisonCollection:
 
 
 def _compute_runtime_shares(curves: RunCurves, spread: Array) -> list[dict[str, Array]]:
-    """Compute for each range and tuner the share reached after 0..100 % of the budget."""
+    """Compute the share of thresholds that each tuner has reached after 0..100 % of the budget.
+
+    Args:
+        curves: errors of all runs of one comparison.
+        spread: thresholds of the runtime distribution.
+
+    Returns:
+        For each range: the shares (101,) by tuner.
+    """
     budget = curves.values.shape[1] - 1
     points = np.floor(np.linspace(0, budget, 101)).astype(np.int64)
     shares = []

@@ -267,7 +267,7 @@ def _standing(one: headline.Standing) -> list[str]:
 def _results(
     lines: pd.DataFrame, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> list[str]:
-    """Format one or two short tables for each range."""
+    """Format the median errors of each range, then the errors along directions where known."""
     texts = []
     for kind in lines["range"][lines["range"] != ""].unique():
         texts.append("\n" + _text(lines, kind, labels, statistics))
@@ -328,7 +328,10 @@ def _directions(
 
 
 def _seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:
-    """Format the mean seconds per run of each tuner, of its simulations, and of its training."""
+    """Format the mean seconds per run of each tuner, of its simulations, and of its training.
+
+    `lines` are rows of table.csv; the values after all simulations are used.
+    """
     last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
     columns = {
         "tuner": "tuner_seconds",

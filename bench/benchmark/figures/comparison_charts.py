@@ -324,7 +324,11 @@ def _make_panel(
     across: Axis,
     up: Axis,
 ) -> Panel:
-    """Make a panel of one range of targets."""
+    """Make a panel of one range of targets, whose title has the number of targets.
+
+    `table` is the name of the panel's table and `x` its column for the horizontal axis `across`;
+    `up` is the vertical axis.
+    """
     counted = "starting points" if kind == "real" else "targets"
     title = f"{PANEL_TITLES[kind]} ({view.statistics.target_counts[kind]} {counted})"
     return Panel(title, table, x, series, across, up, {SIDE_BY_SIDE: PANEL_TITLES[kind]})
@@ -345,7 +349,11 @@ def _make_lines(
     high: str = "",
     **where: str,
 ) -> tuple[Series, ...]:
-    """Make a series for each tuner of a table."""
+    """Make a series for each tuner of a table.
+
+    `y` is the column that is drawn, `low` and `high` are the columns of its interval (empty for
+    none). `where` selects rows by further columns.
+    """
     styles: list[tuple[str, MarkStyle]] = view.get_tuner_styles(table["tuner"])
     return tuple(
         Series(name, y, look, {"tuner": name, **where}, low, high, draw) for name, look in styles

@@ -66,7 +66,11 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
 
 
 def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
-    """Draw every target's 1 sigma along each direction, the ranges side by side."""
+    """Draw every target's smallest possible standard error (1 sigma) along each direction.
+
+    A direction is a combination of parameters; stiff ones are determined by the data, sloppy ones
+    are not. The ranges of targets are drawn side by side.
+    """
     ranges = list(dict.fromkeys(table["range"]))
     for place, (kind, (marker, colour)) in enumerate(zip(ranges, _MARKS, strict=False)):
         part = table[table["range"] == kind]

@@ -101,7 +101,12 @@ def _preload_modules(modules: list[str]) -> None:
 
 
 def _supervise(request: dict[str, Any], descriptors: list[int], layers: list[str]) -> None:
-    """Act as supervisor: fork the process that runs the service, and report how it ended."""
+    """Act as supervisor: fork the process that runs the service, and report how it ended.
+
+    The supervisor is needed because a new process namespace begins with the next child. It never
+    runs the tuner's code. `descriptors` are the control socket and the two pipes; `layers` are the
+    names of the isolation layers that are active already.
+    """
     set_parent_death_signal()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     folder, (control, *pipes) = request["folder"], descriptors
@@ -150,7 +155,11 @@ def _wait_for_child(child: int, control: int) -> int:
 
 
 def _run_service(request: dict[str, Any], pipes: list[int], layers: list[str]) -> None:
-    """Apply the last isolation layers, and run the service."""
+    """Apply the last isolation layers, and run the service, such as that of a tuner.
+
+    The two pipes become the descriptors 100 and 101. All others are closed, so that code of a tuner
+    cannot reach anything of the harness through an open file.
+    """
     _discard_output()
     reading, writing = (os.dup2(each, 100 + i) for i, each in enumerate(pipes))
     os.closerange(3, 100)

@@ -198,7 +198,11 @@ class ForkServerClient:
 
 
 def _environment(folder: str) -> dict[str, str]:
-    """Return the environment variables of tuner processes."""
+    """Return the environment variables of tuner processes.
+
+    Only variables that numerical libraries and Python need are inherited, because others could pass
+    information to a tuner. Unless the user has set it, the number of numerical threads is one.
+    """
     inherited_names = (
         "PATH",
         "LANG",

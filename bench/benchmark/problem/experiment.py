@@ -531,7 +531,14 @@ _UNHASHED_KEYS = (*SHARED_KEYS, "title", "says", "identifiable", "tags")
 
 
 def _as_in(together: Experiment, name: str) -> list[Experiment]:
-    """Return an experiment that another one names, with the numbers and tuners of the latter."""
+    """Return an experiment that another one names, with the numbers and tuners of the latter.
+
+    This is how one file, such as a suite, runs many problems with the same settings. `together` is
+    the experiment that names others, and `name` one of these.
+
+    Raises:
+        InputError: the named experiment names others itself, or it is not the suite's version.
+    """
     experiment = load_experiment(name)
     if experiment.experiments:
         raise InputError(f"experiment {together.name}: {name} names experiments itself")

@@ -161,7 +161,11 @@ def _diverging(experiment: Experiment, failed: int, draws: int) -> InputError:
 
 
 def _draw(problem: TargetProblem, kind: str, index: int, number: int) -> Target | None:
-    """Make one draw; None if the simulation diverges."""
+    """Make one draw of a target; None if its simulation diverges.
+
+    `kind` is the range of the target: ``wide`` draws from all bounds, others from the training
+    range. `number` is 0 for the first draw, and counts the repeated draws, each from new streams.
+    """
     # The stream's name contains no tuner, seed or budget, so that all tuners get the same target.
     met = problem.experiment.same_targets_as or problem.experiment.name
     again = ("redraw", number) if number else ()

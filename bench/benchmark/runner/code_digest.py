@@ -182,7 +182,10 @@ def _name(kind: type) -> str:
 
 
 def _parts(kind: type) -> list[type]:
-    """Return a class, its bases, and the classes that it lists in ``made_of``."""
+    """Return a class, its bases, and the classes that it lists in ``made_of``, recursively.
+
+    Their sources together determine the behaviour of the class, so all of them are hashed.
+    """
     parts: list[type] = []
     waiting = [kind]
     while waiting:

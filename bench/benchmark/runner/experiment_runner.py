@@ -338,7 +338,11 @@ def _store_untrained_runs(
     failures: Mapping[tuple[str, int], Exception],
     progress: ProgressFactory,
 ) -> _ReadyRuns:
-    """Store runs whose training failed as failures, and return the other missing runs."""
+    """Store runs whose training failed as failures, and return the other missing runs.
+
+    A failure is a result too, so these runs are not tried again. `failures` are the errors of
+    trainings by label of the tuner and seed.
+    """
     missing = [
         index for index in range(len(results.plan)) if index not in results.run_sink.statuses
     ]

@@ -98,7 +98,11 @@ def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:
 
 
 def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) -> None:
-    """Send the properties of a simulator, and simulate if the message requests it."""
+    """Send the properties of a simulator, and simulate if the message requests it.
+
+    It serves a learned tuner that trains in an isolated process. A request that is not valid, or
+    beyond the budget, is answered by a refusal (message X), and the training can continue.
+    """
     result: dict[str, NDArray[Any]] = {}
     if message.flags & 2:
         try:

@@ -120,7 +120,11 @@ def _permutation_p_value(changes: Array, rng: np.random.Generator) -> float:
 
 
 def _mean_split_half_tau(ranks: Array, rng: np.random.Generator) -> float:
-    """Compute the mean tau between random halves of the targets from ranks (targets, tuners)."""
+    """Compute the mean Kendall tau between the rankings on two random halves of the targets.
+
+    It says how well a ranking of tuners repeats on other targets: 1 is the same order, 0 a random
+    one. `ranks` (targets, tuners) are the ranks on each target. NaN with fewer than two targets.
+    """
     half = len(ranks) // 2
     if not half:
         return float("nan")

@@ -130,7 +130,11 @@ class _Ranking(NamedTuple):
 
 
 def _rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Ranking]:
-    """Compute the ranking after each number of simulations of `ranked_after`."""
+    """Compute the ranking of the tuners after each number of simulations of `ranked_after`.
+
+    Tuners are ordered by median log error, then mean, then earlier ranks; those whose runs all
+    failed come last. Errors at or below `floor` count as equal.
+    """
     failed = {t: bool(curves.select(tuner=t).failed.all()) for t in curves.list_tuners()}
     rankings: dict[int, _Ranking] = {}
     earlier: list[pd.Series[float]] = []
@@ -147,7 +151,12 @@ def _rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Rankin
 
 
 def _verdicts(ranking: _Ranking, curves: RunCurves, key: tuple[str, str, int]) -> pd.DataFrame:
-    """Build the rows of one ranking, with each tuner tested against the first."""
+    """Build the rows of one ranking, with each tuner tested against the first.
+
+    The test is Wilcoxon's signed-rank test over targets with Holm's correction for several tests. A
+    tuner is WORSE if the difference is significant, EQUAL if it shares the first rank, and
+    otherwise UNDECIDED. `key` are the first columns of each row.
+    """
     logs, ranks, order = ranking
     runs = {t: curves.select(tuner=t).failed for t in order}
     delivered = [t for t in order if not runs[t].all()]

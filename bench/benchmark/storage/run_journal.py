@@ -223,7 +223,13 @@ def _placed(place: int, rows: pa.Table) -> pa.Table:
 
 
 def _locked(path: Path) -> IO[str]:
-    """Lock the folder until this process ends in any way."""
+    """Lock the folder until this process ends in any way.
+
+    Two processes that write to one journal would damage it.
+
+    Raises:
+        InputError: another process has the lock.
+    """
     file = path.open("a", encoding="ascii")
     try:
         import fcntl

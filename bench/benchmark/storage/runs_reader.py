@@ -234,7 +234,14 @@ def _changes(values: pa.ChunkedArray) -> Mask:
 
 
 def _check_counts(rows: pa.Table, goes_on: bool) -> None:
-    """Check that k counts 0, 1, 2, ... in every run."""
+    """Check that k counts 0, 1, 2, ... in every run.
+
+    `rows` is one batch of the file; `goes_on` is True if its first row continues the last run of
+    the batch before.
+
+    Raises:
+        CellError: k has another value, so that a row is missing or added.
+    """
     k: NDArray[np.int64] = rows["k"].to_numpy()
     wanted = np.append(0, k[:-1] + 1)
     wanted[_new(rows)] = 0
