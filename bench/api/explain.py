@@ -131,7 +131,10 @@ def score(
 
 
 def _of_model(model: Path, about: FrameDescription) -> FrameDescription:
-    """Complete the description of a data frame by the system or robot of a model."""
+    """Complete the description of a data frame by the system or robot of a model.
+
+    `model` is a robot's model file, or an extended simulator (TOML) that names a robot or a system.
+    """
     if model.suffix in MODEL_FILES:
         return replace(about, model=model)
     extended = extended_file.read_extended(model)

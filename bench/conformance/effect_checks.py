@@ -150,7 +150,12 @@ def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable
 def _contributions(
     acting: Effect, c: Array, host: type[SystemSimulator], system: System
 ) -> list[tuple[Array, Array]]:
-    """Return pairs of the hook's result and the expected result of an inactive effect."""
+    """Return pairs of the hook's result and the expected result of an inactive effect.
+
+    `c` are coefficients of zero, at which the effect must do nothing: a force must be zero, and a
+    sensor must return its input. `host` is the simulator, `system` the system on which the effect
+    acts.
+    """
     moment = _make_state_snapshot(host, system)
     speed, e = np.array([[0.3], [2.0]]), np.array([[0.4], [0.8]])
     values = np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.6]])

@@ -221,7 +221,14 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
 
 
 def _find_changed_fields(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
-    """Return the model fields that an effect changes, with the indices of the changed numbers."""
+    """Return the model fields that an effect changes, with the indices of the changed numbers.
+
+    They show where in the robot the effect acts. `c` are its coefficients, `kind` the simulator
+    class.
+
+    Raises:
+        CheckError: an effect of one place changes several places.
+    """
     from sims.robot.coupled_drives import COUPLING_PLACEHOLDER
     from sims.robot.dynamics.series_joints import add_series_joints
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
@@ -266,7 +273,11 @@ def _put_in_series(effect: HiddenStateEffect, c: Array, kind: type) -> tuple[obj
 def _find_forced_coordinates(
     effect: Force | Friction | HiddenStateEffect, c: Array, kind: type
 ) -> tuple[object, ...]:
-    """Return the coordinates on which an effect exerts a force or friction."""
+    """Return the coordinates on which an effect exerts a force or friction.
+
+    The effect is called at one state in motion. `c` are its coefficients, `kind` is the simulator
+    class.
+    """
     from sims.robot.dynamics.effect_forces import make_snapshot
 
     system = kind.system()  # type: ignore[attr-defined]

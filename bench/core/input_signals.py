@@ -148,7 +148,13 @@ def evaluate_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
 
 
 def _one(text: str, times: Array, rng: np.random.Generator) -> Array:
-    """Compute the values of one signal without sums."""
+    """Compute the values (T,) of one signal, such as ``sine:2:0.5``, without sums.
+
+    The limits on the numbers prevent values that overflow, and signals that change too often.
+
+    Raises:
+        InputError: the text is not a known form with valid numbers.
+    """
     name, *given = text.split(":")
     if not given:
         name, given = "constant", [text]

@@ -157,7 +157,11 @@ def _salt(experiment: Experiment) -> str:
 def _rows(
     stored: StoredComparison, problem: TuningProblem, say: PrintLine, every: bool
 ) -> list[VerificationFailure]:
-    """Verify runs.parquet, and return the failures."""
+    """Verify runs.parquet, and return the failures.
+
+    The targets are drawn again from the salt. Errors are computed from them in all rows; losses are
+    simulated again in a selection of rows, or in all with `every`.
+    """
     targets = {target.blinded.name: target for target in problem.draw_targets()}
     runs = stored.runs
     doubts = [
@@ -208,7 +212,11 @@ def _errors(
 def _losses(
     problem: TuningProblem, target: Target, rows: pd.DataFrame
 ) -> Iterator[VerificationFailure]:
-    """Yield rows of a target whose losses and errors differ from repeated simulations."""
+    """Yield rows of a target whose losses and errors differ from repeated simulations.
+
+    The proposals are simulated again for the losses, the recommendations for the errors on the
+    fitted and on the held-out scenarios.
+    """
     names = [parameter.name for parameter in problem.cube.parameters]
     channel = problem.error_channel
     simulated_rows = rows[rows["k"] > 0]

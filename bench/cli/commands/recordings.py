@@ -335,7 +335,11 @@ def _differing_conventions(
 
 
 def _print_identifiability(options: argparse.Namespace, say: PrintLine) -> list[JsonDocument]:
-    """Print the identifiability of every number, before any fit."""
+    """Print which numbers the recording can determine, before any fit.
+
+    The numbers are those that the user named with ``--free``, then the coefficients of the possible
+    causes. The same is returned as JSON documents.
+    """
     from bench.diagnosis.identifiability import format_identifiability
     from bench.diagnosis.recording_check import check_identifiability
 

@@ -143,7 +143,11 @@ def _build_guide_rows(tables: SuiteTables) -> list[dict[str, Any]]:
 
 
 def _build_rank_rows(tables: SuiteTables, k: int, order: Sequence[str]) -> list[dict[str, Any]]:
-    """Build the rows of methods x cells after k simulations, best mean rank first."""
+    """Build the rows of methods x cells after k simulations, best mean rank first.
+
+    Each entry has the rank of the method in the cell and a colour class from it. Methods that do
+    not have results in every cell come last, without a mean. `order` are the methods.
+    """
     ranks = tables.get_ranks(k)
     errors = tables.errors[tables.errors["simulations"] == k].set_index(["cell", "tuner"])
     means, counts = ranks.mean(), ranks.notna().sum(axis=1)

@@ -274,7 +274,13 @@ class SuiteTables:
         return pd.DataFrame(lines, columns=ERT_COLUMNS)
 
     def _measure(self, curves: RunCurves, threshold: float, share: float) -> tuple[float, ...]:
-        """Compute the ERT with its interval, the ERT with training, successes and runs."""
+        """Compute the expected running time (ERT) to an error threshold, with interval and cost.
+
+        `share` is the part of the training cost that falls on one target, in simulations.
+
+        Returns:
+            ERT, its 95 % interval (two numbers), ERT with training, successes and number of runs.
+        """
         # Beyond the end of a smaller budget nothing is known.
         known = ~np.isnan(curves.values).any(axis=1)
         budget = self.suite.budget if known.all() else int(np.max(curves.used))
