@@ -375,7 +375,11 @@ class ComparisonResult:
         return "a bounce shot" if self.experiment.shot else "a study of two comparisons"
 
     def _both(self, rows: Callable[[StoredComparison], pd.DataFrame]) -> pd.DataFrame:
-        """Concatenate rows of a study's two comparisons, with the simulator's name first."""
+        """Concatenate the tables of a study of a missing effect, which consists of two comparisons.
+
+        They use the simulator before and after its extension; the new first column ``model`` says
+        which.
+        """
         import pandas as pd
 
         parts = []

@@ -114,7 +114,14 @@ class Comparison:
         return comparison
 
     def _attach(self, results: ExperimentRun) -> None:
-        """Open the journal of the folder, and write or check the plan."""
+        """Prepare the comparison for running: open its journal, write or check its plan.
+
+        `results` are the problem and the planned runs. A finished comparison has no journal any
+        more; then the statuses of its runs are read from its tables.
+
+        Raises:
+            InputError: the stored plan or runs do not belong to the configuration.
+        """
         from bench.benchmark.runner.tuner_training import get_weights_folder
 
         self.results = results
@@ -245,7 +252,11 @@ class Comparison:
         return self.results
 
     def _write_spectra(self, results: ExperimentRun) -> None:
-        """Write identifiability.csv, one row per target and direction, for several parameters."""
+        """Write identifiability.csv: how well the data determine the parameters.
+
+        It has one row per target and direction of the parameter space. There is no such file for a
+        single parameter.
+        """
         if results.spectra:
             from bench.benchmark.statistics.identifiability_table import build_identifiability_table
 

@@ -56,7 +56,7 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
 
 
 def _option(action: argparse.Action) -> JsonDocument:
-    """Describe an argument or option."""
+    """Describe an argument or option of a command by plain values, for `simgap list commands`."""
     default = None if action.default in ([], "") else action.default
     read = getattr(action.type, "__name__", "")
     flag = _TYPES.get(type(action).__name__)

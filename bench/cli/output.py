@@ -146,7 +146,11 @@ def to_json_value(value: Any) -> Any:
 
 @contextmanager
 def _stdout_to_stderr() -> Iterator[None]:
-    """Redirect to stderr what Python, C libraries and worker processes print."""
+    """Redirect to stderr what Python, C libraries and worker processes print.
+
+    With ``--json`` stdout must contain the JSON document only. C libraries write to the descriptor
+    1 directly, so it is redirected too.
+    """
     sys.stdout.flush()
     with redirect_stdout(sys.stderr):
         try:

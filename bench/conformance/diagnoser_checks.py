@@ -79,7 +79,14 @@ def _open_case(
     budget: int = SIMULATION_BUDGET,
     missing: bool = False,
 ) -> Iterator[DiagnosisCase]:
-    """Make a case as a diagnoser gets it; its folder is deleted afterwards."""
+    """Make a case as a diagnoser gets it; its folder is deleted afterwards.
+
+    Args:
+        kind: class of the diagnoser, which is trained first if it learns.
+        hidden: whether the recording has a hidden cause (strong linear drag).
+        budget: maximum number of simulations.
+        missing: whether the recording has gaps.
+    """
     made = _get_recording(hidden)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"

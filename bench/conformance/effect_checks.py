@@ -97,7 +97,11 @@ def _scenario(system: type[System]) -> Scenario:
 
 
 def _theta(simulator: SystemSimulator, share: float) -> Array:
-    """Return nominal parameters, and all coefficients at a fraction of their plausible range."""
+    """Return parameters (1, P) for one simulation with the effect.
+
+    The system's own parameters are nominal; each coefficient of the effect is at the fraction
+    `share` (0 to 1) of its plausible range.
+    """
     # The coefficients of the effect follow the parameters of the system.
     own = len(simulator.system.parameters)
     values = [p.nominal for p in simulator.parameters[:own]]
@@ -185,7 +189,10 @@ def _contributions(
 
 
 def _make_state_snapshot(host: type[SystemSimulator], system: System) -> StateSnapshot:
-    """Make the state of two batch elements in motion."""
+    """Make the state of two batch elements in motion, for direct calls of an effect's hook.
+
+    Coordinates and rates are arbitrary, but not zero, and different for each element.
+    """
     shape = (2, len(system.coordinates))
     theta = np.repeat([[p.nominal for p in system.parameters]], 2, axis=0)
     constants = {c.name: np.full((2, 1), c.value) for c in host.constants}

@@ -120,7 +120,10 @@ _ROUNDING = 1e-9
 
 
 def _way(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
-    """Compute the change (C,) of every channel over a run, in units of its scale."""
+    """Compute the change (C,) of each of C channels over a run, in units of its scale.
+
+    The run has `steps` steps of `seconds` each, with constant inputs.
+    """
     inputs = {c.name: c.scale for c in simulator.inputs}
 
     def observation() -> Array:

@@ -72,7 +72,10 @@ class ResourceNeed:
     seconds: float = 0.0
 
     def find_excess(self, machine: MachineResources) -> str:
-        """Describe the first need that exceeds the machine; empty if none does."""
+        """Describe the first need that exceeds the machine; empty if none does.
+
+        The needs are memory, disk, number of files, time steps of one simulation, and total time.
+        """
         for wanted, there, unit in (
             (self.memory, machine.memory, "of memory"),
             (self.disk, machine.disk, "of free disk"),

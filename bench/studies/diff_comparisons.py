@@ -257,7 +257,10 @@ class ComparisonDiff:
         return self.errors[self.errors["significant"]] if len(self.errors) else self.errors
 
     def _failing(self) -> Iterator[tuple[float, float]]:
-        """Yield the fractions of failed runs in both comparisons, for each common tuner."""
+        """Yield the fractions of failed runs in both comparisons, for each common tuner.
+
+        Skipped runs count as failed, because they have no result either.
+        """
         frames = [s.stored.statuses for s in (self.a, self.b)]
         for tuner in self.a.curves.list_tuners():
             if tuner not in self.unshared_tuners["a"]:

@@ -59,7 +59,7 @@ class DirectRegressor(PairTuner):
     clean: bool = True
 
     def make_network_design(self) -> PairNetworkDesign:
-        """Return the design of the network."""
+        """Return the design of the network: that of TuneNet, with one observation as its input."""
         if self.published:
             return PUBLISHED_DESIGN
         # The two inputs of this network are not a pair that could be exchanged.
@@ -71,7 +71,7 @@ class DirectRegressor(PairTuner):
         )
 
     def make_feature_config(self) -> FeatureConfig:
-        """Return the configuration of the inputs."""
+        """Return how an observation becomes inputs of the network; raw samples if published."""
         if self.published:
             return FeatureConfig(self.points, noise=0.0, raw=True)
         return FeatureConfig(

@@ -27,7 +27,10 @@ class AxisLabels(NamedTuple):
 
 
 def make_axis_labels(problem: TuningProblem) -> AxisLabels:
-    """Make the axis labels for a comparison's problem."""
+    """Make the axis labels for a comparison's problem, with units.
+
+    The label of a parameter is empty if there are several, because they share no unit.
+    """
     channel = problem.channels[problem.error_channel]
     parameters = problem.cube.parameters
     parameter = ""

@@ -193,7 +193,11 @@ def _layer(active: list[str], *names: str) -> Iterator[None]:
 
 
 def _set_resource_limits(has_user_namespace: bool) -> None:
-    """Limit core dumps, open files and file sizes, and threads if they are counted separately."""
+    """Limit core dumps, open files and file sizes, and threads if they are counted separately.
+
+    Threads are counted for each user of the machine. Without a user namespace, those of the user's
+    other programs would count too, so the number is not limited then.
+    """
     limits = {
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: _FILES,

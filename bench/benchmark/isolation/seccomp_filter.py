@@ -169,7 +169,11 @@ def _when(opcode: int, operand: int, body: list[BpfInstruction]) -> list[BpfInst
 
 
 def _apply(rule: int | ArgumentRule) -> list[BpfInstruction]:
-    """Return instructions that end with the verdict of a rule."""
+    """Return the instructions of the filter program that decide about one system call.
+
+    `rule` is the verdict itself, or a rule that depends on one argument of the call: it is loaded,
+    masked and compared with each known value.
+    """
     if isinstance(rule, int):
         return [BpfInstruction(_RETURN, rule)]
     return [

@@ -108,7 +108,11 @@ def _report_failure(channel: MessageChannel, text: str) -> None:
 
 
 def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | None) -> Tuner | None:
-    """Execute the request of one message, and return the present tuner."""
+    """Execute the request of one message, and return the present tuner.
+
+    Message kinds: B builds a tuner, L loads its weights, T runs it on a task, F trains it. `tuner`
+    is None before the first message B.
+    """
     if message.kind == b"B":
         description = message.to_document()
         tuner = load_class(description)(**description["options"])

@@ -122,7 +122,11 @@ class TuningProblem:
             raise InputError(f"{who}: {error}") from None
 
     def _check_world(self) -> None:
-        """Raise an error if the parameters of `world` are not the first of the tuned ones."""
+        """Raise an error if the parameters of `world` are not the first of the tuned ones.
+
+        `world` makes the targets, so a parameter that only `world` has could not be tuned. The
+        tuned simulator may have further parameters.
+        """
         tuned, made = (
             [parameter.name for parameter in simulator.parameters]
             for simulator in (self.simulator, self.world)

@@ -98,7 +98,10 @@ def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
 
 
 def _classes(experiment: Experiment) -> list[str]:
-    """Hash the sources of simulator and tuners; classes of a notebook are in no plugin file."""
+    """Hash the sources of the simulator and the tuners, one hash each.
+
+    This covers classes that a notebook defines, which are in no plugin file.
+    """
     sources = [hash_class_source(get_simulator_class(experiment))]
     for entry in experiment.tuners:
         try:

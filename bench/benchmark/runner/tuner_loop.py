@@ -83,7 +83,13 @@ class _DivergenceError(Exception):
 
 
 def _points(proposed: object, dim: int, label: str) -> Array:
-    """Return proposals as a new (n, dim) array, clipped to the unit cube."""
+    """Return proposals as a new (n, dim) array, clipped to the unit cube.
+
+    `label` names them in messages: "proposals" or "recommendations".
+
+    Raises:
+        _DivergenceError: a point is not finite.
+    """
     points = to_points(proposed, dim, label)
     # Nearly all points are inside, so the expensive check is done only if some are not.
     if not _is_in_unit_cube(points):

@@ -187,7 +187,11 @@ def _refused(archive: Path, why: str) -> InputError:
 
 
 def _top(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
-    """Return the single top-level folder of an archive."""
+    """Return the single top-level folder of an archive, which contains the manifest.
+
+    Raises:
+        InputError: the archive has another form, so it was not made by `simgap bundle`.
+    """
     tops = {entry.filename.partition("/")[0] for entry in entries}
     if len(tops) != 1 or f"{(top := tops.pop())}/{MANIFEST_FILE}" not in {
         e.filename for e in entries
@@ -224,7 +228,11 @@ def _manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any
 def _written(
     archive: Path, packed: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path
 ) -> tuple[int, str]:
-    """Unpack one file; return its size and hash."""
+    """Unpack one file to `path`; return its size in bytes and its SHA-256.
+
+    The size is checked while it is written, because a compressed file may be far larger than the
+    archive says and fill the disk.
+    """
     digest, size = hashlib.sha256(), 0
     with packed.open(entry) as source, path.open("wb") as to:
         for block in _blocks(source):

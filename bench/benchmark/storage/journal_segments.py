@@ -59,7 +59,14 @@ def encode_record(place: int, status: RunStatus, rows: pa.Table) -> bytes:
 
 
 def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
-    """Yield index, status, rows and end offset of every complete record of a journal."""
+    """Yield every complete record of a journal: plan index, status, rows and end offset in bytes.
+
+    A process that was killed may have left an incomplete record at the end. It is detected by its
+    length and checksum, and reading stops before it.
+
+    Raises:
+        InputError: a record is complete but damaged.
+    """
     import pyarrow as pa
 
     data, end = path.read_bytes(), 0

@@ -102,7 +102,7 @@ def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableError
 
 
 def _seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
-    """Return the number of seeds of an entry.
+    """Return the number of seeds of an entry; `largest` is the largest seed in its planned runs.
 
     It equals `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.
     """

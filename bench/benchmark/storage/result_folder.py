@@ -312,7 +312,10 @@ def read_checked_comparison(folder: Path) -> StoredComparison:
 def _with_defaults(
     frame: pd.DataFrame, declared: Columns, wanted: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """Add columns with a default that an older folder lacks."""
+    """Add columns that a folder of an older version lacks, filled with their declared default.
+
+    `wanted` are the names of the columns to be used; None for all.
+    """
     missing = {
         column.name: column.default
         for column in declared

@@ -124,7 +124,14 @@ def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
 def _run_study(
     study: Study, pool: Pool | None, options: argparse.Namespace, say: PrintLine
 ) -> CommandResult:
-    """Run and report one study."""
+    """Run one study until it is complete or stopped, then write its report.
+
+    `pool` executes the runs on a cluster; None for worker processes on this machine.
+
+    Returns:
+        JSON document and exit code; not EXIT_OK if runs are missing, or if some failed and failures
+        are not allowed.
+    """
     from bench.cli.progress_display import ProgressBars
     from bench.cli.study_summary import summarise_study
 

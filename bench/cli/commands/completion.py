@@ -73,7 +73,10 @@ _WORDS = {
 
 
 def _complete(command: str, action: argparse.Action, shtab: Any) -> None:
-    """Set the completion of an argument: known names, or a file."""
+    """Set how the shell completes an argument: known names (in bash only), or a file.
+
+    `shtab` is the library that builds the completion script.
+    """
     known = _WORDS.get((command, action.dest))
     if known:
         complete = {**shtab.FILE, "bash": known}

@@ -82,7 +82,10 @@ class SuiteTables:
 
     @cached_property
     def curves(self) -> dict[str, RunCurves]:
-        """Error curves of each cell."""
+        """Error curves of each cell: the error of each run after 0, 1, 2, ... simulations.
+
+        A cell is a problem with a range of targets, see `suite_runs`.
+        """
         runs, result = self.suite.runs, {}
         for cell in self.suite.cells["cell"]:
             rows = (runs["cell"] == cell).to_numpy()
@@ -158,7 +161,11 @@ class SuiteTables:
 
     @cached_property
     def _medians(self) -> dict[tuple[str, int], pd.DataFrame]:
-        """Median log errors: a row per cell, a column per tuner, by training and simulations."""
+        """Median log errors over targets: a row per cell and a column per tuner.
+
+        The key is (training, k): whether the simulations of a training are counted (COUNTED) or not
+        (FREE), and the number of simulations.
+        """
         result = {}
         for training in (FREE, COUNTED):
             for k in self.checkpoints:
@@ -202,7 +209,11 @@ class SuiteTables:
 
     @cached_property
     def ranks(self) -> pd.DataFrame:
-        """Mean ranks over cells with 95 % bootstrap intervals, best first."""
+        """Mean ranks over cells with 95 % bootstrap intervals, best first.
+
+        The intervals come from resampled cells: they say how far the mean rank depends on the
+        chosen problems. Only tuners with results in every cell are ranked.
+        """
         lines = []
         for training in (FREE, COUNTED):
             for k in self.checkpoints:
@@ -233,7 +244,12 @@ class SuiteTables:
 
     @cached_property
     def pairs(self) -> pd.DataFrame:
-        """Test the best tuner against each other one, by signed ranks over cells (Holm)."""
+        """Test the best tuner against each other one over all cells.
+
+        The test is Wilcoxon's signed-rank test of the median log errors, with Holm's correction for
+        the number of tuners. One row per tuner, number of simulations, and with or without training
+        cost.
+        """
         lines = []
         for training in (FREE, COUNTED):
             for k in self.checkpoints:
