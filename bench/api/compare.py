@@ -250,7 +250,12 @@ def _cluster(address: str | None) -> Pool | None:
 
 
 def _report(begun: study.Study, outcome: StudyOutcome) -> ComparisonResult:
-    """Write the tables and figures of a study that has been run."""
+    """Write the tables and figures of a study that has been run, and return its results.
+
+    Raises:
+        InputError: the study cannot be run here.
+        KeyboardInterrupt: the user interrupted the runs; finished ones are stored.
+    """
     if outcome.skipped:
         raise InputError(f"{begun.configuration.experiment.name}: skipped: {outcome.skipped}")
     begun.report(_discard_line)
@@ -307,7 +312,11 @@ def _choose_diagnosers(
 
 
 def _label(tuner: str | type[Tuner]) -> str:
-    """Return the name under which a tuner runs; register a class."""
+    """Return the name under which a tuner runs; a class is registered under its name first.
+
+    Raises:
+        InputError: it is neither a name nor a subclass of Tuner.
+    """
     if isinstance(tuner, str):
         return tuner
     if not (inspect.isclass(tuner) and issubclass(tuner, Tuner)):

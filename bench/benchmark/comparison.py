@@ -181,7 +181,10 @@ class Comparison:
         return dict(enumerate(statuses))
 
     def _stored(self) -> list[RunStatus]:
-        """Return the statuses of a finished comparison in the order of its plan."""
+        """Return the statuses of a finished comparison in the order of its plan.
+
+        Tuners that were skipped have no run in the plan, so their rows are left out.
+        """
         statuses = read_comparison(self.folder, ["run", "tuner", "k"]).statuses
         executed = statuses[statuses["status"] != "skipped"]
         rows: list[dict[str, Any]] = [

@@ -283,7 +283,10 @@ class ComparisonCollection:
         return figure
 
     def _shares(self) -> dict[str, Array]:
-        """Compute each tuner's share reached after 0..100 % of the budget, mean over problems."""
+        """Compute the runtime distribution of each tuner (101,), the mean over problems.
+
+        It is the share of error thresholds reached after 0..100 % of the budget.
+        """
         each = [
             problem
             for part in self.parts

@@ -204,7 +204,7 @@ def _drawn(
 
 
 def _kept(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Path]:
-    """Write the figures, and return the paths of the PNG files."""
+    """Write the figures to the folder ``figures`` as PNG and PDF; return the paths of the PNGs."""
     return [
         write_figure_files(
             folder / "figures" / comparison_figures.FIGURE_FILES[name], picture.png, picture.pdf

@@ -244,7 +244,10 @@ def list_schemas() -> list[JsonDocument]:
 
 
 def _part(registry: Any, name: str, told: Callable[[Any], JsonDocument]) -> JsonDocument:
-    """Describe a registered part, or why it cannot be used here."""
+    """Describe a registered part, or why it cannot be used here.
+
+    `told` returns further properties of the part's class, which depend on the kind of part.
+    """
     from bench.core.plugin_registries import PartUnavailableError
 
     try:

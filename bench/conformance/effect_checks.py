@@ -45,7 +45,10 @@ _RATE = 30.0
 
 
 def _declared() -> Iterator[type[SystemSimulator]]:
-    """Yield the registered simulators of declared systems whose packages are installed."""
+    """Yield the registered simulators of declared systems (`SystemSimulator`).
+
+    Simulators whose packages are not installed are left out.
+    """
     for name in simulators.names():
         with suppress(PartUnavailableError):
             kind = simulators.get(name)

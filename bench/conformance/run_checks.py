@@ -160,7 +160,7 @@ def _summary(checked: SuiteResult) -> str:
 
 
 def _outcome(line: str) -> str:
-    """Return the outcome that a check's line stands for."""
+    """Return the outcome that a check's line stands for; an empty line is a passed check."""
     for begin, outcome in _OUTCOMES.items():
         if line.startswith(begin):
             return outcome
@@ -168,7 +168,7 @@ def _outcome(line: str) -> str:
 
 
 def _mark(line: str) -> str:
-    """Return the label printed before a check's title."""
+    """Return the label printed before a check's title; an empty line is a passed check."""
     for begin, mark in _MARKS.items():
         if line.startswith(begin):
             return mark

@@ -293,7 +293,11 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
 
 
 def _final_logs(subjects: tuple[Tuner, ...], target: int) -> Array:
-    """Compute the logarithms of the final errors of several tuners on one target."""
+    """Compute the logarithms of the final errors of several tuners on one target.
+
+    Each runs on the toy problem with 2 parameters and 30 simulations. The error is the mean
+    absolute error of the recommendation, at least 1e-12, so that its logarithm is finite.
+    """
     _, truth = make_task(2, 30, target)
     traces = [run_tuner(tuner, 2, 30, seed=target, target=target) for tuner in subjects]
     return np.log(

@@ -123,7 +123,10 @@ def with_options(
 
 
 def _describe(call: Any, options: Any, signature: inspect.Signature) -> None:
-    """Give a function the signature of its callers, and the descriptions of its options."""
+    """Give a function the signature of its callers, and the descriptions of its options.
+
+    Without this, help() and editors would show ``*args, **kwargs``.
+    """
     call.__signature__ = signature
     texts = read_option_texts(options)
     lines = [f"    {name}: {texts[name]}" for name in signature.parameters if name in texts]

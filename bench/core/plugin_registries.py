@@ -142,7 +142,7 @@ def _parts(module: ModuleType) -> list[tuple[Registry[Any], type]]:
 
 
 def _module_name(path: Path) -> str:
-    """Return the module name of a plugin file."""
+    """Return a module name for a plugin file that no other file has in this process."""
     name = f"simgap_plugin_{path.stem}"
     number = 1
     # Two files of the same name in different folders need different modules, because the source of

@@ -273,7 +273,7 @@ def _find_first_difference(
 
 
 def _select_rows(runs: pd.DataFrame, max_count: int) -> pd.DataFrame:
-    """Select at most `max_count` rows, evenly spaced."""
+    """Select at most `max_count` rows, evenly spaced, since simulating all again takes long."""
     row_indices = np.unique(
         np.linspace(0, len(runs) - 1, min(max_count, len(runs))).round().astype(int)
     )

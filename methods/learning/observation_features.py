@@ -81,7 +81,16 @@ def resample_runs(observations: Array, lengths: tuple[int, ...], points: int) ->
 
 
 def _interpolated(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
-    """Interpolate linearly between available samples, shape (points,); NaN if there are none."""
+    """Interpolate linearly between available samples of one channel of one run.
+
+    Args:
+        at: (points,) sample indices at which values are computed; they need not be whole.
+        samples: (T,) indices of the samples.
+        values: (T,) samples; NaN for missing ones.
+
+    Returns:
+        (points,) values; NaN if all samples are missing.
+    """
     there = ~np.isnan(values)
     if not there.any():
         return np.full(len(at), np.nan)

@@ -67,7 +67,11 @@ class PosteriorRounds:
             return self._train(points, self._compute_features(residuals), count)
 
     def _fit_components(self, residuals: Array) -> None:
-        """Compute the principal components of the first round's residuals."""
+        """Compute the principal components of the first round's residuals (n, N).
+
+        Later rounds use the same components, so that the network's inputs keep their meaning. At
+        most `_MAX_COMPONENTS` are used; those without variance (rounding errors) are left out.
+        """
         self._centre = residuals.mean(axis=0)
         _, singular, directions = np.linalg.svd(residuals - self._centre, full_matrices=False)
         kept = max(int((singular[:_MAX_COMPONENTS] > 1e-9 * singular[0]).sum()), 1)

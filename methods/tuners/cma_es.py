@@ -103,7 +103,10 @@ class CMAES(Tuner):
 
 
 def _rank_failures_last(losses: Array) -> Sequence[float]:
-    """Return losses with failed simulations ranked last."""
+    """Return losses (n,) with failed simulations ranked last.
+
+    CMA-ES only uses the order of the losses, so an infinite one is replaced by a large number.
+    """
     finite = np.isfinite(losses)
     worst = np.max(losses, where=finite, initial=0.0)
     # Only ranks matter, so any number larger than the worst loss is suitable.

@@ -185,7 +185,10 @@ class TuneNetLeastSquares(TuneNet):
 
 
 def _orthogonal_complement(basis: list[Array], dim: int) -> Array:
-    """Return orthonormal directions (m, dim) orthogonal to `basis`; the axes if it is empty."""
+    """Return orthonormal directions (m, dim) orthogonal to `basis`; the axes if it is empty.
+
+    `basis` are orthonormal vectors (dim,): directions in which the slope is already known.
+    """
     if not basis:
         return np.eye(dim)
     # These are the right singular vectors beyond the rank.

@@ -241,7 +241,12 @@ class InContextTransformer(Tuner):
         self._prepared = NoiseMatchedNetworks.train(data, rng, self.make_feature_config(), learned)
 
     def _histories(self, each: int, rng: np.random.Generator) -> HistoryIndices:
-        """Draw the histories of a batch from `each` simulations per scenario."""
+        """Draw the histories of a batch from `each` simulations per scenario.
+
+        A history is a sequence of simulations and a target among the others, given by their
+        indices. As published it follows the order of the binary search; otherwise the order is
+        random.
+        """
         window = min(self.window, each - 1)
         return (
             make_ordered_histories(each, window)

@@ -235,7 +235,11 @@ class BroydenSearch:
         return self._bracketed(guess, point, residual) if len(point) == 1 else guess
 
     def _learn(self, step: Array, change: Array) -> None:
-        """Apply Broyden's update (3); a step of length zero is ignored."""
+        """Correct the slope by Broyden's update (3), so that it explains the last step.
+
+        `step` (dim,) is the difference of two points and `change` (dim,) that of their estimates h.
+        A step of length zero is ignored.
+        """
         square = step @ step
         if square > 0.0:
             missed = change - self._slope @ step

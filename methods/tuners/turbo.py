@@ -188,7 +188,7 @@ class TuRBO(Tuner):
 
 
 def _draw_sobol_points(rng: np.random.Generator, n: int, dim: int) -> Array:
-    """Return scrambled Sobol points (n, dim)."""
+    """Return scrambled Sobol points (n, dim): quasi-random, evenly spread in the unit cube."""
     from scipy.stats import qmc
 
     with warnings.catch_warnings():

@@ -309,7 +309,10 @@ CHARTS: Mapping[str, Callable[[ComparisonView], ComparisonChart]] = {
 def _make_notes(
     view: ComparisonView, coinciding: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    """Make the notes of the legend: failed runs and coinciding curves."""
+    """Make the notes of the legend, by tuner: failed runs and coinciding curves.
+
+    `coinciding` are the notes on tuners whose curves lie on those of others; None for none.
+    """
     parts = (view.statistics.notes, coinciding or {})
     names = dict.fromkeys(name for part in parts for name in part)
     return {name: "; ".join(part[name] for part in parts if name in part) for name in names}

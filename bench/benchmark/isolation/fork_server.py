@@ -175,7 +175,7 @@ def _run_service(request: dict[str, Any], pipes: list[int], layers: list[str]) -
 
 
 def _discard_output() -> None:
-    """Discard output and close the input."""
+    """Discard output and close the input, which code of a tuner could use to reach the terminal."""
     null_device = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(null_device, descriptor)

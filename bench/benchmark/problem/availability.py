@@ -76,7 +76,10 @@ def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str,
 
 
 def _together(experiment: Experiment) -> Availability:
-    """Combine what is missing for the experiments that this one names."""
+    """Combine what is missing for the experiments that this one names.
+
+    Only the first missing data set is reported; the others follow when it has been downloaded.
+    """
     parts = {each.name: availability(each) for each in expand_sweep(experiment)}
     data_sets = [part.data_set for part in parts.values() if part.data_set]
     skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]

@@ -71,7 +71,13 @@ def _check(path: Path, where: str, values: Sequence[Any]) -> None:
 
 
 def _text(path: Path, where: str, value: Any) -> str:
-    """Return a value as text for a label."""
+    """Return a swept value as text, for the name of its experiment and thus for its folder.
+
+    Characters that do not fit into a folder name become hyphens.
+
+    Raises:
+        InputError: the value is a table.
+    """
     if isinstance(value, dict):
         raise make_error(path, where, "texts, numbers, bools or lists of them", value)
     if isinstance(value, list | tuple):
@@ -82,7 +88,10 @@ def _text(path: Path, where: str, value: Any) -> str:
 
 
 def _put(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
-    """Insert a value at the position that a key joined by dots names."""
+    """Insert a value at the position that a key such as ``noise.q`` names; tables are created.
+
+    Names that contain dots themselves are recognised if the table has them already.
+    """
     table, rest = document, key
     while (name := _first(table, rest)) != rest:
         table, rest = table.setdefault(name, {}), rest[len(name) + 1 :]

@@ -81,7 +81,10 @@ class InformationSpectrum:
 
 
 def _rms(squares: Array) -> Array:
-    """Return root means (k,) of squares (k, directions); NaN if there is no direction."""
+    """Return the root mean square (k,) over directions of squares (k, directions).
+
+    NaN if there is no direction.
+    """
     if squares.shape[1] == 0:  # numpy would warn of an empty mean
         return np.full(len(squares), np.nan)
     rms: Array = np.sqrt(squares.mean(axis=1))

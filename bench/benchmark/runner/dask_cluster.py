@@ -332,7 +332,10 @@ def run_on_worker(
 
 
 def _here(plugin: Plugin, content: bytes) -> Plugin:
-    """Return the plugin with its file on this machine."""
+    """Write a plugin file with this content on this worker's machine.
+
+    Returns the plugin with the path of the new file; a plugin without a file is returned unchanged.
+    """
     if not plugin.path:
         return plugin
     name = Path(plugin.path).name

@@ -220,7 +220,10 @@ _packages: dict[str, Plugin] = {}
 
 
 def _announce_installed(names: Iterable[str]) -> None:
-    """Inspect tuners of other packages before they are imported in this process."""
+    """Inspect tuners of other packages before they are imported in this process.
+
+    Their code must not run here, so a stub with the properties found is registered in their place.
+    """
     for name in names:
         if is_external_part(name):
             with suppress(PartUnavailableError):

@@ -74,7 +74,10 @@ def _main_module_left_out() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
-    """Block SIGINT in this thread; processes started in the block inherit the mask."""
+    """Block SIGINT in this thread; processes started in the block inherit the mask.
+
+    Ctrl-C is sent to all processes of the terminal's group; workers must finish their runs.
+    """
     if not hasattr(signal, "pthread_sigmask"):  # on Windows a new process is in no process group
         yield
         return

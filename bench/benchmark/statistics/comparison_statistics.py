@@ -178,7 +178,7 @@ class ComparisonStatistics:
         return self._medians[key]
 
     def _of_all(self, metric: str) -> RunCurves:
-        """Return the curves of a metric for all runs that have it."""
+        """Return the curves of a metric for all runs that have it, from a cache if possible."""
         if metric not in self._curves:
             there = self.all_runs[metric].notna()
             rows = self._all if there.all() else self._laid_out(self.all_runs[there])

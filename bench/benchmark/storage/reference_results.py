@@ -223,7 +223,7 @@ def _plain(value: Any) -> Any:
 
 
 def _said(value: Any) -> str:
-    """Format a value in one line."""
+    """Format a value of a configuration in one line, lists and tables cut off at 80 characters."""
     if isinstance(value, Mapping):
         inside = ", ".join(f"{key} = {_said(inner)}" for key, inner in value.items())
         return f"{{{inside}}}"[:80]

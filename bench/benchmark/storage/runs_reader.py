@@ -261,7 +261,13 @@ def _described(rows: pa.Table) -> list[str]:
 
 
 def _check_same(rows: pa.Table) -> None:
-    """Check that the columns that describe a run are constant within it."""
+    """Check that the columns that describe a run are constant within it.
+
+    These are columns such as tuner and target, which are repeated in each row of the run.
+
+    Raises:
+        CellError: a value differs from the row before.
+    """
     within = ~_new(rows)[1:]
     for name in _described(rows):
         bad = _changes(rows[name]) & within
@@ -272,7 +278,11 @@ def _check_same(rows: pa.Table) -> None:
 
 
 def _summarise_new_runs(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFrame:
-    """Return one line for each run that begins in these rows."""
+    """Return one line for each run that begins in these rows, a batch of a larger file.
+
+    `goes_on` is True if the first row belongs to the last run of the batch before. `offset` is the
+    number of rows before the batch, so that ``row`` is the row of the file at which the run begins.
+    """
     new = _new(rows)
     if goes_on:
         new[0] = False

@@ -215,7 +215,7 @@ def name_cell(problem: str, kind: str, condition: str, experiment: Experiment) -
 
 
 def _count_parameters(experiment: Experiment) -> int:
-    """Return the number of tuned parameters."""
+    """Return the number of tuned parameters, for which the simulator must be built."""
     from bench.benchmark.problem.tuning_problem import TuningProblem
 
     problem = TuningProblem(experiment)
