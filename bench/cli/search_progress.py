@@ -104,7 +104,9 @@ class SearchProgress:
         self.stage(name)
 
     def lines(self, empty: str = "", full: str = "") -> Iterator[str]:
-        """Yield the state as one line, in forms that need fewer and fewer columns.
+        """Yield the state of the search as one line, first the longest form, then shorter ones.
+
+        The caller shows the first one that fits into the width of the terminal.
 
         Args:
             empty: Character of the bar for the part that is not done; empty for no bar.

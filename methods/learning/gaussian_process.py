@@ -164,7 +164,7 @@ class GaussianProcess:
         return float(value), np.append(by_length, by_noise)
 
     def predict(self, points: Array) -> Array:
-        """Compute the posterior mean (2.25) at points (m, dim)."""
+        """Compute the posterior mean (m,) of the function at points (m, dim), eq. (2.25)."""
         squares = (points[:, None] - self.points) ** 2
         k, _ = self._correlation(squares)
         mean: Array = self.mean + k @ self._alpha  # (2.25)

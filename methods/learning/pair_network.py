@@ -283,9 +283,11 @@ def _initial(
 def _loss(
     design: PairNetworkDesign, w: dict[str, Any], alone: bool
 ) -> Callable[[Any, Any, Any], Any]:
-    """Return the data term of (3) as a function of both sides' rows and the parameters.
+    """Return a function that computes the loss (3) without the penalty on the weights.
 
-    The function's arguments are rows (n, m, D), (n, m, E) and parameters (n, m, dim).
+    The function's arguments are the input rows of the proposed side (n, m, D) and of the target's
+    side (n, m, E), and the parameters (n, m, dim), for n scenarios of m simulations. `w` are the
+    weights as tensors. `alone` is True for a network that sees the target only (direct regression).
     """
     import torch
     from torch.nn.functional import softplus

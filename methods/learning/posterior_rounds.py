@@ -47,13 +47,15 @@ class PosteriorRounds:
     def update(self, evaluation: Evaluation, count: int, rng: np.random.Generator) -> Array:
         """Train on one more round of simulations, and draw the points of the next.
 
+        With too few successful simulations the points are uniformly random.
+
         Args:
             evaluation: evaluation of the round's points.
             count: number of points to draw.
             rng: random generator.
 
         Returns:
-            (count, dim) points.
+            (count, dim) points drawn from the posterior.
         """
         residuals = self._task.residuals(evaluation.observations)
         usable = np.isfinite(residuals).all(axis=1)

@@ -18,11 +18,13 @@ _FIXED_POINT_ITERATIONS = 60
 
 
 def generate_quasi_random_points(count: int, shift: Array) -> Array:
-    """Return quasi-random points of the unit cube.
+    """Return quasi-random points of the unit cube by the additive recurrence (2).
+
+    They fill the cube more evenly than random points. A random shift gives another set of points.
 
     Args:
         count: number of points.
-        shift: (d,) shift s of (2).
+        shift: (d,) shift s of (2), in the unit cube.
 
     Returns:
         (count, d) points.

@@ -121,10 +121,11 @@ class TuneNetLeastSquares(TuneNet):
     def _build_linear_model(
         self, run: EvaluationHistory, finish: LeastSquares
     ) -> SimulationGenerator[LinearModel]:
-        """Build the linear model at the lowest loss.
+        """Build the linear model of the residuals around the point with the lowest loss.
 
-        Its Jacobian consists of secants to points nearby, and of finite differences in the
-        remaining directions.
+        Simulations nearby are used for the Jacobian, since they cost nothing more (1): it has
+        secants to these points, and finite differences, which are simulated, in the remaining
+        directions.
         """
         finite = np.isfinite(run.losses)
         best = int(np.nanargmin(np.where(finite, run.losses, np.nan)))

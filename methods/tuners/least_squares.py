@@ -264,11 +264,14 @@ class LinearModel:
         return bool(here > _MIN_RELATIVE_SENSITIVITY * (self.jacobian**2).mean())
 
     def compute_step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
-        """Compute the step (1) within the cube, and the predicted decrease of the sum of squares.
+        """Compute Marquardt's step (1) from the model's point, clipped to the unit cube.
 
         Args:
             chosen: mask of the fitted samples.
-            mu: damping.
+            mu: damping; a larger one gives a shorter step.
+
+        Returns:
+            The step (dim,), and the decrease of the sum of squares that the linear model predicts.
         """
         r = self.residual[chosen]
         jacobian = self.jacobian[chosen]

@@ -158,12 +158,15 @@ def enter_process_namespace() -> list[str]:
 def lock_down(policy: AccessPolicy, has_user_namespace: bool) -> list[str]:
     """Apply the remaining restrictions to this process permanently.
 
+    This comes before code of a tuner runs in it. They concern the file system, memory, open files
+    and system calls.
+
     Args:
-        policy: access policy.
+        policy: what the process may still access.
         has_user_namespace: True if the process has a user namespace.
 
     Returns:
-        Names of the active isolation layers.
+        Names of the isolation layers that the kernel has permitted.
     """
     active: list[str] = []
     # If its own /proc cannot be mounted, Landlock allows only this process's part of the old one.

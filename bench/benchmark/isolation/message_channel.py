@@ -141,13 +141,13 @@ class MessageChannel:
         size: int = 0,
         deadline: float = float("inf"),
     ) -> None:
-        """Send a message.
+        """Send a message to the other side.
 
         Args:
-            kind: one byte.
+            kind: one byte that says what the message means.
             parts: parts of the body; arrays are float64.
-            flags: 0 to 255.
-            size: at least 0.
+            flags: 0 to 255; the meaning depends on the kind.
+            size: at least 0, such as the number of points; the meaning depends on the kind.
             deadline: latest time, as of `time.perf_counter`.
 
         Raises:

@@ -166,7 +166,11 @@ class IsolatedSteps:
         return self._asked()
 
     def send(self, evaluation: Evaluation) -> Array | Proposal:
-        """Send an evaluation, and return the next proposal."""
+        """Send an evaluation to the tuner, and return its next proposal.
+
+        It has the losses and observations of the last proposal. The flags tell the process on which
+        processor to run, see `AffinityController`.
+        """
         flags = self._pace.record_exchange()
         # False until the next proposal: if this fails, the process has been ended.
         self._waits = False

@@ -183,7 +183,10 @@ class ForkServerClient:
                 path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """End the fork server and every process that it started."""
+        """End the fork server and every process that it started, and delete their scratch folder.
+
+        The server ends by itself when its link is closed; it is killed if this takes more than 5 s.
+        """
         atexit.unregister(self.close)
         self._link.close()
         with contextlib.suppress(subprocess.TimeoutExpired):

@@ -70,6 +70,9 @@ class InformationSpectrum:
     def compute_directional_errors(self, errors: Array) -> tuple[Array, Array]:
         """Compute RMS errors along the stiff and along the sloppy directions.
 
+        The data determine the stiff directions of the parameter space well, and the sloppy ones
+        badly, so that errors along sloppy directions say little about a tuner.
+
         Args:
             errors: (k, dim) recommended minus true parameters, in training ranges.
 

@@ -329,7 +329,11 @@ class _WorkerSlot:
         self.given[future] = call
 
     def collect(self, waiting: deque[_AssignedCall]) -> list[tuple[_AssignedCall, Any]]:
-        """Return the ended calls; put those that a lost worker did not begin back into `again`."""
+        """Return the calls of this worker that have ended, each with its result or exception.
+
+        Calls that a lost worker did not begin, or whose end is no fault of theirs, are put back to
+        the front of `waiting`. A lost worker is replaced.
+        """
         ended: list[tuple[_AssignedCall, Any]] = []
         lost = False
         for future in [future for future in self.given if future.done()]:

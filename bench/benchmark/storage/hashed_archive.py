@@ -165,7 +165,11 @@ def _sound(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 
 
 def _wrong(entry: zipfile.ZipInfo) -> str:
-    """Return why an entry must not be unpacked; empty if it may be."""
+    """Return why an entry of an archive must not be unpacked; empty if it may be.
+
+    An archive of unknown origin could contain paths outside its folder, links or devices, which
+    would overwrite files of the user.
+    """
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     parts = name.split("/")
     # If the two stored names of an entry differ, programs would unpack it to different paths.
