@@ -19,6 +19,7 @@ from methods.tuner import Tuner
 _BUDGET = 5
 """Number of simulations of a run, enough for a tuner to use all of its features."""
 _SEED = 0
+"""Seed of the runs that are compared."""
 
 
 def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:

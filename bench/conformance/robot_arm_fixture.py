@@ -51,6 +51,7 @@ OBSERVED_CHANNELS = ("q.shoulder", "q.elbow", "qd.shoulder", "tau.elbow", "s.wri
 """Observed channels, one of each kind."""
 
 _SECONDS = 0.8
+"""Duration of a run in seconds."""
 
 
 @lru_cache(maxsize=1)

@@ -38,7 +38,9 @@ from sims.system_simulator import SystemSimulator
 VERDICTS = ("adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable")
 """Possible verdicts; see docs/verdict.md."""
 _MAX_CAUSES = 20
+"""Maximum number of causes in an answer."""
 _MAX_ALTERNATIVES = 200
+"""Maximum number of alternative effects of one cause in an answer."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Options that a command, a Python function and the code below them share, declared once.
 
 A frozen dataclass declares the options of one job. `option` declares a field, `with_options` gives
-a public function the fields as keyword arguments, and `bench.cli.option_arguments` makes options of
+a public function the fields as keyword arguments, and `bench.cli.shared_options` makes options of
 a command from them. The docstring of the class is the documentation of both.
 """
 

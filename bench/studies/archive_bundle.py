@@ -40,8 +40,11 @@ from sims.extended_simulator import ExtendedSimulator, open_extended
 
 PrintLine = Callable[[str], None]
 VERDICT_FILE = "verdict.json"
+"""File of the verdict in the folder of an explanation."""
 EXTENDED_MODEL_FILE = "extended.toml"
+"""File of the extended simulator in the folder of an explanation."""
 _FORMAT = 1
+"""Version of the manifest's format."""
 _RECORDINGS_FOLDER = "recordings"
 """Folder of recordings in the archive of an explanation."""
 _PLUGINS = "plugins"

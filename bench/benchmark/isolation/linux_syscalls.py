@@ -33,11 +33,16 @@ CLONE_NEWPID = 0x20000000
 PR_SET_PDEATHSIG = 1
 """Option of prctl: the signal that a process gets when its parent ends."""
 _PR_SET_DUMPABLE = 4
+"""Option of prctl: whether other processes of the user may read this process's memory."""
 _PR_SET_NO_NEW_PRIVS = 38
+"""Option of prctl: programs that this process starts get no further privileges."""
 
 _LANDLOCK_CREATE = 444
+"""Number of the system call landlock_create_ruleset."""
 _LANDLOCK_ADD_RULE = 445
+"""Number of the system call landlock_add_rule."""
 _LANDLOCK_RESTRICT = 446
+"""Number of the system call landlock_restrict_self."""
 _LANDLOCK_READ = 1 << 0 | 1 << 2 | 1 << 3
 """Landlock rights to execute (as a library is), to read a file, and to read a folder."""
 _LANDLOCK_ALL = ((1, (1 << 13) - 1), (2, 1 << 13), (3, 1 << 14), (5, 1 << 15))
@@ -132,7 +137,9 @@ _MS_CAREFUL = 0b1110
 
 
 _MOUNT_SETATTR = 442
+"""Number of the system call mount_setattr."""
 _AT_RECURSIVE = 0x8000
+"""AT_RECURSIVE: mount_setattr changes all mounts below the given one too."""
 _READ_ONLY = 0b0011
 """MOUNT_ATTR_RDONLY and NOSUID."""
 

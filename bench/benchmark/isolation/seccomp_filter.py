@@ -24,6 +24,7 @@ from bench.benchmark.isolation.linux_syscalls import (
 )
 
 _PR_SET_SECCOMP = 22
+"""Option of prctl: install a filter of system calls."""
 
 _NUMBERS: Mapping[str, Mapping[str, int]] = {
     "x86_64": {

@@ -291,7 +291,7 @@ def run_experiment(
 ) -> None:
     """Execute every run of a prepared experiment that is not yet stored.
 
-    Each result is added to `results.kept` as soon as its run ends.
+    Each result is appended to `results.run_sink` as soon as its run ends.
 
     Args:
         results: prepared experiment from `prepare_experiment`.

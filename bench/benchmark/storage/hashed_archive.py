@@ -34,10 +34,13 @@ _MOST = 100_000
 """Maximum number of files in an archive."""
 _MANIFEST_BYTES = 64 << 20
 _BLOCK = 1 << 20
+"""Number of bytes that are read at a time."""
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """The earliest time that a zip file can store, which is given to every file."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compression methods that an archive may have."""
 _ENCRYPTED = 0x1
+"""Flag of an encrypted file in a zip archive."""
 _LONGEST = 1000
 """Maximum length of a path in characters."""
 
