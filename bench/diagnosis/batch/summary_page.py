@@ -146,6 +146,10 @@ class _ClosedShare(NamedTuple):
 
 
 def _format_verdicts(rows: Sequence[LogResult]) -> str:
+    """Count the logs with each verdict in words, for example "2 adequate, 1 unknown".
+
+    Logs that could not be explained have no verdict; they are counted at the end.
+    """
     counts = Counter(row.verdict for row in rows if row.verdict)
     ordered = [*_VERDICT_ORDER, *(verdict for verdict in counts if verdict not in _VERDICT_ORDER)]
     parts = [f"{counts[verdict]} {verdict}" for verdict in ordered if counts[verdict]]

@@ -475,6 +475,11 @@ def _liveliest_part(run: Run) -> slice:
         return slice(0, max(count, min(run.times.size, 2)))
 
     def movement(begin: int) -> float:
+        """Sum the standard deviations of all channels in the part that starts at sample `begin`.
+
+        Each is divided by the standard deviation of the channel in the whole run, so that channels
+        with different units can be added. Channels without samples in the part are skipped.
+        """
         total = 0.0
         for values in run.channels.values():
             part = values[begin : begin + PART_SAMPLES]

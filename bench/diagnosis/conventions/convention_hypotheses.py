@@ -104,10 +104,17 @@ class ConventionHypothesis:
         return replace(recording, noise=noise, runs=tuple(map(self._applied_to, recording.runs)))
 
     def _applied_to(self, run: Run) -> Run:
+        """Return one run with its signals converted to the conventions of the model.
+
+        `run.before` has, by signal name, the stacked pair of time stamps and values recorded before
+        the run; the values are converted like those of the run. The initial states are dropped if a
+        signal changes, because they were stated in the old convention.
+        """
         signals = {**run.inputs, **run.channels}
         earlier = {name: values[1] for name, values in run.before.items()}
 
         def changed(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
+            """Return signals by name; a signal with a change is computed from `source`."""
             return {
                 name: self.changes[name].applied(source) if name in self.changes else old
                 for name, old in values.items()

@@ -211,6 +211,11 @@ class Hypothesis:
         return self.scale * signal.scale
 
     def _sentence(self, file: str, factors: Mapping[str, float]) -> str:
+        """Write what seems wrong with a unit, sign or scale, and how the user corrects it.
+
+        `file` is the name of the description file. `factors` has, by signal name, the factor by
+        which the recorded values have to be multiplied; it is shown for a wrong unit.
+        """
         first, unit = self.signals[0], self.units[0]
         names = listed([signal.said for signal in self.signals], _NAMED)
         table = f"[{first.kind}.{first.name}]" if len(self.signals) == 1 else "the tables of each"
@@ -390,6 +395,12 @@ def _gain(signal: Signal, unit: str) -> float:
 
 
 def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
+    """Return the run with each signal named in `factors` multiplied by its factor.
+
+    `run.before` has pairs of time stamps and values recorded before the run; only the values are
+    multiplied.
+    """
+
     def scaled(signals: Mapping[str, Array]) -> dict[str, Array]:
         return {n: v * factors[n] if n in factors else v for n, v in signals.items()}
 
@@ -512,6 +523,10 @@ def _promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypot
     """
 
     def best(those: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
+        """Sort hypotheses by their misfit in the first `share` of each run, smallest first.
+
+        The recording is simulated with the starting values of the base fit; nothing is fitted here.
+        """
         scores = []
         for one in those:
             world, noise = _world(subject, one.factors())
@@ -524,6 +539,16 @@ def _promising(subject: Subject, hypotheses: Sequence[Hypothesis]) -> list[Hypot
 
 
 def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[RunEvaluator, NoiseModel]:
+    """Build the run evaluator of the rescaled recording, and white noise at its noise floor.
+
+    Args:
+        subject: Recording and simulator to check.
+        factors: Factor of each signal that is rescaled, by name.
+
+    Returns:
+        The run evaluator, which the caller closes, and the noise with the standard deviation sigma
+        (C,) of each channel and no autocorrelation.
+    """
     recording = subject.rescaled(factors)
     world = subject.world(recording)
     sigma = compute_noise_floor(world, recording).sigma

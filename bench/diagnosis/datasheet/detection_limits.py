@@ -217,6 +217,15 @@ class _Shown:
         found: DirectionSet,
         residual: Array,
     ) -> None:
+        """Compute the information on each candidate coefficient, eq. (1), and its step, eq. (2).
+
+        The columns of the least-squares problem are the q fitted parameters, the K candidate
+        directions and the residual. `left` (q + K + 1, q + K + 1) has their inner products after
+        the initial states are projected out by a Schur complement. `along` (K, q) has the
+        coefficients with which the parameters reproduce each direction; `powers` (K,) is the
+        information of eq. (1) that remains, and `leaning` (K,) the estimate after one Gauss-Newton
+        step from zero, eq. (2).
+        """
         self.world, self.found = world, found
         self.q = fit.free.size
         self.places = fit.free.tolist()
@@ -260,6 +269,11 @@ class _Shown:
         return self.world.available_effects[effect].on(self.world.simulator.system)[place].name
 
     def _proportional(self, k: int) -> DetectionLimit:
+        """Return the detection limit of direction k, whose effect is proportional to its size.
+
+        The limit is half the 95 % interval, 1.96 / sqrt(power) with the power of eq. (1). It is
+        infinite if the data contain no information on the coefficient.
+        """
         power = self.powers[k]
         size = Z95 / np.sqrt(power) if power > 0 else np.inf
         parameter = self.world.parameters[self._place(self.found.candidates[k])]
@@ -301,6 +315,12 @@ class _Shown:
         return False
 
     def _limit(self, name: str) -> DetectionLimit:
+        """Return the detection limit of a limit or backlash, which is not proportional to its size.
+
+        The search contains directions of several fixed sizes of the effect (`probes`). A size is
+        detectable if it changes the runs by at least `MIN_DETECTABLE_LIMIT_SIGMAS`, after the
+        parameters of the model have absorbed what they can.
+        """
         probes = [
             (k, p) for k, p in enumerate(self.found.candidates) if p.effect == name and p.fixed
         ]

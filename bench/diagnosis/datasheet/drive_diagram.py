@@ -176,6 +176,12 @@ class _Joint:
     """Friction and force laws of a joint, evaluated at rest."""
 
     def __init__(self, subject: SheetSubject, extended: ExtendedSimulator) -> None:
+        """Collect the static force and friction laws that the extended simulator has at the joint.
+
+        `laws` has each law with its coefficients (k, 1, 1). `without` names the laws with a hidden
+        state; the diagram omits them because they act before the drive force. `stated` is the
+        Coulomb friction in the model file, in N or N·m; 0 if there is none.
+        """
         self.system = _Slide() if subject.is_prismatic else _StaticJoint()
         self.laws: list[tuple[Effect, Array]] = []
         self.without: tuple[str, ...] = ()
@@ -220,6 +226,10 @@ class _Joint:
         return pull
 
     def _moment(self, drive: Array, load: Array) -> StateSnapshot:
+        """Build the state of the joint at rest, under N pairs of drive and load force (N,).
+
+        Friction and force laws are evaluated at this state.
+        """
         nothing = np.zeros((len(drive), 1))
         inputs = {"drive": drive[:, None], "load": load[:, None]}
         return StateSnapshot(

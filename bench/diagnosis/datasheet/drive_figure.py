@@ -267,6 +267,7 @@ def _beside(figure: Figure, diagram: DriveDiagram, x: float, y: float) -> None:
 
 @contextmanager
 def _styled() -> Iterator[None]:
+    """Apply the Matplotlib style of data sheets in a `with` block; hide missing-glyph warnings."""
     from matplotlib import rc_context
 
     with rc_context(_STYLE), warnings.catch_warnings():

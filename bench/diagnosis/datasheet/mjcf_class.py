@@ -65,6 +65,11 @@ def build_mjcf(facts: SheetContent, folder: Path) -> MjcfFiles:
 
 
 def _of_robot(facts: SheetContent) -> MjcfFiles:
+    """Build the MJCF default class of a joint of a robot, and the robot's model with this class.
+
+    The class is for the joint and its first actuator. The model is omitted if the class cannot be
+    used in it.
+    """
     kind: Any = facts.subject.kind
     causes = collect_causes(facts.extended)
     actuator = next(iter(facts.subject.actuators), None)
@@ -106,6 +111,10 @@ def _of_system(facts: SheetContent, folder: Path) -> MjcfFiles:
 
 
 def _model_file(facts: SheetContent, setting: ConstantsGroup) -> RenderedModelFile | None:
+    """Render the system with the constants of one group of runs as an MJCF model.
+
+    Return None if the constants give no valid model, or if the system has no form in MJCF.
+    """
     try:
         return facts.subject.kind.system.model_file(setting.numbers)
     except ZeroDivisionError:

@@ -80,6 +80,12 @@ class SheetRow:
 
 
 def _reached(reach: DetectionLimit) -> dict[str, Any]:
+    """Return the TOML keys of a detection limit in the row of a data sheet.
+
+    `resolved` is the detectable size of a proportional effect; `none_above` and `none_below`
+    exclude a backlash above, or a limit below, a size. The size is omitted if the data are
+    insensitive to the effect.
+    """
     row: dict[str, Any] = {}
     if np.isfinite(reach.size):
         row[{"": "resolved", "above": "none_above", "below": "none_below"}[reach.limit]] = (
@@ -224,6 +230,11 @@ class _Rows:
             yield self._absent(effect, label, unit, reach)
 
     def _absent(self, effect: str, label: str, unit: str, reach: DetectionLimit) -> SheetRow:
+        """Build the row of an effect that is not in the model, with its detection limit.
+
+        If the effect changes a number of the model file, the limit is converted to the unit of that
+        number. `label` is the name of the row, and `unit` the unit of the coefficient.
+        """
         stated = self.subject.get_model_file_value(effect)
         value = None
         if stated is not None:
@@ -255,6 +266,16 @@ class _Rows:
         state: QuantityState,
         cause: Cause | None = None,
     ) -> SheetRow:
+        """Build the row of a fitted parameter or a diagnosed cause.
+
+        Args:
+            effect: Effect with its place, as ``name@place``.
+            label: Name of the row.
+            number: Fitted coefficient of the effect. If the effect changes a number of the model
+                file, the row has the resulting total of that number instead.
+            state: State of the quantity, such as ``fitted`` or ``found``.
+            cause: Cause in the verdict, for its p-value and alternatives; None for a parameter.
+        """
         placed = library.find_effect(effect, self.subject.kind.system)
         stated = self.subject.get_model_file_value(effect)
         if stated is not None:
@@ -275,6 +296,7 @@ class _Rows:
 def _row(
     name: str, says: str, part: str, state: QuantityState, number: FittedValue, stated: Any
 ) -> SheetRow:
+    """Build a row with a fitted value and, unless `stated` is None, the model file's value."""
     value = None if stated is None else stated.value
     return SheetRow(name, says, part, state, number.unit, number, value)
 

@@ -137,6 +137,12 @@ class SheetSubject:
         return None
 
     def _stated(self, base: str, spot: Any) -> ModelFileValue:
+        """Return the model file's value of the number that an effect changes here.
+
+        `base` is the name of the effect without its place, and `spot` the joint or actuator. A
+        number that an effect changes by a share of its value has its own unit; for others the value
+        has the unit of the effect's coefficient.
+        """
         length, force = ("m", "N") if spot.kind == "slide" else ("rad", "N*m")
         share = base in _SHARES
         effect = library.find_effect(f"{base}@{spot.name}", self.kind.system)

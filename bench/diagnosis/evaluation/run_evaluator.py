@@ -129,6 +129,12 @@ class RunEvaluator:
         free: Sequence[str] = (),
         candidates: Sequence[str] | None = None,
     ) -> None:
+        """Build the simulator with all observable effects, and prepare the runs as padded arrays.
+
+        An effect is included if the recorded channels and inputs can show it. `free` names
+        constants that are fitted like parameters. `candidates` are the names of the effects to
+        include; None means all that are observable.
+        """
         self.kind = kind
         self.recording = recording
         self.engine = engine
@@ -264,6 +270,10 @@ class RunEvaluator:
         return self._travels[name]
 
     def _travel(self, name: str) -> float:
+        """Compute the largest range (maximum less minimum) of a channel within one run.
+
+        The range is 0 if the channel is not recorded. `_range` caches it.
+        """
         if name not in self.channels:
             return 0.0
         values = self.observed[:, :, self.channels.index(name)]

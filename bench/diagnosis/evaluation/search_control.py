@@ -108,6 +108,11 @@ class SearchControl:
         progress: ProgressCallback | None = None,
         listener: ProgressListener | None = None,
     ) -> None:
+        """Set the deadline, and start the progress estimate at the fit of the base model.
+
+        A search answers a sequence of questions, such as ``base_fit``. Each has a weight, its usual
+        duration in seconds, from which the finished share is estimated.
+        """
         self.deadline = None if budget is None else time.monotonic() + budget
         self._stop = stop
         self._progress = progress

@@ -84,6 +84,11 @@ class ForkedWorkerPool:
     """
 
     def __init__(self, jobs: int = 1) -> None:
+        """Create a pool without workers; they are forked when enough work was done to justify them.
+
+        `_spent` is the time, in seconds, that tasks took in this process; workers start when it
+        reaches `PARALLEL_THRESHOLD_SECONDS`.
+        """
         self._jobs = jobs
         self._spent = 0.0
         # `_worlds` are all registered worlds, `_known` those that the present workers inherited.
@@ -164,6 +169,11 @@ class ForkedWorkerPool:
             self._start()
 
     def _start(self) -> None:
+        """Fork the workers, each with its own pipe to this process.
+
+        A forked worker inherits the registered worlds without a copy. `told` has the arguments of
+        the worker's main function.
+        """
         if self._ending is None:
             self._ending = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")
@@ -188,6 +198,15 @@ class ForkedWorkerPool:
         task: Task[Result],
         items: Sequence[tuple[Any, ...]],
     ) -> Iterator[tuple[int, Result]]:
+        """Distribute the items of a task among the workers, and yield each result as it arrives.
+
+        An item is processed again if its worker dies; without any worker, the items are processed
+        in this process. `waiting` has the numbers of unprocessed items, `busy` the item number of
+        each working pipe, and `free` the idle pipes. `place` is the index by which the workers know
+        the world.
+
+        An error in a task is raised after all other items are finished.
+        """
         errors: dict[int, tuple[Exception, str]] = {}
         waiting = list(range(len(items)))[::-1]
         busy: dict[Connection, int] = {}
@@ -272,6 +291,11 @@ class _Pickler(pickle.Pickler):
     """Pickler that keeps the memory order of arrays, because sums depend on it in the last bit."""
 
     def reducer_override(self, thing: Any) -> Any:
+        """Pickle an array that is not C-contiguous together with the order of its axes in memory.
+
+        Pickle itself would not keep every memory order. All other objects are pickled as usual,
+        which `NotImplemented` requests.
+        """
         if type(thing) is not np.ndarray or thing.ndim < 2 or thing.flags.c_contiguous:
             return NotImplemented
         order = np.argsort([-abs(stride) for stride in thing.strides], kind="stable")
@@ -291,6 +315,7 @@ def serialise_message(message: Any) -> bytes:
 
 
 def _sent(pipe: Connection, message: Any) -> bool:
+    """Send a message through the pipe; return False if the process at the other end is gone."""
     try:
         pipe.send_bytes(serialise_message(message))
     except OSError:
