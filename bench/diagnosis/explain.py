@@ -202,6 +202,16 @@ class _ExplainRun:
         options: ExplainOptions,
         crew: ForkedWorkerPool,
     ) -> None:
+        """Load and check the recording, and build the run evaluators, before any fit.
+
+        The steps are: read the logs, check the plausibility, thin the samples, leave out the first
+        samples while actuator filters settle, split the runs into segments, and give channels
+        without noise a small one. Every change is reported to the user with `say` and kept in
+        `notes`.
+
+        Raises:
+            InputError: The recording or the simulator cannot be used for a diagnosis.
+        """
         self.started = time.perf_counter()
         self.seed = options.seed
         self.tuner = options.tuner
@@ -304,6 +314,10 @@ class _ExplainRun:
         return VerdictBuilder(*given)
 
     def _world(self, kind: type[SystemSimulator], runs: Sequence[Run]) -> RunEvaluator:
+        """Build a run evaluator of some runs that shares the search control and the worker pool.
+
+        It also has the widened bounds and the identified parameters of the base model found so far.
+        """
         world = RunEvaluator(
             kind, self.recording, runs, self.engine, list_hat_effects(kind), self.free
         )
@@ -315,12 +329,19 @@ class _ExplainRun:
         return world
 
     def _takes_no_effects(self) -> InputError:
+        """Return the error for a simulator to which no effects can be added."""
         return InputError(
             f"{self.path}: simulator {self.recording.system} takes no effects, "
             "so nothing can be missing from it"
         )
 
     def _check(self) -> None:
+        """Refuse a recording that is too short, or whose values are far too large.
+
+        Raises:
+            InputError: It has too few samples for its parameters and initial states, or the values
+                of a channel are so large that its unit must be wrong.
+        """
         world = self.fitting
         # With fewer samples than unknowns every model fits exactly, and no gap would be visible.
         samples = int(np.isfinite(world.observed).sum())
@@ -346,6 +367,12 @@ class _ExplainRun:
     # With a thread per core, small matrix products take five times as long on a busy machine.
     @limit_to_one_thread()
     def run(self) -> Explanation:
+        """Fit the base model, search for causes, and build the verdict and the report data.
+
+        Raises:
+            InputError: The conventions of the recording contradict the model file, or no fit of the
+                base model can simulate the recording.
+        """
         self._refuse_broken_conventions()
         self.watch.stage(STAGES["base_fit"])
         base = self._base()
@@ -876,6 +903,11 @@ class _ExplainRun:
         return find_start_with_tuner(self.tuner, self.fitting, self.noise, self.seed)
 
     def _extended(self, search: EffectSearch, finding: DiagnosisResult) -> ExtendedSimulator:
+        """Build the extended simulator: the base simulator with fitted values and found effects.
+
+        `own` has the fitted base parameters, `freed` the constants fitted like parameters, and
+        `added` the coefficients of each found effect, all by name.
+        """
         world, numbers = (
             self.fitting,
             self.assessor.collect_parameter_estimates(search, finding.model),

@@ -163,6 +163,7 @@ class Explanation:
         return json.dumps(self.answer.to_document(), indent=1, allow_nan=False) + "\n"
 
     def __repr__(self) -> str:
+        """Summarise the verdict, the causes and the share of the gap that is closed."""
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
         lines.append(format_early_stop(self.story))
         # Titles and names come from files; a long one must not fill the cell.

@@ -120,6 +120,11 @@ def collect_causes(extended: ExtendedSimulator) -> dict[str, Mapping[str, Fitted
 
 
 def _numerics(kind: Any) -> dict[str, Mapping[str, FittedValue]]:
+    """Return the time step and integrator as causes, if they differ from those of the model file.
+
+    The step is in seconds; the integrator is its MuJoCo number. They have no intervals because they
+    are chosen, not fitted.
+    """
     from sims.robot.integrator_settings import INTEGRATOR_IDS, read_integrator_settings
 
     own, numerics = read_integrator_settings(kind.robot), kind.numerics

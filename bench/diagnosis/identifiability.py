@@ -101,6 +101,12 @@ class _Identified:
     def __init__(
         self, world: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit, found: DirectionSet
     ) -> None:
+        """Scale the derivatives by the noise, and project the unknown initial states out of them.
+
+        `states` (R, n, s) has the scaled derivatives by the initial states, where n = T · C is
+        the number of samples times channels of a run. `parameters` (R · n, q) has those by the q
+        free parameters, without the part that a change of the initial states can reproduce.
+        """
         self.world, self.noise, self.fit, self.found = world, noise, fit, found
         self.seen = np.isfinite(world.observed)
         q = fit.free.size
@@ -230,6 +236,16 @@ def _number(
     bounds: tuple[float, float],
     mixed: Sequence[tuple[str, float]],
 ) -> ParameterIdentifiability:
+    """Classify a parameter by the width of its 95 % interval as a share of its plausible range.
+
+    Args:
+        name: Name of the parameter or cause.
+        free: Whether it is a free parameter of the model, not a possible cause.
+        unit: Unit of its value.
+        half: Half the width of its 95 % interval; infinite if the data are insensitive to it.
+        bounds: Plausible range.
+        mixed: Other parameters with their correlation; only the strongly correlated ones are kept.
+    """
     low, high = bounds
     share = 2.0 * half / max(high - low, 1e-300)
     word: IdentifiabilityLevel = "not identifiable"

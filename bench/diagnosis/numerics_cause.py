@@ -102,6 +102,12 @@ def add_numerics_cause(verdict: Verdict, coarse: CoarseStepFinding) -> Verdict:
 
 
 def _causes(coarse: CoarseStepFinding) -> list[Cause]:
+    """Return the integrator and the time step as causes if they differ from the model file.
+
+    Their p-value is that of the gain in twice the log-likelihood by Wilks' theorem, exp(-gain / 2)
+    for two parameters; the gain is limited to 1400 so that the p-value does not become zero by
+    underflow.
+    """
     from sims.robot.integrator_settings import INTEGRATOR_IDS
 
     own, numerics = coarse.refinement.own, coarse.refinement.numerics

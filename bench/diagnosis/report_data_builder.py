@@ -189,6 +189,10 @@ class DiagnosisReportDataBuilder:
         return residual_analysis.build_data_split(world, before, after), runs
 
     def _channels(self, sigma: Array) -> tuple[ChannelInfo, ...]:
+        """Return name, unit and noise of each channel.
+
+        `sigma` (C,) is the noise standard deviation of each channel in its unit.
+        """
         floor = self.assessor.noise_floor
         rows = zip(
             self.assessor.fitting_evaluator.simulator.channels,
@@ -281,6 +285,7 @@ class DiagnosisReportDataBuilder:
                 )
 
     def _structure(self) -> str:
+        """Say how the residual of the final model still differs from the noise of the sensors."""
         p_value = self.finding.lack_of_fit.p_value
         # Lack of fit is either a residual with a pattern, or one that is only too large.
         if p_value < STRUCTURE_P_VALUE_THRESHOLD:

@@ -329,6 +329,7 @@ def _estimates(numbers: Mapping[str, FittedValue]) -> JsonDocument:
 
 
 def _estimate(number: FittedValue) -> JsonDocument:
+    """Return a fitted value as a JSON object with value, unit and interval."""
     found: JsonDocument = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
     # Empty fields are left out.
     for key in ("at_bound", "stated", "total", "total_unit"):

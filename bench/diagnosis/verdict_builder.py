@@ -300,6 +300,10 @@ class VerdictBuilder:
         )
 
     def _cause(self, evidence: CauseEvidence, numbers: dict[int, FittedValue]) -> Cause:
+        """Build a cause of the verdict from an effect found by the search.
+
+        `numbers` has the fitted values by their index in the parameter vector.
+        """
         world = self.fitting_evaluator
         # The coefficients of an effect are contiguous in the parameter vector, in the effect's
         # order.
@@ -334,6 +338,11 @@ class VerdictBuilder:
         return float(np.sqrt(np.square(self.estimate_noise_sigma(finding)[self._counted()]).mean()))
 
     def _heldout(self, finding: DiagnosisResult, rng: np.random.Generator) -> HeldOutResult | None:
+        """Measure by how much the causes improve the prediction of held-out runs.
+
+        Return None if the prediction of the base model failed, or if no runs were predicted with
+        both models.
+        """
         runs, measured, names = (
             self.held_out_evaluator,
             finding.held_out_fits,

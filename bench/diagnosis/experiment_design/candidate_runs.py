@@ -80,6 +80,13 @@ class RigModel:
     """
 
     def __init__(self, world: RunEvaluator, seconds: float) -> None:
+        """Measure the usual input levels, command sizes and sampling interval of the present runs.
+
+        `rest` has the median of each input over all runs, in the unit of the input; `largest` its
+        largest deviation from this median. `driven` names the inputs that deviate at all. `step` is
+        the median sampling interval of the first run in seconds, and `begin` the initial state of a
+        candidate run.
+        """
         self.world, self.seconds = world, seconds
         self.old = world.tracks[0].scenario
         self.step = float(np.median(np.diff(self.old.times)))
@@ -195,6 +202,13 @@ class RigModel:
         return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
 
     def _says(self, plan: RunPlan, inputs: Mapping[str, Array], limited: Sequence[str]) -> str:
+        """Describe a plan in words that tell the user how to record the run.
+
+        Args:
+            plan: Plan of the run.
+            inputs: (T,) commands by name, after they are limited.
+            limited: Names of the inputs that were clipped to the limits of the setup.
+        """
         if plan.driven_inputs:
             what = plan.driven_inputs[0] if len(plan.driven_inputs) == 1 else "all inputs"
             text = f"{what}: {plan.form}, {plan.size:g} times as large as so far"

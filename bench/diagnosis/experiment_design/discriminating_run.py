@@ -207,6 +207,7 @@ def _limited(values: Any, limits: Interval | None) -> Any:
 
 
 def _longer(first: _Run) -> _Run:
+    """Return the run recorded for twice the time, with its inputs repeated from the beginning."""
     times = first.scenario.times
     later = times[1:] - times[0]
     twice = np.concatenate([times, times[-1] + later])

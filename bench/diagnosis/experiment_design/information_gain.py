@@ -110,6 +110,13 @@ class RunRanker:
     """Ranker of candidate runs for some models, the first of which is the present diagnosis."""
 
     def __init__(self, models: ModelSet, rivals: Sequence[FittedModel]) -> None:
+        """Prepare the noise, the limits of the setup, and the covariances of the parameters.
+
+        `known` has the covariance of the parameters of each model, as C in eq. (1). `pairs` has all
+        ordered pairs (true model, competing model). `most` is the total value above which a run
+        gains nothing more, and `patience` the maximum number of exact evaluations in a row. `free`
+        (s,) marks the initial states that have to be estimated.
+        """
         self.models, self.world = models, models.world
         self.known = [_known(models, one) for one in rivals]
         self.noise: NoiseModel = compute_fisher_blocks(models, rivals[0]).noise
@@ -136,6 +143,11 @@ class RunRanker:
         return sorted(entries, key=get_sort_key)
 
     def _entry(self, run: CandidateRun, slopes: Sequence[_LinearisedRun]) -> RunValue:
+        """Value a run with linearised models, one per model of the ranker.
+
+        With several models the value is the discrimination T of eq. (1), for each pair of a true
+        and a competing model; with one model it is the information gain D of eq. (2).
+        """
         if not self.pairs:
             value = _compute_information_gain(slopes[0], self.known[0])
             return RunValue(run, np.array([value]), value)
@@ -251,6 +263,12 @@ class RunRanker:
 
 
 def _known(models: ModelSet, model: FittedModel) -> _Known:
+    """Compute the covariance C of a model's parameters from the present runs, for eqs. (1) and (2).
+
+    The unit of each parameter, `spread`, is its standard error, but at most a tenth of the width of
+    its bounds: otherwise the step of a parameter that the data hardly determine would be too large
+    for a derivative.
+    """
     own = compute_covariance(models, model)
     bounds = np.array([models.world.parameters[i].bounds for i in model.fit.free]).reshape(-1, 2)
     widest = 0.1 * (bounds[:, 1] - bounds[:, 0])

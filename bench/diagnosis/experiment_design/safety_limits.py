@@ -50,6 +50,7 @@ class RigLimits:
     """
 
     def __init__(self, world: RunEvaluator, model: FittedModel) -> None:
+        """Simulate the present runs with the fitted model, and derive the channel limits."""
         self.world = world
         self.past = self._seen(
             model,
@@ -137,6 +138,13 @@ class RigLimits:
         return bounds
 
     def _within(self, channels: Mapping[str, Array]) -> bool:
+        """Return whether a simulated run stays within the limits of all monitored channels.
+
+        A run of a robot must not touch bodies that did not touch each other in the present runs.
+
+        Args:
+            channels: (T,) simulated values by channel. A run with NaN or infinity is rejected.
+        """
         for name, values in channels.items():
             low, high = self.bounds[name]
             slack = 1e-9 * max(abs(low), abs(high)) if np.isfinite([low, high]).all() else 0.0

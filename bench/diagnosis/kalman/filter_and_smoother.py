@@ -109,6 +109,7 @@ class LinearRuns:
         count = -(-samples // length)
 
         def cut(values: Any) -> Any:
+            """Cut an array (R, T or T - 1, ...) into segments; pad the last one with zeros."""
             padded = np.zeros((number, count * length, *values.shape[2:]), dtype=values.dtype)
             padded[:, : values.shape[1]] = values
             parts = padded.reshape(number * count, length, *values.shape[2:])

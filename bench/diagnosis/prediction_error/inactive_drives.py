@@ -387,6 +387,12 @@ class _Stretches:
     """
 
     def __init__(self, forces: Sequence[JointForces], joints: Sequence[int], state: int) -> None:
+        """Find the most likely intervals of the hypothesis, and keep those that are plausible.
+
+        `residuals` of a joint are its force residuals under each hypothesis, run by run; the costs
+        of all joints are added. If the intervals are too many, the hypothesis explains noise, and
+        none is kept.
+        """
         self.state = state
         self._forces, self._joints = forces, joints
         self._residuals = [[one.residuals(joint) for one in forces] for joint in joints]

@@ -77,6 +77,7 @@ class Regression:
     always: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        """Sum the products of eq. (1) over all runs, and group the columns by effect."""
         self.gram, self.cross = self.grams.sum(axis=0), self.crosses.sum(axis=0)
         self.total = float(self.totals.sum())
         self._batches = batch_groups(self.groups)

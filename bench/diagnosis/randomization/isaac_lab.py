@@ -201,6 +201,16 @@ def _joint_term(
     ends: tuple[float, float],
     notes: Sequence[str],
 ) -> Term:
+    """Build an Isaac Lab event term that sets a parameter of a joint to a uniform random value.
+
+    Args:
+        prefix: First part of the name of the term.
+        joint: Name of the joint.
+        function: Isaac Lab function that sets the parameter.
+        key: Name of the function's argument for the range.
+        ends: Minimum and maximum of the range.
+        notes: Comments above the term.
+    """
     params = {
         "asset_cfg": _asset("joint_names", joint),
         key: _pair(*ends),
@@ -213,6 +223,10 @@ def _joint_term(
 def _body_term(
     prefix: str, body: str, function: str, params: Mapping[str, str], notes: Sequence[str]
 ) -> Term:
+    """Build an Isaac Lab event term that calls `function` with `params` for one body of the robot.
+
+    `params` has the code of each further argument; `notes` become comments above the term.
+    """
     return Term(
         f"{prefix}_{body}", function, {"asset_cfg": _asset("body_names", body), **params}, notes
     )

@@ -185,6 +185,7 @@ class _Totals:
     """Numbers of the model file with all effects applied, for changes of one coefficient."""
 
     def __init__(self, kind: Any, causes: list[FittedCause]) -> None:
+        """Store the robot, and the fitted coefficients of each cause by name."""
         self.robot: RobotModel = kind.robot
         self.effects = [kind.system.effect(cause.name) for cause in causes]
         self.values = [

@@ -147,6 +147,10 @@ def _name(report: DiagnosisReportData, candidate: Candidate) -> str:
 def _label_rows(
     axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate], names: Sequence[str]
 ) -> None:
+    """Write the names of the candidates beside their rows, the first at the top.
+
+    A name is bold unless the status of the candidate is "not needed".
+    """
     axis.set_yticks(np.arange(len(candidates)), names, fontsize=_NAME_SIZE, linespacing=1.15)
     axis.set_ylim(len(candidates) - 0.5, -0.5)
     axis.tick_params(axis="y", length=0)

@@ -162,6 +162,12 @@ def is_overstated(cause: Cause) -> bool:
 
 
 def _share(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
+    """Return a function that says by which percentage a quantity differs from the model file.
+
+    The function takes the place in words and the fitted values; the first value is the relative
+    change.
+    """
+
     def say(where: str, values: Sequence[FittedValue]) -> str:
         c = values[0].value
         percent = format_percent(abs(c))
@@ -171,6 +177,11 @@ def _share(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
 
 
 def _difference(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
+    """Return a function that says by how much, in its unit, a quantity differs from the model file.
+
+    The function takes the place in words and the fitted values; the first value is the difference.
+    """
+
     def say(where: str, values: Sequence[FittedValue]) -> str:
         size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
         comparison = _MORE[values[0].value > 0]
@@ -180,6 +191,10 @@ def _difference(quantity: str) -> Callable[[str, Sequence[FittedValue]], str]:
 
 
 def _moved(where: str, values: Sequence[FittedValue]) -> str:
+    """Say how far the centre of mass at `where` is from that of the model file.
+
+    `values` has the fitted displacement along each axis.
+    """
     distance = append_unit(
         format_number(float(np.linalg.norm([n.value for n in values])), 2), values[0].unit
     )
@@ -197,6 +212,10 @@ def _tilted(where: str, values: Sequence[FittedValue]) -> str:
 
 
 def _length(where: str, values: Sequence[FittedValue]) -> str:
+    """Say by which percentage the length of the link at `where` differs from the model file.
+
+    `values[0]` is the relative change of the length.
+    """
     c = values[0].value
     percent = format_percent(abs(c))
     return (

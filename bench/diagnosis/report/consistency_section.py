@@ -101,6 +101,11 @@ def _has_trend(spread: ParameterConsistency) -> bool:
 
 
 def _format_inconsistency(spread: ParameterConsistency, effects: Sequence[str]) -> str:
+    """Say that a parameter differs between runs, how uncertain it is for a new run, and why.
+
+    If the parameter has a trend with a covariate, such as a load, the sentence names the kind of
+    effect that could explain it. `effects` are the effects of the model.
+    """
     text = (
         f"{_name(spread)} differs between {_plural(spread.by)}, {_format_span(spread)} "
         f"({format_p_value(spread.p_value)}): for a new run it is known to "

@@ -186,6 +186,10 @@ def _robot(report: DiagnosisReportData) -> Figure:
 
 
 def _overview(report: DiagnosisReportData) -> Figure:
+    """Draw the run with the largest residual: each channel over time, and its residual below.
+
+    For a robot, the figure of `joint_figure` is drawn instead.
+    """
     view = select_worst_run(report)
     if is_robot(report):
         return draw_joint_figure(report, view)

@@ -176,6 +176,11 @@ def render_report(
 
 
 def _format_badge(report: DiagnosisReportData) -> str:
+    """Return the verdict in a few words, with the reason if it is not complete.
+
+    The reasons are tested in order of importance: a fault of the recording, a search that was
+    stopped early, and a fitted value or base parameter at a bound.
+    """
     verdict = report.verdict
     if verdict.recording_faults:
         return "unknown: a unit or a sign of the recording is wrong"
@@ -252,6 +257,10 @@ _FIGURES = ("robot", "overview", "where", "candidates")
 def _make_still(
     report: DiagnosisReportData, drawn: Mapping[str, RenderedFigure], name: str
 ) -> PrintedFigure | None:
+    """Return a figure of the page with its text alternative; None if it was not drawn.
+
+    `drawn` has the rendered figures by name.
+    """
     figure = drawn.get(name)
     if figure is None:
         return None
@@ -291,6 +300,7 @@ class MarkedPlace(NamedTuple):
 
 
 def _list_marks(report: DiagnosisReportData) -> list[MarkedPlace]:
+    """List the places that are marked in the drawing of the robot, each with joint and text."""
     return [
         MarkedPlace(
             find_joint(report, mark.kind, mark.name),
@@ -322,6 +332,11 @@ def _list_splits(report: DiagnosisReportData) -> list[tuple[str, DataSplit, str]
 
 
 def _list_channels(report: DiagnosisReportData) -> list[ChannelRow]:
+    """List each channel with its noise, the source of the noise, and its RMS errors.
+
+    `columns` has one array (C,) of errors for each combination of runs and model; see
+    `_list_splits`.
+    """
     columns = [
         compute_channel_errors(split)[:, int(when == " after")]
         for _, split, when in _list_splits(report)
@@ -359,6 +374,7 @@ class ParameterRow(NamedTuple):
 
 
 def _make_parameter_row(p: ParameterChange) -> ParameterRow:
+    """Return a table row with a base parameter before and after the causes were added."""
     # An insensitive parameter was not estimated from the data.
     if not p.is_sensitive:
         nominal = append_unit(format_number(p.before[0]), p.unit)

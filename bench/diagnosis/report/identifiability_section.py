@@ -242,6 +242,11 @@ def _matrix(rows: Sequence[_Row], kind: str) -> Matrix:
 
 
 def _cell(row: _Row | None) -> MatrixCell | None:
+    """Return the matrix cell of an effect at a place; None if the effect is not available there.
+
+    The cell is emphasised if the verdict names the effect here, or if the effect explains the data
+    as well as a named cause.
+    """
     if row is None:
         return None
     interval = _interval(row.number)
@@ -267,6 +272,7 @@ def _families(
 
 
 def _names(effects: Sequence[str]) -> str:
+    """Join the names of at most `MAX_NAMED_CAUSES` different effects, and count the others."""
     unique = list(dict.fromkeys(effects))
     shown = ", ".join(format_effect_name(effect) for effect in unique[:MAX_NAMED_CAUSES])
     more = len(unique) - MAX_NAMED_CAUSES

@@ -364,6 +364,10 @@ def _closer(report: DiagnosisReportData) -> str:
 
 
 def _format_fitted_gain(report: DiagnosisReportData) -> str:
+    """State the residual of the fitted runs with the tuned model and with the causes added.
+
+    It replaces the gain on held-out runs if that gain was not measured.
+    """
     before, after = (
         compute_normalised_rms(report, report.fitting, which) for which in ("before", "after")
     )

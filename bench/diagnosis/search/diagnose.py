@@ -93,6 +93,12 @@ class Inquiry:
     """
 
     def __init__(self, search: EffectSearch, held_out: Validation | None) -> None:
+        """Start a diagnosis without results.
+
+        `_trial` is the validation of the models on held-out runs, and `_model` the best model so
+        far; both are None until their step is reached. They are kept so that a search that is
+        stopped early can report what it found.
+        """
         self._search = search
         self._held_out = held_out
         self._watch = search.world.watch

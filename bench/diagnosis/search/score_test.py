@@ -109,6 +109,12 @@ class ScoreTest:
     def __init__(
         self, at: TrajectoryFit, directions: DirectionSet, seen: Mask, noise: NoiseModel
     ) -> None:
+        """Prepare what does not depend on the residual: groups, products and log-determinants.
+
+        A group has the directions of one effect that act together. `_count` is n of eq. (3), the
+        number of samples. `_determinants` has twice log det W for each correlation phi of the grid,
+        which is log det W'W of eq. (3).
+        """
         self._groups = group_directions(directions)
         self._batches = batch_groups(self._groups)
         self._count = int(seen.sum())
@@ -179,6 +185,13 @@ class _BestScores:
     """
 
     def __init__(self, members: Sequence[DirectionGroup], residuals: int, count: int) -> None:
+        """Create an empty table of E effects by S residuals.
+
+        `_rows` has the row of each group's effect. `_best` (E, S) is the largest l(phi) of eq. (3)
+        so far, `_without` (S,) that without any direction, and `_white` (E,) the score without
+        autocorrelation. `_gains` (E, S) has the explained sums of squares at the present
+        correlation `_phi`, and `_total` (S,) the sums of squares before.
+        """
         self._count = count
         self._groups = members
         self._names = list(dict.fromkeys(group.effect for group in members))

@@ -190,6 +190,14 @@ class WhiteningDesign:
         sigma: Array,
         blocks: Sequence[Indices],
     ) -> None:
+        """Sum the products of Jacobian and directions over all samples, for all correlations.
+
+        The sums have the three parts of eq. (1) and are combined for a given phi later. `_normal`
+        has the products of the q parameters and s initial states with each other (R, q + s, q + s),
+        `_mixed` those with the K directions (R, q + s, K), `_powers` (K,) the squares of the
+        directions, and `_grams` the products of directions that act together. `_lacking` counts the
+        missing neighbours of each sample, and `_known` caches the projected design of each phi.
+        """
         self.blocks = list(blocks)
         self._own = at.free.size
         self._jacobian = np.moveaxis(at.jacobian, 3, 0)

@@ -92,6 +92,15 @@ class CrossValidation:
         ]
 
     def _measured(self, simulated: Array, states: Array, free: float) -> HeldOutFit:
+        """Return a model's prediction of all runs with its merit, the penalised log-likelihood.
+
+        A failed simulation has the merit -infinity, so that any other model is preferred.
+
+        Args:
+            simulated: (R, T, C) prediction of each run by the model refitted without it.
+            states: (R, s) initial states.
+            free: Effective number of fitted initial states, for the penalty.
+        """
         if not np.isfinite(simulated[self.seen]).all():
             return HeldOutFit(np.full_like(simulated, np.nan), -np.inf, states)
         merit = merit_of(self.world.observed, simulated, free)

@@ -218,6 +218,10 @@ class HeldOutRuns:
         return self._fitted([fit.make_start() for fit in fits], stages)
 
     def _measured(self, fit: TrajectoryFit) -> HeldOutFit:
+        """Return the prediction of a fit with its merit, the penalised log-likelihood.
+
+        A failed fit has the merit -infinity, so that any other model is preferred.
+        """
         if not np.isfinite(fit.cost):
             nothing = np.full_like(self.world.observed, np.nan)
             return HeldOutFit(nothing, -np.inf, fit.states)

@@ -278,6 +278,18 @@ def _compute_run_normal_equations(models: ModelSet, model: FittedModel) -> tuple
 def _spreads(
     world: RunEvaluator, model: FittedModel, by: _RunGrouping, curvatures: Array, gradients: Array
 ) -> Iterator[ParameterConsistency]:
+    """Test for each parameter whether the groups of runs agree on it.
+
+    Each group G alone would change the joint fit by the Gauss-Newton step d_G of eq. (2). A group
+    whose interval is too wide is left out, and a parameter needs at least two groups.
+
+    Args:
+        world: Run evaluator of the runs.
+        model: Joint fit of all runs.
+        by: Groups of runs, for example one for each load.
+        curvatures: (R, q, q) H_r of eq. (1), the information of each run on the parameters.
+        gradients: (R, q) g_r of eq. (1).
+    """
     joint = _regularised_inverse(curvatures.sum(axis=0))
     steps, errors = [], []
     for runs in by.runs:

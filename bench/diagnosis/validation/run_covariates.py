@@ -74,6 +74,11 @@ def classify_constant(world: RunEvaluator, name: str) -> CovariateKind:
 
 
 def _list_non_motion_covariates(world: RunEvaluator) -> Iterator[RunCovariate]:
+    """Yield the covariates of each run that do not depend on its motion.
+
+    They are the order of the runs, the root mean square of each command, and the mean of each
+    recorded signal that the simulator does not use, such as a temperature.
+    """
     yield RunCovariate("time", "the order of runs", np.arange(len(world.runs), dtype=np.float64))
     for name in world.runs[0].inputs:
         sizes = [float(np.sqrt(np.mean(np.square(run.inputs[name])))) for run in world.runs]
