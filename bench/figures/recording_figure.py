@@ -150,6 +150,10 @@ def _decimate(times: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _finish(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
+    """Style the panels, and mark with dotted lines where each run after the first begins.
+
+    `axes` has the panels from top to bottom; the last one gets the label of the time axis.
+    """
     for axis in axes:
         axis.grid(visible=True, axis="y", linewidth=0.4, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)

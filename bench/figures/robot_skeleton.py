@@ -118,6 +118,11 @@ def _find_base_points(robot: RobotModel, data: Any) -> list[Array]:
 
 
 def _draw_joint(axis: Axes, joint: Joint, data: Any, view: Projection) -> None:
+    """Draw a joint as a circle, or as a square if it is prismatic, with its axis as a dashed line.
+
+    `data` is the mujoco.MjData of the pose: `xanchor` and `xaxis` have the position (m) and the
+    axis of each joint in the world.
+    """
     anchor = data.xanchor[joint.id]
     x, y = view.project(anchor[None])[0]
     if joint.has_one_coordinate:

@@ -65,6 +65,10 @@ class Projection:
 
 
 def _axes(azimuth: float, elevation: float) -> Array:
+    """Return the unit vectors right, up and forward of a camera, in the rows of a (3, 3) array.
+
+    The angles are in degrees, by the convention of MuJoCo's free camera.
+    """
     a, e = np.deg2rad([azimuth, elevation])
     forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     up = np.array([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)])

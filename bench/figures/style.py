@@ -204,6 +204,7 @@ class TunerStyles:
         behind: Sequence[ReferenceResult] = (),
         notes: Mapping[str, str] | None = None,
     ) -> None:
+        """Map each tuner with runs to its index in the experiment, which sets colour and marker."""
         self.experiment, self.behind, self.notes = experiment, behind, notes or {}
         present = set(order)
         # Tuners without runs count, too, so that a colour means the same tuner in every figure.

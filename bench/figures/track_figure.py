@@ -77,6 +77,11 @@ def _scene(axis: Axes, track: BallTrack) -> None:
 
 
 def _over_time(axis: Axes, track: BallTrack, part: slice, values: Array, label: str) -> None:
+    """Draw a quantity of the ball (T,) over time, with marks where the ball was not detected.
+
+    `part` selects the recorded frames, which have a grey background. The marks are at 2 % of the
+    height of the panel.
+    """
     times, gone = track.times, ~np.isfinite(track.u)
     axis.axvspan(times[part][0], times[part][-1], color=RECORDED_PART_GREY, linewidth=0)
     axis.plot(times, values, ".-", color=_SEEN, markersize=3, linewidth=0.7)

@@ -146,6 +146,11 @@ def _noise(seen: BallTrack, heights: ball_heights.BallHeights, part: slice) -> f
 def _heights(
     seen: BallTrack, video: Path, diameter: float | None, scale: str | None
 ) -> ball_heights.BallHeights:
+    """Convert the track of the ball from pixels to heights in metres.
+
+    The best available scale is used unless `scale` names one: a calibrated camera whose file lies
+    beside the film, the known diameter of the ball (m), or the acceleration of free fall.
+    """
     known = get_camera_file_path(video)
     if scale == "camera" or (scale is None and known.is_file()):
         return ball_heights.compute_heights_by_camera(seen, read_camera_file(known))
@@ -157,6 +162,11 @@ def _heights(
 def _recording(
     seen: BallTrack, heights: ball_heights.BallHeights, noise: float, part: slice, video: Path
 ) -> Recording:
+    """Build the recording: the height z of the ball (m), and its track in pixels as extra columns.
+
+    `part` selects the frames after the release of the ball. `noise` is the standard deviation of z,
+    m.
+    """
     pixels = {"u": seen.u, "v": seen.v, "radius_px": seen.radius}
     run = Run(
         "1",

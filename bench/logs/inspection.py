@@ -174,6 +174,7 @@ def _use(run: Run) -> str:
 
 
 def _run_row(run: Run) -> tuple[str, ...]:
+    """Format the statistics of a run as a table row; sampling intervals are in milliseconds."""
     facts = compute_run_statistics(run)
     return (
         facts.name,
@@ -188,6 +189,11 @@ def _run_row(run: Run) -> tuple[str, ...]:
 
 
 def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[str, ...]]:
+    """Yield a row of the table of signals for each channel and input: unit, range, gaps and noise.
+
+    `what` is the kind of the signal. The stated noise is "-" for a channel whose noise is not
+    stated; steps are quantisation steps.
+    """
     for channel, what in list_recorded_signals(recording, kind):
         facts = compute_signal_statistics(recording, channel, what)
         not_stated = "-" if what == "channel" else ""
@@ -205,6 +211,7 @@ def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[
 
 
 def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
+    """Yield a line for each constant of the system, and one for the stated initial states."""
     for constant in kind.constants:
         yield _constant(recording, constant.name, constant.value, constant.unit)
     known = []

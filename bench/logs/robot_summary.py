@@ -59,6 +59,7 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
 
 
 def _left_out(recording: Recording, robot: RobotModel) -> Iterator[str]:
+    """Yield a line for the commands and one for the joint positions missing in the log."""
     run = recording.runs[0]
     silent = [f"u.{a.name}" for a in robot.actuators if f"u.{a.name}" not in run.inputs]
     if silent:

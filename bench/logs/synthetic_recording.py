@@ -177,6 +177,15 @@ class _RecordingSimulation:
     """A checked specification, and its simulation."""
 
     def __init__(self, wish: SimulationSpec) -> None:
+        """Check the specification, and build the simulator with the true effects and constants.
+
+        What the specification leaves open is taken from the default recording of the system
+        (`usual`). `theta` has the true parameters by name, `effects` the true coefficients by
+        effect, and `ranges` the interval from which each initial state is drawn.
+
+        Raises:
+            InputError: The specification names something unknown or has implausible numbers.
+        """
         self.wish = wish
         self.kind = kind = _kind(wish)
         self.name = wish.system or kind.name
@@ -203,6 +212,11 @@ class _RecordingSimulation:
         self.times = _times(samples, wish.rate)
 
     def make(self) -> SimulatedRecording:
+        """Simulate all runs, add noise, and return the recording with its true model.
+
+        `truth` has everything that produced the recording, so that a diagnosis can be compared with
+        it.
+        """
         scenarios = {str(number): self._scenario(number) for number in range(1, self.wish.runs + 1)}
         runs: list[Run] = []
         for name, scenario in scenarios.items():
@@ -233,6 +247,7 @@ class _RecordingSimulation:
         return SimulatedRecording(recording, truth, self.simulator)
 
     def _simulator(self) -> Simulator:
+        """Build the simulator with the specified constants, channels, engine and true effects."""
         constants = self.wish.constants or {}
         check_known_names("constant", constants, [c.name for c in self.kind.constants])
         values = {n: _number("constant", n, value) for n, value in constants.items()}
@@ -259,6 +274,15 @@ class _RecordingSimulation:
         return Scenario(self.times, initial, inputs)
 
     def _run(self, number: int, scenario: Scenario) -> Run:
+        """Simulate a run, and add white Gaussian noise to each channel.
+
+        `number` counts runs from 1; the last ones are held out for validation. The true initial
+        states are left out, because a diagnosis has to estimate them; only the pose of a floating
+        body is given.
+
+        Raises:
+            InputError: The simulation has values that are not finite.
+        """
         observed = self.simulator.simulate(np.array([list(self.theta.values())]), scenario)[0]
         if not np.isfinite(observed).all():
             raise InputError(
@@ -314,6 +338,11 @@ def _held_out(wish: SimulationSpec) -> int:
 
 
 def _samples(wish: SimulationSpec) -> int:
+    """Return the number of samples of a run: duration (s) times rate (Hz), rounded.
+
+    Raises:
+        InputError: The number is below 2 or too large, the run too short, or the rate too high.
+    """
     product = wish.seconds * wish.rate
     samples = round(product) if 0 < product < _MOST_SAMPLES else 0
     if samples < 2 or wish.seconds < MIN_RUN_SECONDS or wish.rate > MAX_SAMPLING_RATE_HZ:
@@ -407,6 +436,13 @@ def _signal_text(name: str, given: float | str) -> str:
 
 
 def _number(what: str, name: str, value: object) -> float:
+    """Return a value of the specification as a float if it is a plausible number.
+
+    `what` and `name` identify the value in the message of the error.
+
+    Raises:
+        InputError: The value is not a number, or not a plausible one.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise InputError(f"{what} {name}: expected a number, found {value!r:.60}")
     if not is_plausible_number(value):

@@ -109,6 +109,11 @@ def draw_chart(
 
 
 def _draw_panel(axis: Axes, panel: Panel, table: pd.DataFrame | Table, horizontal: bool) -> None:
+    """Draw a panel of a chart: background spans, series, axes and title.
+
+    `table` has the values of the series. If `horizontal`, the axes are exchanged, so that x runs
+    upwards.
+    """
     style_axis(axis)
     for span in panel.spans:
         _draw_span(axis, span)
@@ -153,6 +158,12 @@ def _to_numbers(values: Iterable[Any]) -> Array:
 def _draw_series(
     axis: Axes, panel: Panel, series: Series, values: Mapping[str, Array], horizontal: bool
 ) -> None:
+    """Draw a series of N values as points with error bars, or as a line with a band.
+
+    `values` has the arrays x and y (N,), and low and high (N,) if the series has an interval.
+    `ends` (2, N) has the lengths of the error bars below and above the points. Only points can be
+    drawn horizontally.
+    """
     x, y = values["x"] + series.shift, values["y"]
     ends = None
     if "low" in values:
@@ -213,6 +224,11 @@ def _format_axis(axis: Axes, spec: Axis, which: str, reverse: bool = False) -> N
 
 
 def _draw_span(axis: Axes, span: AxisSpan) -> None:
+    """Draw a grey or coloured interval of an axis behind the series.
+
+    A span with `foot` is a strip at the bottom of the panel, with its name above it if it is wide
+    enough on the logarithmic axis.
+    """
     colour = span.look.colour if span.look else NOISE_BAND_GREY
     if not span.foot:
         draw = axis.axvspan if span.along == "x" else axis.axhspan

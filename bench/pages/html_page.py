@@ -41,6 +41,11 @@ class HtmlPage:
     """
 
     def __init__(self, style: str = "") -> None:
+        """Start an empty page; rendering the template adds its sections, charts and grids.
+
+        `_tables` has each table as CSV text for the browser, `_frames` the tables from which the
+        rows of grids are selected, and `_parts` the macros of the template `parts.html`.
+        """
         self._own_style = style
         self._sections: list[tuple[str, str]] = []
         self._tables: dict[str, str] = {}

@@ -23,6 +23,7 @@ class Table:
     """
 
     def __init__(self, columns: Mapping[str, Sequence[Any]]) -> None:
+        """Copy the columns, and check that all have the same length."""
         self._columns = {name: list(values) for name, values in columns.items()}
         lengths = {len(values) for values in self._columns.values()}
         if len(lengths) > 1:

@@ -35,6 +35,11 @@ def load_template(path: Path) -> Template:
 
 @cache
 def _get_environment() -> Environment:
+    """Create the Jinja2 environment of all pages, with escaping and the project's filters.
+
+    A name that the template does not get is an error (`StrictUndefined`), not an empty text.
+    Compiled templates are cached on disk.
+    """
     # Commands that write no page do not load Jinja2.
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 

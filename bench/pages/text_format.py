@@ -49,6 +49,7 @@ def joined(parts: Sequence[str], last: str = "and") -> str:
 
 
 def _harmless(character: str) -> str:
+    """Return a character if it is printable, else a replacement that cannot change the output."""
     if character.isprintable():
         return character
     # A line break or tab becomes a space; an escape sequence or a change of direction is spelled

@@ -52,6 +52,10 @@ class ColumnAssigner:
         options: ImportOptions,
         result: ImportResult,
     ) -> None:
+        """Store the inputs; nothing is assigned yet.
+
+        `normalised` is set later if the log has positions as shares of a joint's range.
+        """
         self._logs, self._signals, self._result = logs, signals, result
         self._options = options
         self.normalised: NormalisedPositions | None = None

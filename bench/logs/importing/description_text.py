@@ -65,6 +65,7 @@ class DescriptionWriter:
         folder: Path,
         result: ImportResult,
     ) -> None:
+        """Store the inputs; nothing is written yet."""
         self._logs, self._signals, self._options = logs, signals, options
         self._model, self._folder, self._result = model, folder, result
 
@@ -102,6 +103,7 @@ class DescriptionWriter:
         return "\n".join([*head, "", *body]).rstrip("\n") + "\n"
 
     def _time_lines(self) -> Iterator[str]:
+        """Yield the lines of the table `[time]`: a sampling rate (Hz) or the time stamp column."""
         yield "[time]"
         if self._logs.rate is not None:
             yield f"rate = {float(self._logs.rate)!r}"
@@ -111,6 +113,10 @@ class DescriptionWriter:
         yield ""
 
     def _run_lines(self) -> Iterator[str]:
+        """Yield a table `[runs.NAME]` for each run: its file or folder, and whether it is held out.
+
+        A single run without a name has no table.
+        """
         for run, files in self._logs.runs.items():
             if run:
                 path = files.paths[0] if files.alone else files.folder
@@ -199,6 +205,10 @@ class DescriptionWriter:
         return samples
 
     def _relative(self, path: Path) -> str:
+        """Return a path relative to the folder of the description, with forward slashes.
+
+        On another drive of Windows no relative path exists, so the path is absolute.
+        """
         try:
             return Path(os.path.relpath(path, self._folder)).as_posix()
         except ValueError:  # on another drive

@@ -46,6 +46,11 @@ class RunLogs:
         joint_names: Sequence[str],
         result: ImportResult,
     ) -> None:
+        """Read the files of the first run, find their time stamps, and list the columns to import.
+
+        Without time stamps (`rate` is given), the time of row k is k / rate in seconds. `_starts`
+        has the first time stamp of each file, and `_cache` the files that were read already.
+        """
         self.runs, self.rate = runs, rate
         self.time_column, self.time_unit = "", "s"
         self.seconds: dict[str, Array] = {}

@@ -96,6 +96,7 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
 
 
 def _commands(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+    """Find commands of a robot that are often at or beyond the range of their actuator."""
     if not kind.has_model:
         return
     robot: Any = kind

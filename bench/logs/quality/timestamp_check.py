@@ -105,6 +105,10 @@ def find_anomalies(recording: Recording, kind: type[Simulator]) -> Iterator[Anom
 
 
 def _check_gap(run: Run) -> Anomaly | None:
+    """Find a gap that is more than `MAX_GAP_RATIO` times as long as the rest of the run.
+
+    Such a run probably consists of two. Return None if there is no such gap.
+    """
     intervals = np.diff(run.times)
     place = int(intervals.argmax())
     gap = float(intervals[place])

@@ -199,6 +199,7 @@ class _Series(NamedTuple):
 
     @staticmethod
     def read(run: Run, position: str, rate: str) -> _Series:
+        """Return the samples of a run at which both the position and its rate are recorded."""
         q, v = run.channels[position], run.channels[rate]
         # If two publishers alternate, each row has the joints of one of them.
         known = np.isfinite(q) & np.isfinite(v)
@@ -218,6 +219,17 @@ class _Series(NamedTuple):
 
 
 def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[QualityFinding]:
+    """Yield a finding if a recorded velocity contradicts the change of its position.
+
+    The changes of the position are compared with the integral of the velocity over the same
+    intervals. The tests follow each other: no correlation, a wrong sign, a wrong factor (such as a
+    unit), and a delay.
+
+    Args:
+        runs: Runs that contain both channels.
+        position: Name of the position channel.
+        rate: Name of the velocity channel.
+    """
     comparison = VelocityComparison.measure(runs, position, rate)
     if comparison is None:
         return
