@@ -60,12 +60,16 @@ class AlternativeFinder:
     simulates: bool = True
 
     def collect_evidence(self, model: FittedModel) -> tuple[CauseEvidence, ...]:
-        """Return the evidence for each effect of the model, strongest first."""
+        """Return the evidence for each effect of the model, the largest likelihood gain first."""
         effects = [self._evidence(model, name) for name in model.effects]
         return tuple(sorted(effects, key=lambda evidence: -evidence.gain))
 
     def _evidence(self, model: FittedModel, effect: str) -> CauseEvidence:
-        """Return the evidence for one effect of the model."""
+        """Return p-value, gain and indistinguishable alternatives of one effect of the model.
+
+        The gain is the increase of twice the log-likelihood over the model without the effect
+        (`rest`). `rivals` has pairs of distance and name, the effect itself included.
+        """
         rest = self._rest(model, effect)
         gain = model.likelihood.value - rest.likelihood.value
         p_value = self._p_value(rest, effect, gain)
@@ -86,7 +90,10 @@ class AlternativeFinder:
         )
 
     def _rest(self, model: FittedModel, effect: str) -> FittedModel:
-        """Return the model without the effect, or the base model if that would need a new fit."""
+        """Return the model without the effect, against which the gain of the effect is measured.
+
+        If no simulations are allowed and this model was not fitted, return the base model.
+        """
         if self.simulates:
             return self.search.remove_effect(model, effect)
         rest = frozenset(model.effects) - {effect}
@@ -111,7 +118,12 @@ class AlternativeFinder:
         return min(by_score, by_refit)
 
     def _rivals(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
-        """Return equivalent effects in place of the given one, with their distance."""
+        """List the effects that explain the data as well as the given one, with their distance.
+
+        A rival is tested by the fitted models in which it replaces the effect and everything else
+        is equal. The distance is how far such a model is behind, in twice the log-likelihood; the
+        effect itself has the distance 0.
+        """
         shared = set(model.effects) - {effect}
         rivals = [(0.0, effect)]
         for other in list(self.search.models.values()):
@@ -199,7 +211,10 @@ class AlternativeFinder:
         return model.penalised_log_likelihood + lucky
 
     def _is_plausible(self, effect: str) -> bool:
-        """Return whether the best fit with an effect has plausible coefficients."""
+        """Return whether the best fit of an effect has coefficients in their plausible ranges.
+
+        The best fit is the model with the effect that has the highest penalised log-likelihood.
+        """
         world = self.search.world
         having = [m for m in self.search.models.values() if effect in m.effects]
         if not having:

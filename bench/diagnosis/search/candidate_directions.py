@@ -203,7 +203,10 @@ def first_probes(world: RunEvaluator, at: TrajectoryFit, name: str) -> Iterator[
 
 
 def _is_contained_in_model(world: RunEvaluator, at: TrajectoryFit, name: str) -> bool:
-    """Return whether the model has an effect that this one contains, itself or in a family."""
+    """Return whether the model already has a simpler effect that the effect `name` contains.
+
+    The simpler effect may also be in the model as a member of a family (one effect at all places).
+    """
     effects = [world.available_effects[own] for own in at.effects]
     there = {m.name for effect in effects for m in members_of(effect)}
     return bool(there & set(world.available_effects[name].contains))
@@ -212,7 +215,10 @@ def _is_contained_in_model(world: RunEvaluator, at: TrajectoryFit, name: str) ->
 def _make_end_stop_probes(
     world: RunEvaluator, name: str, first: int
 ) -> Iterator[CandidateDirection]:
-    """Yield soft and hard end stops at both ends of the range of a coordinate."""
+    """Yield end stops of several depths and stiffnesses at both ends of the range of a coordinate.
+
+    Each is one candidate that is valid only at its size. `first` is the number of its first group.
+    """
     either = [
         c
         for side in (1.0, -1.0)
@@ -303,7 +309,10 @@ def _make_shape_grid(
 
 
 def _is_period(parameter: Parameter, travel: float) -> bool:
-    """Return whether a coefficient is a period over position, in runs with motion."""
+    """Return whether a coefficient is a period over position (in m or rad), and the position moves.
+
+    `travel` is the largest range of the position within one run.
+    """
     return parameter.name.endswith(".period") and travel > 0
 
 
@@ -354,7 +363,11 @@ def _shift_frequency_or_time(
 
 
 def _frequencies(low: float, high: float, extent: float) -> Array:
-    """Return frequencies from low to high, about half a cycle over the extent apart on average."""
+    """Return a grid of frequencies from `low` to `high`, about half a cycle over `extent` apart.
+
+    Two frequencies that differ by less are nearly the same signal in a run. `extent` is the length
+    of the longest run in seconds, or the range of the position for frequencies over position.
+    """
     halves = 2.0 * (high - low) * extent
     count = int(np.clip(halves, 4, MAX_FREQUENCIES))
     # Low frequencies are closer together, because their periods would be far apart otherwise.
@@ -366,7 +379,11 @@ def _frequencies(low: float, high: float, extent: float) -> Array:
 def _find_observable_probes(
     world: RunEvaluator, probes: Sequence[CandidateDirection], values: Array
 ) -> Mask:
-    """Return which probes (K,) change the runs (K, R, T, C) by more than rounding."""
+    """Return the mask (K,) of the probes that change the runs by more than rounding errors.
+
+    `values` (K, R, T, C) has the direction of each probe; times the size of the probe it is the
+    change.
+    """
     rounding = ROUNDING_SHARE * np.nanmax(np.abs(world.observed), axis=(0, 1))
     # One changed channel is sufficient, because effects of a sensor show only in its channel.
     changes = [
@@ -378,7 +395,10 @@ def _find_observable_probes(
 
 
 def _sizes(probes: Sequence[CandidateDirection]) -> Array:
-    """Return the scaling coefficients (K,); one where the direction is the whole change."""
+    """Return the divisor c of eq. (1) for each probe (K,), which is its scaling coefficient.
+
+    It is one for a fixed probe, whose direction is the whole change.
+    """
     sizes = []
     for probe in probes:
         size = 1.0 if probe.fixed else probe.coefficients[probe.place]
@@ -389,7 +409,12 @@ def _sizes(probes: Sequence[CandidateDirection]) -> Array:
 def _make_modifier_probes(
     world: RunEvaluator, probes: Sequence[CandidateDirection], acting: Mask
 ) -> Iterator[CandidateDirection]:
-    """Yield grid points of modifiers: coefficients that act only together with an active one."""
+    """Yield combinations of modifiers: coefficients that act only together with an active one.
+
+    An example is a wind speed, which only matters if there is drag. A coefficient counts as a
+    modifier if its probe changes nothing (`acting`) although another coefficient of its effect
+    does.
+    """
     leading: dict[str, CandidateDirection] = {}
     idle: list[CandidateDirection] = []
     for probe, acts in zip(probes, acting, strict=True):
@@ -438,7 +463,10 @@ def _grid_points(
 def _responses(
     world: RunEvaluator, at: TrajectoryFit, probes: Sequence[CandidateDirection]
 ) -> Array:
-    """Return the responses (K, R, T, C), per unit of the coefficient or as a whole change."""
+    """Compute the directions (K, R, T, C) of eq. (1): change of the runs per unit coefficient.
+
+    For a fixed probe it is the whole change. `probes` are the K candidates.
+    """
     added = [(probe.effect, probe.coefficients) for probe in probes]
     # These are the largest arrays of a search, so all operations are in place.
     values = compute_responses(world, at, added)

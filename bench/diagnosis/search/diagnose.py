@@ -76,7 +76,7 @@ def diagnose(search: EffectSearch, held_out: Validation | None) -> DiagnosisResu
 
 
 def answer(inquiry: Inquiry) -> DiagnosisResult:
-    """Answer all questions, or those for which there is time."""
+    """Run the complete diagnosis, or as many of its steps as the time limit allows."""
     try:
         return inquiry.answered()
     except SearchStoppedError:
@@ -170,7 +170,10 @@ class Inquiry:
         return None
 
     def _try(self) -> None:
-        """Validate models on held-out runs, and drop idle effects."""
+        """Compare the model with its rivals on held-out runs, and drop effects that do not help.
+
+        It does nothing if there are no held-out runs and too few runs for cross-validation.
+        """
         if self._held_out is None or self._model is None:
             return
         self._watch.begin_question("held_out")
@@ -200,7 +203,10 @@ class Inquiry:
         return True
 
     def so_far(self) -> DiagnosisResult:
-        """Return the result of a search that had to end, which claims only what was tested."""
+        """Return the result of a search that had to end early, which claims only what was tested.
+
+        Only existing fits and scores are used; nothing is simulated here.
+        """
         search = self._search
         cut = self._watch.make_early_stop(self._held_out is not None)
         model = self._model or search.get_best_so_far()
@@ -223,13 +229,16 @@ class Inquiry:
         causes: tuple[CauseEvidence, ...],
         left: LackOfFitResult,
     ) -> DiagnosisResult:
-        """Return a result with the held-out evaluations."""
+        """Bundle a verdict with its models, and with the held-out predictions if there are any."""
         measured = self._trial.held_out_fits if self._trial is not None else None
         return DiagnosisResult(verdict, model, base, causes, left, held_out_fits=measured)
 
 
 def is_motionless(search: EffectSearch) -> bool:
-    """Return whether the recording shows no motion, and the model expects none."""
+    """Return whether the recording shows no motion, and the base model expects none.
+
+    Without motion the residual is only rounding, so the diagnosis ends before the search.
+    """
     observed = search.world.observed
     largest = np.nanmax(observed, axis=(0, 1))
     smallest = np.nanmin(observed, axis=(0, 1))
@@ -241,7 +250,7 @@ def is_motionless(search: EffectSearch) -> bool:
 
 
 def _without_motion(search: EffectSearch) -> DiagnosisResult:
-    """Return the result for a recording without motion."""
+    """Return the verdict "unidentifiable" for a recording without motion."""
     base, world = search.base_model, search.world
     # No parameter can be determined, and no test of the residual is meaningful.
     vague = tuple(world.parameters[i].name for i in world.base)
@@ -273,7 +282,11 @@ def find_unidentified_parameters(search: EffectSearch, base: FittedModel) -> tup
 def _validate_on_held_out(
     search: EffectSearch, model: FittedModel, held_out: Validation
 ) -> HeldOutValidation:
-    """Evaluate the base model, the best singles, the result and its rivals on held-out runs."""
+    """Evaluate the models that matter for the verdict on held-out runs.
+
+    They are the base model, the result, models with a part of its effects, models that explain the
+    data nearly as well, and the best models of a single effect.
+    """
     models = search.models.values()
     # Parts of the model are included, because an effect that does not help on held-out runs is
     # dropped.
@@ -294,7 +307,11 @@ def _validate_on_held_out(
 def _select_preferred_model(
     search: EffectSearch, trial: HeldOutValidation | None, model: FittedModel, left: LackOfFitResult
 ) -> tuple[FittedModel, tuple[CauseEvidence, ...]]:
-    """Return the model with the preferred effect of each set, and its causes."""
+    """Replace each effect by the preferred one of its indistinguishable alternatives.
+
+    Return this model if it was fitted, else the given one, with the evidence for its effects.
+    `left` is the lack-of-fit result of the given model.
+    """
     alternatives = AlternativeFinder(search, trial, left.has_structure)
     causes = alternatives.collect_evidence(model)
     names = frozenset(cause.preferred for cause in causes)
@@ -305,7 +322,11 @@ def _select_preferred_model(
 
 
 def _is_unexplained(search: EffectSearch, model: FittedModel, left: LackOfFitResult) -> bool:
-    """Return whether the model lacks something, with a score test if none exists yet."""
+    """Return whether the model lacks something: structure in the residual, or a significant effect.
+
+    The p-value of the best missing effect (`chance`) comes from an earlier score test, or from one
+    that is made here if the residual is above the noise.
+    """
     chance = search.best_p_values.get(frozenset(model.effects))
     # A model with a residual above the noise was not scored, because the search did not need it.
     if chance is None:
@@ -339,7 +360,7 @@ def compute_gap_closed(search: EffectSearch, model: FittedModel, left: LackOfFit
 
 
 def _compute_normalised_rms(search: EffectSearch, model: FittedModel, noise: Array) -> float:
-    """Return the RMS residual of a model in units of the noise."""
+    """Return the RMS over all samples of a model's residual divided by the noise `sigma` (C,)."""
     left = search.compute_residual(model.fit) / noise
     squares = np.square(left[search.observed_mask])
     return float(np.sqrt(squares.mean()))

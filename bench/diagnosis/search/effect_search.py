@@ -155,7 +155,11 @@ class EffectSearch(ModelMoves):
         )
 
     def _larger(self, best: FittedModel, size: int) -> FittedModel | None:
-        """Return a model with at most `size` effects to compare with the best smaller one."""
+        """Fit models of `size` effects, and return the best one after exchanges and simplification.
+
+        It may have fewer effects, if some were not needed. `best` is the best smaller model. Return
+        None if no model of this size could be fitted.
+        """
         if size > 1:
             self.world.watch.begin_larger_models()
         larger = self._grown(size)
@@ -216,7 +220,12 @@ class EffectSearch(ModelMoves):
         return [[rival] for rival in rivals] if self.world.has_linearisation else [rivals]
 
     def refit_from_segments(self, size: int) -> None:
-        """Fit the models with `size` effects that explain short segments of the runs best."""
+        """Search on short segments of the runs, and refit the best models to whole runs.
+
+        Models of `size` effects are searched. Each segment has its own initial state, so errors
+        accumulate less and fits have fewer local minima (multiple shooting). The search is skipped
+        if segments are no easier to fit than whole runs.
+        """
         if size > MAX_EFFECTS_ON_SEGMENTS or self._forgets:
             return
         cut = make_segment_evaluator(self.world)
@@ -236,7 +245,10 @@ class EffectSearch(ModelMoves):
 
     @cached_property
     def _forgets(self) -> bool:
-        """Whether segments of the runs are no easier to fit than whole runs."""
+        """Whether the motion forgets its initial state quickly, as strongly damped systems do.
+
+        Segments of the runs are then no easier to fit than whole runs.
+        """
         fit, world = self.base_model.fit, self.world
         by_states = (
             world.derivatives if world.has_linearisation else fit.jacobian[..., fit.free.size :]
@@ -262,7 +274,7 @@ class EffectSearch(ModelMoves):
 
 
 def select_by_size(models: ModelSet, size: int) -> list[FittedModel]:
-    """Return the models with `size` effects, those with the highest merit first."""
+    """Return the fitted models with `size` effects, by descending penalised log-likelihood."""
     members = [model for model in models.models.values() if len(model.effects) == size]
     return sorted(members, key=lambda model: -model.penalised_log_likelihood)
 
@@ -306,7 +318,7 @@ def is_hopeless(search: EffectSearch, larger: FittedModel) -> bool:
 
 
 def _list_excesses(search: EffectSearch, size: int) -> list[float]:
-    """Return the excess of each model with `size` effects."""
+    """Return the RMS residual minus one, in units of the noise, of models of `size` effects."""
     return [search.compute_excess(m) for m in search.models.values() if len(m.effects) == size]
 
 

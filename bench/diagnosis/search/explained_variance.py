@@ -53,7 +53,7 @@ class GroupBatch:
 
 
 def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
-    """Return the groups of directions that act together."""
+    """Group the directions of each effect at each grid point of its shape; they act together."""
     places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.candidates):
         key = probe.effect, probe.group
@@ -67,7 +67,7 @@ def group_directions(directions: DirectionSet) -> list[DirectionGroup]:
 
 
 def batch_groups(members: Sequence[DirectionGroup]) -> list[GroupBatch]:
-    """Return the groups in batches with equal sign constraints."""
+    """Collect groups with equal sign constraints in batches, which are solved at once."""
     alike: dict[tuple[bool, ...], list[int]] = {}
     for i, group in enumerate(members):
         alike.setdefault(group.positive, []).append(i)
@@ -119,7 +119,11 @@ def compute_explained_squares(
 
 
 def _solve_best_subset(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
-    """Solve for the best subset of columns; see `compute_explained_squares` for the arguments."""
+    """Try all subsets of columns, and keep for each group and residual the one that explains most.
+
+    A subset counts only if its constrained coefficients are not negative. Arguments and result are
+    those of `compute_explained_squares`.
+    """
     number, count, samples = cross.shape
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
@@ -164,7 +168,11 @@ class _SubsetSolution(NamedTuple):
 
 
 def _solved(gram: Array, cross: Array, chosen: list[int]) -> _SubsetSolution:
-    """Solve for a subset of columns of each group."""
+    """Solve the normal equations G c = h of each group for a subset of its columns.
+
+    Groups whose columns are zero or collinear are left out. `gram` G is (n, k, k), `cross` h (n, k,
+    S), and `chosen` has the indices of the columns.
+    """
     products = gram[:, chosen][:, :, chosen]
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     acting = np.flatnonzero((lengths > 0).all(axis=1))
@@ -183,7 +191,17 @@ def _solved(gram: Array, cross: Array, chosen: list[int]) -> _SubsetSolution:
 
 
 def _solve_unconstrained(gram: Array, cross: Array) -> tuple[Array, Array]:
-    """Solve for all columns of groups with many columns, without constraints."""
+    """Solve G c = h with all columns by eigenvalues, without sign constraints.
+
+    It is used for groups with too many columns to try all subsets.
+
+    Args:
+        gram: G (n, k, k) of each group.
+        cross: h (n, k, S).
+
+    Returns:
+        The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
+    """
     # Some of many columns nearly repeat others, as overlapping hats do; their contribution is
     # rounding.
     powers = np.diagonal(gram, axis1=1, axis2=2)

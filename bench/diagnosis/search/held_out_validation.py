@@ -51,7 +51,11 @@ class HeldOutValidation:
     held_out_fits: dict[EffectNames, HeldOutFit] = field(default_factory=dict)
 
     def evaluate_models(self, models: Iterable[FittedModel]) -> None:
-        """Evaluate models together; each starts from the initial states of the nearest one."""
+        """Predict the held-out runs with each model, and store the results by its effects.
+
+        The models are evaluated together, because the initial states of a model that predicts badly
+        are fitted again from those of the model that predicts best.
+        """
         # Stored by effects, so that a repeated model is simulated only once.
         chosen = {model.effects: model for model in models}
         results = self.runs.validate([model.fit for model in chosen.values()])
@@ -130,7 +134,7 @@ class HeldOutValidation:
         return max(fitted, unseen) / enough
 
     def _smaller(self, search: EffectSearch, model: FittedModel) -> list[FittedModel]:
-        """Return the evaluated models that lack one of the effects of the model."""
+        """Return the evaluated models that consist of the model without one of its effects."""
         names = set(model.effects)
         size = len(names) - 1
         smaller = []

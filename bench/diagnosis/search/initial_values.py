@@ -69,7 +69,10 @@ def compute_reachable_levels(world: RunEvaluator, name: str) -> Array:
 
 
 def _command(track: RunData, effect: Effect) -> Array:
-    """Return the input (T,) that an effect acts on; the first input if it names none."""
+    """Return the input signal (T,) of a run on which an effect acts.
+
+    It is the first input if the effect names none, and zero if the run has no such input.
+    """
     signals = track.scenario.inputs
     nothing = np.zeros(track.scenario.times.size)
     first = next(iter(signals.values()), nothing)
@@ -77,35 +80,45 @@ def _command(track: RunData, effect: Effect) -> Array:
 
 
 def _largest(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
-    """Return the largest magnitude of the input in a run."""
+    """Return the largest magnitude of the input of an effect in a run; `world` is not used."""
     return float(np.abs(_command(track, effect)).max())
 
 
 def _max_input_rate(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
-    """Return the largest rate of change of the input in a run, per second."""
+    """Return the largest rate of change of an effect's input in a run, in its unit per second."""
     risen = np.abs(np.diff(_command(track, effect)))
     return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
 
 
 def _max_input_acceleration(world: RunEvaluator, track: RunData, effect: Effect) -> float:  # noqa: ARG001
-    """Return the acceleration that crosses the input's range to rest in `MIN_PROFILE_SECONDS`."""
+    """Return the acceleration 4 d / t² that moves the input over its range d from rest to rest.
+
+    Half of t = `MIN_PROFILE_SECONDS` is acceleration, half braking. It is the largest acceleration
+    limit that is tried.
+    """
     return 4.0 * float(np.ptp(_command(track, effect))) / MIN_PROFILE_SECONDS**2
 
 
 def _recorded(world: RunEvaluator, effect: Effect) -> str:
-    """Return the channel of the level that an effect acts on; empty if it is not recorded."""
+    """Return the channel of the stored quantity, such as a tank's level, that an effect limits.
+
+    It is empty if the quantity is not recorded.
+    """
     name = effect.place or world.simulator.system.levels[0]
     return name if name in world.channels else ""
 
 
 def _max_level(world: RunEvaluator, track: RunData, effect: Effect) -> float:
-    """Return the largest value of the level in a run."""
+    """Return the maximum of the stored quantity, such as a tank's level, recorded in a run."""
     shown = track.observed[:, world.channels.index(_recorded(world, effect))]
     return float(np.nanmax(shown, initial=0.0))
 
 
 def _max_servo_error(world: RunEvaluator, track: RunData, effect: Effect) -> float:
-    """Return the largest servo error in a run; zero if the coordinate is not recorded."""
+    """Return the largest difference of command and position of a servo in a run.
+
+    It is zero if the position is not recorded. The position is multiplied by the gear ratio first.
+    """
     system = world.simulator.system
     place = system.primary if effect.coordinate is None else effect.coordinate
     name = system.coordinates[place]

@@ -96,7 +96,10 @@ def list_joint_families(world: RunEvaluator, slow: float) -> Iterator[JointHatFa
 
 
 def _fastest(world: RunEvaluator, channel: int) -> float:
-    """Return the 98 % quantile of the speed of a joint."""
+    """Return the 98 % quantile of the speed of a joint, from differences of its recorded position.
+
+    The quantile is used instead of the maximum, because single differences may be noise.
+    """
     rates = [np.zeros(1)]
     for track in world.tracks:
         if len(track.observed) > 3:

@@ -89,7 +89,13 @@ class HatForce(Force):
     )
 
     def force(self, c: Array, moment: StateSnapshot) -> Array:
-        """Return strength times a triangle around the centre, eq. (1)."""
+        """Return strength c times a triangle of half-width w around the centre m, eq. (1).
+
+        Args:
+            c: The six coefficients: strength, variable, centre, width, direction, slow (the speed
+                over which dry friction reverses its sign).
+            moment: States of all batch elements at one time.
+        """
         strength, variable, centre, width, direction, slow = c
         axes = moment.x.shape[1]
         variables = [moment.t, moment.speed, *(moment.x[:, k, None] for k in range(axes))]
@@ -127,12 +133,15 @@ class LackOfFitResult:
 
     @property
     def has_structure(self) -> bool:
-        """Whether the residual has structure."""
+        """Whether the residual contains more than noise, by the test or by its size."""
         return has_structure(self.p_value, self.p_value_threshold, self.channels_above_noise)
 
 
 def list_hat_effects(kind: type[SystemSimulator]) -> list[type[Effect]]:
-    """Return the hat effects for lack-of-fit tests of this kind of simulator."""
+    """Return the effects with which `assess_lack_of_fit` simulates a force of any shape.
+
+    Run evaluators need them in their library. A robot has a hat force for each joint.
+    """
     return [JointHatForce] if kind.has_model else [HatForce]
 
 
@@ -195,7 +204,10 @@ def assess_residual_size(models: ModelSet, model: FittedModel) -> LackOfFitResul
 
 
 def _sigma_standard_error(models: ModelSet, model: FittedModel, channel: int) -> float:
-    """Return the relative standard error of the sigma of a channel, eq. (2)."""
+    """Return the relative standard error of the estimated noise of a channel, eq. (2).
+
+    Its residual must exceed the noise by a multiple of this error to count as too large.
+    """
     # At a correlation of one, the formula diverges, and no channel would exceed its noise.
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
     count = max(int(models.observed_mask[:, :, channel].sum()), 2)
@@ -244,7 +256,10 @@ HatFactory = Callable[[float, float], tuple[str, Array]]
 
 
 def _shapes(world: RunEvaluator, size: float) -> Iterator[tuple[str, float, float, HatFactory]]:
-    """Yield families of hats: label, range of the variable, and a function that creates one hat."""
+    """Yield each family of hats: label, lowest and highest centre, function that makes a hat.
+
+    `size` is the strength of a hat.
+    """
     if JointHatForce.name in world.slots:
         for joint in joint_families(world, SIGN_CHANGE_SPEED_SHARE):
             yield joint.label, joint.low, joint.high, partial(_on_joint, joint, size)
@@ -257,7 +272,7 @@ def _shapes(world: RunEvaluator, size: float) -> Iterator[tuple[str, float, floa
 def _on_joint(
     family: JointHatFamily, size: float, centre: float, width: float
 ) -> tuple[str, Array]:
-    """Return the effect name and the coefficients of one hat on a joint."""
+    """Return the name of the effect and the coefficients of one hat force at a joint of a robot."""
     follows = family.joint, family.variable, centre, width, family.direction, family.slow
     return JointHatForce.name, np.array([size, *follows])
 
@@ -265,7 +280,10 @@ def _on_joint(
 def _anywhere(
     family: _Family, size: float, slow: float, centre: float, width: float
 ) -> tuple[str, Array]:
-    """Return the effect name and the coefficients of one hat on a system without joints."""
+    """Return effect name and coefficients of one hat force on a system without joints.
+
+    `size` is the strength of the hat, and `slow` the speed over which dry friction reverses.
+    """
     return HatForce.name, np.array([size, family.variable, centre, width, family.direction, slow])
 
 
@@ -280,14 +298,14 @@ class _Family(NamedTuple):
 
 
 def _families(world: RunEvaluator) -> Iterator[_Family]:
-    """Yield every family of hats that the recording can show."""
+    """Yield every family of hat forces, eq. (1), whose variable the recording shows."""
     yield from _over_time(world)
     yield from _over_positions(world)
     yield from _over_speed(world)
 
 
 def _over_time(world: RunEvaluator) -> Iterator[_Family]:
-    """Yield families of hats over time."""
+    """Yield families of hat forces over time, along each coordinate and against the motion."""
     durations = []
     for track in world.tracks:
         times = track.scenario.times
@@ -300,7 +318,10 @@ def _over_time(world: RunEvaluator) -> Iterator[_Family]:
 
 
 def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
-    """Yield families of hats over each recorded coordinate."""
+    """Yield families of hat forces over each coordinate, from its 1 % to its 99 % quantile.
+
+    The forces act along the last coordinate, against the motion, or as dry friction.
+    """
     system = world.simulator.system
     # A bouncing body flies freely and slides on nothing; its last coordinate is the height.
     free, last = system.bounces, len(system.coordinates) - 1
@@ -323,7 +344,7 @@ def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
 
 
 def _over_speed(world: RunEvaluator) -> Iterator[_Family]:
-    """Yield families of hats over the speed."""
+    """Yield families of hat forces over the speed: against the motion, or dry friction."""
     speed = _high_speed_quantile(world)
     if speed > 0:
         yield _Family("speed, against the motion", SPEED_VARIABLE, VISCOUS_DIRECTION, 0.0, speed)
@@ -332,7 +353,10 @@ def _over_speed(world: RunEvaluator) -> Iterator[_Family]:
 
 
 def _high_speed_quantile(world: RunEvaluator) -> float:
-    """Return the 98 % quantile of the speed, from the recorded coordinates."""
+    """Return the 98 % quantile of the speed, from differences of the recorded coordinates.
+
+    It is the upper end of the hats over speed; a quantile, because single differences may be noise.
+    """
     squares = []
     for name in world.simulator.system.coordinates:
         if name not in world.channels:

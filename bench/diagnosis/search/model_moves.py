@@ -54,7 +54,10 @@ class ModelMoves(ScoredModelSet):
         return self.models[rest]
 
     def _lessen(self, model: FittedModel, names: Iterable[str]) -> None:
-        """Fit the model without each of the given effects, starting from its present parameters."""
+        """Fit and store the models that lack one of the effects `names`.
+
+        Each fit starts from the present parameters and initial states of the model.
+        """
         starts = []
         for name in names:
             # Zero coefficients switch the effect off, and they are not fitted; all else starts as
@@ -136,7 +139,11 @@ class ModelMoves(ScoredModelSet):
             yield {members[most].name: own[each * most : each * (most + 1)]}
 
     def _with_parts(self, model: FittedModel, name: str, parts: EffectStarts) -> FittedModel:
-        """Return the model with simpler effects in place of a richer one, fitted from here."""
+        """Fit the model with the simpler effects `parts` in place of the richer effect `name`.
+
+        All other parameters start from their present values. A model that was already fitted from
+        here is not fitted again.
+        """
         replaced = ([*parts] if n == name else [n] for n in model.effects)
         names = tuple(dict.fromkeys(chain.from_iterable(replaced)))
         key, step = frozenset(names), (frozenset(model.effects), frozenset(names))
@@ -155,7 +162,11 @@ class ModelMoves(ScoredModelSet):
         return self.models[key]
 
     def swap_effect(self, model: FittedModel) -> FittedModel:
-        """Return the best model that results from replacing one effect at a time."""
+        """Replace one effect at a time by a better one, while that improves the model.
+
+        Each effect in turn is removed, and the smaller model is extended by the most promising
+        effects.
+        """
         for _ in range(MAX_SWAP_ROUNDS):
             # Each smaller model is extended again, because the removed effect may not be the best.
             self.refit_extensions(

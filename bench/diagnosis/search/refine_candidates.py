@@ -64,7 +64,10 @@ def refine_best_model(search: EffectSearch, model: FittedModel) -> FittedModel:
 
 
 def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
-    """Return the best among a model and all models with one effect replaced by any other."""
+    """Replace each effect by every other effect of the library, and return the best model.
+
+    Unlike `swap_effect`, which refits only the most promising candidates, all are fitted.
+    """
     size = len(model.effects)
     known = set(search.models)
     smaller = [search.remove_effect(model, name) for name in model.effects]
@@ -80,7 +83,7 @@ def _swap_each_effect(search: EffectSearch, model: FittedModel) -> FittedModel:
 
 
 def _differs_in_one(model: FittedModel, other: FittedModel) -> bool:
-    """Return whether two models share at least one effect and differ in exactly one."""
+    """Return whether `other` has all effects of a model of at least two effects except one."""
     return len(model.effects) > 1 and len(set(model.effects) - set(other.effects)) == 1
 
 
@@ -143,7 +146,10 @@ def list_submodels(search: EffectSearch, model: FittedModel) -> list[FittedModel
 
 
 def _estimate_model_noise(search: EffectSearch, model: FittedModel) -> NoiseModel | None:
-    """Return the noise of the residual of a model; None if the residual has structure."""
+    """Estimate the AR(1) noise of each channel from the residual of a model.
+
+    Return None if the residual has structure, because it is then not noise.
+    """
     if assess_lack_of_fit(search, model).has_structure:
         return None
     sigma = np.maximum(model.likelihood.sigma, 1e-300)

@@ -94,7 +94,11 @@ def select_refit_starts(
 
 
 def _find_simulated_scores(world: RunEvaluator, scores: CandidateScores) -> frozenset[int]:
-    """Return the indices of candidates scored by full simulation, if the others are linearised."""
+    """Return the indices of the candidates of a robot that are scored by full simulation.
+
+    They are the series effects, whose response cannot be linearised; for other systems all scores
+    are computed in the same way, and the result is empty.
+    """
     if not world.has_linearisation:
         return frozenset()
     # Imported here, because only robots need it.
@@ -110,7 +114,15 @@ def _find_simulated_scores(world: RunEvaluator, scores: CandidateScores) -> froz
 def _rank_candidates(
     scores: CandidateScores, most: int, share: float, everything: bool, apart: frozenset[int]
 ) -> list[int]:
-    """Return the indices of the candidates to refit, the most promising first."""
+    """Return the indices of the candidates to refit, the most promising first.
+
+    Args:
+        scores: scores of all candidates.
+        most: maximum number of candidates by their score.
+        share: minimum score above the null level, as a share of the best one.
+        everything: whether to return all candidates.
+        apart: candidates scored by full simulation, which are selected separately.
+    """
     promise = scores.score - scores.null_quantiles
     ranked: list[int] = np.argsort(-promise, kind="stable").tolist()
     if everything:
@@ -182,7 +194,11 @@ def _predict_jacobian(
 def _list_start_sizes(
     world: RunEvaluator, found: DirectionSet, group: DirectionGroup, scored: Array, name: str
 ) -> Iterator[Array]:
-    """Yield initial coefficients: as scored, smaller, and at shares of the plausible range."""
+    """Yield initial coefficients of an effect, from which its fit may reach different local minima.
+
+    They are the linear estimate `scored`, smaller shares of it, and shares of the plausible range.
+    `group` has the directions of the effect at one grid point.
+    """
     bounds = compute_coefficient_bounds(world, name)
     first = found.candidates[group.column_indices[0]]
     # A direction for one full size says nothing about other sizes.

@@ -126,7 +126,10 @@ class ScoreTest:
         }
 
     def project_out(self, residuals: Array) -> Array:
-        """Return residuals (S, R, T, C) after a linear fit of parameters and initial states."""
+        """Subtract from residuals (S, R, T, C) what parameters and initial states can absorb.
+
+        Surrogate residuals are treated so, because the real residual is what a fit has left.
+        """
         return self._design.project_out(residuals)
 
     def compute_scores(self, residual: Array, surrogate: Array | None = None) -> CandidateScores:
@@ -224,7 +227,12 @@ class _BestScores:
         self._without = np.maximum(self._without, nothing)
 
     def _value(self, left: Array, total: Array) -> Array:
-        """Return eq. (3) for the remaining sums of squares."""
+        """Return l(phi) of eq. (3), twice the log-likelihood, at the present correlation.
+
+        Args:
+            left: sums of squares of the residual after the directions have explained their part.
+            total: sums of squares before, which limit the logarithm.
+        """
         # A fully explained residual leaves only rounding, so the logarithm is bounded.
         floor = 1e-12 * total + 1e-300
         logarithms = np.log(np.maximum(left, floor))
@@ -253,7 +261,7 @@ class _BestScores:
         self._coefficients[places, : coefficients.shape[1]] = coefficients[better]
 
     def end(self) -> None:
-        """Finish a correlation after all groups were entered."""
+        """Finish a correlation: update the best likelihood of each effect from its groups."""
         values = self._value(self._total - self._gains, self._total)
         self._best = np.maximum(self._best, values)
         # With phi = 0, whitening leaves sums of squares unchanged.
@@ -262,7 +270,7 @@ class _BestScores:
             self._white = np.maximum(values[:, 0] - nothing, 0.0)
 
     def ranked(self) -> CandidateScores:
-        """Return the scores in descending order, with their p-value."""
+        """Return the scores of eq. (4) in descending order, with the p-value of eq. (5)."""
         gains = self._best - self._without  # (4)
         observed = gains[:, 0]
         drawn = gains[:, 1:]
@@ -291,7 +299,12 @@ class _BestScores:
         )
 
     def _peaks(self, places: NDArray[np.intp]) -> tuple[ScorePeak, ...]:
-        """Return the best group of an effect; with many shapes also further local maxima."""
+        """Return the best group of an effect with its coefficients, as start of a fit.
+
+        An effect with many shapes, such as frequencies, may have several local maxima of the
+        likelihood; the best of them are returned. `places` has the indices of the groups of the
+        effect.
+        """
         values = self._values[places]
         several = len(places) > SHAPE_COUNT_FOR_MULTISTART
         peaks = values == values.max()

@@ -94,12 +94,15 @@ class ScoredModelSet(ModelSet):
 
     @property
     def base_model(self) -> FittedModel:
-        """The model without any effect."""
+        """The fitted model without any effect."""
         return self.models[frozenset()]
 
     @property
     def base_scores(self) -> CandidateScores | None:
-        """Scores about the base model or its previous fit; None if there are none."""
+        """Scores of all effects about the base model; None if it was not scored.
+
+        If the base model was replaced by a better fit, these are the scores about its previous fit.
+        """
         key: frozenset[str] = frozenset()
         if key in self.scores_by_effects or key not in self.superseded_scans:
             return self.scores_by_effects.get(key)
@@ -113,7 +116,10 @@ class ScoredModelSet(ModelSet):
         return None
 
     def on_replaced(self, key: frozenset[str]) -> None:
-        """Discard the scores about a model that was replaced."""
+        """Discard the scores about a model that was replaced by a better fit of the same effects.
+
+        Its directions are kept, because they are reused if the better fit is nearly the same.
+        """
         self.scores_by_effects.pop(key, None)
         if key in self.cached_scans:
             self.superseded_scans[key] = self.cached_scans.pop(key)
@@ -191,12 +197,15 @@ class ScoredModelSet(ModelSet):
         self._make_room([*keys, *(frozenset(model.effects) for model in beside)])
 
     def _look(self, model: FittedModel) -> None:
-        """Report the scoring of a model as the next step."""
+        """Report to the user that a model is scored now, and stop if the search has to end."""
         about = " + ".join(model.effects) or "the base model"
         self.world.watch.report_and_check(f"scores of the library about {about}")
 
     def _make_room(self, asked: Sequence[frozenset[str]]) -> None:
-        """Remove the oldest stored directions, except those of the base model and of `asked`."""
+        """Remove the oldest stored directions until `DIRECTION_CACHE_BYTES` is not exceeded.
+
+        Those of the base model and of the models `asked` are kept.
+        """
         for kept in (self.superseded_scans, self.cached_scans):
             for key in [k for k in kept if k and k not in asked]:
                 held = [*self.superseded_scans.items(), *self.cached_scans.items()]
@@ -208,8 +217,8 @@ class ScoredModelSet(ModelSet):
                 del kept[key]
 
     def _take(self, key: frozenset[str], scanned: ModelScan) -> None:
+        """Store the scan of the model `key` (its effects) as the latest one, with its scores."""
         # Insert the entry again, so that it is the newest one.
-        """Store results as the latest ones."""
         self.cached_scans.pop(key, None)
         self.cached_scans[key] = scanned
         self.enter_scores(key, scanned.scores)
@@ -228,12 +237,16 @@ class ScoredModelSet(ModelSet):
             self.null_gains = dict(zip(scores.effects, scores.null_quantiles.tolist(), strict=True))
 
     def _moved(self, one: TrajectoryFit, other: TrajectoryFit) -> float:
-        """Return the RMS difference of two fits at the samples, in sigmas."""
+        """Return by how much two fits differ: RMS over all samples, in units of the noise."""
         apart = (one.simulated - other.simulated) / self.noise.sigma
         return float(np.sqrt(np.square(apart[self.observed_mask]).mean()))
 
     def _lacking(self, model: FittedModel) -> list[str]:
-        """Return the effects that a model lacks."""
+        """Return the effects that could be added to a model.
+
+        These are all effects of the library that are neither in the model nor contained in one of
+        its effects.
+        """
         held = set(model.effects)
         # An effect and one that it contains have no unique solution together.
         for name in model.effects:
@@ -299,13 +312,16 @@ class ScoredModelSet(ModelSet):
         return self.world.has_linearisation and behind > NESTED_MODEL_TOLERANCE
 
     def _contained(self, start: FitStart) -> set[frozenset[str]]:
-        """Return the models in which one effect is replaced by an effect that it contains."""
+        """Return the models in which one effect is replaced by a simpler one that it contains.
+
+        Each model is the set of its effects.
+        """
         own = frozenset(start.effects)
         effects = self.world.available_effects
         return {own - {name} | {part} for name in own for part in effects[name].contains}
 
     def _explained(self, keys: Iterable[frozenset[str]]) -> bool:
-        """Return whether one of these models leaves only noise."""
+        """Return whether one of the fitted models `keys` (sets of effects) leaves only noise."""
         models = [self.models[key] for key in keys if key in self.models]
         return any(
             self.is_noise_like(m) and self.compute_excess(m) < MAX_EXCESS_TO_STOP for m in models
@@ -388,7 +404,17 @@ def _scan_model(
     seen: Mask,
     stream: np.random.Generator,
 ) -> ModelScan:
-    """Score one model; runs in this process or in a worker."""
+    """Score all effects that one model lacks; runs in this process or in a worker.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        lacking: names of the effects that it lacks.
+        weights: noise that weights the channels.
+        residual: (R, T, C) residual of the model.
+        seen: (R, T, C) mask of available samples.
+        stream: random generator of the surrogates.
+    """
     candidates = compute_directions(world, at, lacking)
     test = ScoreTest(at, candidates, seen, weights)
     return ModelScan(at, candidates, test, _scored(test, residual, residual, seen, stream))
@@ -397,7 +423,11 @@ def _scan_model(
 def _scored(
     test: ScoreTest, residual: Array, against: Array, seen: Mask, stream: np.random.Generator
 ) -> CandidateScores:
-    """Return the scores of a residual, with surrogates that have the spectrum of `against`."""
+    """Return the scores of a residual, with a p-value from surrogate residuals.
+
+    The surrogates are random noise with the spectrum of the residual `against` (R, T, C); they show
+    which scores such noise reaches by chance.
+    """
     return compute_calibrated_scores(
         test,
         residual,

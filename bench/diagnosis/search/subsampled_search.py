@@ -48,7 +48,10 @@ def search_with_subsampling(search: EffectSearch) -> FittedModel:
 
 
 def _search_subsampled(search: EffectSearch, few: RunEvaluator) -> FittedModel:
-    """Search on thinned runs, then confirm the result on all samples."""
+    """Search on the thinned runs `few`, which is faster, then confirm the result on all samples.
+
+    If all samples show more effects than the thinned runs did, the search is repeated on them.
+    """
     # If the scores of the base model, which all merits need anyway, show nothing, no search is
     # needed.
     if search.is_complete(search.base_model, MAX_P_VALUE_FIRST_EFFECT):
@@ -74,14 +77,21 @@ def _search_subsampled(search: EffectSearch, few: RunEvaluator) -> FittedModel:
 
 
 def _adopt_subsampled_models(search: EffectSearch, model: FittedModel) -> None:
-    """Store the model that the thinned runs support without a fit, for lack of time."""
+    """Store the model that the thinned runs support; simulate it on all samples without a fit.
+
+    It is used if the time limit ends the search on the thinned runs.
+    """
     fitter = TrajectoryFitter(search.world, search.noise, search.frozen)
     (fit,) = fitter.fit_models([model.fit.make_start()], iterations=0)
     search.best_supported_model = search.add_fit(fit)
 
 
 def _collect_full_fit_starts(sketch: EffectSearch, found: FittedModel) -> list[FitStart]:
-    """Return starts of fits to all samples: the result, its rivals and parts, and best singles."""
+    """Collect the models on thinned runs (`sketch`) from which fits to all samples start.
+
+    They are the result, models that explain the data nearly as well, models without one of its
+    effects, and the best models of a single effect.
+    """
     near = [found, *list_competing_models(sketch, found), *list_submodels(sketch, found)]
     near += [sketch.remove_effect(found, name) for name in found.effects]
     near += select_by_size(sketch, 1)[:MAX_SINGLE_EFFECT_REFITS]
@@ -103,7 +113,7 @@ def _select_full_model(search: EffectSearch, found: FittedModel) -> FittedModel:
 
 
 def _is_confirmed_by_all_samples(search: EffectSearch, model: FittedModel) -> bool:
-    """Return whether all samples show no more effects than the thinned runs did."""
+    """Return whether all samples support the model without any further effect."""
     # Far from the noise, more samples of the same runs show nothing new.
     if search.compute_excess(model) >= FAR_EXCESS:
         return True

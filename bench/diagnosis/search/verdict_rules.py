@@ -207,7 +207,7 @@ def convert_excess_ratio(ratios: Sequence[float]) -> float:
 
 
 def compute_excess_ratio(excess: float, other: float) -> float:
-    """Return the ratio of two excesses, each at least `NEGLIGIBLE_EXCESS`."""
+    """Return the ratio of two excesses, each raised to at least `NEGLIGIBLE_EXCESS`."""
     # For two models at the noise floor, the ratio is random and may be arbitrarily large.
     return max(excess, NEGLIGIBLE_EXCESS) / max(other, NEGLIGIBLE_EXCESS)
 
@@ -259,7 +259,7 @@ class DiagnosisState:
 
 
 def decide_verdict(state: DiagnosisState) -> VerdictName:
-    """Return the verdict for the given answers; the first rule that applies decides."""
+    """Return the verdict that follows from the answers; the first rule that applies decides."""
     # If the base model is not determined, every cause could be a wrong parameter value.
     if not state.fixed:
         return "unidentifiable"

@@ -50,7 +50,7 @@ class LaggedSums(NamedTuple):
         return LaggedSums(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     def combine(self, phi: float) -> Array:
-        """Return the products after whitening with the given correlation."""
+        """Combine the three sums to the whitened inner products (W a)'(W b) of eq. (1)."""
         square = phi * phi
         follow = (1.0 + square) * self.whole - phi * self.mixed - square * self.ends
         result: Array = follow / (1.0 - square)  # (1)
@@ -90,7 +90,10 @@ class SegmentColumns(NamedTuple):
 
 
 def count_missing_neighbours(seen: Mask) -> Array:
-    """Return the number of missing neighbours (R, T, C) of each available sample."""
+    """Count the missing neighbours in time of each available sample: n_t of eq. (1), (R, T, C).
+
+    The first and the last sample of a run lack one neighbour each.
+    """
     lacking = np.full(seen.shape, 2.0)
     lacking[:, 1:] -= seen[:, :-1]
     lacking[:, :-1] -= seen[:, 1:]
@@ -100,7 +103,7 @@ def count_missing_neighbours(seen: Mask) -> Array:
 
 
 def select_run(parts: LaggedSums, run: int) -> LaggedSums:
-    """Return the sums of one run, from sums that are stored for each run."""
+    """Return one run's part of per-run sums, as views to which products can be added."""
     return LaggedSums(*(values[run] for values in parts))
 
 
@@ -215,7 +218,7 @@ class WhiteningDesign:
             self._add(place)
 
     def _places(self) -> Iterator[RunSegment]:
-        """Yield all runs in sections that fit in the CPU cache."""
+        """Yield sections of the runs that are so short that their columns fit in the CPU cache."""
         count, runs, length, channels = self._directions.shape
         step = max(MAX_CHUNK_SIZE // (max(count, 1) * channels), MIN_CHUNK_SAMPLES)
         for run in range(runs):
@@ -226,7 +229,13 @@ class WhiteningDesign:
                 yield RunSegment(run, begin, end, edge, without[edge])
 
     def _columns(self, values: Array, place: RunSegment, beside: bool = True) -> SegmentColumns:
-        """Return the columns of values (k, R, T, C); neighbours only if requested."""
+        """Return weighted samples of one section, and the sums of their two neighbours in time.
+
+        Args:
+            values: (k, R, T, C) columns: derivatives, directions or residuals.
+            place: the section.
+            beside: whether neighbours are needed; otherwise they are zero.
+        """
         run, begin, end = place.run, place.begin, place.end
         rows = len(values)
         # Include one more sample on either side, as a neighbour of the outermost samples.
@@ -245,7 +254,7 @@ class WhiteningDesign:
         return SegmentColumns(flat, near.reshape(size), flat[:, place.edge])
 
     def _add(self, place: RunSegment) -> None:
-        """Add the products of one section."""
+        """Add the products of one section of a run to the sums of eq. (1)."""
         own = self._columns(self._jacobian, place)
         some = self._columns(self._directions, place)
         add_cross_products(select_run(self._normal, place.run), own, own, place)
@@ -313,13 +322,19 @@ class WhiteningDesign:
         return np.where(self._weights > 0, result, 0.0)
 
     def reduce(self, phi: float) -> _ReducedDesign:
-        """Return the design whitened with a correlation and projected; the result is cached."""
+        """Return the whitened design with fitted unknowns projected out, eq. (2), for one phi.
+
+        The result is cached.
+        """
         if phi not in self._known:
             self._known[phi] = self._reduce(phi)
         return self._known[phi]
 
     def _reduce(self, phi: float) -> _ReducedDesign:
-        """Whiten and project the design for one correlation."""
+        """Whiten the design with the correlation phi, and project it by eq. (2), without a cache.
+
+        First the initial states of each run are projected out, then the parameters of all runs.
+        """
         q = self._own
         normal = self._normal.combine(phi)
         mixed = self._mixed.combine(phi)
@@ -386,7 +401,7 @@ class InnerProducts:
 
 
 def _flat(values: Array) -> Array:
-    """Return rows (k, T, C) with all channels in one row."""
+    """Reshape (k, T, C) to (k, T · C)."""
     return values.reshape(len(values), -1)
 
 
@@ -405,7 +420,15 @@ def _project_residuals(known: _ReducedDesign, shared: Array) -> tuple[Array, Arr
 
 
 def _project_directions(roots: Array, products: Array) -> Array:
-    """Return L'J'a of eq. (2), (R s, n), from products (R, s, n)."""
+    """Multiply the products J'a of each run by the root L', as in eq. (2).
+
+    Args:
+        roots: (R, s, s) L of each run.
+        products: (R, s, n) J'a of each run for n columns a.
+
+    Returns:
+        L'J'a of all runs, (R s, n).
+    """
     runs, size, count = products.shape
     return (roots.transpose(0, 2, 1) @ products).reshape(runs * size, count)
 
