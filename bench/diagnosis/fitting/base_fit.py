@@ -72,7 +72,7 @@ class BaseFit:
 
     @property
     def fixed_parameters(self) -> frozenset[int]:
-        """Indices of all parameters that stay nominal."""
+        """Indices in theta of all base parameters that stay at their nominal values."""
         return self.insensitive_parameters | self.unidentified_parameters
 
 
@@ -146,7 +146,11 @@ def correct_discretisation(world: RunEvaluator, noise: NoiseModel, base: BaseFit
 
 
 def _starts(world: RunEvaluator, given: Array | None) -> list[Array]:
-    """Return start parameters (P,): the given ones, or the nominal ones and a regular grid."""
+    """Return parameter vectors (P,) from which the base model is fitted.
+
+    They are the `given` base parameters (b,), or the nominal ones and a regular grid over the
+    bounds.
+    """
     nominal = world.get_nominal_theta()
     if given is not None:
         nominal[world.base] = given
@@ -165,7 +169,10 @@ def _starts(world: RunEvaluator, given: Array | None) -> list[Array]:
 
 
 def _between(parameter: Parameter, share: float) -> float:
-    """Return the value at a share of the bounds of a parameter."""
+    """Return the value at a share (0 to 1) of the way from the lower to the upper bound.
+
+    Over a wide positive range, equal steps of the share multiply the value by equal factors.
+    """
     low, high = parameter.bounds
     if low > 0 and high / low > LOG_SCALE_RATIO:
         return float(low * (high / low) ** share)
@@ -219,7 +226,11 @@ def costs_of_starts(
 
 
 def _is_sensitive(world: RunEvaluator, fit: TrajectoryFit, place: int, noise: NoiseModel) -> bool:
-    """Return whether a parameter influences the data."""
+    """Return whether the simulated runs depend on a parameter enough to estimate it.
+
+    The test is the norm of the change of all samples, in units of the noise, if the parameter moves
+    over its whole range. `place` is the index of the parameter in theta.
+    """
     # A fixed parameter has no column.
     columns = np.flatnonzero(fit.free == place)
     if not columns.size:

@@ -29,7 +29,10 @@ ROUNDS = 5
 
 
 def at_bounds(world: RunEvaluator, base: BaseFit) -> list[int]:
-    """Return the indices of fitted base parameters at a bound that physics allows to exceed."""
+    """Return the indices in theta of fitted base parameters whose range should be widened.
+
+    They are at a bound of their range, and physics allows values beyond this bound.
+    """
     places = []
     for i in world.base.tolist():
         if i in base.fixed_parameters:
@@ -128,7 +131,10 @@ def limits_of(world: RunEvaluator, place: int) -> Bounds:
 
 
 def _coefficient(kind: Any, name: str) -> Any:
-    """Return the effect coefficient of a robot that a freed parameter stands for, or None."""
+    """Return the effect coefficient that a freed parameter of a robot's model file is fitted as.
+
+    It is None for a parameter of the simulator itself.
+    """
     for effect in kind.system.freed_effects:
         for c in effect.coefficients:
             if name in (effect.name, f"{effect.name}.{c.name}"):

@@ -27,7 +27,7 @@ Larger values come from an unstable motion, which says nothing about motions nea
 
 
 def is_finite_response(changes: Array) -> Mask:
-    """Return where a change is usable: neither NaN, infinite, nor larger than `MAX_RESPONSE`."""
+    """Return a mask of usable changes: not NaN, and of a magnitude below `MAX_RESPONSE`."""
     # Two comparisons avoid the modulus, which would copy one of the largest arrays.
     near: Mask = (changes > -MAX_RESPONSE) & (changes < MAX_RESPONSE)
     return near

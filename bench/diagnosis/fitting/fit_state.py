@@ -97,7 +97,10 @@ class KnownJacobian(NamedTuple):
     jacobian: Array
 
     def drop_parameters(self, places: Collection[int]) -> KnownJacobian:
-        """Return the derivatives without those by some parameters."""
+        """Return the derivatives without the columns of the parameters `places` (indices in theta).
+
+        It is used for a model with fewer effects than the one whose derivatives are known.
+        """
         kept = [j for j, place in enumerate(self.free.tolist()) if place not in places]
         return KnownJacobian(self.free[kept], self.jacobian[..., kept])
 
@@ -154,11 +157,11 @@ class TrajectoryFit:
     is_own_jacobian: bool = True
 
     def get_known_jacobian(self) -> KnownJacobian:
-        """Return the derivatives by the parameters, for use in fits that start nearby."""
+        """Return the derivatives by the parameters, for reuse in fits that start nearby."""
         return KnownJacobian(self.free, self.jacobian[..., : self.free.size])
 
     def make_start(self) -> FitStart:
-        """Return a start that continues from this fit."""
+        """Return a start with which another fit continues from this one."""
         return FitStart(self.effects, self.theta, self.states)
 
 
@@ -229,7 +232,11 @@ class FitState:
         return slow and not self._is_far(self.point.cost)
 
     def get_tolerance(self, cost: float) -> float:
-        """Return the convergence threshold: minimum decrease of the cost by a step."""
+        """Return the decrease of the cost by a step below which the fit has converged.
+
+        It has an absolute part in units of the noise variance, and a share of the `cost` (the sum
+        of squares), which is larger if the model is far from the data.
+        """
         if self.is_final_fit:
             return FINAL_CONVERGENCE_TOLERANCE
         return (
@@ -238,11 +245,14 @@ class FitState:
         )
 
     def _is_far(self, cost: float) -> bool:
-        """Return whether a fit with a rough cost is far from the data."""
+        """Return whether a fit is far from the data and has a rough cost (only robots do).
+
+        The cost of such a fit changes by jumps that are larger than the remaining gain.
+        """
         return self.rough and cost > FAR * self.samples
 
     def make_fit(self) -> TrajectoryFit:
-        """Return the present result of the fit."""
+        """Return the best point so far as a fitted model."""
         at = self.point
         return TrajectoryFit(
             at.start.effects,
@@ -318,7 +328,11 @@ class FitState:
             self.mark_converged()
 
     def reject_step(self) -> None:
-        """Increase the damping (3) after a rejected step, unless outdated derivatives caused it."""
+        """Increase the damping by eq. (3) after a step that did not decrease the cost.
+
+        If the derivatives belong to another point, they may have caused the bad step, so they are
+        recomputed first. A fit with a rough cost ends if it can hardly gain anything.
+        """
         if not self.has_own_jacobian:
             self.is_jacobian_stale = True
             return

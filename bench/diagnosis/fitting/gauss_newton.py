@@ -77,7 +77,15 @@ class _ArrowheadEquations:
     pull: Array
 
     def solved(self, stuck: Mask) -> tuple[Array, Array]:
-        """Solve (4) and (5) for the steps (q,) and (R, s); stuck parameters (q,) do not move."""
+        """Solve the normal equations by the Schur complement, eqs. (4) and (5).
+
+        Args:
+            stuck: (q,) mask of parameters that do not move, because they are at a bound.
+
+        Returns:
+            The steps of the shared parameters (q,) and of the initial states (R, s); NaN if the
+            derivatives give no usable step.
+        """
         schur, inverse_cross = compute_schur_complement(self.shared, self.cross, self.inner)
         # V⁻¹ b of all runs.
         columns = self.pull[:, :, None]
@@ -179,7 +187,15 @@ def _assemble_normal_equations(
     drift: Array,
     prior: Array,
 ) -> _ArrowheadEquations:
-    """Build equations (2) and (3) from residuals (R, n) and derivatives (R, n, q + s)."""
+    """Build the normal equations (2) and (3) of all runs, without damping.
+
+    Args:
+        j: (R, n, q + s) whitened derivatives, initial states last; n samples of all channels.
+        r: (R, n) whitened residuals.
+        q: number of shared parameters.
+        drift: (R, s) d of eq. (1).
+        prior: (s,) π of eq. (1).
+    """
     own = slice(q, j.shape[2])
     # One product contains all AᵀA, AᵀB and BᵀB, another one all Aᵀr and Bᵀr.
     transposed = j.transpose(0, 2, 1)
@@ -196,7 +212,11 @@ def _assemble_normal_equations(
 
 
 def _apply_damping(arrow: _ArrowheadEquations, damping: float, known: Mask) -> _ArrowheadEquations:
-    """Return the damped equations, in which known initial states do not move."""
+    """Add the damping λ times their own diagonals to U and V, and hold known initial states fixed.
+
+    A small ridge is always added to U, so that it can be inverted if parameters have the same
+    response. `known` (R, s) marks the known initial states.
+    """
     diagonal = np.einsum("rii->ri", arrow.inner)
     inner = arrow.inner + damping * diagonal[:, :, None] * np.eye(arrow.inner.shape[1])
     inner, cross = hold_known_states(inner, arrow.cross, known)
@@ -215,7 +235,11 @@ def _predict_decrease(
     shared: Array,
     own: Array,
 ) -> float:
-    """Return the decrease (6) of the cost if the residual were linear."""
+    """Return the decrease of the cost by a step if the residual were linear, eq. (6).
+
+    The damping is adapted to how well the actual decrease agrees with it. Arguments are those of
+    `_assemble_normal_equations`, with the steps `shared` (q,) and `own` (R, s).
+    """
     repeated = np.tile(shared, (len(r), 1))
     steps = np.concatenate([repeated, own], axis=1)
     changes = np.matmul(j, steps[:, :, None])[:, :, 0]

@@ -60,7 +60,11 @@ def compute_effect_responses(
 def _responses(
     world: RunEvaluator, run: int, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
 ) -> tuple[Array, int]:
-    """Compute the responses of one run (K, T, C), and the number of simulations used."""
+    """Compute how one run changes by each of K added effects (K, T, C); runs in a worker.
+
+    The second result is the number of simulations that were needed. `states` (s,) is the initial
+    state of the run.
+    """
     about = _get_linearisation(world, run, theta, states)
     return about.compute_effect_responses([(world.available_effects[name], c) for name, c in added])
 
@@ -103,14 +107,18 @@ def begun_about(world: RunEvaluator, theta: Array, states: Array) -> Array:
 
 
 def _begun(world: RunEvaluator, run: int, theta: Array, states: Array) -> Array:
-    """Compute the derivatives (s, T, C) of one run by its initial states."""
+    """Compute the derivatives (s, T, C) of one run by its initial states; runs in a worker."""
     return _get_linearisation(world, run, theta, states).compute_initial_state_responses()
 
 
 def _get_linearisation(
     world: RunEvaluator, run: int, theta: Array, states: Array
 ) -> RunLinearisation:
-    """Return the linearisation of one run, cached because most are used more than once."""
+    """Return the linearised dynamics along one run of a robot, about given parameters.
+
+    The latest ones are cached, one per run on average, because most are used more than once.
+    `theta` is (P,), `states` (s,): positions first, then velocities.
+    """
     key = run, theta.tobytes(), states.tobytes()
     kept = world.neighbourhoods
     about: RunLinearisation | None = kept.pop(key, None)

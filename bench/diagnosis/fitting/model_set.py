@@ -119,7 +119,7 @@ class ModelSet:
 
     @property
     def observed_mask(self) -> Mask:
-        """Mask (R, T, C) of available samples."""
+        """Mask (R, T, C) of the samples that were recorded."""
         return np.isfinite(self.world.observed)
 
     def compute_residual(self, fit: TrajectoryFit) -> Array:
@@ -129,11 +129,17 @@ class ModelSet:
         return residual
 
     def add_fit(self, fit: TrajectoryFit) -> FittedModel:
-        """Store a fit, unless a better fit of the same effects is known; return the better one."""
+        """Compute the merit of a fit, and store it unless a better fit of its effects is known.
+
+        The better one is returned.
+        """
         return self._entered(self._of(fit))
 
     def _entered(self, model: FittedModel) -> FittedModel:
-        """Return the better one of a model and the stored model of the same effects."""
+        """Store a model unless a better one with the same effects is stored; return the better one.
+
+        The better one has the higher penalised log-likelihood.
+        """
         # The key does not depend on the order in which effects were added.
         key = frozenset(model.effects)
         if (
@@ -145,7 +151,7 @@ class ModelSet:
         return self.models[key]
 
     def _of(self, fit: TrajectoryFit) -> FittedModel:
-        """Return a fit with its likelihood and merit."""
+        """Return a fit with its likelihood and its merit (1), the penalised log-likelihood."""
         free = fit.free.size + count_identified_states(self.world, fit, self.noise)
         # A model that could not be simulated is stored, too, so that it is not tried again.
         found = _LOST
@@ -156,7 +162,10 @@ class ModelSet:
         return FittedModel(fit, found, merit)
 
     def with_sensitivities(self, start: FitStart) -> FitStart:
-        """Return a start with the derivatives that are known near it."""
+        """Return the start with derivatives that are known near it, to save their computation.
+
+        Here it is unchanged; a subclass may have derivatives from its linear model.
+        """
         return start
 
     def force_of_any_shape(self, model: FittedModel) -> tuple[float, str] | None:  # noqa: ARG002
@@ -167,16 +176,20 @@ class ModelSet:
         return None
 
     def on_replaced(self, key: frozenset[str]) -> None:
-        """React to the replacement of a model; does nothing here."""
+        """React to a better fit of the effects `key`; a hook for subclasses, empty here."""
 
     @property
     def parameter_penalty(self) -> float:
-        """Penalty log n of (1) for each parameter that the data determine."""
+        """Penalty log n of eq. (1), the merit, for each parameter that the data determine."""
         count = int(self.observed_mask.sum())
         return float(np.log(max(count, MIN_EFFECTIVE_SAMPLES)))
 
     def get_effect_penalty(self, name: str) -> float:
-        """Return the additional penalty of an effect, its part of the last term of (1)."""
+        """Return the part of the last term of eq. (1), the merit, that belongs to an effect.
+
+        An effect with many shapes gains likelihood by chance. The part of this gain that the
+        penalty of its coefficients does not cover is subtracted.
+        """
         slot = self.world.slots[name]
         # If there are few shapes, the coefficients alone pay for the gain under the null
         # hypothesis.
@@ -219,16 +232,22 @@ class ModelSet:
         self._report_best()
 
     def fit_all(self, starts: Sequence[FitStart]) -> list[FittedModel]:
-        """Fit models from their starts together, and return the best fits of their effects."""
+        """Fit models from their starts together, and return the best known fit of each.
+
+        Unlike in `refit_models`, no fit is stopped because another one is better.
+        """
         self.refit_models(starts, race=False)
         return [self.models[frozenset(start.effects)] for start in starts]
 
     def fit_one(self, start: FitStart) -> FittedModel:
-        """Fit a model from a start, and return the best fit of its effects."""
+        """Fit a model from a start, and return the best known fit with the same effects."""
         return self.fit_all([start])[0]
 
     def _report_best(self) -> None:
-        """Report the model with the highest merit and the share of the discrepancy it removes."""
+        """Report the effects of the best model, and how much they explain, to the display.
+
+        The share is the part of the base model's excess over the noise that they remove.
+        """
         base = self.models.get(frozenset())
         best = max(
             self.models.values(), key=lambda model: model.penalised_log_likelihood, default=base
@@ -292,7 +311,11 @@ class ModelSet:
         return model
 
     def _sifted(self, starts: Sequence[FitStart], noise: NoiseModel) -> list[FitStart]:
-        """Return the starts of the best models after all fit horizons but the last (whole runs)."""
+        """Fit the first part of the runs, and return the starts of the models that fit it best.
+
+        Each fit horizon is a longer part of the runs, with fewer models; the last horizon, whole
+        runs, is left to the caller.
+        """
         begun = list(starts)
         # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.
         for horizon, count in zip(FIT_HORIZONS[:-1], MODELS_KEPT_PER_HORIZON, strict=True):
@@ -303,26 +326,36 @@ class ModelSet:
         return begun
 
     def _reached(self, starts: Sequence[FitStart]) -> float:
-        """Return the lowest cost of known models with at most as many effects as the starts."""
+        """Return the lowest cost of fitted models that are at most as large as the starts.
+
+        Fits that fall far behind this cost are stopped early. It is infinite without such models.
+        """
         most = max(len(start.effects) for start in starts)
         known = self.models.values()
         costs = [m.fit.cost for m in known if 0 < len(m.effects) <= most]
         return min(costs, default=np.inf)
 
     def get_best(self, size: int) -> FittedModel | None:
-        """Return the model with the highest merit among those with `size` effects."""
+        """Return the model of `size` effects with the highest merit; None if none was fitted."""
         known = self.models.values()
         models = [m for m in known if len(m.effects) == size]
         return max(models, key=lambda m: m.penalised_log_likelihood) if models else None
 
     def compute_excess(self, model: FittedModel) -> float:
-        """Return the RMS residual of a model in units of the noise floor, minus one."""
+        """Return the RMS residual of a model, in units of the noise floor, minus one.
+
+        A model whose residual is only noise has the excess 0.
+        """
         scaled = self.compute_residual(model.fit) / self.noise.sigma
         squares = np.square(scaled[self.observed_mask])
         return float(np.sqrt(squares.mean())) - 1.0
 
     def compute_channel_weights(self, model: FittedModel) -> NoiseModel:
-        """Return noise that is raised to the residual of a model where that is larger."""
+        """Return the noise that weights the channels in a score test about a model.
+
+        It is raised to the residual of the model where that is larger, so that a channel that the
+        model does not follow does not dominate.
+        """
         sigma = model.likelihood.sigma
         # A channel without samples has no sigma, and its weight has no influence.
         left = np.where(np.isfinite(sigma), sigma, 0.0)
@@ -330,14 +363,14 @@ class ModelSet:
 
 
 def _format_starts(starts: Sequence[FitStart]) -> str:
-    """Return a short description of the models that start there."""
+    """Return a short description of the models of these starts, for the progress display."""
     names = list(dict.fromkeys(" + ".join(start.effects) or "the base model" for start in starts))
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     return f"{names[0]}{more}" if names else "nothing"
 
 
 def _fitting(starts: Sequence[FitStart]) -> str:
-    """Return the name of the stage that fits these models, by their number of effects."""
+    """Return the name of the stage that fits these models, for the progress display."""
     size = max((len(start.effects) for start in starts), default=0)
     one, several = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
     return f"fitting {one if len(starts) == 1 else several}"

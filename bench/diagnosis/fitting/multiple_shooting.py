@@ -64,7 +64,7 @@ def make_segment_evaluator(world: RunEvaluator) -> RunEvaluator | None:
 
 
 def _split_run(run: Run) -> list[Run]:
-    """Return the segments of a run, or the run itself if it is too short."""
+    """Split a run into segments of equal length, or return it whole if one is too sparse."""
     # A time counts as sampled if any channel has a sample.
     values = np.stack(list(run.channels.values()))
     seen: Mask = np.any(np.isfinite(values), axis=0)

@@ -169,7 +169,10 @@ class TrajectoryFitter:
         return [p.make_fit() for p in problems]
 
     def _terms(self) -> tuple[Any, ...]:
-        """Return all fields except the world, as sent to workers."""
+        """Return all fields except the run evaluator, which workers have already.
+
+        A worker creates its own fitter from them; see `_advance_group`.
+        """
         return self.noise, self.frozen, self.share, self.parameters, self.exact
 
     def _groups(self, problems: Sequence[FitState], going: Sequence[int]) -> list[list[int]]:
@@ -229,7 +232,7 @@ class TrajectoryFitter:
         return list(problems)
 
     def _begin(self, problems: Sequence[FitState], seen: Mask) -> None:
-        """Simulate the starts, and compute derivatives or reuse known ones from nearby."""
+        """Simulate the start of each fit, and compute its derivatives unless they are known."""
         nearby = [p for p in problems if self._knows(p)]
         others = [p for p in problems if not self._knows(p)]
         if others:
@@ -246,7 +249,10 @@ class TrajectoryFitter:
                 problem.has_own_jacobian = False
 
     def _knows(self, problem: FitState) -> bool:
-        """Return whether derivatives by all fitted parameters are known near the start."""
+        """Return whether the derivatives by all fitted parameters are known near the start.
+
+        This saves one simulation per parameter. Only robots reuse derivatives.
+        """
         known = problem.point.start.known
         return (
             self.world.has_linearisation
@@ -279,7 +285,7 @@ class TrajectoryFitter:
             self._take(problem, point)
 
     def _problem(self, start: FitStart) -> FitState:
-        """Create the state of a fit: the fitted parameters, their bounds and step sizes."""
+        """Create the state of a new fit: fitted parameters, their bounds and difference steps."""
         world = self.world
         free: list[int] = []
         bounds: list[tuple[float, float]] = []
@@ -350,7 +356,10 @@ class TrajectoryFitter:
         return points
 
     def _plain_points(self, trials: Sequence[_TrialStep], seen: Mask) -> list[FitPoint]:
-        """Simulate trial points, and keep the derivatives of the present point of each fit."""
+        """Simulate trial points, and give each the derivatives of its fit's present point.
+
+        `_judge` updates these derivatives if the point is accepted.
+        """
         runs = len(self.world.guess)
         simulated = self.world.simulate(
             np.concatenate([np.tile(start.theta, (runs, 1)) for _, start in trials]),
@@ -413,7 +422,7 @@ class TrajectoryFitter:
         return jacobian
 
     def _take(self, problem: FitState, point: FitPoint) -> None:
-        """Move a fit to a point, and adapt its difference steps to the responses there."""
+        """Move a fit to a point with its derivatives, and adapt the difference steps to them."""
         problem.point = point
         problem.has_own_jacobian, problem.is_jacobian_stale, problem.is_waiting = True, False, False
         problem.steps = compute_difference_steps(point.jacobian, self.noise, problem.widths)
@@ -424,16 +433,25 @@ class TrajectoryFitter:
         return residual
 
     def _drift(self, states: Array) -> Array:
-        """Return the deviations (R, s) of initial states from their guesses, in prior sigmas."""
+        """Return d (R, s) of eq. (1) of `gauss_newton`: initial states minus their guesses.
+
+        They are in units of the prior standard deviation.
+        """
         drift: Array = (states - self.world.guess) / compute_state_prior(self.world)
         return drift
 
     def compute_cost(self, fit: TrajectoryFit) -> float:
-        """Return the cost of a fit for the noise of this fitter."""
+        """Return the cost that a fit has with the noise weights of this fitter.
+
+        Costs with different weights cannot be compared directly.
+        """
         return self._cost(fit.simulated, fit.states, self.world.get_sample_mask(self.share))
 
     def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
-        """Return the cost, eq. (1) of `arrow`; infinite if the simulation was abandoned."""
+        """Return the cost, eq. (1) of `gauss_newton`: the whitened residual and the prior, squared.
+
+        It is infinite if the simulation was abandoned.
+        """
         residual = self._residual(simulated, seen)
         # An abandoned batch element is NaN, which cannot be compared.
         if not np.isfinite(residual).all():
@@ -443,7 +461,10 @@ class TrajectoryFitter:
         return float((w * w).sum() + (drift * drift).sum())
 
     def _trials(self, problems: Sequence[FitState], seen: Mask) -> Iterator[_TrialStep]:
-        """Yield the next trial of each unfinished fit; a fit without a useful step is finished."""
+        """Propose the next point of each fit that is neither finished nor waiting.
+
+        A fit without a useful step is marked as finished or waiting and yields nothing.
+        """
         for problem in problems:
             if problem.is_finished or problem.is_waiting:
                 continue
@@ -495,7 +516,10 @@ class TrajectoryFitter:
         return replace(at.start, theta=theta, states=at.start.states + step.state_steps)
 
     def _judge(self, problem: FitState, point: FitPoint) -> None:
-        """Accept a trial point if its cost is lower, and update the damping."""
+        """Accept a trial point if its cost is lower, else reject it, and update the damping.
+
+        The derivatives of a robot are updated by Broyden's method instead of simulations.
+        """
         gained = problem.point.cost - point.cost
         own = problem.has_own_jacobian
         if point.cost < problem.point.cost:
@@ -515,7 +539,10 @@ def _advance_group(world: RunEvaluator, terms: tuple[Any, ...], *call: Any) -> l
 
 
 def compute_state_prior(world: RunEvaluator) -> Array:
-    """Return the prior standard deviations (s,) of the initial states."""
+    """Return the standard deviations (s,) of the normal priors of the initial states, SI units.
+
+    A state that samples show has such a wide prior that only the samples decide.
+    """
     if world.state_prior is not None:
         return world.state_prior
     system, shown = world.simulator.system, set(world.channels)
