@@ -123,7 +123,11 @@ def _within(bounds: tuple[float, float], coefficient: Coefficient) -> tuple[floa
 def _bounds(
     parameter: Parameter, coefficient: Coefficient, effect: Effect, world: RunEvaluator
 ) -> tuple[float, float]:
-    """Return the range of one coefficient without its physical limits."""
+    """Return the range in which a fit may move a coefficient, without its physical limits.
+
+    It is the plausible range, widened by a factor; times and frequencies are adapted to the length
+    of the runs, because the data cannot show slower changes.
+    """
     low, high = parameter.bounds
     longest = world.longest
     if is_instant(parameter):

@@ -62,7 +62,10 @@ def _missing(recording: Recording, name: str) -> float:
 
 
 def _noisy(run: Run, sizes: dict[str, float]) -> Run:
-    """Return the run with white noise in some channels, reproducible for each run and channel."""
+    """Add white noise with the standard deviations `sizes`, by channel, to a run.
+
+    The noise depends only on the names of run and channel, so it is the same every time.
+    """
 
     def noise(name: str, values: Array) -> Array:
         return sizes[name] * make_rng("least noise", run.log, run.name, name).normal(

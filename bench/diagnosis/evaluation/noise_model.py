@@ -191,7 +191,10 @@ def _maximise_channel_likelihood(
 
 
 def _list_nearby_phis(residual: Array, seen: Mask) -> Array:
-    """Return correlations to try, near the sample correlation of the residual."""
+    """Return AR(1) correlations to try for a channel, near the residual's sample correlation.
+
+    Zero (white noise) is always included.
+    """
     follows = _has_predecessor(seen)
     former = residual[:, :-1][follows]
     latter = residual[:, 1:][follows]
@@ -233,7 +236,10 @@ def compute_portmanteau_p_value(residual: Array, seen: Mask, found: Likelihood) 
 
 
 def _correlated(w: Array, count: int) -> float:
-    """Return the sum in (5) for whitened values (R, T) with `count` samples."""
+    """Return the sum Σ r_k² / (n - k) of eq. (5), the Ljung-Box test of autocorrelation.
+
+    `w` (R, T) has the whitened values of a channel, and `count` is n, the number of samples.
+    """
     runs, length = w.shape
     power = max(float((w * w).sum()), MIN_VARIANCE)
     total = 0.0

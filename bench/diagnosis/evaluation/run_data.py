@@ -87,7 +87,10 @@ def prepare_run(
 
 
 def _guessed(run: Run, simulator: SystemSimulator) -> dict[str, float]:
-    """Return initial states by name: specified, guessed from the first samples, or default."""
+    """Return a guess of each initial state, from which fits start, by name.
+
+    It is the specified value, or an estimate from the first samples, or the default.
+    """
     system = simulator.system
     values = dict(simulator.states)
     # Not strict, because a user-defined system may have states in addition to coordinates and
@@ -121,7 +124,10 @@ def _estimate_start_height(run: Run, simulator: SystemSimulator) -> float:
 
 
 def _find_unobserved_states(simulator: SystemSimulator) -> set[str]:
-    """Return the states of coordinates that no recorded channel shows; they keep their defaults."""
+    """Return the states of coordinates that no recorded channel shows.
+
+    They keep their defaults, because the data cannot determine them.
+    """
     system, shown = simulator.system, {c.name for c in simulator.channels}
     hidden = set()
     pairs = zip(system.coordinates, system.rates, strict=False)

@@ -190,7 +190,10 @@ class RunEvaluator:
         self._parts: dict[float, list[Scenario]] = {}
 
     def _simulators(self) -> tuple[SystemSimulator, SystemSimulator]:
-        """Create the simulator with all effects, and a copy with the fine step for filters."""
+        """Create the simulator with all available effects, and a copy with a finer time step.
+
+        The copy simulates coefficients that need fine steps, such as those of filters.
+        """
         kind = self.kind
         effects: list[str | type[Effect]] = list(self.library)
         effects += [effect for effect in self.extra if effect.fits(kind.system)]
@@ -382,7 +385,11 @@ class RunEvaluator:
         return result
 
     def _simulate(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
-        """Simulate a batch without correction; arguments and result as in `simulate`."""
+        """Simulate a batch in several engine calls, without cache and discretisation correction.
+
+        Elements of different kinds are simulated separately, and large batches are split. Arguments
+        and result are those of `simulate`.
+        """
         self.simulations += len(theta)
         _, length, channels = self.observed.shape
         result = np.empty((len(theta), length, channels))
@@ -436,7 +443,10 @@ class RunEvaluator:
         return other
 
     def with_kind(self, kind: type[SystemSimulator]) -> RunEvaluator:
-        """Return a `RunEvaluator` with the same runs and another simulator of the same system."""
+        """Return a run evaluator of the same runs with another simulator of the same system.
+
+        Parameters keep their indices, so that fitted models can be compared between the simulators.
+        """
         other = RunEvaluator(
             kind,
             self.recording,

@@ -58,7 +58,10 @@ def _factor(run: Run) -> int:
 
 
 def _take_every_nth(run: Run, factor: int) -> Run:
-    """Return the run with every n-th sample; n is `factor`."""
+    """Return the run with every n-th sample of its channels; n is `factor`.
+
+    An input becomes its mean between the kept samples, so that it has the same effect.
+    """
     first = np.arange(0, run.times.size, factor)
     return replace(
         run,

@@ -135,7 +135,10 @@ def _correct_bias(weights: Array, leavings: Array, seen: Mask) -> Array:
 
 
 def _drive_autoregression(weights: Array, innovations: Array) -> Array:
-    """Apply the autoregression (1) to innovations (T, ...), in place."""
+    """Turn innovations (T, ...) into autocorrelated noise by the autoregression (1), in place.
+
+    `weights` (p,) has the a_k; without weights the noise stays white.
+    """
     order = weights.size
     if not order:
         return innovations
@@ -168,7 +171,10 @@ def _centred(filled: Array, seen: Mask, weights: Array) -> Array:
 
 
 def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
-    """Return the autocovariances (largest + 1,) of values (R, T), lag 0 first."""
+    """Estimate the autocovariances (largest + 1,) of values (R, T) at the lags 0 to `largest`.
+
+    Missing samples are zero in `filled`; only pairs of available samples (`seen`) count.
+    """
     length = seen.shape[1]
     covariances = []
     for lag in range(largest + 1):
@@ -194,7 +200,10 @@ def _select_order_by_aic(covariances: Array, count: int) -> Array:
 
 
 def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
-    """Return the innovations (n,) u of (1), where all samples that they need are available."""
+    """Return the innovations u_t (n,) of eq. (1): samples minus their prediction from earlier ones.
+
+    Times at which one of the required samples is missing are left out.
+    """
     order, length = weights.size, seen.shape[1]
     predicted = np.zeros(1)
     # A sample and all samples that predict it.

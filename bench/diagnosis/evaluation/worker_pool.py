@@ -156,7 +156,10 @@ class ForkedWorkerPool:
         self._jobs = 1
 
     def _ready(self, world: SharedState) -> None:
-        """Ensure that the workers know a world; otherwise replace them by new workers."""
+        """Ensure that the workers have inherited a world; otherwise replace them by new ones.
+
+        A worker has the data that existed when it was forked, so it does not know later worlds.
+        """
         if _is_same_array(self._known, world):
             return
         for worker in list(self._team):
@@ -339,7 +342,15 @@ def _work(
     ending: mmap.mmap,
     parent: int,
 ) -> None:
-    """Process the requests of the parent until the pipe ends; main loop of a worker."""
+    """Process the requests of the parent until the pipe ends; main loop of a worker.
+
+    Args:
+        worlds: objects that the worker inherits; a request names one by its index.
+        pipe: connection to the parent.
+        others: inherited ends of other pipes, which the worker closes.
+        ending: one shared byte; a value other than zero asks all workers to stop.
+        parent: process id of the parent.
+    """
     # Ctrl-C of a terminal reaches every process of the group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError):

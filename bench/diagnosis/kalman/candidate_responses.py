@@ -221,7 +221,11 @@ class FollowedRuns:
         force: Array,
         typical: Array,
     ) -> FollowedRuns:
-        """Filter the linearised models of all runs; other arguments as those of `_fit_noise`."""
+        """Fit the process noise of the linearised models of all runs, and return their filter.
+
+        `linear` has the model of each run, linearised at its samples; other arguments are those of
+        `_fit_noise`.
+        """
         # A model that diverges between two samples overflows; `is_sound` is then false.
         with np.errstate(all="ignore"):
             maps = [run_model.interval_maps() for run_model in linear]
@@ -284,7 +288,10 @@ class FollowedRuns:
 
     @cached_property
     def losses_without_force(self) -> Array:
-        """Loss in twice the log-likelihood (E,) without each missing force."""
+        """Loss in twice the log-likelihood (E,) if the process noise of one force is removed.
+
+        A large loss shows that the model lacks a force at this coordinate.
+        """
         coloured, white = with_coloured_noise(self.runs, self.noise)
         log_likelihood = self.log_likelihood
         losses = []
@@ -320,7 +327,7 @@ class FollowedRuns:
 
     @cached_property
     def trajectories(self) -> list[Trajectory]:
-        """Smoothed motion of each run."""
+        """Smoothed motion of each run: the most likely states, given all samples of the run."""
         size = self.runs.prior.size
         trajectories = []
         for run, linear in enumerate(self.linear):

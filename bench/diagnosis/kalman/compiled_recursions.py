@@ -45,7 +45,10 @@ def _product(a: Array, b: Array, out: Array) -> None:
 
 
 def _sandwich(a: Array, p: Array, half: Array, out: Array) -> None:
-    """Write a p aᵀ for symmetric p to `out`."""
+    """Write a p aᵀ for a symmetric matrix p to `out`, as a covariance is propagated.
+
+    `half` receives the product a p. Only one triangle is computed; the other one is copied.
+    """
     product(a, p, half)
     size = a.shape[0]
     for i in range(size):

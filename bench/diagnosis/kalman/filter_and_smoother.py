@@ -104,7 +104,10 @@ class LinearRuns:
         return self._mapped(lambda values: values[chosen])
 
     def segments(self, length: int) -> LinearRuns:
-        """Split the runs into segments of `length` samples, each with the prior of a run."""
+        """Split the runs into segments of `length` samples, each with the prior of a run.
+
+        The process noise is fitted on such segments.
+        """
         number, samples, _ = self.residuals.shape
         count = -(-samples // length)
 

@@ -185,7 +185,11 @@ def gauss_newton_step(
 
 
 def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bounds) -> Array:
-    """Return the negative derivative (R, T, C) of the whitened innovations by a parameter."""
+    """Return minus the derivative (R, T, C) of the whitened innovations by one parameter.
+
+    It is a one-sided difference that stays within the bounds. `target` has the innovations at the
+    present parameters, and `place` is the index of the parameter in theta.
+    """
     low, high = bounds
     first, last = followed.world.parameters[place].bounds
     step = DIFFERENCE * min(last - first, high - low)

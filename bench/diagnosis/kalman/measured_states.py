@@ -40,7 +40,10 @@ def measured_states(world: RunEvaluator, sigma: Array, run: int) -> Mapping[int,
 
 
 def _measured(world: RunEvaluator, sigma: Array, run: int) -> Mapping[int, Array]:
-    """Estimate the states for `measured_states`."""
+    """Compute the result of `measured_states` for a run that is not in its cache.
+
+    Joints with fewer than three recorded positions are left out.
+    """
     coordinates, rates = world.simulator.system.coordinates, world.simulator.system.rates
     track = world.tracks[run]
     times, observed = track.scenario.times, track.observed

@@ -86,7 +86,11 @@ class EffectProposals:
         return by_regression + self._offset_and_friction(joint, excluded), joint_model
 
     def _by_regression(self, current: FilteredSet) -> Proposals:
-        """Return the effects that gain most by regression, each with its coefficients."""
+        """Propose the effects with the largest net gain by regression, with their coefficients.
+
+        The innovations (one-step prediction errors) of the filter with the set `current` are
+        regressed on the responses to each effect.
+        """
         regression, _ = regression_about(current, self.columns.library, current.followed)
         gains = regression.net_gains()
         proposals: dict[str, Array] = {}

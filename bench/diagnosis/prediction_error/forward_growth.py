@@ -133,7 +133,10 @@ def _grow(context: SearchContext, current: FilteredSet) -> FilteredSet:
 
 
 def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
-    """Return sets with one more effect whose likelihood pays for it, the likeliest first."""
+    """Return the sets with one more effect whose gain in likelihood exceeds its penalty.
+
+    The likeliest set is the first.
+    """
     filters = context.filters
     base = filters.log_likelihood(filters.reference)
     log_likelihood = current.followed.log_likelihood if current.names else base
@@ -185,7 +188,11 @@ def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -
 def _nearly_as_likely(
     context: SearchContext, larger_sets: Sequence[FilteredSet]
 ) -> Sequence[FilteredSet]:
-    """Return the sets between which simulation has to decide, the likeliest first."""
+    """Return the sets whose likelihood in the filter is too close to that of the best set.
+
+    The filter uses a linearised model, so these sets are then fitted by simulation. The likeliest
+    is the first; at least `MAX_FIRST_EFFECTS` sets are returned if there are so many.
+    """
     if not larger_sets:
         return ()
     error = LINEARISATION_ERROR * _gain(context, larger_sets[0])

@@ -190,7 +190,11 @@ def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Reco
 def _message(
     recording: Recording, drives: Sequence[InactiveDrive], left_out: Sequence[Mask]
 ) -> str:
-    """Return the note about drives whose state no column shows."""
+    """Write the note on samples with inactive drives that were left out.
+
+    No column of the recording shows when these drives are on. The note says how a column can be
+    stated that does.
+    """
     joints = ", ".join(drive.joint for drive in drives)
     where = spans_of_runs(recording.runs, left_out)
     noun = "joint" if len(drives) == 1 else "joints"
@@ -305,7 +309,10 @@ def _thinned(recording: Recording, every: int) -> list[Run]:
 
 
 def _forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
-    """Compute the forces of (1) by MuJoCo's inverse dynamics."""
+    """Compute the forces f, τ and g of eq. (1) of a run by MuJoCo's inverse dynamics.
+
+    Positions, velocities and accelerations are estimated from the recorded positions first.
+    """
     model = robot.compiled
     states = np.stack(track_joints(run.times, _readings(robot, recording, run)))
     motion = np.transpose(states, (2, 1, 0))
@@ -328,7 +335,10 @@ def _forces(robot: RobotModel, recording: Recording, run: Run) -> JointForces:
 
 
 def _readings(robot: RobotModel, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
-    """Return recorded positions and velocities of all joints, and their noise."""
+    """Return for each joint its recorded positions and velocities (T, 2), and their noise (2,).
+
+    A velocity that is not recorded is NaN. Noise that is not stated is estimated.
+    """
     readings = []
     for joint in robot.joints:
         columns, noise = [], []
@@ -354,7 +364,10 @@ def _mean_input(run: Run, name: str) -> Array:
 
 
 def _controls(robot: RobotModel, run: Run) -> tuple[Array, Array]:
-    """Return controls (T, nu) and activations (T, na) at the samples."""
+    """Return the controls (T, nu) and filtered activations (T, na) of a run at its samples.
+
+    nu and na are MuJoCo's numbers of actuators and of activation states.
+    """
     model = robot.compiled
     controls = np.zeros((run.times.size, model.nu))
     activations = np.zeros((run.times.size, model.na))

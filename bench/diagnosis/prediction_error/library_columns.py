@@ -88,7 +88,7 @@ class LibraryColumns:
         self._library = self.library.joined(self.filters.base.columns(self.probes(names)))
 
     def probes(self, names: Sequence[str]) -> list[CandidateDirection]:
-        """Return the probes of effects about the base model."""
+        """Return small trial coefficients (probes) of effects; their responses are regressors."""
         base, world, probes = (
             self.filters.models.base_model,
             self.filters.world,
@@ -215,7 +215,11 @@ def regression_about(
 
 
 def _tangents(world: RunEvaluator, name: str, theta: Array) -> list[CandidateDirection]:
-    """Return the whole change by an effect of a model, and one with each coefficient displaced."""
+    """Return probes for an effect of the model: as it is, and with each coefficient displaced.
+
+    The first shows what the effect changes as a whole; the differences of the others from it are
+    the derivatives by the coefficients.
+    """
     c = theta[world.slots[name]]
     probes = [CandidateDirection(name, 0, 0, c, signed=True, fixed=True)]
     for place, (low, high) in enumerate(compute_coefficient_bounds(world, name)):

@@ -105,7 +105,7 @@ class ModelFilters:
         return FilteredSet(self.base, ())
 
     def of_model(self, model: FittedModel) -> FollowedRuns:
-        """Return the runs, followed with a fitted model."""
+        """Return the Kalman filter of the runs with a fitted model; it is cached."""
         if not model.effects:
             return self.base
         key = model.fit.theta.tobytes()

@@ -98,7 +98,11 @@ class PredictionErrorSearch(EffectSearch):
         return best
 
     def _search_effects(self) -> FittedModel:
-        """Select, fit and add effects until the residual of a set is only noise."""
+        """Select effects by regression and fit them by simulation, until only noise is left.
+
+        Each further method is slower, so it is tried only if the best model does not explain the
+        runs.
+        """
         context = self._context
         selected = context.columns.select()
         if not self.is_form_given:

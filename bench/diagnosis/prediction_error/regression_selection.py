@@ -172,7 +172,11 @@ class Regression:
         return float(coefficients + 2.0 * np.log(max(len(self.effects), 2)))
 
     def gains(self, chosen: Sequence[DirectionGroup]) -> Array:
-        """Return the gain of each group in addition to a set, in twice the log-likelihood (n,)."""
+        """Return the gain (n,) in twice the log-likelihood of each group in addition to a set.
+
+        The columns of the set are projected out first. Groups that are collinear with the set, or
+        that the set contains, gain nothing.
+        """
         columns = columns_of(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
         gram, cross, rss = self.gram, self.cross, self.total
@@ -251,7 +255,7 @@ class Regression:
         return bool(after.sum() < before.sum() and (after < before).mean() >= MAJORITY)
 
     def _left_out(self, chosen: Sequence[DirectionGroup]) -> Array:
-        """Return the residual sum of squares (R,) of each run, predicted from the others."""
+        """Return the residual sum of squares (R,) of each run, predicted from the other runs."""
         found = []
         groups = [*chosen, self._nuisance]
         columns = columns_of(groups)
@@ -264,7 +268,10 @@ class Regression:
         return np.array(found)
 
     def pruned(self, chosen: Sequence[DirectionGroup]) -> list[DirectionGroup]:
-        """Remove effects that do not fulfil (2), the least useful first."""
+        """Remove effects one by one whose gain is below their price, the right side of (2).
+
+        The effect with the smallest net gain is removed first.
+        """
         left = list(chosen)
         while left:
             rss, _ = self.solve(left)

@@ -182,7 +182,10 @@ def without_idle_effects(context: SearchContext, model: FittedModel) -> FittedMo
 
 
 def _merge_into_families(context: SearchContext, model: FittedModel) -> FittedModel:
-    """Replace all members of a family by the family, which needs fewer decisions."""
+    """Replace single effects at all places by their family, one effect with the same coefficients.
+
+    The family is kept if it fits about as well. It is one decision instead of one per place.
+    """
     world = context.world
     for family in (name for name in world.library if name.endswith("@*")):
         members = [member.name for member in members_of(world.available_effects[family])]

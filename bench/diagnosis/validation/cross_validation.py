@@ -118,7 +118,7 @@ class CrossValidation:
         return folds
 
     def _of_runs(self, rows: Indices) -> RunEvaluator:
-        """Make a run evaluator of a subset of the runs."""
+        """Make a run evaluator of the runs `rows`, which are the fitted or the left-out ones."""
         world = self.world.with_runs([self.world.runs[row] for row in rows])
         length = world.observed.shape[1]
         if self.world.correction is not None:
@@ -130,7 +130,15 @@ class CrossValidation:
         return world
 
     def _refitted(self, fold: _Fold, fits: Sequence[TrajectoryFit]) -> list[Array]:
-        """Refit each model to the runs that a fold keeps, and return its parameters (P,)."""
+        """Refit each model to the runs of a fold that are not left out.
+
+        Args:
+            fold: Fold whose left-out runs will be predicted.
+            fits: Models fitted to all runs, from which the refits start.
+
+        Returns:
+            Parameters (P,) of each model; an effect that these runs do not show is switched off.
+        """
         base = set(self.world.base.tolist())
         # All models of a search keep the same parameters fixed at their nominal values.
         frozen = frozenset(base - set(fits[0].free.tolist()))
@@ -146,7 +154,12 @@ class CrossValidation:
     def _without_unsupported(
         self, world: RunEvaluator, fits: Sequence[TrajectoryFit]
     ) -> list[Array]:
-        """Return parameters (P,) of each model, with unsupported effects set to zero."""
+        """Return parameters (P,) of each model; effects that the runs do not show are off.
+
+        An effect is not shown if switching it off changes the simulated samples by less than
+        `SHOWN`, in units of the noise. Its coefficients are then arbitrary and would spoil the
+        prediction.
+        """
         thetas = [fit.theta.copy() for fit in fits]
         trials = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
         if not trials:

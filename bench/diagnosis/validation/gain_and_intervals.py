@@ -346,7 +346,10 @@ def compute_held_out_gain(
 def _sums(
     world: RunEvaluator, before: Array, after: Array, channels: Sequence[int], by_stretches: bool
 ) -> Array:
-    """Sum up each run or segment (n, 3): squared errors before and after, and sample counts."""
+    """Sum up the squared errors of two models over each run or segment, for the bootstrap.
+
+    Each row (n, 3) has the sum of squares before, the one after, and the number of samples.
+    """
     rows = []
     for run, part in _parts(world, by_stretches):
         observed = world.observed[run, part][:, channels]
@@ -365,7 +368,10 @@ def _sums(
 
 
 def _parts(world: RunEvaluator, by_stretches: bool) -> list[tuple[int, slice]]:
-    """List the parts that are resampled: whole runs, or segments if there are too few runs."""
+    """List the parts that the bootstrap resamples: whole runs, or segments of too few runs.
+
+    Each is the index of the run and the slice of its samples.
+    """
     count = len(world.tracks)
     if count > 1 and not by_stretches:
         return [(run, slice(None)) for run in range(count)]
@@ -378,7 +384,10 @@ def _parts(world: RunEvaluator, by_stretches: bool) -> list[tuple[int, slice]]:
 
 
 def _closed(sums: Array, floor: float) -> Array:
-    """Compute the share of the gap closed of each row (n, 3); 0 without a gap."""
+    """Compute the share of the gap closed, eq. (1), for each row of sums (n, 3); 0 without a gap.
+
+    A row has the squared errors before and after, and the number of samples.
+    """
     before, after, counts = sums.T
     base = np.sqrt(before / counts)
     extended = np.sqrt(after / counts)

@@ -155,7 +155,10 @@ class HeldOutRuns:
     def _fitted(
         self, starts: Sequence[FitStart], stages: Sequence[tuple[float, int]]
     ) -> list[TrajectoryFit]:
-        """Fit initial states over increasing parts of the runs."""
+        """Fit only the initial states of the runs, first to their beginning, then to longer parts.
+
+        Each of the `stages` is the share of the runs and the maximum number of iterations.
+        """
         fits: list[TrajectoryFit] = []
         if not starts:
             return fits
@@ -209,7 +212,7 @@ class HeldOutRuns:
     def _about(
         self, fits: Sequence[TrajectoryFit], stages: Sequence[tuple[float, int]]
     ) -> list[TrajectoryFit]:
-        """Continue the fits with derivatives at the nearest of them."""
+        """Continue the fits with derivatives by initial states about the best of them."""
         # This import is needed for robots only.
         from bench.diagnosis.fitting.linearised_runs import compute_state_jacobian
 

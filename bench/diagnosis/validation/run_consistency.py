@@ -199,7 +199,11 @@ def assess_consistency(models: ModelSet, model: FittedModel) -> tuple[ParameterC
 def _find_trend_covariate(
     world: RunEvaluator, model: FittedModel, by: _RunGrouping, one: ParameterConsistency
 ) -> TrendCovariate | None:
-    """Find the covariate with which the group estimates of a parameter move."""
+    """Find the covariate, such as load or temperature, with which a parameter changes.
+
+    It is the one with a significant linear trend and the smallest scatter about the line. Return
+    None if no trend is significant.
+    """
     if by.by not in ("run", "log"):
         if one.trend is None or one.trend.p_value >= SIGNIFICANCE_LEVEL:
             return None
@@ -242,7 +246,7 @@ def _assess_parameter(one: ParameterConsistency, level: float) -> ParameterConsi
 
 
 def _list_groupings(runs: Sequence[Run]) -> Iterator[_RunGrouping]:
-    """Yield the groupings by log, by each constant that differs between runs, and by run."""
+    """Yield the ways to group the runs: by log, by each differing constant, by single run."""
     logs = tuple(dict.fromkeys(run.log for run in runs))
     if len(logs) > 1:
         places = tuple(tuple(i for i, run in enumerate(runs) if run.log == log) for log in logs)
@@ -334,7 +338,10 @@ def _regularised_inverse(curvature: Array) -> Array:
 
 
 def _estimate_heterogeneity(parts: Sequence[GroupEstimate]) -> tuple[float, float]:
-    """Compute tau of (4) and the p-value of (3)."""
+    """Estimate by how much groups differ beyond their errors: tau of (4), and the p-value of (3).
+
+    The method is that of DerSimonian and Laird, with Cochran's Q.
+    """
     values = np.array([part.value for part in parts])
     weights = np.array([part.error for part in parts]) ** -2.0
     mean = float(weights @ values / weights.sum())
@@ -346,7 +353,10 @@ def _estimate_heterogeneity(parts: Sequence[GroupEstimate]) -> tuple[float, floa
 
 
 def _fit_trend(parts: Sequence[GroupEstimate], numbers: Array) -> Trend | None:
-    """Fit a weighted least-squares line to the groups; None for fewer than three groups."""
+    """Fit a line to the group estimates over covariate values, weighted by 1 / error².
+
+    Return None for fewer than three groups, or if the covariate is the same in all.
+    """
     if len(parts) < 3 or not np.ptp(numbers) > 0:
         return None
     values = np.array([part.value for part in parts])

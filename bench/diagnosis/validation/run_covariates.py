@@ -92,7 +92,11 @@ def _list_non_motion_covariates(world: RunEvaluator) -> Iterator[RunCovariate]:
 def _compute_motion_covariates(
     world: RunEvaluator, model: FittedModel, number: str
 ) -> Iterator[RunCovariate]:
-    """Yield amplitude, speed, direction and position of the coordinate of a parameter."""
+    """Yield covariates of the simulated motion of each run, at the joint of a parameter.
+
+    They are the amplitude (standard deviation), the RMS speed, the direction of motion (-1 to 1),
+    and the mean position.
+    """
     system = world.simulator.system
     if not system.coordinates:
         return
