@@ -275,7 +275,10 @@ class _ExplainRun:
         self._check()
 
     def _enter(self, kind: type[SystemSimulator]) -> None:
-        """Set up run evaluators, noise floor and validation for a simulator class."""
+        """Set up run evaluators, noise floor and validation for a simulator class.
+
+        It is called again if a finer time step or another friction model replaces the simulator.
+        """
         before = self._followed()
         self.fitting = self._world(kind, self.recording.training())
         self.floor: NoiseFloor = compute_noise_floor(self.fitting, self.recording)
@@ -396,7 +399,11 @@ class _ExplainRun:
         return Explanation(verdict, story, self._extended(search, finding))
 
     def _searched(self, base: BaseFit) -> _Found:
-        """Search and judge; repeat with MuJoCo's soft dry friction if the data support it."""
+        """Search for causes; repeat with MuJoCo's soft dry friction if the data support that form.
+
+        Dry friction of a robot is either a stiff limit (the search's own effects) or MuJoCo's soft
+        constraint. A search ends with `SoftFrictionError` if it finds the soft form likelier.
+        """
         # Surrogates and bootstrap share one random stream, so that a seed gives the same result.
         rng = self._rng()
         search = self._search(base, rng)
@@ -527,7 +534,10 @@ class _ExplainRun:
     def _unexplained(
         self, search: EffectSearch, finding: DiagnosisResult
     ) -> tuple[RecordingFault, ...]:
-        """Return wrong units and signs of a robot's recording that no effect explains."""
+        """Test for a wrong unit or sign of a robot's recording, if no effect explains the residual.
+
+        For a robot, units are usually tested only if no effect has explained the gap before.
+        """
         explained = finding.verdict in EXPLAINED
         if not self._asks_units_late or explained or self.watch.has_abandoned_fits():
             return ()
@@ -584,7 +594,12 @@ class _ExplainRun:
         return design_next_run(search, finding.model, (), seconds, longest)
 
     def _search(self, base: BaseFit, rng: np.random.Generator, **attributes: Any) -> EffectSearch:
-        """Begin a search; by prediction errors where the simulator can be linearised."""
+        """Create a search that starts from the base fit.
+
+        It is a prediction-error search if the runs of a robot could be filtered, because it needs
+        fewer simulations; otherwise it is a beam search. `attributes` are further fields of the
+        search.
+        """
         kind = EffectSearch
         if self.fitting.followed is not None:
             # This import is needed for robots only.
@@ -630,7 +645,11 @@ class _ExplainRun:
         return bool(self.fitting.base.size)
 
     def _follow(self) -> None:
-        """Estimate the initial states of a robot's runs by a filter with the present model."""
+        """Filter the runs of a robot with the present model (Kalman filter and smoother).
+
+        The filter provides initial states and starting values of free parameters. If the linearised
+        model diverges, nothing is stored, and causes are searched by simulation.
+        """
         # This import is needed for robots only.
         from bench.diagnosis.kalman.candidate_responses import FollowedRuns
 

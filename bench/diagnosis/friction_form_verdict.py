@@ -133,7 +133,10 @@ def choose_friction_form(
 
 
 def _refit_in(world: RunEvaluator, models: ModelSet, model: FittedModel) -> FittedModel:
-    """Fit the effects of a model with a run evaluator of the other form."""
+    """Fit the effects of a model with `world`, which has the other form of dry friction.
+
+    Both forms can then be compared by their likelihoods.
+    """
     names, theta = with_plain_friction(models.world, model.effects, model.fit.theta)
     # The random numbers of these models do not affect the result.
     others = ModelSet(world, models.noise, models.frozen, make_rng("friction form"), models.stated)

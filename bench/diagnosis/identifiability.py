@@ -134,7 +134,7 @@ class _Identified:
         return left.reshape(runs * samples, count)
 
     def _free(self) -> list[ParameterIdentifiability]:
-        """Assess the free parameters jointly by (1)."""
+        """Assess all free parameters from their joint covariance, eq. (1)."""
         own = self.parameters
         scale = np.sqrt(np.einsum("nk,nk->k", own, own))
         touched = scale > 0
@@ -168,7 +168,12 @@ class _Identified:
         return numbers
 
     def _causes(self) -> list[ParameterIdentifiability]:
-        """Assess every cause alone next to the free parameters; families by their members."""
+        """Assess the coefficient of each possible cause, fitted with the free parameters.
+
+        Effects that act at all places are represented by their members at single places. `powers`
+        (k,) has the norm of each direction, in units of the noise, after the part that the
+        parameters can reproduce is projected out.
+        """
         world = self.world
         probes = [
             p

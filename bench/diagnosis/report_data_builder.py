@@ -59,7 +59,7 @@ class DiagnosisReportDataBuilder:
     notes: tuple[str, ...] = ()
 
     def build_report_data(self, verdict: Verdict) -> DiagnosisReportData:
-        """Build the report data for the verdict on the finding."""
+        """Collect everything that text, figures and page of a report need, for a verdict."""
         world = self.assessor.fitting_evaluator
         recording = self.assessor.recording
         before = self.finding.base.fit.simulated
@@ -95,7 +95,7 @@ class DiagnosisReportDataBuilder:
         )
 
     def _track(self) -> bytes:
-        """Return the figure that film tracking saved next to the recording; empty if none."""
+        """Return the PNG figure that film tracking saved next to the recording; empty if none."""
         recording = self.assessor.recording
         path = recording.path.with_suffix(".png")
         if not recording.extra.keys() >= TRACK_COLUMNS:
@@ -124,7 +124,10 @@ class DiagnosisReportDataBuilder:
         return ConsistencySummary(before, after, self._rival())
 
     def _rival(self) -> tuple[ParameterConsistency, ...]:
-        """Return the group estimates of the best other effect, for a diagnosis of one cause."""
+        """Return the estimates by run, log or load of the best effect other than a single cause.
+
+        They let the report compare how consistent the cause and its best competitor are.
+        """
         if len(self.finding.causes) != 1:
             return ()
         (cause,) = self.finding.causes
@@ -206,7 +209,11 @@ class DiagnosisReportDataBuilder:
         )
 
     def _parameters(self) -> Iterator[ParameterChange]:
-        """Yield the base parameters before and after; insensitive ones are marked."""
+        """Yield each base parameter with its value before and after the causes were added.
+
+        A parameter is marked if the data do not determine it, so that it was kept at its nominal
+        value.
+        """
         world = self.assessor.fitting_evaluator
         before = self.assessor.collect_parameter_estimates(self.search, self.finding.base)
         after = self.assessor.collect_parameter_estimates(self.search, self.finding.model)
@@ -224,7 +231,7 @@ class DiagnosisReportDataBuilder:
             )
 
     def _remains(self) -> Iterator[str]:
-        """Yield sentences on what the extended model leaves unexplained, and further notes."""
+        """Yield sentences on what the extended model does not explain, and further notes."""
         world = self.assessor.fitting_evaluator
         remains = self.finding.lack_of_fit
         for channel in remains.channels_above_noise:
@@ -248,7 +255,7 @@ class DiagnosisReportDataBuilder:
         yield from self.notes
 
     def _bordering(self) -> Iterator[str]:
-        """Yield sentences on parameters that a fit leaves at a bound of their range."""
+        """Yield a warning for each base parameter whose fitted value is at a bound of its range."""
         for parameter in self._parameters():
             values = parameter.before[0], parameter.after[0]
             for when, value, bound in zip(
@@ -265,7 +272,10 @@ class DiagnosisReportDataBuilder:
                 break
 
     def _why(self) -> Iterator[str]:
-        """Yield the reasons for the verdict, the most important first."""
+        """Yield the reasons for the verdict as sentences, the most important first.
+
+        A search that was stopped early has no such reasons.
+        """
         finding = self.finding
         if finding.early_stop is not None:
             return

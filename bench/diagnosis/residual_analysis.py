@@ -75,7 +75,11 @@ def compute_gap_locations(
 
 
 def _parts(world: RunEvaluator, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
-    """List the kind, label and observed mask (R, T, C) of each run, channel and phase."""
+    """List the parts of the data for which the residual is reported: runs, channels and phases.
+
+    Each has its kind, its label and the mask (R, T, C) of its samples. `mark` is appended to the
+    names of runs. `simulated` (R, T, C) determines the phases of the motion.
+    """
     seen = np.isfinite(world.observed)
     runs, _, channels = seen.shape
     parts: list[tuple[str, str, Mask]] = []
@@ -159,7 +163,7 @@ def _lasting(mask: Mask) -> Mask:
 
 
 def _impacts(world: RunEvaluator, simulated: Array) -> Mask:
-    """Return the samples around the lowest points of the flight."""
+    """Return the mask (R, T) of the samples around each minimum of the simulated height."""
     name = world.simulator.system.coordinates[-1]
     mask = np.zeros(simulated.shape[:2], dtype=bool)
     if name not in world.channels:
@@ -261,7 +265,10 @@ def _edges(values: Array) -> Array | None:
 
 
 def _variables(world: RunEvaluator, simulated: Array) -> Iterator[tuple[str, str, Array]]:
-    """Yield name, unit and values (R, T) of the variables of the profiles."""
+    """Yield the variables of residual profiles, each with name, unit and values (R, T).
+
+    They are the time, the position, the speed, and each recorded input.
+    """
     times = _times(world)
     yield "time", "s", times
     system = world.simulator.system
@@ -301,7 +308,10 @@ def _inputs(world: RunEvaluator, names: Collection[str]) -> Iterator[tuple[str, 
 def _variables_of_joint(
     world: RunEvaluator, simulated: Array, channel: str
 ) -> Iterator[tuple[str, str, Array]]:
-    """Yield the variables of a channel's joint, with signed velocity, which friction needs."""
+    """Yield the variables for residual profiles of a joint's channel: name, unit and values (R, T).
+
+    The velocity has its sign, because friction acts against it.
+    """
     times = _times(world)
     yield "time", "s", times
     robot = get_robot(world)

@@ -115,7 +115,10 @@ def _check_plugin(model: Path) -> None:
 def _robot(
     model: Path, stated: ModelFileReference | None
 ) -> tuple[ExtendedSimulator, type[SystemSimulator]]:
-    """Load a robot from its model file, without fitted numbers and without added effects."""
+    """Load a robot from its model file as a simulator, without fitted parameters and added effects.
+
+    `stated` has the actuators and the engine that the description of the recording specifies.
+    """
     from sims.robot.parsing.read_model_file import read_robot
 
     tables = stated.actuators if stated else {}
@@ -192,7 +195,10 @@ def _squares(world: RunEvaluator, simulated: Array) -> Array:
 
 
 def _errors(world: RunEvaluator, squares: Array, sigma: Array) -> dict[str, Any]:
-    """Summarise the RMSE by channel, and over all channels in units of the noise."""
+    """Summarise the RMS error of each channel, and that of all in units of the noise.
+
+    `squares` (R, T, C) has the squared errors, zero where no sample exists; `sigma` (C,) the noise.
+    """
     seen = np.isfinite(world.observed)
     counts = seen.sum(axis=(0, 1))
     rmse = {}

@@ -174,7 +174,11 @@ class VerdictBuilder:
     def _with_totals(
         self, model: FittedModel, numbers: dict[int, FittedValue]
     ) -> dict[int, FittedValue]:
-        """Add specified and resulting values to the numbers that a robot's model file contains."""
+        """Add to each fitted number of a robot the model file's value and the resulting value.
+
+        Numbers of effects that change no number of the file remain as they are. `numbers` is by
+        index in the parameter vector.
+        """
         kind: Any = self.fitting_evaluator.kind
         if not kind.has_model:
             return numbers
@@ -196,7 +200,10 @@ class VerdictBuilder:
         return numbers
 
     def _placed(self, model: FittedModel) -> Iterator[tuple[type[Effect], list[int]]]:
-        """Yield the fitted effects with a single place, and the indices of their coefficients."""
+        """Yield each fitted effect at one place, with the indices of its coefficients in theta.
+
+        An effect that acts at all places is divided into its members.
+        """
         world, kind = self.fitting_evaluator, cast(Any, self.fitting_evaluator.kind)
         # The free numbers of the user come first, in the order of their effects.
         places = iter(range(world.own))
@@ -214,7 +221,7 @@ class VerdictBuilder:
                     yield type(member), [next(places) for _ in member.coefficients]
 
     def _ranges(self, model: FittedModel) -> dict[int, tuple[float, float]]:
-        """Return the range of each fitted number, by index in the parameter vector."""
+        """Return the bounds of each fitted number, by index in the parameter vector."""
         world = self.fitting_evaluator
         ranges = {i: world.parameters[i].bounds for i in world.base.tolist()}
         for name in model.effects:
@@ -433,7 +440,11 @@ class VerdictBuilder:
         return found
 
     def _next(self, search: EffectSearch, finding: DiagnosisResult) -> DiscriminatingRun | None:
-        """Propose the next experiment; None if nothing is open or the search was stopped early."""
+        """Propose a run that distinguishes the strongest cause from its most plausible alternative.
+
+        If the base model is not identifiable, the run should identify its parameters. Return None
+        if nothing is open, or if the search was stopped early.
+        """
         if finding.early_stop is not None:
             return None
         if finding.verdict == "unidentifiable":

@@ -162,7 +162,10 @@ def _place(track: BallTrack) -> Array:
 
 
 def _radius(track: BallTrack) -> Array:
-    """Return the radius as a linear function of the position; single frames are too noisy."""
+    """Smooth the radius (T,) of the ball in pixels, as a linear function of its position.
+
+    The outline in a single frame is too noisy. Frames far from the line get a small weight.
+    """
     s, seen = _place(track), track.visible_frames
     places, radii = s[seen], track.radius[seen]
     line = np.polyfit(places, radii, 1)
@@ -177,7 +180,10 @@ def _radius(track: BallTrack) -> Array:
 
 
 def _arcs(times: Array, q: Array) -> list[_Flight]:
-    """Find flights between the lowest points of the ball, and fit a parabola to each."""
+    """Divide the motion of the ball at its bounces, and fit a parabola to each free flight.
+
+    `q` (T,) is the position downwards, in ball radii; NaN where the ball was not detected.
+    """
     seen = np.flatnonzero(np.isfinite(q))
     last = len(seen) - 1
     # q counts downwards: the ball is lowest where q is largest.
@@ -209,7 +215,10 @@ def _factor(arcs: list[_Flight]) -> float | None:
 
 
 def _ground(track: BallTrack, q: Array, arcs: list[_Flight]) -> float:
-    """Return q at ground contact: where flights meet, or the lowest position."""
+    """Return the position q, in ball radii, at which the ball touches the ground.
+
+    It is where two successive flights meet, or the lowest position if there is only one flight.
+    """
     meets = []
     for before, after in pairwise(arcs):
         roots = np.roots(before.curve - after.curve)

@@ -80,7 +80,11 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
 
 
 def _kind(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
-    """Return the simulator of the system or robot that a description names."""
+    """Return the simulator class of the system or robot model that a description names.
+
+    Raises:
+        InputError: It names neither, or an unknown system.
+    """
     file = model_in(Path(name), meta)
     if file is not None:
         return make_robot_simulator(file.path, file.actuators, file.engine, file.free)

@@ -205,7 +205,11 @@ class ConventionComparison:
         return float((followed.force / followed.typical).max()) if followed.is_sound else np.inf
 
     def _suspects(self, followed: FollowedRuns) -> list[JointSignals]:
-        """Return the joints with a large missing force; all joints if the filter diverges."""
+        """Return the joints at which the filter needs a large missing force.
+
+        A wrong sign, unit or joint order shows as such a force. If the filter diverges, all joints
+        are suspects.
+        """
         if not followed.is_sound:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
@@ -222,7 +226,11 @@ class ConventionComparison:
     def _best_hypothesis(
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> ConventionDifference | None:
-        """Return the hypothesis with the largest likelihood; None if none is clearly better."""
+        """Return the convention with which the model predicts the recording clearly best.
+
+        Each hypothesis about the suspects is evaluated by the log-likelihood of a Kalman filter.
+        Return None if none exceeds that of the log as described by `LOG_LIKELIHOOD_MARGIN`.
+        """
         described = ConventionHypothesis("")
         limit = self._evaluate(described, recording) + LOG_LIKELIHOOD_MARGIN
         # Most hypotheses already fail on the run that the log as described explains worst.
@@ -314,7 +322,7 @@ class ConventionComparison:
     def _follow(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
     ) -> FollowedRuns:
-        """Filter the training runs of a recording with the model file's numbers."""
+        """Filter the runs for fitting with the parameters of the model file (Kalman filter)."""
         world = self.subject.world(recording)
         followed = FollowedRuns.follow(
             world,
@@ -438,7 +446,10 @@ def _unfitted(world: RunEvaluator) -> TrajectoryFit:
 def _with_best_coefficients(
     followed: FollowedRuns, groups: Sequence[DirectionGroup]
 ) -> FollowedRuns:
-    """Improve the coefficients of effects by Gauss-Newton steps of the filter's likelihood."""
+    """Fit the coefficients of effects by maximum likelihood of a Kalman filter (Gauss-Newton).
+
+    `groups` names the effects; their present coefficients are those of the filter.
+    """
     world = followed.world
     names = [group.effect for group in groups]
     return maximise_likelihood(
@@ -468,7 +479,10 @@ def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
 
 
 def _liveliest_part(run: Run) -> slice:
-    """Return the part of a run in which its channels move most."""
+    """Return the part of a run, of `PART_SAMPLES` samples, in which its channels move most.
+
+    Hypotheses are compared on such parts, because whole runs would take too long.
+    """
     # The commands after the end of a run are not known, and a hypothesis may move them.
     count = run.times.size - max(LATE_SAMPLES)
     if count <= PART_SAMPLES:

@@ -185,7 +185,10 @@ class JointSignals:
 
 
 def recorded_joints(subject: Subject) -> list[JointSignals]:
-    """Return the joints of a robot, in the order of its coordinates, with their signals."""
+    """Collect for each joint of a robot its recorded channels, inputs and position range.
+
+    The order is that of the coordinates of the robot.
+    """
     kind: Any = subject.kind
     run = subject.recording.runs[0]
     units = {channel.name: channel.unit for channel in kind.channels}
@@ -256,7 +259,10 @@ class HypothesisGenerator:
         return [joint.channels[quantity] for joint in self.joints if quantity in joint.channels]
 
     def _normalised(self) -> Iterator[ConventionHypothesis]:
-        """Yield positions and commands that are normalised to the range of each joint."""
+        """Yield hypotheses that positions and commands are shares of the range of each joint.
+
+        The shares are in percent, from 0 or from -100 to 100, as LeRobot records them.
+        """
         limited = [joint for joint in self.joints if joint.range and "q" in joint.channels]
         if not limited:
             return
@@ -276,7 +282,10 @@ class HypothesisGenerator:
 
 
 def _signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
-    """Yield reversed signs: of position, command, both, velocity alone, torque alone."""
+    """Yield hypotheses of a reversed sign at a joint.
+
+    They are: position with velocity, command, velocity alone, torque alone, and the whole axis.
+    """
     positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
     groups = [positions, list(joint.inputs)]
     if len(joint.channels) > 1:
@@ -292,7 +301,10 @@ def _signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
 
 
 def _zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield other zero positions: of the encoder, and of encoder and command."""
+    """Yield hypotheses that a hinge is counted from another zero, in position or also in command.
+
+    With a servo, the mean difference of command and position is the likely offset of the position.
+    """
     position = joint.channels.get("q")
     if position is None or not joint.is_hinge:
         return
@@ -315,7 +327,7 @@ def _zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypo
 
 
 def _wraps(joints: Sequence[JointSignals], recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield positions from which whole turns are missing."""
+    """Yield hypotheses that recorded angles jump by whole turns, which have to be added again."""
     for joint in joints:
         name = joint.channels.get("q")
         if name is None or not joint.is_hinge:
@@ -390,7 +402,10 @@ def _order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> 
 
 
 def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield other units of signals that share one, and encoder ticks if all values are integers."""
+    """Yield hypotheses of another unit for signals that share a unit.
+
+    If all values of an angle are integers, encoder ticks are tried as well.
+    """
     first = signals[0]
     names = [signal.name for signal in signals]
     text = listed(names, MAX_NAMED)

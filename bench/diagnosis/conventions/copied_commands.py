@@ -58,7 +58,11 @@ def find_copied_commands(
 
 
 def _likely_column(recording: Recording, channel: str) -> str:
-    """Return the unused column of the log that a position follows best."""
+    """Find the column of the log that is the likely command of a recorded position.
+
+    It is the column with the highest correlation that the description does not use. Return
+    `UNKNOWN_COLUMN` if none correlates enough.
+    """
     try:
         description, meta = read_meta(recording.path)
     except InputError:  # A recording in memory has no description.

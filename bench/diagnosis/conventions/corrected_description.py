@@ -58,7 +58,10 @@ def corrected(
 def _moved(
     tables: Mapping[str, Mapping[str, Any]], name: str, change: SignalChange
 ) -> dict[str, Any]:
-    """Return the table of a signal whose values are in another column."""
+    """Return the description table of a signal after its values were taken from another column.
+
+    `change.source` names that column or the signal that has it; `tables` are the present tables.
+    """
     is_signal = change.source in tables
     table = dict(tables[change.source if is_signal else name])
     if change.source != name:

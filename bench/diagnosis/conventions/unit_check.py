@@ -482,7 +482,10 @@ def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> I
 
 
 def _hypotheses_of_one_unit(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
-    """Yield the hypotheses of signals that share a unit."""
+    """Yield hypotheses that signals of one unit have another unit, a reversed sign, or both.
+
+    Factors that undo a conversion that was made twice are tried as well.
+    """
     first = signals[0]
     stated_units = (first.stated,) * len(signals)
     yield Hypothesis(signals, stated_units, -1.0)

@@ -164,7 +164,11 @@ def _another(consistencies: Sequence[ParameterConsistency]) -> dict[str, float]:
 def _with_small_gaps(
     evaluator: RunEvaluator, fit: TrajectoryFit, directions: DirectionSet
 ) -> DirectionSet:
-    """Add directions with smaller backlash than a search tries, to find the detection limit."""
+    """Add directions of backlash that is smaller than the search tries.
+
+    Otherwise the smallest direction may already be detectable, and the limit is not known.
+    Each size is half the previous one, `GAP_HALVINGS` times.
+    """
     smallest: dict[str, CandidateDirection] = {}
     for probe in directions.candidates:
         is_backlash = (
@@ -196,7 +200,10 @@ def _with_small_gaps(
 def _fitted(
     evaluator: RunEvaluator, extended: ExtendedSimulator, noise: NoiseModel
 ) -> TrajectoryFit:
-    """Evaluate the simulator on the runs with derivatives; only initial states are fitted."""
+    """Simulate the runs with the extended simulator, and compute its derivatives at this point.
+
+    Only the initial states are fitted; parameters and coefficients keep their values.
+    """
     theta = build_theta(evaluator, extended)
     (measured,) = HeldOutRuns(evaluator, noise).fit_initial_states([theta])
     known_values = [extended.parameters.get(p.name) for p in evaluator.parameters[: evaluator.own]]

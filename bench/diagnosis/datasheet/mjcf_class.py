@@ -131,7 +131,17 @@ def _class(
     facts: SheetContent,
     notes: Sequence[str] = (),
 ) -> _Class:
-    """Build the class of a robot's joint."""
+    """Write the fitted effects into a robot's model, and render its joint as a default class.
+
+    Args:
+        robot: Robot whose model is changed.
+        causes: Fitted coefficients by effect with its place.
+        joint: Joint of the class.
+        actuator: Actuator of the class; None for an undriven joint.
+        name: Name of the class.
+        facts: Content of the data sheet.
+        notes: Notes for the comment of the class.
+    """
     from sims.robot.export.apply_causes import apply_causes
     from sims.robot.export.default_class import render_default_class, render_model_using_class
     from sims.robot.export.xml_editing import NotEditableError
@@ -179,7 +189,10 @@ class ConstantsGroup:
 
 
 def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
-    """Group the runs by their constants, in the order of the recording."""
+    """Group the runs with equal constants, such as one load, in the order of the recording.
+
+    An MJCF model has fixed numbers, so each group needs its own model.
+    """
     by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
     for run in facts.recording.runs:
         by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
@@ -200,7 +213,11 @@ def group_runs_by_constants(facts: SheetContent) -> list[ConstantsGroup]:
 def _placed(
     facts: SheetContent, setting: ConstantsGroup, model: RenderedModelFile
 ) -> tuple[dict[str, Mapping[str, FittedValue]], list[str]]:
-    """Map the fitted effects to their places in the model file, with notes on approximations."""
+    """Map the fitted effects of a system to the joint, actuator and channel of its MJCF model.
+
+    A friction law that MuJoCo does not have becomes a constant dry friction (its mean over the
+    runs), with a note.
+    """
     from sims.robot.model_field_effects import MODEL_FIELD_EFFECTS
 
     places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}

@@ -87,7 +87,7 @@ def format_evidence(row: SheetRow, short: bool = False) -> str:
 
 
 def format_detection_limit(row: SheetRow) -> str:
-    """Format the smallest value of an absent effect that these data would have revealed."""
+    """Format in words how large an absent effect could be without being detected."""
     reach = row.detection_limit
     if reach is None or reach.size == float("inf"):
         return "none: the data do not depend on it"

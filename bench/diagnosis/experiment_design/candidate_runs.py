@@ -131,7 +131,7 @@ class RigModel:
                     yield RunPlan(driven, form, size)
 
     def list_variants(self, plan: RunPlan) -> Iterator[RunPlan]:
-        """Yield variants of a plan with one property changed."""
+        """Yield variants of a plan with one property changed, to improve the best plans."""
         for name, value in self._beginnings():
             yield replace(plan, states=tuple((dict(plan.states) | {name: value}).items()))
         for name, values in self._knobs().items():
@@ -148,7 +148,11 @@ class RigModel:
                 yield replace(plan, hold_factor=coarser)
 
     def _beginnings(self) -> Iterator[tuple[str, float]]:
-        """Yield larger initial coordinates, and the fastest initial rates recorded."""
+        """Yield other initial states, each as a name and a value.
+
+        They are shares of the usual initial coordinates, and, except for robots, the largest
+        initial rates that were recorded, in both directions.
+        """
         system, world = self.world.simulator.system, self.world
         unseen = {world.states[i] for i in np.flatnonzero(world.known.all(axis=0))}
         for name in system.coordinates:
@@ -178,7 +182,7 @@ class RigModel:
     # -- runs
 
     def make_run(self, plan: RunPlan) -> CandidateRun:
-        """Make the command signals and the initial state of a plan."""
+        """Turn a plan into a run that can be simulated: commands, constants and initial state."""
         times = np.arange(0.0, self.seconds, self.step * plan.hold_factor)
         inputs = {
             name: self._limited(name, np.full(times.size, self.rest[name]))
@@ -249,7 +253,11 @@ COMMAND_FORMS: Mapping[str, str] = {
 
 
 def _command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
-    """Compute a command (T,) of unit size."""
+    """Compute the command signal (T,) of a form, such as a chirp or steps, with magnitude one.
+
+    It is scaled to the size of the recorded commands later. `step` is the sampling interval in
+    seconds.
+    """
     share = times / (times[-1] or 1.0)
     if form == "ramps up and down":
         return np.asarray(2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * share)))

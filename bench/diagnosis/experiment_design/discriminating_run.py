@@ -222,7 +222,10 @@ def _longer(first: _Run) -> _Run:
 
 
 def _elsewhere(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
-    """Yield runs with one changed initial state; a robot starts at rest."""
+    """Yield runs that differ from the first one in one initial state.
+
+    The initial velocities of a robot are not changed, because it starts at rest.
+    """
     system = world.simulator.system
     height = len(system.coordinates) - 1
     named = zip(world.states, _units(world), strict=True)
@@ -247,7 +250,10 @@ def _elsewhere(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterat
 
 
 def _driven(world: RunEvaluator, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
-    """Yield runs with one scaled input, within the limits of the commands."""
+    """Yield runs that differ from the first one in the size of one input.
+
+    An input is never scaled beyond the limits of its command.
+    """
     shares = ROBOT_INPUTS if world.kind.has_model else INPUT_FACTORS
     for name, signal in first.scenario.inputs.items():
         if not signal.any():
@@ -291,7 +297,11 @@ def _units(world: RunEvaluator) -> list[str]:
 def _compute_discrimination(
     world: RunEvaluator, run: _Run, model: FittedModel, rival: FittedModel, sigma: Array
 ) -> float:
-    """Compute the RMS difference (1) of two models on a run."""
+    """Simulate a run with two models, and compute the RMS of their difference, eq. (1).
+
+    The larger it is, the more clearly the run shows which model is right. `sigma` (C,) has the
+    noise.
+    """
     both = [model.fit.theta, rival.fit.theta]
     # Freed constants are fitted with the parameters, but passed to the simulator as constants.
     places = world.base[world.own :]

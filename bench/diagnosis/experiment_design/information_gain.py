@@ -232,7 +232,11 @@ class RunRanker:
         return _LinearisedRun(lanes[0], numbers.T, initial.T / STATE_STEP_SHARE)
 
     def _told(self, run: CandidateRun, true: _Known, rival: _Known) -> float:
-        """Compute (1) by Levenberg-Marquardt."""
+        """Compute the discrimination T of eq. (1) of a run, to which the rival is refitted.
+
+        The prediction of the model `true` takes the place of the recording. The fit of `rival` by
+        Levenberg-Marquardt may move its parameters as far as the present data allow.
+        """
         fit = rival.model.fit
         shown = self._simulated(run, [true.model.fit.theta], [run.states])
         aim = self._whitened(shown)[0]

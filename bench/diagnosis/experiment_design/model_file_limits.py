@@ -50,7 +50,10 @@ class StatedLimits:
 
 
 def stated_limits(world: RunEvaluator) -> StatedLimits:
-    """Read the limits in the model file of the recorded robot."""
+    """Read the limits of commands, positions, velocities and forces from a robot's model file.
+
+    A system without a model file has none.
+    """
     if not world.kind.has_model:
         return StatedLimits()
     kind: Any = world.kind
@@ -74,7 +77,10 @@ def stated_limits(world: RunEvaluator) -> StatedLimits:
 
 
 def _command(robot: Any, actuator: Any) -> Interval:
-    """Compute the interval of an actuator's control within all limits."""
+    """Compute the range of an actuator's control that respects all limits of actuator and joint.
+
+    It is in the unit of the control: a force for a motor, a position or velocity for a servo.
+    """
     own = actuator.range or UNLIMITED
     if actuator.joint is None:
         return own

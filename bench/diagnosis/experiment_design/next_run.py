@@ -166,7 +166,14 @@ def _evaluate_fully(judge: RunRanker, found: Sequence[RunValue]) -> list[RunValu
 def _made(
     models: ModelSet, among: Sequence[FittedModel], rig: RigModel, entry: RunValue
 ) -> NextRunDesign:
-    """Build the design from the best run."""
+    """Describe the best run, and what it is expected to tell, for the report.
+
+    Args:
+        models: Fitted models of the recording.
+        among: The present diagnosis, followed by the models that compete with it.
+        rig: Experimental setup.
+        entry: Best run with its value.
+    """
     run, rivals = entry.run, among[1:]
     told: dict[str, float] = {}
     groups: tuple[tuple[str, ...], ...] = ()

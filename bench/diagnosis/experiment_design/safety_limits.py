@@ -92,7 +92,7 @@ class RigLimits:
     def _seen(
         self, model: FittedModel, scenarios: Sequence[Scenario], states: Array
     ) -> list[Mapping[str, Array]]:
-        """Simulate the monitored channels of each run, by name; each run to its own end."""
+        """Simulate runs with a model, and return the monitored channels of each, (T,) by name."""
         world = self.world
         values = {p.name: float(v) for p, v in zip(world.parameters, model.fit.theta, strict=True)}
         simulator = world.make_observing_simulator(self.monitored_channels, model.effects)
@@ -114,7 +114,11 @@ class RigLimits:
     # -- limits
 
     def _bounds(self) -> dict[str, tuple[float, float]]:
-        """Determine the minimum and maximum of each monitored channel."""
+        """Determine the allowed range of each monitored channel.
+
+        It is the limit in the model file if there is one, else the range of the present runs,
+        widened.
+        """
         ends = {}
         for name in self.monitored_channels:
             values = np.concatenate([run[name] for run in self.past])

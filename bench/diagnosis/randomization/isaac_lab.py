@@ -67,7 +67,10 @@ def isaac_lab_code(ranges: RandomizationRanges, extended: ExtendedSimulator, rob
 def _terms(
     ranges: RandomizationRanges, sentences: Mapping[RandomizationRange, str], robot: Any
 ) -> tuple[list[Term], list[RandomizationRange]]:
-    """Build the terms, and list the ranges for which there is no term."""
+    """Build the Isaac Lab event terms, and list the ranges for which Isaac Lab has no term.
+
+    `sentences` has the comment for each range.
+    """
     by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
     for each in ranges.ranges:
         by_effect.setdefault(each.effect, {}).setdefault(each.name, []).append(each)
@@ -118,7 +121,10 @@ def _gains(
     sentences: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
-    """Yield the terms of stiffness and damping at joints."""
+    """Yield the terms that randomise stiffness and damping of the actuators at each joint.
+
+    Isaac Lab has one damping for each joint, so that of actuators and of the joint itself is added.
+    """
     stiffness = by_effect.pop("actuator.stiffness", {})
     damping = by_effect.pop("actuator.damping", {})
     passive = by_effect.pop("drag.linear", {})
@@ -171,7 +177,7 @@ def _gravity(
     sentences: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
-    """Yield the term of gravity, which sets all components."""
+    """Yield the term that randomises the gravity vector, if its size or direction has a range."""
     scale = [each for ranges in by_effect.pop("gravity.scale", {}).values() for each in ranges]
     tilt = [each for ranges in by_effect.pop("gravity.tilt", {}).values() for each in ranges]
     if not scale and not tilt:

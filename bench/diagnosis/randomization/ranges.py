@@ -224,7 +224,10 @@ def _value(numbers: Mapping[str, FittedValue], coefficient: str) -> float:
 
 
 def _range(robot: RobotModel, totals: _Totals, number: int, entry: _Entry) -> RandomizationRange:
-    """Build the range of a number that has an interval."""
+    """Convert the interval of a fitted coefficient to a range of the number in the model file.
+
+    Its operation says whether a simulator sets, adds or multiplies with the random value.
+    """
     from sims.robot.model_fields import model_fields, operation_of
 
     cause, fitted = entry.cause, entry.cause.numbers[entry.coefficient]

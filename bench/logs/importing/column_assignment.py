@@ -89,7 +89,10 @@ class ColumnAssigner:
             )
 
     def _find_normalised(self, columns: Sequence[LogColumn]) -> None:
-        """Decide whether positions are normalised, and report if it cannot be decided."""
+        """Decide whether positions are shares of the joint ranges, as LeRobot records them.
+
+        If it cannot be decided, the user is asked to check.
+        """
         placed = [(column, joint) for column, joint, _ in self._signals.place_columns(columns)]
         if not placed:
             return
@@ -121,7 +124,11 @@ class ColumnAssigner:
     def _position_signal(
         self, column: LogColumn, joint: Joint, placement: Placement
     ) -> Signal | None:
-        """Assign the unit of a position or position command, as stated or by the joint's range."""
+        """Determine the unit of a position or a position command.
+
+        The unit is the one that the log states, or the user, or the one that fits the range of the
+        joint. Return None, with a message, if there is no such unit.
+        """
         if column.unit:
             if not converts(column.unit, joint.unit):
                 expected = "an angle" if joint.kind == "hinge" else "a length"
@@ -196,7 +203,10 @@ class ColumnAssigner:
     def _assign_command(
         self, column: LogColumn, joint: Joint, placement: Placement, actuator: Actuator
     ) -> None:
-        """Assign the command of an actuator if it takes this quantity."""
+        """Assign a column as command of an actuator, or report that the quantity is wrong.
+
+        A motor takes a torque or force, a servo a position or velocity.
+        """
         quantity = column_guessing.commanded_role(column)
         expected = COMMAND_QUANTITIES.get(actuator.kind)
         if actuator.kind == "motor" and quantity is None and self._resembles(column, joint):
@@ -221,7 +231,7 @@ class ColumnAssigner:
             self._add(self._signals.inputs, name, column, signal)
 
     def _resembles(self, column: LogColumn, joint: Joint) -> bool:
-        """Return whether a command resembles its joint's position, as a desired position does."""
+        """Return whether a command is close to the position, and so a desired position."""
         position = self._signals.position_of(joint.name)
         if position is None:
             return False
