@@ -196,6 +196,8 @@ class _Found(NamedTuple):
 
 
 class _ExplainRun:
+    """One diagnosis: its recording and options, and the state that its steps share."""
+
     def __init__(
         self,
         sources: Sequence[RecordingSource],
@@ -313,6 +315,7 @@ class _ExplainRun:
         return None
 
     def _assessor(self) -> VerdictBuilder:
+        """Create the builder of the verdict from the present run evaluators."""
         given = self.recording, self.fitting, self.validation, self.floor, self.engine
         return VerdictBuilder(*given)
 

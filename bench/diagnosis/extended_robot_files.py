@@ -99,6 +99,7 @@ def written_causes(
 
 
 def _named(done: WrittenModelFiles) -> dict[str, str]:
+    """Return the content of each extended model file that was written, by file name."""
     contents = {"extended.xml": done.xml, "extended.urdf": done.urdf}
     return {name: content for name, content in contents.items() if content is not None}
 

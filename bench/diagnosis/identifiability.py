@@ -98,6 +98,8 @@ def assess_identifiability(
 
 
 class _Identified:
+    """Linearised runs at a fit, from which the identifiability of each number follows."""
+
     def __init__(
         self, world: RunEvaluator, noise: NoiseModel, fit: TrajectoryFit, found: DirectionSet
     ) -> None:
@@ -119,6 +121,7 @@ class _Identified:
         self.parameters = self._without_states(flat[..., :q])
 
     def numbers(self) -> tuple[ParameterIdentifiability, ...]:
+        """Return the identifiability of the free parameters, then of the causes, the best first."""
         free = self._free()
         causes = sorted(self._causes(), key=_share_of_range)
         return (*free, *causes)

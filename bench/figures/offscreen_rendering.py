@@ -67,7 +67,11 @@ def render_robot(model: Any, positions: Array, view: Projection) -> Image | None
 
 
 def _asked(backend: str, model: Any, positions: Array, view: Projection) -> Image | None:
-    """Render the image with one OpenGL backend; return None if it fails."""
+    """Render a robot in a child process with one OpenGL backend; return None if that fails.
+
+    A missing graphics driver may crash a process, so it must not be this one. `positions` is
+    MuJoCo's qpos.
+    """
     import mujoco
 
     environment = dict(os.environ)
@@ -111,7 +115,7 @@ def render_requested(folder: str) -> None:
 
 
 def _drawn(mujoco: Any, model: Any, data: Any, view: Projection) -> Image:
-    """Render the robot in grey on a white background."""
+    """Render the robot by MuJoCo in grey on a white background, in parallel projection."""
     scale = MAX_IMAGE_PIXELS / max(view.width, view.height)
     rows, columns = (max(2, round(scale * size)) for size in (view.height, view.width))
     global_options = model.vis.global_

@@ -115,7 +115,10 @@ def _placed(runs: Sequence[Run]) -> list[_PlacedRun]:
 
 
 def _panel(axis: Axes, part: _PlacedRun, values: Array) -> None:
-    """Draw one signal of one run."""
+    """Draw one signal of one run at its position on the common time axis.
+
+    Missing samples are marked at the foot; a held-out run is shaded.
+    """
     times = part.times
     if part.run.held_out:
         axis.axvspan(float(times[0]), float(times[-1]), color=HELD_OUT_GREY, linewidth=0)
@@ -133,7 +136,10 @@ def _panel(axis: Axes, part: _PlacedRun, values: Array) -> None:
 
 
 def _decimate(times: Array, values: Array) -> tuple[Array, Array]:
-    """Decimate a signal to about `_MOST_POINTS` points: the extremes of each part."""
+    """Reduce a signal (T,) to about `_MOST_POINTS` points: minimum and maximum of each part.
+
+    The curve then looks the same, and the file stays small.
+    """
     if values.size <= _MOST_POINTS:
         return times, values
     size = -(-values.size // (_MOST_POINTS // 2))

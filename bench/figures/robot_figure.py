@@ -178,7 +178,10 @@ def _has_shapes(robot: RobotModel) -> bool:
 def _labels(
     robot: RobotModel, data: Any, projection: Projection, marks: Sequence[PlaceMark]
 ) -> list[_Label]:
-    """Make one label for each marked place, and for the other joints if there are few."""
+    """Make a label for each marked place, and for the other joints if the robot has few.
+
+    `data` is the mujoco.MjData of the pose, from which places are located.
+    """
     lines_by_place: dict[tuple[str, str], list[str]] = {}
     for mark in marks:
         lines = lines_by_place.setdefault((mark.kind, mark.name), [])
@@ -296,7 +299,7 @@ def _write(axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: f
 def _draw_place_rings(
     axis: Axes, robot: RobotModel, data: Any, projection: Projection, marks: Sequence[PlaceMark]
 ) -> None:
-    """Draw rings around places: solid if the place is certain, dashed otherwise."""
+    """Draw a ring around each diagnosed place: dashed if the data allow other places as well."""
     certainty: dict[tuple[str, str], bool] = {}
     for mark in marks:
         key = mark.kind, mark.name
@@ -323,7 +326,10 @@ def _draw_place_rings(
 
 
 def _draw_scale_bar(axis: Axes, projection: Projection, scale: float, tall: float) -> None:
-    """Draw a scale bar below the drawing, at the left."""
+    """Draw a scale bar with a round length below the drawing.
+
+    `scale` is in inches per metre, `tall` the height of the drawing in inches.
+    """
     length = round_down_length(0.3 * projection.width)
     left = -projection.width / 2
     y = -tall / scale / 2 - 0.2 / scale

@@ -145,6 +145,7 @@ def _direction(robot: RobotModel, data: Any) -> tuple[float, float]:
     points = np.concatenate([data.xanchor, moving.mean(axis=0, keepdims=True)])
 
     def spread(azimuth: float) -> float:
+        """Return how widely the joints are spread in the picture from an azimuth, in m²."""
         projected = points @ _axes(azimuth, ELEVATION_DEG)[:2].T
         sizes = np.linalg.svd(projected - projected.mean(axis=0), compute_uv=False)
         return float(np.prod(sizes))
@@ -231,7 +232,10 @@ def locate_place(robot: RobotModel, data: Any, kind: str, name: str) -> Array | 
 
 
 def _place_of_channel(robot: RobotModel, data: Any, name: str) -> Array | None:
-    """Return the position of a joint channel's joint, or of a sensor's mounting object."""
+    """Return the position (3,) in the world that belongs to a channel; None if it has none.
+
+    It is that of the joint, or of the body or site on which a sensor is mounted.
+    """
     import mujoco
 
     kind, _, rest = name.partition(".")

@@ -373,7 +373,7 @@ _ROWS = 18
 def _behind_entries(
     axes: list[Axes], style: TunerStyles, reference: ReferenceResult
 ) -> list[tuple[Line2D, str]]:
-    """Make the legend entries of a reference: a heading, and its tuners that are drawn."""
+    """Make the legend entries of reference results: a heading, and each tuner that is drawn."""
     from matplotlib.lines import Line2D
 
     line_ids = {line.get_gid() for axis in axes for line in axis.get_lines()}
@@ -495,7 +495,7 @@ def _asked_pdf(figure: Figure) -> bytes | None:
 
 @contextmanager
 def _laid_out_once(figure: Figure, dpi: int) -> Iterator[None]:
-    """Context that runs the layout engine once for all files written inside it."""
+    """Compute the layout of a figure once for all files that are written in the `with` block."""
     engine, screen = figure.get_layout_engine(), figure.dpi
     try:
         if engine is not None:

@@ -96,7 +96,11 @@ def _constant(key: str, recording: Recording, run: Run, usual: dict[str, float])
 def _refuse_other(
     first: Recording, kind: type[Simulator], other: Recording, of: type[Simulator]
 ) -> None:
-    """Reject a recording that cannot be joined with the first one."""
+    """Reject a recording that cannot be joined with the first one.
+
+    Raises:
+        InputError: System, model file, channels or inputs of the recordings differ.
+    """
     robots = kind.has_model and of.has_model
     if (kind.has_model or of.has_model) != robots or of.name != kind.name:
         raise InputError(

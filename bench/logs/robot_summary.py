@@ -86,7 +86,10 @@ def _beyond(recording: Recording, robot: RobotModel) -> Iterator[str]:
 def _outside(
     recording: Recording, name: str, limits: tuple[float, float] | None, unit: str, model: str
 ) -> Iterator[str]:
-    """Yield a line if a signal leaves its range, with the runs and the extreme values."""
+    """Yield a line if a recorded signal leaves the range that the model file states.
+
+    The line has the runs and the extreme values. `model` is the name of the model file.
+    """
     if limits is None:
         return
     low, high = limits

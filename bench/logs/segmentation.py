@@ -119,7 +119,11 @@ def _seconds(run: Run) -> float:
 
 
 def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
-    """Cut a run into segments of at most `longest` seconds that last `seconds` in total."""
+    """Cut a run into segments of at most `longest` seconds that last `seconds` in total.
+
+    The segments are spread over the run. Each begins at the sample before which the commands have
+    changed least.
+    """
     length = min(longest, seconds)
     # A segment needs a few samples, even if only little of a run may be kept.
     length = max(length, MIN_SEGMENT_INTERVALS * float(np.median(np.diff(run.times))))

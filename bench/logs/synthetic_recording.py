@@ -354,6 +354,7 @@ def _samples(wish: SimulationSpec) -> int:
 
 
 def _times(samples: int, rate: float) -> Array:
+    """Return the sample times (T,) of a run in seconds, from zero."""
     # Round as in the table, so that the times read back are the times simulated.
     return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
 

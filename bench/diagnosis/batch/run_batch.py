@@ -142,7 +142,10 @@ def _said(error: object) -> str:
 
 
 def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, LogResult]:
-    """Load the results of an earlier call for unchanged files and settings."""
+    """Load the results of an earlier call in the folder `out`, to explain only what has changed.
+
+    A result is reused if its log and all settings are the same and it has no error.
+    """
     path = out / BATCH_STATE_FILE
     if not path.exists():
         check_folder_empty(out)

@@ -431,6 +431,7 @@ def _log_scales(hypotheses: Sequence[ConventionHypothesis], recording: Recording
 
 
 def _white_noise(world: RunEvaluator, recording: Recording) -> NoiseModel:
+    """Return the noise floor of the channels as noise without autocorrelation."""
     sigma = compute_noise_floor(world, recording).sigma
     return NoiseModel(sigma, np.zeros(len(sigma)))
 

@@ -437,6 +437,7 @@ def _shares(world: RunEvaluator, residual: Array, noise: NoiseModel) -> Array:
 
 
 def _rms(residual: Array, is_recorded: Any, noise: NoiseModel) -> float:
+    """Return the RMS of a residual (R, T, C) over its samples, in units of the noise."""
     scaled = (residual / noise.sigma)[is_recorded]
     rms = float(np.sqrt(np.mean(np.square(scaled)))) if scaled.size else 0.0
     return rms if np.isfinite(rms) else np.inf
@@ -589,6 +590,7 @@ def _distinction(
     """
 
     def residual_with_factor(step: float) -> float:
+        """Return the RMS residual if the signals are multiplied by `step` in addition."""
         return _fit_rescaled(subject, {name: step * k for name, k in hypothesis.factors().items()})[
             0
         ]

@@ -216,6 +216,8 @@ def _fitted(
 
 
 class _Shown:
+    """What the runs show about the coefficients of absent effects, at a fitted model."""
+
     def __init__(
         self,
         world: RunEvaluator,

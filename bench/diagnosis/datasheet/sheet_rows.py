@@ -120,6 +120,8 @@ def build_sheet_rows(
 
 @dataclass(frozen=True)
 class _Rows:
+    """Builder of the rows of a data sheet, from a verdict and the detection limits."""
+
     subject: SheetSubject
     extended: ExtendedSimulator
     verdict: Verdict

@@ -68,6 +68,7 @@ def _noisy(run: Run, sizes: dict[str, float]) -> Run:
     """
 
     def noise(name: str, values: Array) -> Array:
+        """Draw white noise for a channel from a random stream of its own."""
         return sizes[name] * make_rng("least noise", run.log, run.name, name).normal(
             size=values.shape
         )

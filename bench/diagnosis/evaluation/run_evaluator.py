@@ -212,6 +212,7 @@ class RunEvaluator:
             fine = {**usual, "time_step": MAX_TIME_STEP_FILTERED}
 
         def made(settings: dict[str, Any]) -> SystemSimulator:
+            """Create a simulator of the recorded channels with all effects."""
             constants = self.recording.constants
             return kind(constants, observe, engine=self.engine, effects=effects, **settings)
 

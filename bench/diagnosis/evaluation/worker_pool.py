@@ -55,6 +55,8 @@ class SharedState(Protocol):
 
 
 class _Worker(NamedTuple):
+    """Worker process, and the pipe to it."""
+
     process: BaseProcess
     pipe: Connection
 

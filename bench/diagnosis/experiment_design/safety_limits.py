@@ -86,6 +86,7 @@ class RigLimits:
 
     @property
     def _joints(self) -> list[Any]:
+        """The joints of the robot with one coordinate."""
         robot: Any = self.world.kind
         return [joint for joint in robot.robot.joints if joint.has_one_coordinate]
 

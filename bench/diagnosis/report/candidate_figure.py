@@ -160,7 +160,10 @@ def _label_rows(
 
 
 def _shares_panel(axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate]) -> None:
-    """Draw the share of the held-out gap that each candidate closes, with its 95 % interval."""
+    """Draw which share of the held-out gap each candidate closes, with its 95 % interval.
+
+    Each candidate is a row, in the given order. One that was not simulated has no mark.
+    """
     lowest = 0.0
     for row, candidate in enumerate(candidates):
         axis.axhline(row, color=NOISE_BAND_GREY, linewidth=0.5, zorder=0)
@@ -201,7 +204,11 @@ def _shares_panel(axis: Axes, report: DiagnosisReportData, candidates: Sequence[
 def _scores_panel(
     axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate], thickness: float
 ) -> None:
-    """Draw the candidates' scores; ticks are the scores of the same effect at other places."""
+    """Draw the score of each candidate as a bar, which is twice the gain in log-likelihood.
+
+    Small vertical lines are the scores of the same effect at other places. `thickness` is the
+    height of a bar in rows.
+    """
     elsewhere = {entry.best.effect: entry.elsewhere for entry in rank_candidates(report)}
     longest = 1e-9
     for row, candidate in enumerate(candidates):
@@ -251,7 +258,7 @@ def _printed(p_value: float) -> str:
 
 
 def _notes(report: DiagnosisReportData, candidates: Sequence[Candidate]) -> list[str]:
-    """Format the number of runs and samples, and p-values that are not printed next to bars."""
+    """Format the notes below the figure: numbers of runs and samples, meaning of p-values."""
     counts = f"Fitted: {_counted(report.fitting)}"
     if report.held_out is not None and report.cross_validated:
         counts += "; each run left out in turn"

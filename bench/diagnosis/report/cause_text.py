@@ -61,7 +61,10 @@ def format_effect_set(names: Sequence[str], last: str = "or") -> str:
 
 
 def _grouped(names: Sequence[str], last: str) -> list[str]:
-    """Format one text for an effect at several places, or for several effects at one place."""
+    """Group effects that share a name or a place, and format one text for each group.
+
+    `last` is the conjunction, such as "or".
+    """
     by_effect: dict[str, list[str]] = {}
     for name in names:
         base, place = split_effect_name(name)
@@ -78,7 +81,7 @@ def _grouped(names: Sequence[str], last: str) -> list[str]:
 
 
 def _together(group: Sequence[str], last: str) -> str:
-    """Format a group of one effect, or of one place."""
+    """Format effects of one name at several places, or several effects at one place."""
     if len(group) == 1:
         return format_effect(group[0])
     bases = list(dict.fromkeys(split_effect_name(name)[0] for name in group))
@@ -202,11 +205,13 @@ def _moved(where: str, values: Sequence[FittedValue]) -> str:
 
 
 def _zero(where: str, values: Sequence[FittedValue]) -> str:
+    """Say how far the zero of a joint, for command and reading, is from that of the model file."""
     size = append_unit(format_number(abs(values[0].value), 2), values[0].unit)
     return f"the zero {where}, of command and reading alike, is {size} from that of the model file"
 
 
 def _tilted(where: str, values: Sequence[FittedValue]) -> str:
+    """Say by how many degrees the axis of a joint is tilted; `values` has the angles in rad."""
     angle = np.rad2deg(np.linalg.norm([n.value for n in values]))
     return f"the axis {where} is tilted by {format_number(float(angle), 2)}° from the model file"
 
@@ -296,7 +301,10 @@ def list_place_marks(report: DiagnosisReportData) -> list[PlaceMark]:
 
 
 def _places(report: DiagnosisReportData, effect: str, cause: Cause) -> list[str]:
-    """List the places of an effect: those of a family's coefficients, else all of its kind."""
+    """List the places at which an effect acts, for marks on the drawing of the robot.
+
+    An effect at all places has those of its coefficients, or all places of its kind.
+    """
     _, place = split_effect_name(effect)
     if place != ALL_PLACES:
         return [place] if place else []

@@ -131,7 +131,7 @@ def _format_span(spread: ParameterConsistency) -> str:
 
 
 def _format_drifts(after: Sequence[ParameterConsistency]) -> Iterator[str]:
-    """Yield sentences on the parameters that drift over the logs."""
+    """Yield sentences on the parameters that increase or decrease from log to log."""
     logs = [spread for spread in after if spread.by == "log" and spread.trend is not None]
     if not logs:
         return

@@ -145,7 +145,7 @@ def place_names(places: Sequence[GapLocation]) -> list[str]:
 
 
 def _rows_of(axis: Axes, places: Sequence[GapLocation]) -> list[float]:
-    """Compute the position of each row downwards, and write a heading above each kind."""
+    """Return the vertical position of each row, and write a heading above each kind of place."""
     rows: list[float] = []
     for i, place in enumerate(places):
         new = i == 0 or places[i - 1].kind != place.kind
@@ -177,7 +177,7 @@ def get_legend_entries(axis: Axes) -> tuple[list[Any], list[str]]:
 
 
 def _decades(axis: Axes, values: Sequence[float]) -> None:
-    """Use a logarithmic axis with plain numbers if the values have a large range."""
+    """Use a logarithmic axis with plain numbers if the values differ by a large factor."""
     positive = np.array([v for v in values if np.isfinite(v) and v > 0])
     if not positive.size or positive.max() / positive.min() < _SPAN_FOR_LOG:
         axis.set_xlim(left=0)
@@ -193,7 +193,7 @@ def _decades(axis: Axes, values: Sequence[float]) -> None:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Return round numbers in an interval of a logarithmic axis."""
+    """Return round ticks of a logarithmic axis; per decade 1, 2, 5 or fewer."""
     # With more decades, each has fewer numbers, so that labels do not overlap.
     steps: tuple[int, ...] = (1,)
     if high / low < 200:

@@ -213,6 +213,7 @@ def _rows(report: DiagnosisReportData) -> list[_Row]:
 
 
 def _place(row: _Row) -> str:
+    """Return the place of an effect; empty if it acts at all places."""
     place = split_effect_name(row.effect)[1]
     return "" if place == ALL_PLACES else place
 
@@ -280,12 +281,14 @@ def _names(effects: Sequence[str]) -> str:
 
 
 def _interval(number: ParameterIdentifiability) -> str:
+    """Format half the 95 % interval with its unit; empty if the data are insensitive."""
     if not np.isfinite(number.half):
         return ""
     return append_unit(f"±{format_number(number.half)}", number.unit)
 
 
 def _table_row(number: ParameterIdentifiability, status: str) -> IdentifiabilityRow:
+    """Format the identifiability of a parameter or cause as a table row."""
     mixed = joined([f"{name} ({correlation:.2f})" for name, correlation in number.mixed])
     span = f"{format_number(number.low)} to {format_number(number.high)}"
     return IdentifiabilityRow(number.name, status, _interval(number), span, mixed or "–")

@@ -109,6 +109,7 @@ def _first(report: DiagnosisReportData) -> str:
 
 
 def _quantities(report: DiagnosisReportData) -> list[str]:
+    """Return the recorded quantities of joints, such as position and velocity, in a fixed order."""
     recorded = {channel.name.partition(".")[0] for channel in report.channels}
     return [quantity for quantity in QUANTITY_LABELS if quantity in recorded]
 
@@ -183,7 +184,10 @@ def _left(report: DiagnosisReportData, view: RunView, c: int, model: str) -> Arr
 def _motion(
     panel: Axes, report: DiagnosisReportData, view: RunView, row: JointRow, is_named: bool
 ) -> None:
-    """Draw the measured and simulated motion, with the name of the joint next to it."""
+    """Draw the measured and simulated motion of a joint, with its name at the left.
+
+    The name is highlighted if the diagnosis names the joint (`is_named`).
+    """
     channel, split = report.channels[row.shown], view.side
     times = split.times[view.row]
     signals = [
@@ -237,7 +241,7 @@ def _row_name(row: JointRow, is_named: bool) -> str:
 
 
 def _residual(panel: Axes, report: DiagnosisReportData, view: RunView, c: int) -> None:
-    """Draw the residuals of a channel, with their RMS."""
+    """Draw the residuals of channel number c in units of its noise, with the RMS above."""
     times = view.side.times[view.row]
     panel.axhspan(
         -2, 2, color=NOISE_BAND_GREY, linewidth=0, label="±2σ: 95 % of the noise", zorder=0
@@ -276,7 +280,7 @@ def _one_scale(
     rows: Sequence[JointRow],
     quantity: str,
 ) -> None:
-    """Set one scale for a column of residuals, so that joints can be compared."""
+    """Give the residuals of one quantity (a column) the same scale, to compare joints."""
     limit = MIN_RESIDUAL_AXIS_SIGMAS
     for row in rows:
         if quantity in row.channels:
@@ -327,7 +331,10 @@ def _finish(
     rows: Sequence[JointRow],
     names_width: float,
 ) -> None:
-    """Add title, legend and margins; the panels begin at `left` inches."""
+    """Add title, legend and margins to the figure of joints.
+
+    `names_width` is the width of the names at the left of the panels, in inches.
+    """
     width, height = figure.get_size_inches().tolist()
     total = len(list_joint_rows(report))
     selection = (

@@ -101,7 +101,7 @@ def build_motion_table(report: DiagnosisReportData, most: int = MAX_ROWS) -> Mot
 
 
 def _runs(report: DiagnosisReportData) -> list[ShownRun]:
-    """List all runs, the worst first, but the run of the printed figure before all others."""
+    """List all runs by descending RMS residual, but the run of the printed figure first."""
     sigma = np.array([c.sigma for c in report.channels])
     first = select_worst_run(report)
     runs = []
@@ -154,7 +154,10 @@ def select_extreme_samples(signals: Sequence[Array], stretches: int) -> NDArray[
 
 
 def _rows(report: DiagnosisReportData, run: ShownRun, c: int, most: int) -> list[list[str]]:
-    """Format the cells of a channel of a run, column by column."""
+    """Format the samples of a channel of a run as columns of text for the chart's table.
+
+    If there are more than `most` samples, only the extremes of short parts are kept.
+    """
     split, channel = run.side, report.channels[c]
     times = split.times[run.row]
     models = ("before", "after") if has_extended_model(report) else ("before",)
@@ -240,7 +243,10 @@ def _places(report: DiagnosisReportData) -> list[tuple[dict[str, str], int]]:
 def _off(
     report: DiagnosisReportData, places: Sequence[tuple[dict[str, str], int]], toggle: str
 ) -> tuple[str, ...]:
-    """Return the channels that are hidden at first: with many channels, those that fit well."""
+    """Return the channels or joints that are hidden at first, if there are many.
+
+    Those with the largest residuals stay visible. `toggle` is the switch that hides them.
+    """
     if len(places) <= MAX_INITIAL_CHANNELS:
         return ()
     gaps: dict[str, float] = {}
@@ -262,7 +268,10 @@ def _off(
 def _pair(
     report: DiagnosisReportData, run: ShownRun, c: int, facets: dict[str, str], wide: bool
 ) -> tuple[Panel, Panel]:
-    """Make the panels of a channel's motion and of its residual."""
+    """Make two panels of channel number c of a run: its motion, and its residual in noise units.
+
+    `facets` has the values of the switches that show these panels; `wide` places them side by side.
+    """
     channel = report.channels[c]
     selection = {
         "run": sanitise(run.side.names[run.row], 80),
@@ -317,7 +326,10 @@ def _pair(
 
 
 def _tells(unit: str, sigma: float, extended: bool) -> tuple[TooltipLine, ...]:
-    """Return the values at the cursor: signals, and residuals in noise units and their unit."""
+    """Return the values that the chart shows at the cursor.
+
+    They are the signals in `unit`, and the residuals both in that unit and in units of the noise.
+    """
 
     def residual(says: str, y: str, look: MarkStyle) -> TooltipLine:
         return TooltipLine(says, y, "σ", look, sigma, unit)

@@ -295,7 +295,7 @@ def format_gain_and_caveats(report: DiagnosisReportData) -> Iterator[str]:
 
 
 def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
-    """Yield the evidence for a wrong unit or sign, alternative explanations, and what to do."""
+    """Yield sentences on a wrong unit or sign: evidence, alternatives, and what to do."""
     first, *further_faults = faults
     if first.error_after is not None:
         before = (
@@ -346,7 +346,7 @@ def format_interval(held_out: HeldOutResult) -> str:
 
 
 def _closer(report: DiagnosisReportData) -> str:
-    """Return the beginning of the sentence about the share of the gap that is closed."""
+    """Return the subject and verb of the sentence on how much of the gap is closed."""
     causes = report.verdict.causes
     if report.verdict.verdict == "unknown" and report.verdict.cut is None:
         names = joined([format_effect(cause.effect) for cause in causes])

@@ -241,6 +241,7 @@ def _compute_residual_mean_square(parts: Sequence[GroupEstimate], numbers: Array
 
 
 def _assess_parameter(one: ParameterConsistency, level: float) -> ParameterConsistency:
+    """Mark a parameter as consistent if its scatter is small or not significant at `level`."""
     slight = one.scatter < MIN_RELEVANT_SCATTER * abs(one.value)
     return replace(one, is_consistent=slight or one.p_value >= level)
 

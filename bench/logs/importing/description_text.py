@@ -154,7 +154,11 @@ class DescriptionWriter:
         return [*lines, ""]
 
     def _added_servo(self, name: str, joint: Joint) -> _AddedServo:
-        """Estimate the gains of a servo that is missing in the model file."""
+        """Estimate the gains kp and kv of a servo that is missing in the model file.
+
+        They follow from frequency and damping of its response and from the inertia of the joint.
+        Without motion, the gains of a usual servo are taken.
+        """
         signals = self._signals
         inertia = float(compute_joint_scales(signals.robot).inertia[signals.joints.index(joint)])
         samples = self._servo_samples(name, joint)
@@ -182,7 +186,10 @@ class DescriptionWriter:
         return _AddedServo(name, joint, kp, kv, is_moved)
 
     def _servo_samples(self, name: str, joint: Joint) -> list[tuple[Array, Array, Array]]:
-        """Return times, commands and positions (T,) of a servo in each run, SI units."""
+        """Return times (s), commands and positions (T,) of a servo in each run, in rad or m.
+
+        A command holds until the next one.
+        """
         command, position = self._signals.inputs[f"u.{name}"], self._signals.position_of(joint.name)
         samples: list[tuple[Array, Array, Array]] = []
         if position is None:

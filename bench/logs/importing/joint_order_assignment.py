@@ -68,7 +68,11 @@ def assign_order(
 
 
 def _servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
-    """Return the joints with servo, command and position; with values where an order is a guess."""
+    """Collect the joints that have a servo, a recorded command and a recorded position.
+
+    Their values (T,) are included only if the order of the columns is a guess, to test other
+    orders.
+    """
     joints = [
         joint
         for joint in signals.joints

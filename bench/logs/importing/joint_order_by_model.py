@@ -96,7 +96,11 @@ def preferred_order(
 
 
 def _orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
-    """Yield the tested orders: all for few joints, else common ones and exchanges of two."""
+    """Yield the orders of the columns that are tested, each as the column index of every joint.
+
+    For few joints they are all permutations; otherwise the stated, the alphabetical and the
+    reversed order, each also with two joints exchanged.
+    """
     count = len(names)
     if count <= ALL_ORDERS:
         yield from permutations(range(count))

@@ -244,7 +244,10 @@ class RunLogs:
         return clocks
 
     def _complete_columns(self, logs: Mapping[str, LogFile]) -> list[LogColumn]:
-        """Return the columns that have one number for each time stamp of their file."""
+        """Return the columns that have one number for each time stamp of their file.
+
+        Other columns are left out with a message.
+        """
         columns = []
         for file, seconds in self.seconds.items():
             for column in _all_columns(file, logs[file]):

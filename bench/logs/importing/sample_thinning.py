@@ -62,7 +62,11 @@ def _rate(run: Run) -> float:
 
 
 def _holds(recording: Recording, every: int) -> bool:
-    """Return whether every k-th sample preserves all motion of all channels."""
+    """Return whether every k-th sample still shows the whole motion; k is `every`.
+
+    The motion between the kept samples is interpolated by a spline. Its error may hardly be larger
+    than if every second sample is kept, which is noise.
+    """
     for run in recording.runs:
         if run.times.size < FEWEST * every:
             return False

@@ -98,7 +98,10 @@ def assign_velocities(
 def _compare(
     logs: RunLogs, column: LogColumn, position: Signal, joint: Joint
 ) -> VelocityComparison | None:
-    """Compare a velocity with the derivative of its position, over the first runs."""
+    """Compare a velocity column with the derivative of its joint's position, over the first runs.
+
+    Return None if no run has enough motion for a comparison.
+    """
     runs = []
     for name in list(logs.runs)[:MAX_RUNS]:
         velocities, positions = logs.read(name, column), logs.read(name, position.column)
@@ -128,7 +131,11 @@ def _confirmed_unit(comparison: VelocityComparison | None, column: LogColumn, jo
 def _assign_kind(
     candidates: Sequence[_Candidate], signals: SignalAssignment, result: ImportResult
 ) -> None:
-    """Assign the columns of one kind: all that may be derivatives, unless they lag."""
+    """Assign velocity columns that agree with the derivative of their position.
+
+    `candidates` are the columns of one kind, which share a unit and a filter. All are left out if
+    the velocities lag behind the positions. A joint that hardly moves gets the unit of the others.
+    """
     confirmed = [candidate for candidate in candidates if candidate.unit]
     units = [candidate.unit for candidate in confirmed]
     usual_unit = max(units, key=units.count) if units else ""

@@ -69,6 +69,8 @@ SIGNIFICANCE_SIGMAS = 4.0
 
 
 class _Estimate(NamedTuple):
+    """Relative clock drift and its standard error, both dimensionless."""
+
     drift: float
     error: float
 
@@ -115,7 +117,11 @@ def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
 
 
 def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
-    """Estimate the drift of one run by equation (2); yield nothing if (1) explains too little."""
+    """Estimate the drift of the sensors' clock against the commands' clock in one run, by eq. (2).
+
+    The position is predicted by past commands, eq. (1); a drift makes the error of this prediction
+    grow with time. Nothing is yielded if the commands explain too little of the motion.
+    """
     t, u, y = run.times, run.inputs[command], run.channels[position]
     seen = np.isfinite(y)
     if seen.sum() < 2 * len(LAG_BIN_EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):

@@ -80,7 +80,10 @@ def _sigma(runs: list[tuple[Array, Array]], order: int) -> float:
 
 
 def _compute_divided_differences(times: Array, values: Array, order: int) -> Array:
-    """Compute divided differences, scaled to the variance of one sample, omitting gaps."""
+    """Compute differences of the given order, eq. (1): smooth motion cancels, noise stays.
+
+    They are scaled so that white noise keeps its variance. Differences across a gap are left out.
+    """
     t, y = sliding_window_view(times, order + 1), sliding_window_view(values, order + 1)
     # Motion across a gap is no longer close to a polynomial.
     near = t[:, -1] - t[:, 0] <= _GAP * order * np.median(np.diff(times))

@@ -66,7 +66,10 @@ def check_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Anomaly
 
 
 def _check_range(recording: Recording, joint: Any) -> Iterator[Anomaly]:
-    """Find positions far beyond a joint's limits; only the first such run is reported."""
+    """Find positions far beyond the limits of a joint, which a wrong unit would explain.
+
+    Only the first run with such positions is reported.
+    """
     column = f"q.{joint.name}"
     unit, (smaller, name) = joint.unit, _SMALLER[joint.unit]
     for run in recording.runs:
@@ -193,7 +196,10 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
 
 
 def _place(kind: type[Simulator], positions: Mapping[str, Array]) -> Iterator[Any]:
-    """Yield MuJoCo's data with a robot at up to `CHECKED_INSTANTS` recorded poses."""
+    """Yield MuJoCo's data (mujoco.MjData) of a robot at some of its recorded poses.
+
+    The same object is yielded each time, with up to `CHECKED_INSTANTS` poses one after another.
+    """
     import mujoco
 
     robot = kind.robot  # type: ignore[attr-defined]
@@ -224,7 +230,10 @@ class _Pair(NamedTuple):
 
 
 def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
-    """Find servos whose joints do not behave like a servo."""
+    """Find servos whose joint moves against the command, or by a factor that a wrong unit explains.
+
+    Exchanged joints are found as well.
+    """
     servo_signals = [
         (f"u.{a.name}", f"q.{a.joint}")
         for a in robot.actuators
@@ -260,7 +269,10 @@ def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
 def _check_exchanged(
     servo_signals: list[tuple[str, str]], pairs: dict[tuple[str, str], _Pair]
 ) -> Iterator[Anomaly]:
-    """Find two joints that follow each other's commands and not their own."""
+    """Find pairs of joints that follow each other's command instead of their own.
+
+    `pairs` has slope and correlation for each pair of a command and a position.
+    """
     for i, (command, position) in enumerate(servo_signals):
         for other_command, other in servo_signals[i + 1 :]:
             crossed_correlations = pairs[command, other].like, pairs[other_command, position].like
@@ -294,5 +306,6 @@ def _compare(recording: Recording, command: str, position: str) -> _Pair:
 
 
 def _products(u: Array, q: Array) -> Array:
+    """Return the sums of squares and products (3,) of u and q about their means."""
     u, q = u - u.mean(), q - q.mean()
     return np.array([u @ u, u @ q, q @ q])

@@ -31,7 +31,7 @@ _MAD = 1.4826
 
 
 def check_intervals(recording: Recording) -> Iterator[QualityFinding]:
-    """Find jitter and lost samples, summarised over all runs."""
+    """Find irregular sampling intervals (jitter) and lost samples, summarised over all runs."""
     jittered, rests, lost, whole, lossy = [], [], 0, 0, []
     for run in recording.runs:
         steps = np.diff(_select_timestamps(run))
@@ -92,7 +92,10 @@ def _uneven(times: Array) -> float:
 
 
 def check_repeated_samples(recording: Recording) -> Iterator[QualityFinding]:
-    """Find samples that repeat the previous one in every channel while the system moves."""
+    """Find samples that repeat the previous one in every channel although the system moves.
+
+    Such samples were not measured anew, and look like a delay.
+    """
     found, there, runs = 0, 0, []
     for run in recording.runs:
         count, expected = _count_stale_samples(run)

@@ -178,7 +178,10 @@ def _has_inputs(run: Run) -> bool:
 
 
 def _accelerations(recording: Recording, run: Run, system: System) -> Array:
-    """Compute (T, D) accelerations by the system's own forces, at rest in recorded positions."""
+    """Compute the accelerations (T, D) that the system's forces cause at the recorded positions.
+
+    The system is at rest, so drag and friction do not act; D is the number of coordinates.
+    """
     count = run.times.size
     given = {**recording.constants, **run.constants}
     constants = {c.name: np.full((count, 1), given.get(c.name, c.value)) for c in system.constants}

@@ -147,7 +147,10 @@ class VelocityComparison(NamedTuple):
 
     @staticmethod
     def pool(comparisons: Sequence[VelocityComparison]) -> VelocityComparison:
-        """Join comparisons of several joints, each velocity in the unit of its position."""
+        """Join the comparisons of several joints to one, from which a common delay is estimated.
+
+        Each velocity is first multiplied by its slope, so that a wrong unit has no influence.
+        """
         scaled = [
             VelocityComparison(
                 one.position_changes,
