@@ -268,6 +268,8 @@ def _command(form: str, times: Array, step: float, rng: np.random.Generator) -> 
     if form == "a push, then let go":
         return np.where(share < RELEASE_SHARE, 1.0, 0.0)
     seconds = float(times[-1])
+    # Frequencies in Hz: `slow` is one cycle in the run, but 0.1 to 0.5; `fast` has at least ten
+    # samples in a cycle, but is at most 8.
     slow = min(max(1.0 / max(seconds, step), 0.1), 0.5)
     fast = max(min(8.0, 0.1 / step), 2.0 * slow)
     text = COMMAND_FORMS[form].format(slow=slow, middle=min(1.0, 0.5 * fast), fast=fast)

@@ -256,6 +256,7 @@ class RunRanker:
             own = np.inf if after is None else float(np.square(aim - after.centre).sum())
             cost = own + float((gone + step) @ rival.inverse @ (gone + step))
             if after is None or not cost < least:
+                # The step was too long or failed, so the next one is much shorter (Marquardt).
                 damping *= 100.0
                 continue
             done = least - cost < 1e-3 * least
@@ -275,6 +276,7 @@ def _known(models: ModelSet, model: FittedModel) -> _Known:
     """
     own = compute_covariance(models, model)
     bounds = np.array([models.world.parameters[i].bounds for i in model.fit.free]).reshape(-1, 2)
+    # At most a tenth of the range, because derivatives are finite differences with this step.
     widest = 0.1 * (bounds[:, 1] - bounds[:, 0])
     spread = np.minimum(np.sqrt(np.maximum(np.diagonal(own), 1e-300)), widest)
     inverse = np.asarray(np.linalg.pinv(own / np.outer(spread, spread), hermitian=True))

@@ -144,9 +144,8 @@ def correct_discretisation(
 
     to first order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for
     any higher order. An error below `MAX_CORRECTABLE_ERROR` is not reported as a cause, but could
-    be mistaken for
-    one: for example dry friction that stops within a step and not at its end, or a servo that is
-    nearly too fast for the step.
+    be mistaken for one: for example dry friction that stops within a step and not at its end, or a
+    servo that is nearly too fast for the step.
 
     Args:
         world: the runs of a robot.
@@ -167,6 +166,7 @@ def correct_discretisation(
     for kind in (half, half.with_half_step()):
         finer = kind(world.recording.constants, world.channels, effects=effects)
         seen.append(finer.simulate_batch(lanes, scenarios, begun))
+    # In units of a run with the usual step: 1 + 2 with half of the step + 4 with a quarter.
     world.simulations += 7 * runs
     left = 2.0 * seen[2] - seen[1] - seen[0]  # (1)
     sizes = np.square(left / noise.sigma)[np.isfinite(world.observed)]

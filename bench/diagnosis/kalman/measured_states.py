@@ -96,7 +96,8 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     sizes = np.array(
         [max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings]
     )
-    # The scale is the range per second, or per duration of the run if that is shorter.
+    # The prior of position, velocity and acceleration is so wide that the readings decide. Its
+    # scale is the range per second, or per duration of the run if that is shorter.
     span = min(float(times[-1] - times[0]), 1.0)
     prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(sizes.max()), 1e-9)
     levels = JERKS.size

@@ -81,6 +81,7 @@ def list_joint_families(world: RunEvaluator, slow: float) -> Iterator[JointHatFa
         if name not in world.channels:
             continue
         values = world.observed[:, :, world.channels.index(name)]
+        # Quantiles instead of extremes, so that single outliers do not widen the range.
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
         speed = _fastest(world, world.channels.index(name))
         about = slow * speed

@@ -329,6 +329,7 @@ def _over_positions(world: RunEvaluator) -> Iterator[_Family]:
         if name not in world.channels:
             continue
         values = world.observed[:, :, world.channels.index(name)]
+        # Quantiles instead of extremes, so that single outliers do not widen the range.
         low, high = (float(v) for v in np.nanquantile(values, [0.01, 0.99]))
         if not high > low:
             continue

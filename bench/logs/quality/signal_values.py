@@ -47,6 +47,7 @@ def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[
         values = np.concatenate([values for _, values in signals])
         spread = float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
         stated = recording.noise.get(channel.name)
+        # A rounding error is uniformly distributed over a step; its standard deviation follows.
         rounding = step / 12**0.5
         unit = channel.unit
         if step and stated is not None and stated < rounding / 2:
