@@ -122,7 +122,7 @@ def explain(
 def _explain_run(
     recording: RecordingSource | Sequence[RecordingSource], options: ExplainOptions
 ) -> Iterator[_ExplainRun]:
-    """Open the run of an explanation with its worker processes."""
+    """Create a diagnosis and its worker pool for a `with` block, and close both at its end."""
     sources = [recording] if isinstance(recording, RecordingSource) else list(recording)
     with (
         closing(ForkedWorkerPool(options.jobs or 1)) as crew,
@@ -526,7 +526,10 @@ class _ExplainRun:
         return DiagnosisResult("unknown", base, base, (), assess_lack_of_fit(search, base))
 
     def _named(self, search: EffectSearch) -> DiagnosisResult:
-        """Diagnose the causes; for a robot by prediction errors."""
+        """Run the search and select a verdict.
+
+        For a robot whose runs could be filtered, the search uses prediction errors.
+        """
         if self.fitting.followed is None:
             return diagnose(search, self.validation)
         # This import is needed for robots only.

@@ -149,7 +149,7 @@ class Explanation:
 
     @cached_property
     def _told(self) -> DiagnosisReportData:
-        """Report data with the changes of a robot's model file."""
+        """Report data, with the changes that the diagnosis makes to a robot's model file."""
         files = self._robot_files
         if not files.contents:
             return replace(self.story, unwritable_causes=files.notes)

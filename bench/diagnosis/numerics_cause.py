@@ -41,7 +41,7 @@ class Reusable(Generic[Item]):
         self._rest, self._known = items, list[Item]()
 
     def __iter__(self) -> Iterator[Item]:
-        """Yield all items from the first."""
+        """Yield all items from the first; none is computed a second time."""
         number = 0
         while True:
             if number == len(self._known):

@@ -181,7 +181,10 @@ def _impacts(world: RunEvaluator, simulated: Array) -> Mask:
 
 
 def _saturated(world: RunEvaluator) -> Mask:
-    """Return where the first input stays at its extreme."""
+    """Return the mask (R, T) of samples at which the first input stays near its largest magnitude.
+
+    It is empty for an input that is there most of the time, such as a square wave.
+    """
     mask = np.zeros(world.observed.shape[:2], dtype=bool)
     for r, track in enumerate(world.tracks):
         for signal in list(track.scenario.inputs.values())[:1]:

@@ -170,7 +170,7 @@ def _finish(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
 
 
 def _named(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
-    """Write the names of the runs above the first panel."""
+    """Write the name of each run above the first panel, in the middle of the run."""
     for part in placed:
         middle = float(part.times[[0, -1]].mean())
         axis.annotate(

@@ -130,7 +130,10 @@ def _tips(model: Any, data: Any) -> Array:
 
 
 def _direction(robot: RobotModel, data: Any) -> tuple[float, float]:
-    """Return azimuth and elevation of the camera in degrees."""
+    """Choose azimuth and elevation of the camera, in degrees.
+
+    A planar robot is viewed along its common axis; another one from where its joints look widest.
+    """
     normal = _normal(robot, data)
     if normal is not None and abs(normal[2]) > 1 - PARALLEL_SINE_TOLERANCE:
         return 90.0, -90.0

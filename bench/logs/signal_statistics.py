@@ -66,7 +66,7 @@ class SignalStatistics(NamedTuple):
 
 
 def compute_run_statistics(run: Run) -> RunStatistics:
-    """Compute the statistics of a run."""
+    """Count samples, gaps and missing values of a run, and measure its duration and intervals."""
     intervals = np.diff(run.times)
     median = float(np.median(intervals))
     missing = sum(int(np.isnan(v).sum()) for v in run.channels.values())

@@ -303,7 +303,11 @@ class _RecordingSimulation:
 
 
 def _kind(wish: SimulationSpec) -> type[Simulator]:
-    """Return the simulator class of a specification."""
+    """Return the simulator class that a specification names, by its system or its robot model file.
+
+    Raises:
+        InputError: It names both or neither.
+    """
     if bool(wish.system) == (wish.model is not None):
         found = "both" if wish.system else "neither"
         raise InputError(f"expected a system (see `simgap list systems`) or a model, found {found}")
@@ -326,7 +330,7 @@ def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
 
 
 def _held_out(wish: SimulationSpec) -> int:
-    """Return how many of the last runs are held out."""
+    """Return how many runs, the last ones, are held out for validation; by default a third."""
     if wish.runs < 1:
         raise InputError(f"runs = {wish.runs}: expected at least 1")
     if wish.held_out is None:
@@ -408,7 +412,11 @@ def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[fl
 
 
 def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:
-    """Return 1 sigma of every recorded channel."""
+    """Return the standard deviation of the noise of each channel, in the channel's unit.
+
+    `given` is one value for all channels, or a value for each. Channels that are not named have
+    none.
+    """
     named = given if isinstance(given, Mapping) else {ALL_CHANNELS: given}
     check_known_names(
         "recorded channel", [name for name in named if name != ALL_CHANNELS], channels
@@ -422,7 +430,7 @@ def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[
 
 
 def _range(name: str, given: float | tuple[float, float]) -> tuple[float, float]:
-    """Return the lowest and highest initial value."""
+    """Return the interval (low, high) from which an initial state is drawn."""
     ends = (given, given) if isinstance(given, int | float) else tuple(given)
     if len(ends) != 2:
         raise InputError(f"initial state {name}: expected a value or (low, high), found {given!r}")

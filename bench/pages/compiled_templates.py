@@ -36,7 +36,7 @@ class CompiledTemplates(BytecodeCache):
             bucket.code = code if isinstance(code, CodeType) else None
 
     def dump_bytecode(self, bucket: Bucket) -> None:
-        """Store the code of a template."""
+        """Store the compiled code of a template on disk, for reuse in the next process."""
         if sys.dont_write_bytecode or bucket.code is None:
             return
         path = self._get_path(bucket)

@@ -165,7 +165,7 @@ def _load_previous_results(out: Path, logs: Sequence[BatchLog]) -> dict[str, Log
 
 
 def _write(out: Path, rows: Sequence[LogResult]) -> None:
-    """Write the batch state and the table."""
+    """Write the results so far: the state, with which a later call continues, and the table."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(

@@ -246,7 +246,10 @@ class HypothesisGenerator:
         yield from _late_commands(recording)
 
     def _units_of_log(self, recording: Recording) -> Iterator[ConventionHypothesis]:
-        """Yield other units for all signals of a kind."""
+        """Yield hypotheses that all positions, commands, velocities or torques have another unit.
+
+        They are tried together only if the description states the same unit for all of them.
+        """
         positions = self._channels("q")
         commands = [name for joint in self.joints for name in joint.servo_inputs]
         groups = positions, commands, [*positions, *commands], self._channels("qd")
@@ -430,7 +433,7 @@ def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[Conventi
 
 
 def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
-    """Return whether all values of these columns are integers."""
+    """Return whether all recorded values of these signals are integers, as encoder ticks are."""
     for run in recording.training():
         recorded = {**run.inputs, **run.channels}
         for signal in signals:

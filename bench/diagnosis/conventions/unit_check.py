@@ -411,7 +411,7 @@ def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
 
 
 def _parameters_at_bounds(world: RunEvaluator, fit: TrajectoryFit) -> list[str]:
-    """List the parameters that the base fit leaves at a bound."""
+    """List the names of parameters whose value in the base fit is at a bound of their range."""
     names = []
     for index in fit.free.tolist():
         parameter = world.parameters[index]

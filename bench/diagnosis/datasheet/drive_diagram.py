@@ -206,7 +206,10 @@ class _Joint:
         self.names = tuple(law.name for law, _ in self.laws)
 
     def friction(self, drive: Array, load: Array) -> Array:
-        """Compute the maximum holding force (N,)."""
+        """Compute the largest force (N,) that the friction of the joint can hold at rest.
+
+        It is the sum over all friction laws, under N pairs of drive and load force.
+        """
         moment = self._moment(drive, load)
         limits = [np.full(len(drive), self.stated)]
         for law, c in self.laws:
@@ -216,7 +219,7 @@ class _Joint:
         return holding_force
 
     def pull(self, drive: Array, load: Array) -> Array:
-        """Compute the sum of the other forces at rest (N,)."""
+        """Compute the sum (N,) of the other forces on the joint at rest, such as a bias."""
         moment = self._moment(drive, load)
         forces = [np.zeros(len(drive))]
         for law, c in self.laws:

@@ -199,7 +199,11 @@ class _Rows:
                 yield self._apart(row, effect, parameter)
 
     def _apart(self, row: SheetRow, effect: str, parameter: str) -> SheetRow:
-        """Add the prediction interval from the consistency of the runs."""
+        """Add to a row the interval of its value for a run that is not yet recorded.
+
+        It is known only if several runs or logs identify the value. For a number of the model file
+        it is converted to the unit of that number.
+        """
         half, stated = (
             self.shown.prediction_half_widths.get(parameter),
             self.subject.get_model_file_value(effect),

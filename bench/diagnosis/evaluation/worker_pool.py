@@ -260,7 +260,7 @@ class ForkedWorkerPool:
                 return ready
 
     def _lose(self, pipe: Connection) -> None:
-        """Kill a worker and remove it from the pool."""
+        """Kill the worker at the other end of a pipe, and remove it from the pool."""
         for worker in list(self._team):
             if worker.pipe is pipe:
                 self._team.remove(worker)

@@ -93,7 +93,7 @@ class Columns:
     readings: SingleArray
 
     def joined(self, others: Columns) -> Columns:
-        """Return these candidates followed by others."""
+        """Return the columns of these candidates, followed by those of others."""
         return Columns(
             self.probes + others.probes,
             np.concatenate([self.places, others.places + self.pushed.shape[3]]),

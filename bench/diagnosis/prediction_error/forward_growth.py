@@ -123,7 +123,10 @@ def select_in_model(context: SearchContext, friction: FitStart | None = None) ->
 
 
 def _grow(context: SearchContext, current: FilteredSet) -> FilteredSet:
-    """Add effects to a set as long as each pays."""
+    """Add one effect after another to a set, each time the one with the largest likelihood.
+
+    It stops if no effect is worth its penalty, or if the filter lacks no force any more.
+    """
     for _ in range(MAX_STEPS - 1):
         larger = _larger_that_pay(context, current) if current.followed.lacks_force else []
         if not larger:

@@ -213,7 +213,7 @@ class PredictionErrorSearch(EffectSearch):
         return self.scores_by_effects[key]
 
     def _scores(self, model: FittedModel) -> CandidateScores:
-        """Score the effects by the regression about the model."""
+        """Score the effects that a model lacks by regression of the innovations of its filter."""
         if has_series(self.world, model.effects):
             # The candidates are linear about the robot without additional joints.
             return replace(self.score_missing_effects(self.base_model), p_value=1.0)

@@ -304,7 +304,7 @@ def columns_of(groups: Sequence[DirectionGroup]) -> Places:
 
 
 def groups_of(probes: Sequence[CandidateDirection]) -> list[DirectionGroup]:
-    """Return the columns of probes that act together."""
+    """Group the columns of the probes of one effect at one grid point, which act together."""
     places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(probes):
         places.setdefault((probe.effect, probe.group), []).append(i)

@@ -291,7 +291,7 @@ def _counted(split: DataSplit) -> str:
 
 
 def _legend(report: DiagnosisReportData) -> tuple[list[Any], list[str]]:
-    """Return handles and labels of the legend."""
+    """Return handles and labels of the legend, for the styles that are drawn."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

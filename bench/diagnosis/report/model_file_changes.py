@@ -67,7 +67,7 @@ def _commented(lines: Sequence[str]) -> Iterator[ModelFileChange]:
 
 
 def _with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield each element with the comments before it."""
+    """Yield each XML element (a line) with the comments before it that explain a fitted value."""
     above: list[str] = []
     for line in lines:
         if match := _COMMENT.fullmatch(line):

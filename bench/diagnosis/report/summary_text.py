@@ -178,7 +178,7 @@ def format_headline(report: DiagnosisReportData) -> str:
 
 
 def _undetermined(causes: Sequence[Cause]) -> str:
-    """Explain why causes without result values are not confirmed."""
+    """Say why causes are not confirmed: their coefficient is at a bound or has no interval."""
     numbers = [n for cause in causes for n in cause.open_numbers.values()]
     at_bounds = [n for n in numbers if n.at_bound is not None]
     if not at_bounds:
@@ -405,7 +405,7 @@ def _error(report: DiagnosisReportData, value: float | None) -> str:
 
 
 def format_search_summary(report: DiagnosisReportData) -> str:
-    """Format the number of tested causes and the best candidate."""
+    """Say how many causes were tested, and which is the best if none is significant."""
     candidates = report.verdict.candidates
     if not candidates:
         return "There were no candidate causes."

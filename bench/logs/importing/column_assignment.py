@@ -299,7 +299,7 @@ class ColumnAssigner:
                 )
 
     def report_missing_inputs(self) -> None:
-        """Report which actuators or joints have no input."""
+        """Report actuators without a command column, and columns that may be the command."""
         signals = self._signals
         idle = [a for a in signals.robot.actuators if f"u.{a.name}" not in signals.inputs]
         if not idle and (signals.inputs or signals.robot.actuators):

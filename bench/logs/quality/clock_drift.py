@@ -107,7 +107,7 @@ def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[Q
 
 
 def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
-    """Return pairs of an input and a position that follows it."""
+    """Return pairs of an input and a position that it drives, by channel name."""
     if not issubclass(kind, SystemSimulator):
         return []
     if kind.has_model:

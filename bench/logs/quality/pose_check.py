@@ -292,7 +292,10 @@ def _has_both(recording: Recording, actuator: Any) -> bool:
 
 
 def _compare(recording: Recording, command: str, position: str) -> _Pair:
-    """Compute (1) over all runs, each run about its own means."""
+    """Compute slope and correlation of a position against a command, eq. (1), over all runs.
+
+    The mean of each run is subtracted first.
+    """
     squares = np.zeros(3)
     for run in recording.runs:
         u, q = run.inputs[command], run.channels[position]
