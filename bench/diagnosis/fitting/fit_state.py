@@ -236,6 +236,7 @@ class FitState:
 
         It has an absolute part in units of the noise variance, and a share of the `cost` (the sum
         of squares), which is larger if the model is far from the data.
+        A fit whose parameters are reported has only a smaller absolute part.
         """
         if self.is_final_fit:
             return FINAL_CONVERGENCE_TOLERANCE
