@@ -31,6 +31,15 @@ def build_answer_rows(answered: AnswersByCase, diagnosers: Sequence[str]) -> pd.
 
 
 def _of(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str, Any]]:
+    """Yield the result rows of one diagnoser, ordered by the name of the case.
+
+    A case is left out if it was not drawn (its stored document has no hidden effects) or if this
+    diagnoser has not answered it.
+
+    Args:
+        diagnoser: name of the diagnoser.
+        answered: stored answers by name of the case.
+    """
     for question, one in sorted(answered.items()):
         # The case could not be drawn, or its worker was lost before it was drawn.
         if "effects" not in one["item"] or diagnoser not in one["rows"]:
@@ -43,12 +52,20 @@ def _of(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str, Any]]:
 def build_answer_row(
     question: str, item: BenchmarkCase, given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Build the result row of one answer.
+    """Build the result row of one answer: its case, truth, answer, grade and cost.
+
+    The rows of all answers are the file items.csv, from which all tables and figures are computed.
 
     Args:
         question: name of the case.
         item: the case with its truth.
-        given: stored answer of one diagnoser.
+        given: stored answer of one diagnoser, with its status, reason and cost.
+
+    Returns:
+        Values by column. ``found`` and ``found_class`` tell whether the cause was identified
+        without and with equivalent effects counted as one. ``alarm`` tells whether the diagnoser
+        says that something is missing; a missing answer counts as an alarm. ``intervals`` is the
+        number of closed 95 % intervals, ``holding`` how many of them contain the truth.
     """
     answer = given["answer"]
     mark = grade_answer(item, answer)

@@ -27,6 +27,10 @@ class AnswerStore:
     """
 
     def __init__(self, folder: Path) -> None:
+        """Open the file of the answers for appending, lock it, and read its answers.
+
+        The lock prevents two processes from appending to the same file.
+        """
         self._path = folder / ANSWERS_FILE
         self._file: IO[str] = self._path.open("a", encoding="utf-8")
         try:
@@ -47,7 +51,13 @@ class AnswerStore:
             self._file.flush()
 
     def append(self, one: Mapping[str, Any]) -> None:
-        """Append the answers to a case; they survive a kill of the process after this call."""
+        """Append the answers to a case; they survive a kill of the process after this call.
+
+        Args:
+            one: JSON document of `case_evaluation.evaluate_case`: name of the case, the case, and
+                one
+                row per diagnoser that was asked.
+        """
         self._file.write(json.dumps(one) + "\n")
         self._file.flush()
         _enter(self.answered, one)
@@ -81,6 +91,16 @@ def read_answers(folder: Path) -> AnswersByCase:
 
 
 def _enter(answered: AnswersByCase, one: Mapping[str, Any]) -> None:
+    """Add one line of the file of the answers to the answers in memory.
+
+    A case has several lines if diagnosers were asked in different sessions. The newest line
+    replaces the case, and the rows of its own diagnosers only.
+
+    Args:
+        answered: answers by name of the case; changed in place.
+        one: document of the line: name of the case (``question``), case (``item``), and list of
+            ``rows``.
+    """
     held = answered.setdefault(one["question"], {"item": one["item"], "rows": {}})
     held["item"] = one["item"]
     for row in one["rows"]:

@@ -135,7 +135,19 @@ def _row(
     limits: AnswerLimits,
     hidden: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Run one diagnoser and return its row, with the reason if it gave no answer."""
+    """Run one diagnoser on a case and return its row, with the reason if it gave no answer.
+
+    Args:
+        one: the diagnoser.
+        given: request of the diagnoser, with the texts of the recording; it does not contain the
+            truth.
+        question: name of the case.
+        limits: limits of the answer.
+        hidden: folders that the diagnoser may not read.
+
+    Returns:
+        The row as it is stored: status (done, skipped, or how the process ended), answer and costs.
+    """
     row: dict[str, Any] = {"question": question, "diagnoser": one.label, "trusted": one.trusted}
     learned = _learned(one.learned.get(given["system"]))
     begun = perf_counter()
@@ -155,6 +167,12 @@ def _row(
 
 
 def _reason(text: str) -> str:
+    """Return the reason why a diagnoser failed, marked if it exceeded its simulation budget.
+
+    Args:
+        text: reason of the failure, mostly a traceback. If the budget was exceeded, it contains the
+            name of that exception, and gets `BUDGET_EXCEEDED_REASON` as its first line.
+    """
     return (
         f"{BUDGET_EXCEEDED_REASON}\n{text}"
         if "sims.core.simulation_counter.SimulationBudgetExceededError" in text
@@ -185,6 +203,16 @@ def _diagnose_isolated(
 ) -> dict[str, Any]:
     """Run a diagnoser in an isolated process and validate its answer.
 
+    The process ends after this answer, so that nothing passes from one case to the next. Its
+    messages have a kind of one letter: L sends the trained arrays, Q the case, and A is the answer.
+
+    Args:
+        code: where the code of the diagnoser is.
+        given: request with the texts of the recording.
+        learned: trained arrays; empty if the diagnoser needs no training.
+        limits: limits of the answer.
+        hidden: folders that the diagnoser may not read.
+
     Raises:
         RunEndedError: the diagnoser failed.
     """
@@ -212,7 +240,15 @@ def _diagnose_isolated(
 
 
 def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
-    """Validate the message of an isolated diagnoser.
+    """Validate the message of an isolated diagnoser, which may be malicious.
+
+    Args:
+        said: document that the process of the diagnoser sent.
+        limits: limits of the answer, which the reported costs cannot exceed.
+
+    Returns:
+        Answer, number of simulations and processor time; or the reason in ``skipped`` if the
+        diagnoser does not support the simulator.
 
     Raises:
         ProtocolError: the reported costs are impossible.
@@ -230,6 +266,14 @@ def _validate_answer(said: Any, limits: AnswerLimits) -> dict[str, Any]:
 def _started(
     code: TunerSpec, memory: int, hidden: tuple[str, ...], more: tuple[str, ...] = ()
 ) -> IsolatedProcess:
+    """Start the isolated process of a diagnoser from the fork server, and wait until it is ready.
+
+    Args:
+        code: where the code of the diagnoser is.
+        memory: maximum memory, MiB; 0 for no limit.
+        hidden: folders that the process must not read.
+        more: further modules that the fork server loads first, such as MuJoCo for robots.
+    """
     own = code.module.startswith("bench.")
     child = get_fork_server().start_process(
         "bench.diagnosis_benchmark.diagnoser_process:serve_requests",

@@ -31,6 +31,12 @@ class FlightDynamics:
     """
 
     def __init__(self, world: TrueSystem, number: int) -> None:
+        """Collect the laws of the hidden causes, and the times between which a gust blows.
+
+        `gust` is (acceleration along x, upward acceleration, begin, end) in this run, in m/s^2 and
+        s; None without a gust. `breaks` are the times at which the acceleration jumps: the solver
+        must not step over them.
+        """
         self.g, self.acting = world.constants["gravity"], {**world.effects, **world.foreign}
         self.laws = [
             (ACCELERATION_LAWS[name], c)
@@ -75,6 +81,19 @@ def _wind(
     v: float,
     w: float,
 ) -> Acceleration:
+    """Compute the acceleration by quadratic drag in air that moves horizontally, m/s^2.
+
+    Args:
+        c: drag coefficient in 1/m, and air velocity along x and along y in m/s.
+        g: gravitational acceleration; unused, as are time and position.
+        t: time, s.
+        x: position, m.
+        y: position, m.
+        z: height, m.
+        u: velocity along x, m/s.
+        v: velocity along y, m/s.
+        w: upward velocity, m/s.
+    """
     u, v = u - c[1], v - c[2]
     return _drag(c[0], u, v, w, sqrt(u * u + v * v + w * w))
 
@@ -94,6 +113,22 @@ def _layer_drag(
     v: float,
     w: float,
 ) -> Acceleration:
+    """Compute the acceleration by quadratic drag that acts only above a height, m/s^2.
+
+    This is the unmodelled cause `layer`. The drag fades in over about 0.02 m (`share` rises from 0
+    to 1), because a jump would reduce the order of the solver.
+
+    Args:
+        c: drag coefficient in 1/m, and height in m.
+        g: gravitational acceleration; unused, as are time and horizontal position.
+        t: time, s.
+        x: position, m.
+        y: position, m.
+        z: height, m.
+        u: velocity along x, m/s.
+        v: velocity along y, m/s.
+        w: upward velocity, m/s.
+    """
     share = 0.5 * (1 + tanh((z - c[1]) / 0.02))
     return _drag(c[0] * share, u, v, w, sqrt(u * u + v * v + w * w))
 
@@ -119,7 +154,10 @@ ACCELERATION_LAWS: dict[str, Callable[..., Acceleration]] = {
 
 
 def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: Array) -> Array:
-    """Simulate a run.
+    """Simulate a run: flights between impacts, until the last sample.
+
+    Each flight is integrated until the ball meets the ground. The first part of the rise after an
+    impact is integrated without looking for the ground, because the ball starts there.
 
     Args:
         world: the true system.
@@ -160,6 +198,23 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
 def _fly(
     air: FlightDynamics, now: float, end: float, state: Array, floor: float | None, resting: bool
 ) -> Any:
+    """Integrate a part of a flight by the Runge-Kutta method DOP853, up to an impact or a time.
+
+    Args:
+        air: accelerations of the ball.
+        now: begin, s.
+        end: latest end, s.
+        state: position and velocity at the begin, (6,).
+        floor: height of the centre at which the ball meets the ground, m; None to look for no
+            impact.
+        resting: whether the ball lies on the ground, which then cancels downward accelerations.
+
+    Returns:
+        Result of `scipy.integrate.solve_ivp` with a continuous solution.
+
+    Raises:
+        RuntimeError: the solver failed.
+    """
     middle = 0.5 * (now + end)
 
     def rate(t: float, y: Array) -> tuple[float, ...]:
@@ -184,7 +239,20 @@ def _fly(
 
 
 def _bounce(world: TrueSystem, t: float, state: Array) -> tuple[Array, bool]:
-    """Compute the state after an impact, and whether the ball stays at rest."""
+    """Compute the state after an impact on the ground.
+
+    Restitution reverses the vertical velocity, and contact friction slows the horizontal one by at
+    most the friction coefficient times the vertical impulse, (1 + e) times the impact speed.
+
+    Args:
+        world: the true system.
+        t: time of the impact, s.
+        state: position and velocity before the impact, (6,).
+
+    Returns:
+        The state after it (6,), and whether the ball stays at rest because the rebound is slower
+        than `REST_SPEED`.
+    """
     speed, e = -state[5], world.parameters["restitution"]
     if "restitution.speed" in world.effects:
         e = min(e * speed ** world.effects["restitution.speed"][0], 1.0)

@@ -169,17 +169,30 @@ def _rng(name: str, purpose: str) -> np.random.Generator:
 def _setting(
     name: str, system: str, hidden: tuple[str, ...], asked: RequestedConditions = ANY_CONDITIONS
 ) -> RecordingConditions:
+    """Draw the recording conditions of a case from its name, and cache them."""
     return drawn_setting(system, _rng(name, "setting"), hidden, asked=asked)
 
 
 def restore_conditions(item: BenchmarkCase) -> RecordingConditions:
-    """Restore the recording conditions of a case."""
+    """Restore the recording conditions of a case from its name; a case stores no runs."""
     return _setting(item.name, item.system, tuple(item.effects), item.asked)
 
 
 def _hidden(
     kind: str, system: str, effect: str | None, rng: np.random.Generator
 ) -> tuple[str, ...]:
+    """Choose the names of the causes that a case hides.
+
+    Args:
+        kind: clean, single, double or foreign.
+        system: ball, pendulum or slider.
+        effect: name of the first cause; None to draw it.
+        rng: random generator.
+
+    Returns:
+        No name for a clean case, two for a double case, otherwise one. The second effect is never
+        equivalent to the first, with or without an input, because no data could tell the two apart.
+    """
     if kind == "clean":
         return ()
     names = (
@@ -203,6 +216,11 @@ def _draw_clean(
     wanted: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
+    """Return a clean case unchanged, because it hides nothing.
+
+    The parameters are those of the functions for the other kinds of cases, among which `draw_case`
+    chooses.
+    """
     return item
 
 
@@ -213,6 +231,22 @@ def _draw_single(
     wanted: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
+    """Hide one effect of the library, with coefficients that give the requested size.
+
+    If the effect has a simpler form, the case is rejected unless that form leaves a visible
+    residual (`beyond`, at least `MIN_SIMPLER_RESIDUAL`): otherwise the simpler form would be a
+    correct answer.
+
+    Args:
+        item: the case without its hidden cause.
+        setting: recording conditions with the runs for fitting only.
+        hidden: the name of the effect.
+        wanted: size in units of the noise.
+        rng: random generator.
+
+    Returns:
+        The case; None if it is rejected or no coefficients give this size.
+    """
     (name,) = hidden
     c = find_coefficients(name, setting, wanted, rng)
     if c is None:
@@ -262,7 +296,18 @@ def _draw_pair(
 ) -> BenchmarkCase | None:
     """Hide two effects, each of the requested size alone.
 
-    The case is rejected if one of them explains both.
+    The case is rejected if one of the two explains both: the residual that the better one leaves
+    (`beyond`) must be at least `MIN_DISTINCT_SIZE`.
+
+    Args:
+        item: the case without its hidden causes.
+        setting: recording conditions with the runs for fitting only.
+        hidden: the two names.
+        wanted: size of each effect alone, in units of the noise.
+        rng: random generator.
+
+    Returns:
+        The case; None if it is rejected or no coefficients give this size.
     """
     found = {name: find_coefficients(name, setting, wanted, rng) for name in hidden}
     effects = _order_input_effects({name: c for name, c in found.items() if c is not None})
@@ -294,11 +339,29 @@ def _draw_unmodelled(
     wanted: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
-    """Hide an unmodelled cause, which the library explains only in part."""
+    """Hide an unmodelled cause, which no effect of the library explains fully.
+
+    The case is rejected if the best effect of the library leaves a residual (`beyond`) below
+    `MIN_DISTINCT_SIZE`: that effect would then be a correct answer.
+
+    Args:
+        item: the case without its hidden cause.
+        setting: recording conditions with the runs for fitting only.
+        hidden: the name of the cause.
+        wanted: size in units of the noise.
+        rng: random generator.
+
+    Returns:
+        The case; None if it is rejected or no strength gives this size.
+    """
     (name,) = hidden
     of = effect_coefficients.draw_unmodelled_cause(name, setting, rng)
 
     def observed(strength: float) -> Array:
+        """Simulate noise-free observations (R, T, C) with the cause at a strength, by scipy.
+
+        The batch engine cannot be used here, because it does not know unmodelled causes.
+        """
         world = setting.make_true_system(foreign={name: of(strength)})
         return np.array(
             [
@@ -350,6 +413,12 @@ def write_case(item: BenchmarkCase, folder: str | Path, truth: bool = True) -> P
 
 
 def _runs(item: BenchmarkCase, setting: RecordingConditions) -> tuple[Run, ...]:
+    """Simulate every run of a case, add sensor noise, and mark the last runs as held out.
+
+    Args:
+        item: the case; it states the simulator of the recording (`source`).
+        setting: its recording conditions, with all runs.
+    """
     rng, held_out = _rng(item.name, "noise"), count_held_out_runs(item)
     hidden = {"foreign": item.effects} if item.kind == "foreign" else {"effects": item.effects}
     world, runs = setting.make_true_system(**hidden), []

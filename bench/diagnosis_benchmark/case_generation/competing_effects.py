@@ -111,7 +111,15 @@ def _rank_starts(
 
 
 def _stops(setting: RecordingConditions, path: Array) -> Iterator[tuple[float, float, float]]:
-    """Yield soft and hard end stops at either end of the travel, met late and early."""
+    """Yield starting values of an end stop: stiffness, place and loss.
+
+    There are soft and hard stops at either end of the travel, which the motion meets late and
+    early. A grid is used because a stop that the motion does not reach has no derivative.
+
+    Args:
+        setting: recording conditions.
+        path: positions, of any shape; only the smallest and the largest are used.
+    """
     low, high = float(path.min()), float(path.max())
     far = 20.0 if setting.system == "pendulum" else 5000.0
     for share, part in product((0.03, 0.15), (0.001, 0.01, 0.1)):
@@ -123,6 +131,17 @@ def _stops(setting: RecordingConditions, path: Array) -> Iterator[tuple[float, f
 def _compute_residual(
     fit: NuisanceFitter, observed: Array, theta: Array, bare: ResidualFit
 ) -> float:
+    """Compute the RMS residual at given parameters without refitting, in units of the noise.
+
+    It ranks starting points where the derivative of the effect is zero, so that a linear step is
+    impossible.
+
+    Args:
+        fit: fitter of the model with the effect.
+        observed: noise-free observations, (R, T, C).
+        theta: base parameters and coefficients of the effect.
+        bare: fit without the effect, whose initial states are used.
+    """
     rest, _ = fit.linearise(observed, theta, bare.starts)
     return float(np.sqrt(np.mean(rest**2)))
 
