@@ -38,7 +38,10 @@ MAX_STRENGTH = 2.0  # maximum strength: twice the plausible range
 def draw_effect_shape(
     name: str, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw the shape of an effect of the library.
+    """Draw the shape of an effect of the library: everything except its strength.
+
+    The shape is the sign, direction, period, speed or time constant. The strength stays free, so
+    that `effect_sizing` can find the one that gives the requested size.
 
     Args:
         name: name of the effect.
@@ -57,13 +60,29 @@ def draw_effect_shape(
 
 
 def get_max_strength(name: str) -> float:
-    """Return the maximum strength of an effect."""
+    """Return the maximum strength of an effect: the largest value that the sizing may try.
+
+    For most effects it is twice the plausible range. A saturation above strength 0.97 would remove
+    almost the whole input; `input.hold` is a share of linear interpolation, at most 1.
+    """
     return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, MAX_STRENGTH)
 
 
 def _direction(
     far: float, setting: RecordingConditions, rng: np.random.Generator, *behind: float
 ) -> CoefficientFunction:
+    """Draw the direction of an effect with two components, such as a horizontal or a phase angle.
+
+    Args:
+        far: magnitude at strength 1.
+        setting: recording conditions; unused here.
+        rng: random generator.
+        *behind: further coefficients that do not depend on the strength, such as a period.
+
+    Returns:
+        Function from the strength s to the coefficients: far s cos(angle), far s sin(angle),
+        behind.
+    """
     angle = rng.uniform(0, 2 * np.pi)
     along, across = far * float(np.cos(angle)), far * float(np.sin(angle))
     return lambda s: (along * s, across * s, *behind)
@@ -99,6 +118,19 @@ def _periodic(
 def _wind(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
+    """Draw quadratic drag in moving air: the air velocity is fixed, the drag grows with s.
+
+    The air moves along the rail of a slider at 0.3 to 2 m/s in either direction, otherwise in any
+    horizontal direction at 2 to 8 m/s.
+
+    Args:
+        far: drag coefficient at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength s to the drag coefficient and the air velocity, m/s.
+    """
     if setting.system == "slider":
         speed = float(rng.choice([-1, 1]) * rng.uniform(0.3, 2.0))
         return lambda s: (far * s, speed)
@@ -257,10 +289,12 @@ def _simulate_base_motion(setting: RecordingConditions) -> list[Array]:
 
 
 def _ranges(setting: RecordingConditions) -> list[float]:
+    """Return the travel of the first channel in each run, without hidden causes."""
     return [np.ptp(path) for path in _simulate_base_motion(setting)]
 
 
 def _speeds(setting: RecordingConditions) -> Array:
+    """Return the speeds of the first channel at all samples of all runs, by finite differences."""
     return np.concatenate([np.diff(path) for path in _simulate_base_motion(setting)]) * setting.rate
 
 
@@ -283,7 +317,11 @@ def draw_unmodelled_cause(
 def _draw_onsets(
     setting: RecordingConditions, lasting: float, rng: np.random.Generator
 ) -> list[float]:
-    """Draw a start time for each run, held-out runs included."""
+    """Draw the time at which a gust begins in each run, s; always `MAX_RUNS` numbers.
+
+    The strength is found from the runs for fitting, but the recording has held-out runs too. A
+    begin for every possible run serves both.
+    """
     return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in range(MAX_RUNS)]
 
 
@@ -296,16 +334,26 @@ def _patch(setting: RecordingConditions, rng: np.random.Generator) -> Coefficien
 
 
 def _force(setting: RecordingConditions) -> float:
+    """Return the force of an unmodelled cause at strength 1: N m for a pendulum, N for a slider."""
     return 0.5 if setting.system == "pendulum" else 5.0
 
 
 def _gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw a temporary force of 0.1 to 0.3 s in each run, in either direction.
+
+    Returns:
+        Function from the strength to force, duration (s), and the begin in each run (s).
+    """
     lasting, sign = float(rng.uniform(0.1, 0.3)), float(rng.choice([-1, 1]))
     begins = _draw_onsets(setting, lasting, rng)
     return lambda s: (sign * _force(setting) * s, lasting, *begins)
 
 
 def _ageing(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw damping that grows in proportion to time, up to a value at the end of the run.
+
+    At strength 1 this value is 0.1 N m s/rad for a pendulum and 5 N s/m for a slider.
+    """
     far = (0.1 if setting.system == "pendulum" else 5.0) / setting.seconds
     return lambda s: (far * s,)
 
@@ -320,6 +368,12 @@ def _latch(setting: RecordingConditions, rng: np.random.Generator) -> Coefficien
 
 
 def _updraft(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw a region of rising air that the balls pass; at strength 1 it accelerates by 10 m/s^2.
+
+    Returns:
+        Function from the strength to acceleration (m/s^2), centre and half width of the region (m).
+        The centre lies between the 10 % and 90 % quantiles of x over all runs.
+    """
     where = np.concatenate(_simulate_base_motion(setting))
     half = float(rng.uniform(0.3, 0.8))
     centre = float(rng.uniform(*np.quantile(where, [0.1, 0.9])))
@@ -327,6 +381,14 @@ def _updraft(setting: RecordingConditions, rng: np.random.Generator) -> Coeffici
 
 
 def _ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw a gust of 0.1 to 0.4 s in each run; at strength 1 it accelerates the ball by 20 m/s^2.
+
+    Its direction is drawn in the vertical plane along x.
+
+    Returns:
+        Function from the strength to acceleration along x, upward acceleration (m/s^2), duration
+        (s), and the begin in each run (s).
+    """
     lasting, angle = float(rng.uniform(0.1, 0.4)), rng.uniform(0, 2 * np.pi)
     begins = _draw_onsets(setting, lasting, rng)
     return lambda s: (
@@ -338,6 +400,7 @@ def _ball_gust(setting: RecordingConditions, rng: np.random.Generator) -> Coeffi
 
 
 def _wear(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
+    """Draw restitution that changes linearly with time: at strength 1 by all its value in a run."""
     sign = float(rng.choice([-1, 1]))
     return lambda s: (sign * s / setting.seconds,)
 

@@ -49,6 +49,13 @@ class NuisanceFitter:
     """
 
     def __init__(self, setting: RecordingConditions, effects: Sequence[str] = ()) -> None:
+        """Make the simulator with the fitted effects; collect starting values, bounds and scales.
+
+        The fit starts at the true base parameters and initial states and at the nominal
+        coefficients. A coefficient may reach twice its plausible range, as far as a hidden effect
+        can be. The scale of a base parameter is its value, that of a coefficient a tenth of its
+        range; steps of the fit are in units of these scales.
+        """
         kind = SIMULATORS[setting.system]
         self.simulator = kind(setting.constants, setting.channels, engine="batch", effects=effects)
         self.scenarios, self.sigma, self.states = (
@@ -75,7 +82,10 @@ class NuisanceFitter:
         starts: Array | None = None,
         rounds: int = 12,
     ) -> ResidualFit:
-        """Fit observations.
+        """Fit observations by the Levenberg-Marquardt method.
+
+        A step that does not decrease the sum of squares multiplies the damping by 30, another one
+        divides it by 10. The fit stops when the RMS residual decreases by less than 0.1 %.
 
         Args:
             observed: observations, (R, T, C).
@@ -107,7 +117,10 @@ class NuisanceFitter:
 
     @staticmethod
     def compute_step(rest: Array, slope: Array, damping: float) -> Array:
-        """Solve the damped normal equations.
+        """Solve the damped normal equations of Levenberg and Marquardt.
+
+        The damping is relative to the diagonal. The small constant part, 1e-9 of its largest entry,
+        keeps the matrix regular if an unknown has no influence.
 
         Args:
             rest: residual, (N,).
@@ -190,6 +203,10 @@ def make_gap_function(
     last: list[tuple[float, ResidualFit]] = []
 
     def left(strength: float) -> float:
+        """Return the size of the cause at a strength: the RMS residual in units of the noise.
+
+        The fit starts at the last fitted values, scaled to this strength, which saves iterations.
+        """
         theta, starts = fit.theta, fit.starts
         if last:  # fitted parameters and states change about in proportion to the strength
             before, found = last[-1]
@@ -238,9 +255,13 @@ def find_strength_for_size(
 def _between(low: tuple[float, float], high: tuple[float, float], wanted: float) -> float:
     """Return the next strength to try.
 
+    Without a strength below, the size is assumed to be proportional to it. Without a strength
+    above, the strength grows by at most `MAX_STRENGTH_FACTOR`. With both, it is interpolated on
+    logarithmic scales, or halved there if the bracket is very wide or the upper size is not finite.
+
     Args:
-        low: strength and size below the requested size.
-        high: strength and size above it.
+        low: strength and size below the requested size; strength 0 if there is none.
+        high: strength and size above it; infinite strength if there is none.
         wanted: requested size.
     """
     if not low[0]:

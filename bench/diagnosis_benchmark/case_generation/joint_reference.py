@@ -154,6 +154,15 @@ def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
 
 
 def _play(levels: Array, width: float) -> Array:
+    """Apply backlash to an input: the output follows only when the input leaves the gap around it.
+
+    Args:
+        levels: input at each sample, (T,).
+        width: whole width of the gap, in units of the input.
+
+    Returns:
+        Output at each sample, (T,); it begins at the first level.
+    """
     result, state = [], levels[0]
     for level in levels:
         if abs(level - state) > width / 2:
@@ -184,6 +193,18 @@ class JointDynamics:
     """
 
     def __init__(self, world: TrueSystem, number: int) -> None:
+        """Collect the laws of the system and of its hidden causes, for one run.
+
+        Besides the public attributes, `sideways` is the generalised force of a unit horizontal
+        acceleration, `latched` tells whether the cause `latch` acts in this run (every other run),
+        `breaks` are the times at which a gust jumps, and `restless` tells whether forces change
+        with time while the coordinate rests. The inertia of driven loads is subtracted from that of
+        the drive side.
+
+        Args:
+            world: the true system.
+            number: index of the run in the recording.
+        """
         k, p = world.constants, world.parameters
         self.weight: GravityForce
         self.sideways: GravityForce
@@ -227,7 +248,13 @@ class JointDynamics:
         self.inertia = whole - sum(part.inertia for part in self.behind)
 
     def set_input_segment(self, piece: InputSegment) -> None:
-        """Set the input interval in which the motion is integrated."""
+        """Set the input interval in which the motion is integrated, before the integration starts.
+
+        A gust acts in the whole interval or not at all, which the time in its middle decides.
+
+        Args:
+            piece: part of an input interval that contains no begin or end of a gust.
+        """
         self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
 
     def compute_force(self, t: float, x: float, v: float, *z: float) -> float:
@@ -258,7 +285,9 @@ class JointDynamics:
         return [rate for part, own in parts for rate in part.rates(x, v, *own)]
 
     def compute_friction_limit(self, t: float, x: float, v: float) -> float:
-        """Compute the dry friction limit.
+        """Compute the dry friction limit: the sum of all laws that act.
+
+        It is the friction force of a moving coordinate, and the force that a resting one resists.
 
         Args:
             t: time.
@@ -269,7 +298,7 @@ class JointDynamics:
 
 
 def pair_up(z: Sequence[float]) -> list[tuple[float, float]]:
-    """Group values in pairs."""
+    """Group values in pairs, because each hidden-state effect has two states."""
     return list(zip(z[::2], z[1::2], strict=True))
 
 
@@ -280,6 +309,13 @@ class ReferenceLoad(ABC):
     """
 
     def __init__(self, inertia: float, weight: GravityForce, share: float) -> None:
+        """Store the total inertia and weight, and compute the inertia of the load.
+
+        Args:
+            inertia: inertia of drive side and load together.
+            weight: gravity force of both together, as a function of position.
+            share: fraction of both that belongs to the load.
+        """
         self.whole, self.inertia, self.weight = inertia, share * inertia, weight
         self.share = share
 
@@ -325,6 +361,15 @@ class FlexibleReferenceLoad(ReferenceLoad):
     def __init__(
         self, inertia: float, weight: GravityForce, share: float, frequency: float, ratio: float
     ) -> None:
+        """Store frequency and damping ratio of the load on its spring.
+
+        Args:
+            inertia: inertia of drive side and load together.
+            weight: gravity force of both together, as a function of position.
+            share: fraction of both that belongs to the load.
+            frequency: natural frequency of the load with a fixed drive side, rad/s.
+            ratio: damping ratio of that oscillation.
+        """
         super().__init__(inertia, weight, share)
         self.frequency, self.ratio = frequency, ratio
 
@@ -554,6 +599,15 @@ def _integrate_segment(joint: JointDynamics, state: Array, instants: Array, out:
 def _integrate_until_stop(joint: JointDynamics, now: float, state: Array) -> SegmentResult:
     """Integrate until the next standstill, break-away or end of the input interval.
 
+    A resting coordinate that dry friction can hold is not moved: only its hidden states are
+    integrated, or the time of break-away is searched. Otherwise friction opposes the direction of
+    motion `way` (+1 or -1), and an event stops the integration when the velocity changes its sign.
+
+    Args:
+        joint: the equation of motion, with its input interval.
+        now: begin, s.
+        state: position, velocity and hidden states.
+
     Returns:
         End time, state at that time, and the dense solution (None without motion).
     """
@@ -570,6 +624,11 @@ def _integrate_until_stop(joint: JointDynamics, now: float, state: Array) -> Seg
         way = copysign(1.0, pull)
 
     def rate(t: float, y: Array) -> list[float]:
+        """Return the time derivatives of position, velocity and hidden states.
+
+        Dry friction is `rubbing`, with the fixed sign `way` of the motion, so that the right-hand
+        side is smooth.
+        """
         rubbing = way * joint.compute_friction_limit(t, *y[:2]) if joint.limits else 0.0
         return [
             y[1],
@@ -600,7 +659,16 @@ def _integrate_until_stop(joint: JointDynamics, now: float, state: Array) -> Seg
 
 
 def _integrate_stuck(joint: JointDynamics, now: float, state: Array) -> SegmentResult:
-    """Integrate the hidden states while dry friction holds the coordinate, until it breaks away."""
+    """Integrate the hidden states while dry friction holds the coordinate, until it breaks away.
+
+    Args:
+        joint: the equation of motion, with its input interval.
+        now: begin, s.
+        state: position, velocity (zero) and hidden states.
+
+    Returns:
+        End time, state at that time, and the dense solution.
+    """
     end = joint.piece.end
 
     def rate(t: float, y: Array) -> list[float]:

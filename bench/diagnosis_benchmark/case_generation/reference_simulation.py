@@ -150,13 +150,21 @@ def simulate_with_mujoco(world: TrueSystem, scenario: Scenario, channels: Sequen
 
 
 def _get_read_column(system: str, channels: Sequence[str]) -> int:
-    """Return the index of the channel on which sensor effects act."""
+    """Return the index of the channel on which sensor effects act: the height, angle or position.
+
+    If that channel is not recorded, it is the first recorded one of the others.
+    """
     preferred = {"ball": ("z", "x", "y"), "pendulum": ("q", "qd"), "slider": ("x", "v")}[system]
     return next(channels.index(name) for name in preferred if name in channels)
 
 
 def _refine_time_grid(instants: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Refine a time grid from 0 through all sample times.
+    """Refine a time grid from 0 through all sample times to steps of `FINE_STEP_SECONDS` or less.
+
+    A lagging sensor depends on the motion between the samples, so it is integrated on this grid.
+
+    Args:
+        instants: sample times in increasing order, s, (T,).
 
     Returns:
         The grid, and the index of each sample time in it.
@@ -171,7 +179,18 @@ def _refine_time_grid(instants: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _apply_lag(values: Array, grid: Array, lag: float) -> Array:
-    """Solve y' = (x - y) / lag with y = x at the start, for x linear between grid points."""
+    """Apply a first-order sensor lag: solve y' = (x - y) / lag.
+
+    The solution is exact for readings x that are linear between grid points.
+
+    Args:
+        values: readings x without lag at the grid points, (G, C).
+        grid: times, s, (G,).
+        lag: time constant, s.
+
+    Returns:
+        Lagging readings y, (G, C); at the first grid point y = x.
+    """
     result, y = values.copy(), values[0].copy()
     for k, h in enumerate(np.diff(grid).tolist()):
         slope = (values[k + 1] - values[k]) / h
