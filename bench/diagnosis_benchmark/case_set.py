@@ -88,6 +88,14 @@ class CaseSpec:
         return next((item for item in items if item is not None), None)
 
     def _first(self, seed: int, salt: str) -> int:
+        """Return the seed of the first attempt to draw the case; attempt k uses this seed plus k.
+
+        Args:
+            seed: seed of the public case set; unused with a secret salt.
+            salt: secret salt, or `PUBLIC_SALT`. With a secret salt the seed is a part of the
+                SHA-256 hash
+                of salt and name, so that nobody can compute the case without the salt.
+        """
         if salt in ("", PUBLIC_SALT):
             return _SEED_STRIDE * seed + 10 * self.index
         text = "\x1f".join([salt, self.name])
@@ -124,6 +132,17 @@ def build_case_set(settings: BenchmarkConfig) -> list[CaseSpec]:
 def _combined(
     asked: CaseRequest,
 ) -> Iterator[tuple[str, str, str | None, float | None, RequestedConditions]]:
+    """Yield every combination of the values that one table of the experiment lists.
+
+    A list that is empty gives None, which means that the value is drawn at random; effects are then
+    all that can be hidden.
+
+    Args:
+        asked: the table.
+
+    Yields:
+        Kind, system, effect, size, and recording conditions.
+    """
     for system in asked.systems:
         effects = _effects(asked, system)
         combinations = product(

@@ -70,11 +70,23 @@ _RIGHT = {"(clean)": ("nothing",), "(foreign)": ("unknown",)}
 
 
 def _hidden(rows: pd.DataFrame) -> pd.Series[str]:
+    """Return the row of the confusion matrix of each answer: the family of the hidden effect.
+
+    The family is the part of the name before the dot. Clean recordings and unmodelled causes have
+    the rows ``(clean)`` and ``(foreign)``.
+    """
     family = rows["hidden"].astype(str).str.partition(".")[0]
     return family.where(rows["kind"] == "single", "(" + rows["kind"] + ")")
 
 
 def _answers(rows: pd.DataFrame) -> list[str]:
+    """Return the column of the confusion matrix of each answer.
+
+    It is the family that the answer names, or one of `_FAMILY_LABELS`.
+
+    Args:
+        rows: one row per answer.
+    """
     good = is_correct(rows)
     return [
         _answer(row, is_right) for row, is_right in zip(rows.to_dict("records"), good, strict=True)

@@ -94,6 +94,7 @@ class DiagnosisStudy:
     """
 
     def __init__(self, folder: Path) -> None:
+        """Read the stored configuration; the file of the answers is opened only by `run`."""
         self.folder = folder
         self.configuration = read_configuration(folder)
         self.plugins = self.configuration.plugins
@@ -185,6 +186,15 @@ class DiagnosisStudy:
         return self._made()
 
     def _made(self, **why: Any) -> StudyOutcome:
+        """Return the outcome of a run of the study; reveal its salt if no answer is missing.
+
+        A secret salt stays hidden as long as answers are missing, because it determines the cases.
+
+        Args:
+            **why: reason for which the run ended early (``interrupted`` or ``stopped``); empty if
+                it did
+                not.
+        """
         ends = self.status().ends
         missing = sum(end.status == MISSING_STATUS for end in ends)
         if not missing and not why:
@@ -242,6 +252,16 @@ class _EvaluationRun:
     """Execution of the cases that have missing answers."""
 
     def __init__(self, study: DiagnosisStudy, kept: AnswerStore, progress: ProgressFactory) -> None:
+        """Collect what the run needs: salt, limits of an answer, and hidden folders.
+
+        Diagnosers must not read the hidden folders: the result folder, which contains the truths,
+        and the cache of trained weights.
+
+        Args:
+            study: the study.
+            kept: store of the answers, opened for appending.
+            progress: makes progress callbacks.
+        """
         self._study, self._kept, self._progress = study, kept, progress
         self._experiment = study.configuration.experiment
         self._hidden = tuple(str(place.resolve()) for place in (study.folder, trained()))
@@ -280,7 +300,11 @@ class _EvaluationRun:
         return [questions[place] for place in order.tolist()]
 
     def _open(self, question: CaseSpec) -> list[str]:
-        """Return the names of the diagnosers that have not answered a case."""
+        """Return the names of the usable diagnosers that have not answered a case.
+
+        The list is empty if the sensors cannot show the hidden cause: such a case has an empty
+        document.
+        """
         one = self._kept.answered.get(question.name)
         if one is not None and not one["item"]:
             return []
@@ -288,7 +312,13 @@ class _EvaluationRun:
         return [name for name in self._study.usable_diagnosers if name not in rows]
 
     def _learn(self, workers: Pool) -> tuple[dict[str, EvaluatedDiagnoser], list[TrainingCost]]:
-        """Train the diagnosers.
+        """Train the diagnosers that learn, once for each system, or load them from the cache.
+
+        A training that fails does not stop the study: its error is stored with the costs, and the
+        diagnoser is asked without trained arrays.
+
+        Args:
+            workers: pool of worker processes.
 
         Returns:
             The diagnosers to evaluate, by name, and the costs of their training.
@@ -337,6 +367,16 @@ class _EvaluationRun:
     def _ask(
         self, workers: Pool, questions: Sequence[CaseSpec], examined: dict[str, EvaluatedDiagnoser]
     ) -> None:
+        """Let the workers evaluate the open cases, and store the answers of each finished case.
+
+        A case whose worker died or exceeded its time gets failed answers. The time limit of a case
+        is the time to draw it plus, for each diagnoser, the time of an answer and a reserve.
+
+        Args:
+            workers: pool of worker processes.
+            questions: cases with missing answers.
+            examined: diagnosers by name; each case is put only to those that have not answered it.
+        """
         calls: list[Call] = []
         for question in questions:
             one = self._kept.answered.get(question.name)

@@ -107,6 +107,15 @@ def train_or_load(
 
 
 def _cost(path: Path) -> tuple[int, float] | None:
+    """Read the cost of a cached training.
+
+    Args:
+        path: JSON file next to the trained arrays.
+
+    Returns:
+        Number of simulations and seconds; None if the file is missing or damaged, so that the
+        diagnoser is trained again.
+    """
     try:
         used, seconds = json.loads(path.read_text(encoding="utf-8"))
         return int(used), float(seconds)

@@ -76,6 +76,18 @@ class _ForwardSelection(Diagnoser):
             evidence.close()
 
     def _selected(self, evidence: RegressionEvidence) -> Answer:
+        """Add the best effect to the model, one at a time, and answer with the selected effects.
+
+        The search stops if the model is sufficient, if no effect improves it, or at `MAX_EFFECTS`
+        effects.
+
+        In each round, `rivals` are the models with one more effect, ordered by the criterion. The
+        best becomes the new model; rivals within the tolerance `near` of it are its alternatives
+        (`alike`).
+
+        Args:
+            evidence: fitted base model and directions of the effects.
+        """
         samples = int(evidence.observed_mask.sum())
         best = _add_refit(evidence, evidence.base.fit)
         first, rivals = best, list[RefittedModel]()
@@ -108,6 +120,19 @@ class _ForwardSelection(Diagnoser):
         causes: Sequence[tuple[str, tuple[str, ...]]],
         samples: int,
     ) -> Answer:
+        """Give the verdict on the selected effects.
+
+        The verdict is "adequate" if the base model suffices, "unknown" if the effects explain less
+        than `MIN_GAP_CLOSED` of the excess sum of squares, "partial" if they explain more but not
+        all, and otherwise "named", or "ambiguous" with alternatives.
+
+        Args:
+            evidence: fitted base model and directions of the effects.
+            first: the base model.
+            best: the selected model.
+            causes: each selected effect with its alternatives.
+            samples: number of samples.
+        """
         ends = _intervals(evidence, best)
         parameters = {n: e for n, e in ends.items() if "." not in n}
         chance = self.compute_p_value(first, samples)
@@ -167,11 +192,11 @@ class ForwardBIC(_ForwardSelection):
     near = BIC_TOLERANCE
 
     def compute_criterion(self, one: RefittedModel, samples: int) -> float:
-        """Compute BIC, equation (1).
+        """Compute the Bayesian information criterion, BIC = n log(S / n) + k log n, equation (1).
 
         Args:
-            one: a fitted model.
-            samples: number of samples.
+            one: a fitted model, with sum of squares S and k numbers.
+            samples: number of samples n.
         """
         return float(samples * np.log(one.squares / samples) + one.numbers * np.log(samples))
 
@@ -191,6 +216,18 @@ class ForwardBIC(_ForwardSelection):
         causes: Sequence[tuple[str, tuple[str, ...]]],
         samples: int,
     ) -> Answer:
+        """Give the verdict "adequate", "named", or, if effects have alternatives, "ambiguous".
+
+        BIC compares models but does not say whether one is good enough, so that the verdicts
+        "unknown" and "partial" are impossible.
+
+        Args:
+            evidence: fitted base model and directions of the effects.
+            first: the base model; unused here.
+            best: the selected model.
+            causes: each selected effect with its alternatives.
+            samples: number of samples; unused here.
+        """
         ends = _intervals(evidence, best)
         parameters = {n: e for n, e in ends.items() if "." not in n}
         named = tuple(NamedCause(name, others, _of(ends, name)) for name, others in causes)
@@ -219,12 +256,23 @@ class ForwardChi2(_ForwardSelection):
 
     @staticmethod
     def _chance(one: RefittedModel, samples: int) -> float:
+        """Compute the probability that noise alone gives a sum of squares as large as this one.
+
+        The sum of squares is chi-squared distributed with `samples` minus fitted numbers degrees of
+        freedom if the noise is white and the model is correct.
+        """
         from scipy.special import chdtrc
 
         return float(chdtrc(max(samples - one.numbers, 1), one.squares))
 
 
 def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedModel:
+    """Compute sum of squares and number of parameters of a fit, by which models are compared.
+
+    Args:
+        evidence: the recording and its noise.
+        fit: a fitted model. A fit that diverged gets an infinite sum of squares.
+    """
     left = (evidence.world.observed - fit.simulated) / evidence.noise.sigma
     squares = float(np.square(left[evidence.observed_mask]).sum())
     numbers = fit.free.size + int((~evidence.world.known).sum())
@@ -234,7 +282,14 @@ def _add_refit(evidence: RegressionEvidence, fit: TrajectoryFit) -> RefittedMode
 def _refit_with_one_more_effect(
     evidence: RegressionEvidence, at: TrajectoryFit
 ) -> list[TrajectoryFit]:
-    """Add each of the most promising effects to a model, and refit.
+    """Add each of the most promising effects to a model, and refit all parameters by least squares.
+
+    Promising are the `REFITS_PER_ROUND` effects that decrease the sum of squares most to first
+    order. Each is fitted from several starting values.
+
+    Args:
+        evidence: fitted base model and directions of the effects.
+        at: the model to which an effect is added.
 
     Returns:
         The best fit for each effect.
@@ -266,7 +321,11 @@ def _refit_with_one_more_effect(
 
 
 def _with_model(evidence: RegressionEvidence, at: TrajectoryFit) -> RegressionEvidence:
-    """Copy the evidence, with another fitted model as the base model."""
+    """Copy the evidence, with another fitted model in place of the base model.
+
+    Directions of further effects must be computed at the current model. Cached properties are not
+    copied, because they belong to the old model.
+    """
     other = object.__new__(RegressionEvidence)
     kept = ("world", "noise", "stated", "base", "fitted", "held_out")
     other.__dict__.update({name: evidence.__dict__[name] for name in kept})
@@ -288,6 +347,14 @@ def _starts(
 
     They are the size predicted by the linear model, and 0.3 of it because the linear model holds
     for small sizes only.
+
+    Args:
+        evidence: directions of the effects at the current model.
+        at: the current model.
+        name: name of the effect.
+        column: the best column of the effect.
+        left: residual after parameters and initial states are projected out, (N,).
+        effects: columns of all directions after this projection, (N, K).
     """
     world = evidence.world
     probes = [evidence.sensitivity_directions.candidates[place] for place in column.places]
@@ -308,7 +375,15 @@ def _starts(
 def _intervals(
     evidence: RegressionEvidence, one: RefittedModel
 ) -> dict[str, tuple[float | None, float | None]]:
-    """Compute 95 % intervals of the fitted parameters, by name, from the curvature at the fit."""
+    """Compute 95 % intervals of the fitted parameters, by name, from the curvature at the fit.
+
+    They are the linear least-squares intervals: value plus or minus 1.96 standard errors, with the
+    noise variance estimated from the residual.
+
+    Args:
+        evidence: the recording and its noise.
+        one: the fitted model.
+    """
     world, fit = evidence.world, one.fit
     columns = compute_base_jacobian(world, fit) / evidence.noise.sigma[:, None]
     rows = columns[evidence.observed_mask]

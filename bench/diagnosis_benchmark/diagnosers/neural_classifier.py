@@ -233,7 +233,12 @@ def _compute_network_input(
 
 
 def _network(features: int, classes: int) -> Any:
-    """Make the network: convolutions over a run, mean over runs, and dense layers."""
+    """Make the network: convolutions over a run, mean over runs, and dense layers.
+
+    Args:
+        features: number of channels of the input, F.
+        classes: number of classes: no effect, and each effect of the library.
+    """
     import torch
     from torch import nn
 
@@ -241,6 +246,11 @@ def _network(features: int, classes: int) -> Any:
         """Network described in this module."""
 
         def __init__(self) -> None:
+            """Make the layers: `run` reads each run, `decide` scores the classes.
+
+            Two pooling layers reduce the time grid to a quarter. Mean and maximum over time give
+            two numbers for each channel, therefore `decide` has twice the layer width as input.
+            """
             super().__init__()
             self.run = nn.Sequential(
                 nn.Conv1d(features, LAYER_WIDTH, 5, padding=2),
@@ -279,7 +289,14 @@ def _network(features: int, classes: int) -> Any:
 
 
 def _stack_with_mask(images: Sequence[Array]) -> tuple[Any, Any]:
-    """Stack inputs with different numbers of runs into one tensor, with a mask of the runs."""
+    """Stack inputs with different numbers of runs into one tensor, filled up with zeros.
+
+    Args:
+        images: inputs of B recordings, each (R, F, POINTS) with its own number of runs R.
+
+    Returns:
+        Inputs (B, largest R, F, POINTS), and weights (B, largest R) that are 1 for runs that exist.
+    """
     import torch
 
     most = max(len(image) for image in images)
@@ -294,7 +311,19 @@ def _stack_with_mask(images: Sequence[Array]) -> tuple[Any, Any]:
 def _train_network(
     images: Sequence[Array], labels: Array, classes: int, seed: int
 ) -> dict[str, Array]:
-    """Train the network, and return the weights of the epoch with the best validation loss."""
+    """Train the network with Adam, and return the weights with the best validation loss.
+
+    The loss is the cross entropy. The first `VALIDATION_SHARE` of the examples are not trained on.
+
+    Args:
+        images: inputs, one (R, F, POINTS) per example.
+        labels: index of the class of each example, (B,).
+        classes: number of classes.
+        seed: seed of initial weights, order of the examples and dropout.
+
+    Returns:
+        Weights by the name of the layer.
+    """
     import torch
     from torch.nn.functional import cross_entropy
 
@@ -326,7 +355,13 @@ def _train_network(
 
 
 def _predict_probabilities(learned: Mapping[str, Array], image: Array, classes: int) -> Array:
-    """Compute the class probabilities, (classes,)."""
+    """Compute the class probabilities of one recording, (classes,).
+
+    Args:
+        learned: trained weights by the name of the layer.
+        image: input of the network, (R, F, POINTS).
+        classes: number of classes.
+    """
     import torch
 
     # Creating the network draws random weights; the global random generator is restored.
