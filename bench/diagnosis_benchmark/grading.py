@@ -128,7 +128,18 @@ def _grade_library(
 ) -> tuple[str, int, int]:
     """Grade an answer on one or two effects of the library.
 
-    An answer is right if each effect is in a set of its own and no set is without an effect.
+    An answer is right if each effect is in a set of its own and no set is without an effect. The
+    sets are matched twice: to the effects themselves (`strict`), and to effects that are equivalent
+    in any data (`loose`).
+
+    Args:
+        effects: the hidden effects.
+        word: the verdict.
+        sets: the named sets.
+        equivalents: returns an effect and all effects that are equivalent to it.
+
+    Returns:
+        Outcome, size of the largest matched set, and the same with equivalent effects counted once.
     """
     if not sets or word == "unknown":  # effects listed with the verdict "unknown" are not named
         return "unnamed", 0, 0
@@ -190,7 +201,17 @@ def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:
 def _count_covered_intervals(
     item: BenchmarkCase, verdict: Mapping[str, Any], sets: NamedSets
 ) -> dict[str, bool | None]:
-    """Compare the intervals of base parameters and of leading causes with the truth."""
+    """Compare the intervals of base parameters and of leading causes with the truth.
+
+    Args:
+        item: the case with its truth.
+        verdict: the answer as a dictionary.
+        sets: the named sets; the first name of each is its leading cause.
+
+    Returns:
+        By parameter or coefficient, whether the 95 % interval contains the truth; see `Grade`. It
+        is empty if a leading cause is wrong.
+    """
     truth, said = dict(item.parameters), dict(verdict["parameters"])
     led = {names[0] for names in sets}
     for cause in verdict["causes"]:
@@ -205,6 +226,12 @@ def _count_covered_intervals(
 
 
 def _holds(estimate: Mapping[str, float | None], value: float) -> bool | None:
+    """Return whether a 95 % interval contains a value; None if the interval is open.
+
+    Args:
+        estimate: bounds ``low`` and ``high``, of which None is an open end.
+        value: the true value.
+    """
     low, high = estimate["low"], estimate["high"]
     if low is None or high is None:
         return None

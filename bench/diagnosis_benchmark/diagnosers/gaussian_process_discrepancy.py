@@ -48,7 +48,19 @@ class GaussianProcessDiscrepancy(Diagnoser):
 def _compute_gain_p_value(
     fitted: RegressionData, held_out: RegressionData, rng: np.random.Generator
 ) -> float:
-    """Compute the p-value of the improvement on held-out runs: one-sided t-test over blocks."""
+    """Compute the p-value of the improvement on held-out runs: one-sided t-test over blocks.
+
+    The gain of a sample is the decrease of its squared residual by the prediction of the Gaussian
+    process. Blocks of consecutive samples are compared because neighbouring samples are correlated.
+
+    Args:
+        fitted: acceleration residuals of the runs for fitting.
+        held_out: acceleration residuals of the held-out runs.
+        rng: random generator, which selects the samples on which the process is conditioned.
+
+    Returns:
+        The p-value; 1 if there are too few samples.
+    """
     from scipy.stats import t as students
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel

@@ -116,6 +116,12 @@ class RegressionEvidence:
     """
 
     def __init__(self, case: DiagnosisCase, every: bool = True) -> None:
+        """Find the noise of each channel and fit the base model.
+
+        Runs for fitting come first, held-out runs after them. Systems without an engine of their
+        own are simulated by the batch engine. The directions of the effects are computed when they
+        are first used.
+        """
         recording = case.recording
         runs = [*recording.training(), *(recording.held_out() if every else ())]
         # The simulator of a robot uses the step that its model file states.
@@ -187,11 +193,24 @@ class RegressionEvidence:
         return self._rows(left[..., 0], base, effects, sigma, seen)
 
     def _base_columns(self) -> Array:
+        """Return the columns of parameters and initial states in equation (1), (R, T, C, B)."""
         return compute_base_jacobian(self.world, self.base.fit)
 
     def _rows(
         self, left: Array, base: Array, effects: Array, sigma: Array, seen: Mask
     ) -> RegressionData:
+        """Flatten arrays over runs, samples and channels into the rows of a regression.
+
+        Each row is divided by its noise. Rows that are masked, or not finite because of an impact,
+        are left out.
+
+        Args:
+            left: residual, (R, T, C).
+            base: columns of parameters and initial states, (R, T, C, B).
+            effects: columns of all directions of effects, (R, T, C, K).
+            sigma: standard deviation of the noise, (R, T, C).
+            seen: mask of the samples to use, (R, T, C).
+        """
         runs = np.broadcast_to(np.arange(len(left))[:, None, None], seen.shape)
         # An impact makes some entries very large or not finite; rows that are not finite are
         # excluded.
@@ -223,7 +242,10 @@ class RegressionEvidence:
         return states
 
     def _filtered(self, values: Array, seconds: float) -> tuple[Array, Array, Mask]:
-        """Apply the operator (2) to trajectories.
+        """Apply the operator L of equation (2) to trajectories: L r = r'' - A r - B r'.
+
+        For a channel with a rate, the first derivative replaces the second, and the term with A is
+        omitted. Channels that are neither coordinates nor rates are not used.
 
         Args:
             values: trajectories, (R, T, C, K).
@@ -256,6 +278,16 @@ class RegressionEvidence:
                 def smooth(
                     deriv: int, part: Array = part, window: int = window, step: float = step
                 ) -> Array:
+                    """Compute a derivative (T, K) by local polynomials (Savitzky-Golay filter).
+
+                    The default values bind the loop variables of the current run and channel.
+
+                    Args:
+                        deriv: order of the derivative; 0 for the smoothed values.
+                        part: trajectories of the channel, (T, K).
+                        window: number of samples of the window.
+                        step: sampling interval, s.
+                    """
                     filtered: Array = savgol_filter(
                         part, window, POLYNOMIAL_DEGREE, deriv=deriv, delta=step, axis=0
                     )
@@ -275,7 +307,16 @@ class RegressionEvidence:
         return result, sigma, used & self.observed_mask
 
     def _smooth_at(self, run: int, size: int, window: int) -> Mask:
-        """Return a mask (T,) of the samples whose window has no impact and no end of the run."""
+        """Return a mask (T,) of the samples whose window has no impact and no end of the run.
+
+        An impact is a minimum of the height in the simulated or in the observed path. A polynomial
+        over an impact would be wrong, because the velocity jumps there.
+
+        Args:
+            run: index of the run.
+            size: number of samples of the run.
+            window: number of samples of the window of the local polynomials.
+        """
         good = np.ones(size, dtype=bool)
         half = window // 2
         good[:half] = good[size - half :] = False
@@ -291,10 +332,14 @@ class RegressionEvidence:
         return good
 
     def _linear(self, run: int) -> tuple[Array, Array]:
-        """Compute A and B of (2), each (T, D), by finite differences of the acceleration.
+        """Compute stiffness A and damping B of equation (2), each (T, D), by finite differences.
 
-        They are computed for systems of one coordinate. They are zero if the system's own force is
-        uniform, and for systems of several coordinates.
+        They are the derivatives of the base model's acceleration by the D coordinates and by their
+        rates, along the fitted motion. They are zero if the system's own force is uniform, and for
+        systems of several coordinates.
+
+        Args:
+            run: index of the run.
         """
         world, system = self.world, self.world.simulator.system
         track = world.tracks[run]
@@ -321,6 +366,7 @@ class RegressionEvidence:
         clock = (times - times[0])[:, None]
 
         def accelerated(x: Array, v: Array) -> Array:
+            """Return the base model's acceleration (T, D) at positions x and velocities v."""
             moment = StateSnapshot(system(), theta, constants, clock, x, v, inputs)
             force: Array = moment.system.force(moment) / moment.inertia
             return force
@@ -336,18 +382,22 @@ _IMPACT_HEIGHT = 1.0
 
 
 def _odd(samples: int) -> int:
+    """Return the next lower odd number of samples, but enough for the local polynomials."""
     return max(samples - 1 + samples % 2, POLYNOMIAL_DEGREE + 2)
 
 
 def compute_base_jacobian(world: RunEvaluator, fit: TrajectoryFit) -> Array:
     """Compute the columns of a fit's parameters and of each run's own initial states.
 
+    A parameter affects all runs. An unknown initial state affects its own run only, so its column
+    is zero in the other runs.
+
     Args:
         world: the runs and the simulator.
         fit: a fitted model with its Jacobian.
 
     Returns:
-        Columns, (R, T, C, q + n).
+        Columns, (R, T, C, q + n), for q free parameters and n unknown initial states of all runs.
     """
     shared = fit.free.size
     runs, length, channels, _ = fit.jacobian.shape
@@ -366,6 +416,9 @@ def find_strongest_columns(
     left: Array, effects: Array, columns: Sequence[EffectColumn]
 ) -> dict[str, tuple[float, EffectColumn]]:
     """Find for each effect the column that explains most of the residual.
+
+    The gain of a column is the decrease of the sum of squares by a least-squares fit of all
+    directions that the column contains.
 
     Args:
         left: residual after projection, (N,).

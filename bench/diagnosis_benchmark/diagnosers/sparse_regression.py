@@ -73,7 +73,19 @@ class _SparseRegression(Diagnoser):
         return Answer("ambiguous" if sets else "named", best.causes)
 
     def _found(self, evidence: RegressionEvidence, window: float) -> _RegressionResult | None:
-        """Run the regression with one window; return None if there are too few samples."""
+        """Run the regression with one window of the local polynomials.
+
+        One column is used for each effect, the one that explains most of the residual. Models with
+        different numbers of terms are fitted to the runs for fitting, and the held-out runs select
+        one.
+
+        Args:
+            evidence: fitted base model and directions of the effects.
+            window: length of the window, s.
+
+        Returns:
+            The named causes and their significance; None if there are too few samples.
+        """
         rows = evidence.build_acceleration_regression(window)
         fitted, held_out = rows.select_runs(evidence.fitted), rows.select_runs(evidence.held_out)
         if (
@@ -107,7 +119,12 @@ class _SparseRegression(Diagnoser):
 
     @abstractmethod
     def _models(self, library: Array, left: Array) -> Iterator[Array]:
-        """Yield the coefficients (K,) of models with different numbers of terms."""
+        """Yield the coefficients (K,) of models with different numbers of terms.
+
+        Args:
+            library: columns of the candidate terms with unit mean square, (N, K).
+            left: residual, (N,).
+        """
 
 
 class SequentialThresholdedLeastSquares(_SparseRegression):
@@ -116,6 +133,16 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
     name = "stlsq"
 
     def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        """Yield the coefficients (K,) for 16 thresholds.
+
+        They go from the largest least-squares coefficient down to 0.1 % of it. The method sets
+        coefficients below the threshold to zero and fits the others again, until none changes; a
+        smaller threshold keeps more terms.
+
+        Args:
+            library: columns of the candidate terms with unit mean square, (N, K).
+            left: residual, (N,).
+        """
         from pysindy import optimizers
 
         size = float(np.abs(np.linalg.lstsq(library, left, rcond=1e-6)[0]).max())
@@ -130,6 +157,15 @@ class ForwardOrthogonalLeastSquares(_SparseRegression):
     name = "frols"
 
     def _models(self, library: Array, left: Array) -> Iterator[Array]:
+        """Yield the coefficients (K,) of models with one term, two terms, and so on.
+
+        PySINDy fails if too many terms are requested for nearly dependent columns. The largest
+        number for which it succeeds is used.
+
+        Args:
+            library: columns of the candidate terms with unit mean square, (N, K).
+            left: residual, (N,).
+        """
         from pysindy import optimizers
 
         for most in range(min(2 * MAX_TERMS, library.shape[1]), 0, -1):
@@ -146,6 +182,12 @@ def _drop_duplicate_columns(
     terms: Sequence[tuple[str, int]], effects: Array
 ) -> tuple[list[tuple[str, int]], Array]:
     """Select the terms whose column differs from those of earlier terms.
+
+    Nearly equal columns would get arbitrary coefficients of opposite sign.
+
+    Args:
+        terms: name of the effect and index of its column, for each term.
+        effects: columns of all directions, (N, K).
 
     Returns:
         The terms, and their columns.
@@ -169,6 +211,11 @@ def _select_by_one_standard_error(
     models: Sequence[Array], left: Array, library: Array
 ) -> tuple[Array, float]:
     """Select the simplest model whose held-out error is within one standard error of the best.
+
+    Args:
+        models: coefficients of each model, (K,).
+        left: residual of the held-out runs, (N,).
+        library: columns of the terms in the held-out runs, (N, K).
 
     Returns:
         Its coefficients (zero if no model is significantly better than none), and the improvement
@@ -207,9 +254,19 @@ def _standard_error(differences: Array) -> float:
 def _find_equivalent_effects(
     name: str, picked: Sequence[str], columns: Sequence[EffectColumn], effects: Array
 ) -> tuple[str, ...]:
-    """List effects that were not selected but are nearly collinear with a selected effect."""
+    """List effects that were not selected but are nearly collinear with a selected effect.
+
+    They are the alternatives of the cause, most similar first.
+
+    Args:
+        name: the selected effect.
+        picked: all selected effects.
+        columns: one column for each effect.
+        effects: columns of all directions, (N, K).
+    """
 
     def units(column: EffectColumn) -> Array:
+        """Return the directions of a column that are not zero, with length one, (N, D)."""
         part = effects[:, list(column.places)]
         scale = np.sqrt(np.square(part).sum(axis=0))
         unit: Array = part[:, scale > 1e-9] / scale[scale > 1e-9]

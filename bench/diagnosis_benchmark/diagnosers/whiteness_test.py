@@ -61,7 +61,14 @@ class WhitenessTest(Diagnoser):
 
 
 def _compute_whiteness_p_value(evidence: RegressionEvidence) -> float:
-    """Compute the smallest Ljung-Box p-value of all runs and channels, Bonferroni-corrected."""
+    """Compute the smallest Ljung-Box p-value of all runs and channels, Bonferroni-corrected.
+
+    Series that are constant or not longer than twice the number of autocorrelations are left out;
+    if none remains, the p-value is 1.
+
+    Args:
+        evidence: fitted base model with its residual.
+    """
     from statsmodels.stats.diagnostic import acorr_ljungbox
 
     chances = []
