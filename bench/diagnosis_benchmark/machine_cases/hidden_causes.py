@@ -159,6 +159,15 @@ def draw_effect_shape(
 
 
 def _per_force(bottom: Callable[[dict[str, float]], float]) -> Callable[..., CoefficientFunction]:
+    """Make the function that draws an effect whose force is proportional to its coefficient.
+
+    At strength 1, the coefficient times `bottom` is twice the typical force of the joint.
+
+    Args:
+        bottom: returns, from the typical scales of the joint, the quantity by which the coefficient
+            is multiplied to give the force, such as the speed for a linear drag.
+    """
+
     def made(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
         far = 2.0 * typical["force"] / bottom(typical)
         return lambda s: (far * s,)
@@ -167,6 +176,17 @@ def _per_force(bottom: Callable[[dict[str, float]], float]) -> Callable[..., Coe
 
 
 def _ripple(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+    """Draw a force that is periodic in the joint angle; its amplitude is twice the typical force.
+
+    The motion passes 1.5 to 4 periods, and the period is between 0.08 and 1 rad.
+
+    Args:
+        typical: typical scales of the joint: force, inertia, position, speed and travel.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to sine amplitude, cosine amplitude, and period.
+    """
     angle = rng.uniform(0, 2 * np.pi)
     period = float(np.clip(typical["travel"] / rng.uniform(1.5, 4.0), 0.08, 1.0))
     sine, cosine = (2 * typical["force"] * float(of(angle)) for of in (np.sin, np.cos))
@@ -174,6 +194,16 @@ def _ripple(typical: dict[str, float], rng: np.random.Generator) -> CoefficientF
 
 
 def _stribeck(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+    """Draw Stribeck friction: Coulomb friction and a larger part that ends at some speed.
+
+    Args:
+        typical: typical scales of the joint: force, inertia, position, speed and travel.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to Coulomb friction, additional friction at rest, and Stribeck
+        speed.
+    """
     extra = float(rng.uniform(2.0, 6.0))
     speed = typical["speed"] * float(rng.uniform(0.15, 0.5))
     return lambda s: (0.3 * typical["force"] * s, 0.3 * extra * typical["force"] * s, speed)

@@ -129,7 +129,13 @@ def restore_conditions(
 def _placed(
     item: BenchmarkCase, effect: str | None, rng: np.random.Generator, but: str = ""
 ) -> str:
-    """Draw the effect, if it is not given, and its place.
+    """Draw the effect, if it is not given, and its place: a joint, body, motor or sensor channel.
+
+    Args:
+        item: the case; its system determines the effects and places.
+        effect: name of the effect; None to draw it.
+        rng: random generator.
+        but: effect with place that must not be drawn, because the case already hides it.
 
     Returns:
         ``effect@place`` or ``effect``; empty if the only place is excluded by `but`.
@@ -146,6 +152,22 @@ def _single(
     wanted: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
+    """Hide one effect of the library, with coefficients that give the requested size.
+
+    Stribeck friction of at least one noise is rejected if Coulomb friction or drag explains it too
+    well: the residual that the better of them leaves (`beyond`) must be at least
+    `MIN_SIMPLER_RESIDUAL`.
+
+    Args:
+        item: the case without its hidden cause.
+        made: recording conditions.
+        effect: name of the effect; None to draw it.
+        wanted: size in units of the noise.
+        rng: random generator.
+
+    Returns:
+        The case; None if it is rejected or no coefficients give this size.
+    """
     name = _placed(item, effect, rng)
     c = _find_sized_coefficients(name, made, wanted, rng)
     if c is None:
@@ -180,7 +202,19 @@ def _double(
     wanted: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
-    """Hide two effects, each of the requested size alone; reject the case if one explains both."""
+    """Hide two effects, each of the requested size alone; reject the case if one explains both.
+
+    Args:
+        item: the case without its hidden causes.
+        made: recording conditions.
+        effect: name of the first effect; None to draw it.
+        wanted: size of each effect alone, in units of the noise.
+        rng: random generator.
+
+    Returns:
+        The case; None if it is rejected, the effects are equivalent, or no coefficients give this
+        size.
+    """
     first = _placed(item, effect, rng)
     second = _placed(item, None, rng, but=first)
     if not second or second in find_equivalent_causes(item.system, first):
@@ -204,7 +238,21 @@ def _foreign(
     wanted: float,
     rng: np.random.Generator,
 ) -> BenchmarkCase | None:
-    """Hide an unmodelled cause, which the library explains only in part."""
+    """Hide an unmodelled cause, which the library explains only in part.
+
+    The case is rejected if one effect of the library leaves a residual (`beyond`) below
+    `MIN_DISTINCT_SIZE`.
+
+    Args:
+        item: the case without its hidden cause.
+        made: recording conditions.
+        cause: name of the cause; None to draw it.
+        wanted: size in units of the noise.
+        rng: random generator.
+
+    Returns:
+        The case; None if it is rejected or no strength gives this size.
+    """
     chosen = cause or str(rng.choice(hidden_causes.UNMODELLED_CAUSES))
     joint = str(rng.choice(MACHINES[item.system].joints))
     name = f"{chosen}@{joint}" if joint else chosen
@@ -237,7 +285,15 @@ def _compute_unexplained_size(
 ) -> float:
     """Compute the RMS residual that the best of other causes leaves, to first order.
 
-    It is in units of the noise.
+    It is in units of the noise. The change of the readings by the hidden causes is projected on the
+    direction of each other cause.
+
+    Args:
+        made: recording conditions.
+        effects: hidden effects of the library.
+        foreign: hidden unmodelled causes.
+        others: the other causes, each of which may be a wrong answer.
+        rng: random generator for the shapes of the other causes.
     """
     gauge = _ResidualGauge(made)
     change = made.simulate_readings(effects, foreign) - gauge.bare
@@ -262,6 +318,12 @@ class _ResidualGauge:
     """
 
     def __init__(self, made: MachineRecordingConditions) -> None:
+        """Simulate the runs with each parameter and initial state changed, for their directions.
+
+        All simulations are one batch of R runs times 1 + P + 2 N variants: unchanged, each of P
+        parameters, each of N angles and each of N velocities. A parameter changes all runs, an
+        initial state only its own run.
+        """
         self.made = made
         runs, joints = made.fitted_runs.q.shape
         numbers = list(made.free_parameters)
@@ -294,7 +356,11 @@ class _ResidualGauge:
         self._basis = _orthonormal(columns)
 
     def left(self, seen: Array) -> float:
-        """Compute the size of the change in readings with a hidden cause."""
+        """Compute the size of the change in readings by a hidden cause; infinite if they diverge.
+
+        Args:
+            seen: readings with the hidden cause, (R, T, N).
+        """
         return self._size((seen - self.bare).ravel())
 
     def projected(self, change: Array, direction: Array) -> float:
@@ -315,12 +381,20 @@ class _ResidualGauge:
         return float(np.sqrt(np.mean(self._rest(change) ** 2)) / self.made.noise_sigmas)
 
     def _rest(self, change: Array) -> Array:
+        """Subtract from a change (RTN,) the part that parameters and initial states explain."""
         rest: Array = change - self._basis @ (self._basis.T @ change)
         return rest
 
 
 def _orthonormal(columns: Array) -> Array:
-    """Compute an orthonormal basis of the span of columns, without nearly dependent directions."""
+    """Compute an orthonormal basis of the span of columns by a singular value decomposition.
+
+    Directions with a singular value below 1e-6 of the largest are left out, because they come from
+    columns that are nearly dependent.
+
+    Args:
+        columns: columns, (N, P).
+    """
     scale = np.sqrt(np.square(columns).sum(axis=0))
     left, sizes, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
     basis: Array = left[:, sizes > 1e-6 * sizes[0]]
@@ -353,7 +427,10 @@ def find_equivalent_causes(system: str, name: str) -> frozenset[str]:
 
 
 def record_case(item: BenchmarkCase) -> tuple[MachineRecordingConditions, Array]:
-    """Simulate the recording of a case.
+    """Simulate the recording of a case with all its runs, and add the sensor noise.
+
+    Args:
+        item: the case.
 
     Returns:
         The recording conditions and the noisy encoder readings, (R, T, N).
@@ -391,6 +468,7 @@ def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> 
 
 
 def _stated_constants(made: MachineRecordingConditions) -> dict[str, float]:
+    """Return the parameters of a servo that the recording states, because nobody fits them."""
     return {name: v for name, v in made.numbers.items() if name not in made.free_parameters}
 
 

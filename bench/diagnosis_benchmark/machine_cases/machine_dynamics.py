@@ -64,6 +64,13 @@ class MachineDynamics(ABC):
     motors: ClassVar[tuple[str, ...]]
 
     def __init__(self, numbers: MachineParameters, effects: Effects, foreign: Effects) -> None:
+        """Store the parameters and add the hidden causes.
+
+        Besides the public attributes, `added` is additional rotor inertia (N,), `patch` is (joint,
+        friction limit, centre, half width) of dry friction in a region, and `dull` is the deadband
+        of a servo in rad. Effects on commands and sensors stay in `effects`; `reference_motion`
+        applies them.
+        """
         self.numbers = {name: np.asarray(value, dtype=float) for name, value in numbers.items()}
         self.effects, self.foreign = effects, foreign
         count = len(self.joints)
@@ -143,18 +150,34 @@ class MachineDynamics(ABC):
 
     @abstractmethod
     def compute_base_acceleration_force(self, q: Array) -> Array:
-        """Compute the generalised forces (L, N) of a unit acceleration along x."""
+        """Compute the generalised forces (L, N) of a unit acceleration along x.
+
+        Multiplied by a horizontal part of gravity, they give the effect of a tilted machine.
+
+        Args:
+            q: positions, (L, N).
+        """
 
     @abstractmethod
     def compute_gravity_force(self, q: Array) -> Array:
         """Compute the generalised forces (L, N) of gravity."""
 
     def _take(self, effect: str, place: str, c: list[float]) -> None:
-        """Add an effect; effects on commands and sensors are applied elsewhere."""
+        """Add an effect of the library to the equations of motion.
+
+        Effects on commands (``input.``) and sensors (``sensor.``) are ignored here;
+        `reference_motion` applies them.
+
+        Args:
+            effect: name of the effect.
+            place: joint or body on which it acts; empty if the machine has only one place.
+            c: coefficients.
+        """
         if effect in JOINT_FORCE_LAWS:
             joint, law = self.joints.index(place), JOINT_FORCE_LAWS[effect]
 
             def act(t: float, q: Array, v: Array, u: Array) -> Array:
+                """Return the generalised forces (L, N) of the effect on its joint."""
                 pushed = np.zeros_like(q)
                 pushed[:, joint] = law(c, q[:, joint], v[:, joint])
                 return pushed
@@ -184,6 +207,15 @@ class MachineDynamics(ABC):
             self.numbers[name] = times * self.numbers[name]
 
     def _foreign(self, cause: str, place: str, c: list[float]) -> None:
+        """Add a cause that the library does not contain.
+
+        Args:
+            cause: ``patch`` (dry friction in a region of the joint angle) or ``gust`` (temporary
+                force).
+            place: joint on which it acts.
+            c: friction limit, centre and half width of a patch; force, begin and duration of a
+                gust.
+        """
         joint = self.joints.index(place)
         if cause == "patch":
             most, centre, half = c
@@ -192,6 +224,7 @@ class MachineDynamics(ABC):
             push, begin, lasting = c
 
             def blow(t: float, q: Array, v: Array, u: Array) -> Array:
+                """Return the generalised forces (L, N) of the gust at time t."""
                 pushed = np.zeros_like(q)
                 pushed[:, joint] = push * (begin <= t < begin + lasting)
                 return pushed
@@ -219,14 +252,27 @@ class ServoDynamics(MachineDynamics):
     motors = ("goal",)
 
     def compute_mass_matrix(self, q: Array) -> Array:
-        """Compute the mass matrices; see `MachineDynamics`."""
+        """Compute the inertia (L, 1, 1) of equation (1), with that of hidden causes.
+
+        Args:
+            q: positions, (L, 1); only their number is used.
+        """
         n = self.numbers
         inertia = np.empty((len(q), 1, 1))
         inertia[:, 0, 0] = n["armature"] + n["mass"] * n["length"] ** 2 + self.added[0]
         return inertia
 
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
-        """Compute the motor torque and gravity; see `MachineDynamics`."""
+        """Compute motor torque and gravity, the right-hand side of equation (1).
+
+        The position controller sets the duty d from the error of the goal; the motor's back EMF, k
+        q', reduces the torque.
+
+        Args:
+            q: positions, (L, 1).
+            v: velocities, (L, 1).
+            u: goal positions, (L, 1).
+        """
         n = self.numbers
         error = u[:, 0] - q[:, 0]
         if self.dull:
@@ -262,7 +308,11 @@ class ArmDynamics(MachineDynamics):
     motors = ("m_shoulder", "m_elbow")
 
     def compute_mass_matrix(self, q: Array) -> Array:
-        """Compute the mass matrices; see `MachineDynamics`."""
+        """Compute the mass matrices (L, 2, 2) of the arm, equations (2) and (3).
+
+        Args:
+            q: positions, (L, 2).
+        """
         n = self.numbers
         across = n["mass2"] * n["length"] * n["centre2"] * np.cos(q[:, 1])
         outer = n["inertia2"] + n["mass2"] * n["centre2"] ** 2
@@ -274,7 +324,13 @@ class ArmDynamics(MachineDynamics):
         return inertia
 
     def compute_own_force(self, q: Array, v: Array, u: Array) -> Array:
-        """Compute inputs, gravity, Coriolis forces and damping; see `MachineDynamics`."""
+        """Compute the right-hand side of (4): inputs, gravity, Coriolis forces and damping.
+
+        Args:
+            q: positions, (L, 2).
+            v: velocities, (L, 2).
+            u: joint torques, (L, 2).
+        """
         n = self.numbers
         turning = n["mass2"] * n["length"] * n["centre2"] * np.sin(q[:, 1])
         total = u + self.compute_gravity_force(q)
@@ -283,7 +339,7 @@ class ArmDynamics(MachineDynamics):
         return total
 
     def compute_gravity_force(self, q: Array) -> Array:
-        """Compute the gravity forces; see `MachineDynamics`."""
+        """Compute the gravity forces -g(q) of equation (5), (L, 2)."""
         return -GRAVITY * self._lever(np.sin, q)
 
     def compute_base_acceleration_force(self, q: Array) -> Array:
@@ -291,6 +347,12 @@ class ArmDynamics(MachineDynamics):
         return -self._lever(np.cos, q)
 
     def _lever(self, of: Callable[[Array], Array], q: Array) -> Array:
+        """Sum mass times lever arm of both links for each joint, as in equation (5), kg m, (L, N).
+
+        Args:
+            of: sine for the lever arm of gravity, cosine for that of a horizontal acceleration.
+            q: positions, (L, N).
+        """
         n = self.numbers
         outer = n["mass2"] * n["centre2"] * of(q[:, 0] + q[:, 1])
         inner = (n["mass1"] * n["centre1"] + n["mass2"] * n["length"]) * of(q[:, 0])

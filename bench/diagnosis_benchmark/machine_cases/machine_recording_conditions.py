@@ -125,7 +125,12 @@ class MachineRecordingConditions:
 
     @cached_property
     def motion_scales(self) -> dict[str, Array]:
-        """Scales of the motion without hidden causes, by quantity; one value per joint, (N,)."""
+        """Typical scales of the motion without hidden causes, by quantity; one per joint, (N,).
+
+        Strengths of hidden causes are relative to them. ``force`` (inertia force minus gravity),
+        ``speed`` and ``position`` are RMS values, ``travel`` is the mean range of a run,
+        ``inertia`` the mean diagonal of the mass matrix.
+        """
         q, v = self.base_motion.q, self.base_motion.v
         a = np.gradient(v, self.base_motion.times, axis=0)
         lanes, joints = q.shape[1:]
@@ -183,6 +188,12 @@ def draw_conditions(
 
 
 def _servo(rng: np.random.Generator) -> dict[str, float]:
+    """Draw the fitted parameters of a servo; its other constants are those of the simulator.
+
+    Returns:
+        Torque constant in N m/A, resistance in Ohm, inertia of the rotor in kg m^2, and the
+        constants, by name.
+    """
     drawn = {
         "torque_constant": float(rng.uniform(0.3, 0.8)),
         "resistance": float(rng.uniform(2.5, 6.0)),
@@ -192,6 +203,14 @@ def _servo(rng: np.random.Generator) -> dict[str, float]:
 
 
 def _arm(rng: np.random.Generator) -> dict[str, float]:
+    """Draw the parameters of an arm: masses, centres of mass, inertias, damping and rotor inertias.
+
+    The names end with the number of the link, 1 for the upper arm and 2 for the forearm; ``length``
+    is that of the upper arm. The moments of inertia are those of a rod, about m l^2 / 12.
+
+    Returns:
+        Parameters by name, SI units; see `machine_dynamics.ArmDynamics`.
+    """
     length, outer = rng.uniform(0.25, 0.45), rng.uniform(0.2, 0.35)
     mass1, mass2 = rng.uniform(0.8, 2.0), rng.uniform(0.4, 1.0)
     numbers = {
@@ -214,7 +233,17 @@ def _arm(rng: np.random.Generator) -> dict[str, float]:
 def _runs(
     plant: MachineDynamics, times: Array, count: int, rng: np.random.Generator
 ) -> MachineRuns:
-    """Draw runs whose commands keep the joints within the angle limit."""
+    """Draw runs whose commands keep the joints within the angle limit.
+
+    Commands are scaled down until the motion stays below `MAX_JOINT_ANGLE`. A servo gets goal
+    angles of up to 0.7 rad, an arm torques of up to 1.5 times the gravity torque at 0.4 rad.
+
+    Args:
+        plant: the machine without hidden causes.
+        times: sample times, s, (T,).
+        count: number of runs.
+        rng: random generator.
+    """
     form = str(rng.choice(["steps", "sine", "chirp"]))
     joints = len(plant.joints)
     waves = np.array(

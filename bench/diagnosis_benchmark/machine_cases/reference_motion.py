@@ -80,7 +80,25 @@ def simulate_machine(
 
 
 class _MachineIntegrator:
+    """Integrator of L runs of a machine with N joints by Runge-Kutta 4, with dry friction.
+
+    Attributes:
+        q: positions, (L, N).
+        v: velocities, (L, N).
+        rubs: whether each joint has dry friction, (N,).
+        dry: whether any joint has.
+        way: direction of motion of joints with dry friction: -1, 0 or 1, (L, N).
+        held: whether each joint is stuck, (L, N).
+    """
+
     def __init__(self, plant: MachineDynamics, q: Array, v: Array) -> None:
+        """Start at given positions and velocities.
+
+        Args:
+            plant: the machine.
+            q: initial positions, (L, N).
+            v: initial velocities, (L, N).
+        """
         self.plant, self.q, self.v = plant, q.copy(), v.copy()
         self.rubs = plant.has_dry_friction
         self.dry = bool(self.rubs.any())
@@ -88,6 +106,16 @@ class _MachineIntegrator:
         self.held = np.zeros(q.shape, dtype=bool)
 
     def step(self, t: float, h: float, u: Array) -> None:
+        """Make one step of the Runge-Kutta method of order 4.
+
+        With dry friction, the direction of friction is fixed for the step; joints that come to rest
+        within it are corrected afterwards.
+
+        Args:
+            t: time at the begin of the step, s.
+            h: length of the step, s.
+            u: mean applied input over the step, (L, N).
+        """
         if self.dry:
             self._decide(t, u)
         q, v = self.q, self.v
@@ -104,13 +132,26 @@ class _MachineIntegrator:
             self._turn(t, h, u, v)
 
     def _acceleration(self, t: float, q: Array, v: Array, u: Array) -> Array:
+        """Compute the accelerations (L, N), with dry friction against the direction of motion.
+
+        Args:
+            t: time, s.
+            q: positions, (L, N).
+            v: velocities, (L, N).
+            u: applied input, (L, N).
+        """
         force = self.plant.compute_force(t, q, v, u)
         if self.dry:
             force = force - self.way * self.plant.compute_friction_limit(q, v)
         return self._solved(q, force)
 
     def _solved(self, q: Array, force: Array) -> Array:
-        """Compute the accelerations (L, N); those of stuck joints are zero."""
+        """Solve M q'' = force for the accelerations (L, N); those of stuck joints are zero.
+
+        Args:
+            q: positions, (L, N).
+            force: generalised forces, (L, N).
+        """
         free = ~self.held
         inertia = self.plant.compute_mass_matrix(q)
         if self.held.any():
@@ -124,7 +165,14 @@ class _MachineIntegrator:
         return np.asarray(solved, dtype=np.float64)
 
     def _decide(self, t: float, u: Array) -> None:
-        """Decide which joints at rest are stuck, and in which direction the others move."""
+        """Decide which joints at rest are stuck, and in which direction the others move.
+
+        A joint breaks away if holding it needs more force than its friction limit.
+
+        Args:
+            t: time, s.
+            u: applied input, (L, N).
+        """
         resting = self.rubs & (self.v == 0.0)
         self.way = np.where(self.rubs & ~resting, np.sign(self.v), 0.0)
         self.held = resting
@@ -142,7 +190,17 @@ class _MachineIntegrator:
         self.held = resting & ~loose
 
     def _turn(self, t: float, h: float, u: Array, before: Array) -> None:
-        """Recompute the rest of the step for joints that came to rest within it."""
+        """Recompute the rest of the step for joints that came to rest within it.
+
+        The time of rest is estimated by linear interpolation of the velocity. For the time that is
+        left (`left`), the joint sticks or moves with constant acceleration.
+
+        Args:
+            t: time at the begin of the step, s.
+            h: length of the step, s.
+            u: applied input, (L, N).
+            before: velocities at the begin of the step, (L, N).
+        """
         turned = (self.way * self.v < 0.0) & (self.way * before >= 0.0)
         if not turned.any():
             return
@@ -157,7 +215,9 @@ class _MachineIntegrator:
 
 
 def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Array) -> Array:
-    """Compute the mean applied input over each step.
+    """Compute the mean applied input over each step, after the hidden effects on the command.
+
+    Effects without memory act first, then delay and lag.
 
     Args:
         runs: the runs with their commands.
@@ -200,7 +260,20 @@ def _apply_static_effects(name: str, c: float, u: Array) -> Array:
 
 
 def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) -> Array:
-    """Average levels over each step, with a zero-order hold, a delay and a lag."""
+    """Average an input over each step, with a zero-order hold, a delay and a lag.
+
+    Averages are exact: they are differences of the integral of the input.
+
+    Args:
+        stamps: sample times, s, (T,).
+        levels: input at each sample, held until the next one, (T,).
+        times: times of the steps, s, (K + 1,).
+        late: delay, s.
+        lag: time constant of a first-order lag, s; 0 for none.
+
+    Returns:
+        Averages, (K,).
+    """
     # The first level holds before the first sample, the last one after the last sample.
     ends = np.append(stamps[1:], times[-1] + 1.0)
     area = np.concatenate([[0.0], np.cumsum(levels * (ends - stamps))])
@@ -218,7 +291,16 @@ def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) 
 
 
 def _apply_lag(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
-    """Evaluate a first-order lag of the levels at given times; it starts at the first level."""
+    """Evaluate a first-order lag of the levels at given times; it starts at the first level.
+
+    Between samples the lag approaches a constant level exponentially, so the result is exact.
+
+    Args:
+        stamps: sample times, s, (T,).
+        levels: input at each sample, (T,).
+        at: times, s, (K,).
+        lag: time constant, s.
+    """
     reached = np.empty_like(levels)
     reached[0] = levels[0]
     decay = np.exp(-np.diff(stamps) / lag)
@@ -271,7 +353,12 @@ def select_sensor_effects(effects: Effects, channel: str) -> dict[str, tuple[flo
 
 
 def _interpolate_positions(motion: MachineMotion, at: Array) -> Array:
-    """Interpolate the positions (T, L, N) by cubic Hermite polynomials."""
+    """Interpolate positions (T, L, N) by cubic Hermite polynomials, which use velocities too.
+
+    Args:
+        motion: simulated motion with steps of equal length.
+        at: times, s, (T,).
+    """
     h = motion.times[1] - motion.times[0]
     place = np.clip((at / h).astype(int), 0, len(motion.times) - 2)
     s = ((at - motion.times[place]) / h)[:, None, None]
