@@ -313,6 +313,10 @@ def draw_cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], ti
 
 
 def _bars(line: TableRow) -> list[list[float]]:
-    """Return the lower and upper length of an error bar, in per cent."""
+    """Return the lower and upper length of an error bar, in per cent, as matplotlib expects them.
+
+    Args:
+        line: a fraction with the bounds of its interval: share, low and high, from 0 to 1.
+    """
     share, low, high = (float(line[key]) for key in ("share", "low", "high"))
     return [[100 * max(share - low, 0.0)], [100 * max(high - share, 0.0)]]

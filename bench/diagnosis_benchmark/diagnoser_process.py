@@ -50,6 +50,10 @@ _DOCUMENT = 1 << 30
 def serve_requests(channel: MessageChannel, reach: AccessPolicy, held: list[str]) -> None:
     """Answer requests of the harness until the channel is closed.
 
+    Requests have a kind of one letter: L brings trained arrays, Q a case, F a training. The answers
+    are R (ready), K (arrays received), A (answer), L (trained arrays) and D (the diagnoser failed,
+    with the traceback).
+
     Args:
         channel: message channel to the harness.
         reach: access policy of this process, with its own writable folder.
@@ -87,7 +91,11 @@ _USED = "simulations"
 
 
 def load_diagnoser(wanted: Mapping[str, Any]) -> Diagnoser:
-    """Load a diagnoser from its module or file, and create it."""
+    """Load a diagnoser from its module or file, and create it.
+
+    Args:
+        wanted: name, module, and file of a plugin (empty for a module).
+    """
     kind: type[Diagnoser] = load_class(dict(wanted), Diagnoser)
     return kind()
 

@@ -143,6 +143,9 @@ def draw_figures(
 ) -> dict[str, FigureFiles]:
     """Draw every figure for which there is data.
 
+    Most figures need clean cases and cases with one effect: they compare false alarms with causes
+    found.
+
     Args:
         experiment: the experiment, for the title.
         rows: one row per answer.

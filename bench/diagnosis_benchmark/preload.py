@@ -30,7 +30,13 @@ _NOISE_SIGMA = 1e-3
 
 
 def _warm_up_search(system: str) -> None:
-    """Fit a simulated recording of a system and compute the direction of each effect."""
+    """Fit a simulated recording of a system and compute the direction of each effect.
+
+    The result is discarded: the call makes Python import and compile what every diagnosis needs.
+
+    Args:
+        system: name of the system.
+    """
     wish = SimulationSpec(
         system=system, noise={"*": _NOISE_SIGMA}, runs=2, seconds=0.5, rate=50.0, engine="batch"
     )

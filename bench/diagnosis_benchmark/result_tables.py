@@ -75,6 +75,7 @@ def compute_share(hits: int, of: int, exact: bool = False) -> TableRow:
 
 
 def _share_of(successes: pd.Series[bool], exact: bool = False) -> TableRow:
+    """Compute the fraction of successes with its 95 % interval; see `compute_share`."""
     return compute_share(int(successes.sum()), len(successes), exact)
 
 
@@ -156,6 +157,7 @@ def _by_diagnoser(
 
 
 def _list_metrics(own: pd.DataFrame) -> Iterator[TableRow]:
+    """Yield the lines of table.csv for one diagnoser: the fraction of each metric."""
     for metric in METRICS:
         successes = metric.predicate(metric.select(own))
         yield {"metric": metric.name, **_share_of(successes, metric.is_exact)}
@@ -164,6 +166,14 @@ def _list_metrics(own: pd.DataFrame) -> Iterator[TableRow]:
 
 
 def _list_groups(own: pd.DataFrame) -> Iterator[TableRow]:
+    """Yield the lines of groups.csv for one diagnoser: metrics by system, noise, rate and so on.
+
+    Args:
+        own: rows of the diagnoser.
+
+    Yields:
+        Metric, column that defines the groups (``by``), its value in this group, and the fraction.
+    """
     for metric, columns in GROUPED_METRICS:
         for column in columns:
             for value, part in metric.select(own).groupby(column):
@@ -172,6 +182,13 @@ def _list_groups(own: pd.DataFrame) -> Iterator[TableRow]:
 
 
 def _list_power(own: pd.DataFrame) -> Iterator[TableRow]:
+    """Yield the lines of power.csv: fractions of single effects named and detected, by their size.
+
+    All sizes are counted, also those that are too small to be graded.
+
+    Args:
+        own: rows of one diagnoser.
+    """
     for size, part in own[own["kind"] == "single"].groupby("size"):
         for metric, successes in (("named", _is_named(part)), ("seen", _is_alarm(part))):
             yield {"size": size, "metric": metric, **_share_of(successes)}
@@ -196,6 +213,12 @@ def _list_set_sizes(own: pd.DataFrame) -> Iterator[TableRow]:
 
 
 def _list_costs(own: pd.DataFrame) -> Iterator[TableRow]:
+    """Yield the line of costs.csv for one diagnoser: medians and 95 % quantiles.
+
+    Args:
+        own: rows of the diagnoser. Only finished answers count; the costs are simulations,
+            processor time and elapsed time, s.
+    """
     done = own[own["status"] == "done"]
     line: TableRow = {"answers": len(done)}
     for column in ("simulations", "processor_seconds", "seconds"):
@@ -206,7 +229,10 @@ def _list_costs(own: pd.DataFrame) -> Iterator[TableRow]:
 
 
 def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Count the leading name of the first diagnosed cause for each hidden cause.
+    """Build confusion.csv: how often each hidden cause was answered with each name.
+
+    An answer counts under the leading name of its cause. Cases with two hidden effects are left
+    out.
 
     Args:
         rows: one row per answer.
@@ -222,13 +248,26 @@ def build_confusion_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFr
 
 
 def _leading_name(verdict: str, named: str) -> str:
+    """Return the column of confusion.csv for an answer.
+
+    Args:
+        verdict: verdict of the answer; empty without an answer.
+        named: named causes, separated by " + ", alternatives separated by bars.
+
+    Returns:
+        Leading name of the only cause, ``(several)`` for several causes, or the verdict in brackets
+        if no cause is named.
+    """
     if verdict in ("", "adequate", "unknown", "unidentifiable") or not named:
         return f"({verdict or 'nothing'})"
     return "(several)" if " + " in named else named.partition("|")[0]
 
 
 def build_pair_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Compare each diagnoser with simgap on the same cases, Holm-corrected within each metric.
+    """Compare each diagnoser with simgap on the same cases by McNemar's test.
+
+    The test counts only the cases that exactly one of the two answered correctly. P-values are
+    Holm-corrected over the diagnosers, within each metric.
 
     Args:
         rows: one row per answer.

@@ -15,18 +15,22 @@ from bench.diagnosis_benchmark.wrong_answers import FAILURE_COLUMNS as FAILED
 
 
 def _text(name: str) -> ColumnSpec:
+    """Declare a text column whose cells may be empty."""
     return ColumnSpec(name, str, empty=EmptyCellRule.MAY)
 
 
 def _count(name: str) -> ColumnSpec:
+    """Declare a column of counts, at least 0."""
     return ColumnSpec(name, int, low=0)
 
 
 def _size(name: str) -> ColumnSpec:
+    """Declare a column of numbers of at least 0, whose cells may be empty."""
     return ColumnSpec(name, float, low=0.0, empty=EmptyCellRule.MAY)
 
 
 def _share(name: str) -> ColumnSpec:
+    """Declare a column of fractions from 0 to 1, whose cells may be empty."""
     return ColumnSpec(name, float, low=0.0, high=1.0, empty=EmptyCellRule.MAY)
 
 

@@ -53,6 +53,8 @@ def select_graded_answers(rows: pd.DataFrame) -> pd.DataFrame:
 def build_failure_table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
     """Build the table of incorrect graded answers, ordered by diagnoser, kind and case.
 
+    The column ``right_by`` names the diagnosers that answered the same case correctly, or "nobody".
+
     Args:
         rows: one row per answer.
         order: names of the diagnosers.

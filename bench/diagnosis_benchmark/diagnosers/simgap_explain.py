@@ -32,4 +32,5 @@ class SimgapExplain(Diagnoser):
 
 
 def _ends(number: FittedValue) -> tuple[float | None, float | None]:
+    """Return the 95 % interval of a fitted value; None for an open end."""
     return number.low, number.high

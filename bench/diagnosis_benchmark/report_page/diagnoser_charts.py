@@ -26,7 +26,17 @@ _SHARE_AXIS = Axis("share", scales=("linear",), ends=_SHARE_LIMITS)
 
 
 def build_chart_tables(data: DiagnoserReportData) -> dict[str, pd.DataFrame]:
-    """Build the tables of the charts that are not tables of the comparison."""
+    """Build the tables of the charts that are not tables of the comparison.
+
+    A chart of the page reads a table with one column per coordinate. Category axes need a column
+    ``place`` with the number of the category.
+
+    Args:
+        data: the data of the report.
+
+    Returns:
+        Tables by name; those without data are empty.
+    """
     table = data.tables["table"]
     alarms = table[table["metric"] == "false alarms"].set_index("diagnoser")["share"]
     named = table[(table["metric"] == PRIMARY_METRIC) & (table["of"] > 0)]
@@ -116,7 +126,13 @@ def _make_calibration(data: DiagnoserReportData) -> list[Panel]:
 
 
 def _make_sets(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of answers, and of correct ones, by the size of their largest set."""
+    """Make the chart of answers, and of correct ones, by the size of their largest set.
+
+    A set contains the effects that an answer cannot distinguish.
+
+    Args:
+        data: the data of the report.
+    """
     across = Axis("effects in the largest set of an answer", names=tuple(SET_SIZE_LABELS))
     correct = data.make_interval_series("share", beside=True)
     counts = tuple(replace(series, y="of", low="", high="") for series in correct)

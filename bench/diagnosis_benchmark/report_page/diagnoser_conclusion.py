@@ -37,7 +37,13 @@ class OwnFailures(NamedTuple):
 
 
 def count_own_failures(data: DiagnoserReportData) -> OwnFailures | None:
-    """Count the failures of simgap; None if it does not take part."""
+    """Count the incorrect graded answers of simgap itself, in total and by kind of case.
+
+    The report states these numbers, so that the failures of simgap itself are visible.
+
+    Returns:
+        The counts; None if simgap does not take part in the comparison.
+    """
     own = select_graded_answers(data.rows[data.rows["diagnoser"] == REFERENCE_DIAGNOSER])
     if own.empty:
         return None
@@ -74,7 +80,14 @@ class Leader(NamedTuple):
 
 
 def find_leader(data: DiagnoserReportData) -> Leader | None:
-    """Find the best diagnoser among those with few false alarms; None without clean recordings."""
+    """Find the best diagnoser among those with few false alarms.
+
+    The best one has the highest primary metric. Diagnosers with more than `TARGET_FALSE_ALARM_RATE`
+    false alarms cannot lead, because a diagnoser that always alarms finds every cause.
+
+    Returns:
+        The best diagnoser; None if there are no clean cases.
+    """
     table = data.tables["table"]
     alarms = index_by_diagnoser(table, "false alarms")
     named = index_by_diagnoser(table, PRIMARY_METRIC)

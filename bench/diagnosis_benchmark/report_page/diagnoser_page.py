@@ -18,7 +18,13 @@ _DIGITS = 6
 
 
 def render_page(shown: DiagnoserReportData) -> str:
-    """Render the HTML report of a comparison of diagnosers."""
+    """Render the HTML report of a comparison of diagnosers.
+
+    The tables are embedded in the page for its charts; the numbers of the text are computed here.
+
+    Args:
+        shown: the data of the report.
+    """
     page = HtmlPage()
     failures = build_failure_table(shown.rows, shown.order)
     tables = {**shown.tables, "failures": failures, "items": shown.rows}
