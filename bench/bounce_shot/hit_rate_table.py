@@ -68,6 +68,16 @@ def build_result_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
+    """Compute one line of the results table, in the order of `RESULT_COLUMNS`.
+
+    A shot that never meets the plane of the hoop counts as infinitely far off. Quantiles are
+    therefore not interpolated: they are the next higher value.
+
+    Args:
+        method: label of the method.
+        ball: kind of ball, or `ALL_BALLS`.
+        part: rows of shots.csv of this method and ball.
+    """
     shots, hits = len(part), int(part["hit"].sum())
     miss_distances = part["off"].abs().fillna(math.inf)
     errors = part["prediction_error"]

@@ -54,6 +54,13 @@ class _Moving(NamedTuple):
     ball: Any
 
     def show(self, sample: int) -> None:
+        """Draw the flown path up to a sample, with the ball at its end.
+
+        The ball stops at the last sample of the path.
+
+        Args:
+            sample: index of the sample.
+        """
         now = min(sample, self.end - 1)
         self.line.set_data(self.path[: now + 1, 0], self.path[: now + 1, 2])
         self.ball.set_data(self.path[now : now + 1, 0], self.path[now : now + 1, 2])
@@ -67,6 +74,12 @@ class _Filmed(NamedTuple):
     ring: Any
 
     def show(self, picture: RgbImage, track: Array) -> None:
+        """Draw a frame of the film with its track, and a ring around the last tracked centre.
+
+        Args:
+            picture: frame of the film.
+            track: ball centres tracked until then, pixels, (n, 2).
+        """
         self.picture.set_data(picture)
         self.track.set_data(*track.T)
         self.ring.set_data(*track[-1:].T)
@@ -112,6 +125,14 @@ def write_animation(
     shots = int(np.ceil(max(panel.end for panel in moving) / step)) + 1
 
     def show(frame: int) -> list[Any]:
+        """Draw one frame of the animation: first the film, then the shots in slow motion.
+
+        Args:
+            frame: number of the frame.
+
+        Returns:
+            An empty list, which matplotlib expects if whole figures are drawn.
+        """
         later = frame - len(film.pictures)
         if filmed is not None and later < 0:
             filmed.show(film.pictures[frame], film.tracks[frame])
@@ -141,6 +162,15 @@ def _shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> 
 
 
 def _film_panel(axis: Any, film: FilmFrames) -> _Filmed:
+    """Draw the panel of the film in its initial state: first frame, no track.
+
+    Args:
+        axis: axes to draw on.
+        film: film of the drop.
+
+    Returns:
+        The panel, whose parts change from frame to frame.
+    """
     picture = axis.imshow(film.pictures[0])
     (track,) = axis.plot([], [], color=BLUE, linewidth=0.7)
     look = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": VERMILION}
@@ -151,7 +181,14 @@ def _film_panel(axis: Any, film: FilmFrames) -> _Filmed:
 
 
 def _film(path: Path) -> FilmFrames:
-    """Read the film of a drop and its track; the result is empty if there is no film."""
+    """Read the film of a drop and its track, resampled to the frame rate of the animation.
+
+    Args:
+        path: film; the recording is next to it.
+
+    Returns:
+        Frames and tracks; empty if there is no film, because the study recorded heights instead.
+    """
     try:
         frames = list(VideoFile(path))
         run = read_recording(path.with_suffix(".csv"), Ball, whole=True).runs[0]

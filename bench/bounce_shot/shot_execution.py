@@ -94,7 +94,15 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
 def _through(path: Array, height: float) -> int:
     """Return the index of the sample after which a path descends through a height after its bounce.
 
-    If it does not, return the last index.
+    The height is that of the hoop. The path before the bounce is ignored, because the ball falls
+    through the same height after its release.
+
+    Args:
+        path: positions, (T, 3).
+        height: height, m.
+
+    Returns:
+        Index of the sample; the last index if the path does not descend through the height.
     """
     z = path[:, 2]
     # Before its bounce, the ball falls through the same heights.
@@ -120,6 +128,17 @@ def build_shot_rows(
 
 
 def _row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> dict[str, Any]:
+    """Build the row of shots.csv for one method and shot.
+
+    Lengths are in m. ``off`` is the miss distance, ``margin`` the distance inside the rim of the
+    hoop, and ``planned_margin`` the one that the model predicted. Of a traceback only the last line
+    is kept as ``reason``.
+
+    Args:
+        setup: the shot.
+        model: tuned model with the plan.
+        result: result of the executed shot.
+    """
     effects: Mapping[str, Any] = model.effects
     return {
         "shot": setup.name,

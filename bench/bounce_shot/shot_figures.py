@@ -118,6 +118,7 @@ def draw_success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
 
 
 def _methods_down(axis: Axes, methods: Sequence[str]) -> None:
+    """Label the vertical axis with the methods, the first one at the top."""
     axis.set_yticks(range(len(methods)), [get_method_label(m) for m in methods])
     axis.invert_yaxis()
 
@@ -177,6 +178,14 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
 
 
 def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
+    """Draw a horizontal box plot of one method: quartiles, median, and whiskers at 5 % and 95 %.
+
+    Args:
+        axis: axes to draw on.
+        values: miss distances or prediction errors, cm, (n,); without values nothing is drawn.
+        place: vertical position, the number of the method.
+        colour: colour of the group of the method.
+    """
     if not values.size:
         return
     axis.boxplot(
@@ -250,7 +259,7 @@ class ExampleShot(NamedTuple):
 def execute_example(
     settings: ShotConfig, setup: ShotSetup, methods: Sequence[str], stored: Mapping[str, Any]
 ) -> ExampleShot:
-    """Execute one shot again with each of some methods.
+    """Execute one shot again with each of some methods, because stored results contain no paths.
 
     Args:
         settings: the [shot] table.
@@ -327,6 +336,8 @@ def draw_shot_panel(axis: Axes, setup: ShotSetup, method: str, shot: ExampleShot
 
 def find_path_end(path: Array, scene: ShotGeometry) -> int:
     """Return the index of the sample at which a path is below the hoop after its bounce.
+
+    The path is drawn up to this sample, 0.12 m below the hoop: how it continues is not of interest.
 
     Args:
         path: positions, (T, 3).

@@ -29,6 +29,11 @@ class ShotGeometry:
     hoop_radius: float
 
     def __post_init__(self) -> None:
+        """Check that the incline descends, and that the hoop is in front of it and above it.
+
+        Raises:
+            InputError: the scene is impossible.
+        """
         if not (0 < self.angle < math.pi / 2 and self.hoop_x > 0 and self.hoop_radius > 0):
             raise InputError(
                 "expected an incline between 0 and a right angle and a hoop in front of it,"

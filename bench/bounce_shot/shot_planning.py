@@ -135,6 +135,7 @@ def tune_and_plan(
 
 
 def _nominal() -> float:
+    """Return the nominal restitution of the ball simulator, which an untuned model has."""
     return BallSimulator.system.parameters[0].nominal
 
 
@@ -146,7 +147,20 @@ def _tuned(
     recording: Recording,
     effects: EffectCoefficients,
 ) -> TunedModel:
-    """Run a tuner in the simulator with given effects."""
+    """Run a tuner on the recorded drop, in the simulator with given effects.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        entry: the tuner.
+        inputs: input of the methods.
+        recording: recording of the ball's drop.
+        effects: coefficients of the effects that explain found; empty for the original simulator.
+
+    Returns:
+        The tuned model without a plan; with the status "crashed" if the experiment or recording
+        cannot be used.
+    """
     label, radius = entry.label, _constants(recording)["radius"]
     experiment = make_tuning_experiment(experiment, settings, entry)
     if effects:
@@ -225,7 +239,12 @@ def _constants(recording: Recording) -> dict[str, float]:
 
 
 def _explained(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
-    """Run explain on the recording.
+    """Run explain on the recording of the drop; its fit is a model of its own.
+
+    An error of explain does not stop the other methods: the model then has the status "crashed".
+
+    Args:
+        recording: CSV file of the recording.
 
     Returns:
         Its model, with the effects that act on the shot, and all effects that it found.
@@ -330,6 +349,17 @@ def plan_shot_in_model(
 def _planned(
     model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
 ) -> TunedModel:
+    """Plan a shot in a tuned model, and store the planned drop height and distance to the rim.
+
+    A method that crashed has no model and gets no plan. A finished method whose model reaches the
+    hoop from no height gets the status "no plan".
+
+    Args:
+        model: the tuned model.
+        settings: the [shot] table.
+        scene: incline and hoop.
+        radius: radius of the ball, m.
+    """
     if model.status == "crashed":
         return model
     plan = plan_shot_in_model(model, settings, scene, radius)

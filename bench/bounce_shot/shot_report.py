@@ -125,6 +125,13 @@ def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
 def _say_faults(
     failed: pd.DataFrame, skipped: Mapping[str, str], say: Callable[[str], None]
 ) -> None:
+    """Print why tuners were skipped, and each failure of a method with its count and one reason.
+
+    Args:
+        failed: rows of shots.csv whose method failed or found no plan.
+        skipped: reasons why tuners cannot be used here, by label.
+        say: prints a line.
+    """
     for label, reason in skipped.items():
         say(f"skipped {label}: {reason}")
     for (method, status), part in failed.groupby(["method", "status"]):

@@ -164,6 +164,14 @@ class BounceShotStudy:
         return self._made()
 
     def _made(self, **why: Any) -> StudyOutcome:
+        """Return the outcome of a run of the study; reveal its salt if no shot is missing.
+
+        A secret salt stays hidden as long as shots are missing, because it determines the balls.
+
+        Args:
+            **why: reason for which the run ended early (``interrupted``, ``stopped`` or
+                ``skipped``); empty if it did not.
+        """
         left = list_missing_shots(self.folder, self.shots)
         if not left and not why:
             experiment = self.configuration.experiment
@@ -209,11 +217,23 @@ class BounceShotStudy:
 
 
 class _ShotStages:
-    """Execution of the missing shots, in several stages."""
+    """Execution of the missing shots in stages: record drops, train tuners, tune, plan and shoot.
+
+    Args:
+        study: the study.
+        left: the missing shots.
+        progress: makes progress callbacks.
+    """
 
     def __init__(
         self, study: BounceShotStudy, left: list[ShotSetup], progress: ProgressFactory
     ) -> None:
+        """Collect the isolated tuners, the hidden folders, and the paths of the recordings.
+
+        Tuners that are trusted run in the worker processes and need no specification. The hidden
+        folders, which isolated tuners must not read, are the result folder and the cache of trained
+        weights.
+        """
         self._study, self._left, self._progress = study, left, progress
         self._experiment, self._settings = study.experiment, study.config
         self._tuned: dict[str, TunerSpec] = {}
@@ -297,7 +317,13 @@ class _ShotStages:
     def _shoot(
         self, workers: Pool, faults: dict[int, BaseException], weights: dict[str, Path]
     ) -> None:
-        """Tune and plan with every method, and execute the shots."""
+        """Tune and plan with every method, and execute and store the shots.
+
+        Args:
+            workers: pool of worker processes.
+            faults: errors of drops that could not be recorded, by index of the shot.
+            weights: files of trained weights, by label of the tuner.
+        """
         recorded = [index for index in range(len(self._left)) if index not in faults]
         calls: list[Call] = []
         for index in recorded:
@@ -319,6 +345,7 @@ class _ShotStages:
             step()
 
     def _keep(self, index: int, models: list[dict[str, Any]], visible_share: float) -> None:
+        """Execute a shot in the true world with every model, and store the result."""
         store_shot(self._study.folder, self._left[index], self._settings, models, visible_share)
 
 
@@ -327,7 +354,12 @@ def _failed(
 ) -> list[dict[str, Any]]:
     """Make failed models for a shot without a recording, or whose worker died or was too slow.
 
-    None of them has a plan.
+    None of them has a plan, so that the shot counts as a miss of every method.
+
+    Args:
+        experiment: the experiment with its tuners.
+        error: the error of the recording or of the worker.
+        status: status of the models, unless the error is a timeout.
     """
     if isinstance(error, TimeoutError):
         status = "timeout"

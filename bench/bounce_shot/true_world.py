@@ -98,7 +98,20 @@ def simulate_shot(
 
 
 class _Flight:
+    """Simulation of one ball by MuJoCo, with drag, lift and friction of this module.
+
+    Args:
+        ball: properties of the ball.
+        ground: inclined plane.
+        air: density of the air, kg/m^3.
+    """
+
     def __init__(self, ball: BallKind, ground: InclinedGround, air: float) -> None:
+        """Build the MuJoCo model, and compute the factors of drag (1) and lift (2).
+
+        `_normal` is the x and z part of the unit vector normal to the ground, and `_touches` tells
+        whether the ball is in contact.
+        """
         import mujoco
 
         self._ball = ball
@@ -117,6 +130,12 @@ class _Flight:
         return x * self._normal[0] + z * self._normal[1] - self._ball.radius
 
     def run(self, start: tuple[float, float, float], times: Array) -> Array:
+        """Simulate from rest at a position, and return the centres at the sample times, (T, 3).
+
+        Args:
+            start: initial position of the centre, m.
+            times: sample times, increasing from 0, s, (T,).
+        """
         data = self._data
         last = float(times[-1])
         data.qpos[:3] = start
@@ -146,7 +165,11 @@ class _Flight:
         self._step(self._model, data)
 
     def _prepare(self, speed: float) -> None:
-        """Set the contact damping for an impact at this speed."""
+        """Set the contact damping that gives the ball's restitution, for an impact at this speed.
+
+        Args:
+            speed: speed normal to the ground at the begin of the impact, m/s.
+        """
         self._touches = True
         # Rounded, so that almost equal impacts share the cached result.
         restitution = round(self._ball.compute_restitution(speed), 9)
@@ -156,7 +179,11 @@ class _Flight:
         self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency
 
     def _push(self, velocity: list[float]) -> None:
-        """Apply drag, lift and friction as force and torque of the next step."""
+        """Apply drag (1), lift (2) and friction (5) as force and torque of the next step.
+
+        Args:
+            velocity: velocity of the centre in m/s, and angular velocity in rad/s, (6,).
+        """
         # The spin is in the ball's frame, which makes no difference for a spin about y.
         vx, vy, vz, wx, wy, wz = velocity
         # Forces are constant during the step, so they are evaluated at its midpoint.
@@ -176,7 +203,16 @@ class _Flight:
         self._data.xfrc_applied[1] = (*force, 0.0, torque, 0.0)
 
     def _rub(self, vx: float, vz: float, spin: float) -> float:
-        """Return the Coulomb friction down the slope, N; it does not reverse the slip in a step."""
+        """Return the Coulomb friction (5) on the ball, N, positive down the slope.
+
+        It is limited to the force that stops the slip within the step, so that it does not reverse
+        it.
+
+        Args:
+            vx: velocity along x, m/s.
+            vz: upward velocity, m/s.
+            spin: angular velocity about y, rad/s.
+        """
         slip = vx * self._normal[1] - vz * self._normal[0] - spin * self._ball.radius
         k = self._ball.inertia_ratio
         stops = self._ball.mass * k / (1.0 + k) * abs(slip) / self._model.opt.timestep
@@ -185,6 +221,15 @@ class _Flight:
 
 
 def _mjcf(ball: BallKind, ground: InclinedGround) -> str:
+    """Render the MuJoCo model: an inclined plane, and a free sphere above it.
+
+    Contacts are frictionless (``condim`` 1), because `_Flight` applies the friction. The moments of
+    inertia are equal about all axes.
+
+    Args:
+        ball: properties of the ball.
+        ground: inclined plane.
+    """
     inertia = ball.inertia_ratio * ball.mass * ball.radius**2
     moments = f"{inertia!r} {inertia!r} {inertia!r}"
     return f"""
