@@ -95,7 +95,10 @@ class DataSet:
         return f"needs the data set {self.name} ({self.size}, {self.licence}): run `{self.command}`"
 
     def folder(self) -> Path | None:
-        """Return the folder of the data set on this machine, or None if it is not there."""
+        """Return the folder of the data set on this machine, or None if it is not there.
+
+        A folder counts only if it contains all files that commands read (`provides`).
+        """
         for parent in search_folders(self.kind):
             if all((parent / self.name / file).is_file() for file in self.provides):
                 return parent / self.name
@@ -171,11 +174,18 @@ def providing(kind: str, path: str) -> DataSet | None:
 
 @cache
 def _catalogue() -> dict[str, DataSet]:
+    """Read datasets.toml, and return its data sets by name."""
     text = resources.files(__package__).joinpath("datasets.toml").read_text(encoding="utf-8")
     return {name: _data_set(name, table) for name, table in tomllib.loads(text).items()}
 
 
 def _data_set(name: str, table: dict[str, object]) -> DataSet:
+    """Make a data set from its table in datasets.toml.
+
+    Args:
+        name: name of the table and of the data set.
+        table: keys and values; those of `DataSet`, with ``files`` as a list of tables.
+    """
     given: dict[str, object] = dict(table)
     files = given.pop("files")
     provides = given.pop("provides")

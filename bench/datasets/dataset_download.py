@@ -69,7 +69,20 @@ def download(
 def _fetched(
     data_set: DataSet, file: SourceFile, source: str, advance: Advance
 ) -> tuple[str, bytes]:
-    """Fetch a file, and return its source and content."""
+    """Fetch a file from the folder or address that the user gave, or from the public repository.
+
+    Args:
+        data_set: the data set.
+        file: the file.
+        source: folder, or http or https address; empty for the public repository.
+        advance: called with the number of bytes received.
+
+    Returns:
+        Path or address of the file, for messages, and its content, which is not checked yet.
+
+    Raises:
+        InputError: the source is of another form, or the file cannot be read.
+    """
     if source and "://" not in source:
         return _read(data_set, file, Path(source), advance)
     if source and not source.startswith(("http://", "https://")):
@@ -79,7 +92,22 @@ def _fetched(
 
 
 def _read(data_set: DataSet, file: SourceFile, folder: Path, advance: Advance) -> tuple[str, bytes]:
-    """Read a file from a folder that contains a clone, or the files without subfolders."""
+    """Read a file from a folder that contains a clone, or the files without subfolders.
+
+    At most one byte more than expected is read: enough to see that the file is too long.
+
+    Args:
+        data_set: the data set.
+        file: the file.
+        folder: the folder that the user gave.
+        advance: called with the number of bytes read.
+
+    Returns:
+        Path and content of the file.
+
+    Raises:
+        InputError: the file is not there, or cannot be read.
+    """
     if not folder.is_dir():
         raise InputError(f"--from {folder}: no such folder")
     for path in (folder / file.path, folder / Path(file.path).name, folder / file.name):
@@ -96,7 +124,19 @@ def _read(data_set: DataSet, file: SourceFile, folder: Path, advance: Advance) -
 
 
 def _received(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -> bytes:
-    """Download the content of an address; one byte more than expected if it is longer."""
+    """Download the content of an address, in blocks.
+
+    At most one byte more than expected is received: enough to see that the file is too long.
+
+    Args:
+        url: address of the file.
+        data_set: the data set, for the advice in messages.
+        file: the file.
+        advance: called with the number of bytes received.
+
+    Raises:
+        InputError: the file cannot be downloaded.
+    """
     remedy = f"get it elsewhere and give its folder with `{data_set.command} --from FOLDER`"
     request = urllib.request.Request(url, headers={"User-Agent": f"simgap/{__version__}"})
     content = b""
@@ -118,7 +158,12 @@ def _received(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -
 
 
 def _checked(file: SourceFile, where: str, content: bytes) -> bytes:
-    """Return the content if it is the published one.
+    """Return the content of a file if it is the published one.
+
+    Args:
+        file: the file with its published size and SHA-256.
+        where: path or address from which it was fetched, for messages.
+        content: its content.
 
     Raises:
         InputError: size or SHA-256 differ.
@@ -154,6 +199,15 @@ def _provenance(data_set: DataSet) -> str:
 
 
 def _write(target: Path, contents: dict[str, Content]) -> None:
+    """Write the folder of a data set as a whole, or not at all.
+
+    Args:
+        target: folder of the data set, which must be empty or missing.
+        contents: files by name; text is written as UTF-8.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
     try:
         with atomic_new_folder(target) as partial:
             for name, content in contents.items():

@@ -34,7 +34,10 @@ MODEL_LABELS = (PLAIN, EXTENDED)
 
 
 def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -> Array:
-    """Write the calibration recording.
+    """Write the calibration recording, from which explain extends the simulator.
+
+    It contains runs of the true system. The true parameters are drawn uniformly from the training
+    ranges. The first runs are for fitting, the last ones are held out.
 
     Args:
         experiment: the experiment.
@@ -91,6 +94,15 @@ def write_calibration_recording(experiment: Experiment, salt: str, path: Path) -
 def _run(
     problem: TuningProblem, number: int, scene: Scenario, observed: Array, held_out: bool
 ) -> Run:
+    """Make one run of the calibration recording.
+
+    Args:
+        problem: the tuning problem, for the names of the channels.
+        number: index of the run; runs are named from 1.
+        scene: initial state, inputs and constants of the run.
+        observed: noisy observations, (T, C).
+        held_out: whether the run is held out from the fit.
+    """
     names = [channel.name for channel in problem.channels]
     channels = dict(zip(names, np.ascontiguousarray(observed.T), strict=True))
     return Run(str(number + 1), scene.times, channels, scene.inputs, scene.constants, {}, held_out)
@@ -140,7 +152,7 @@ def list_coefficients(extended: ExtendedSimulator, kind: type[Simulator]) -> dic
 
 
 def make_base_experiment(experiment: Experiment) -> Experiment:
-    """Make the experiment in the original simulator."""
+    """Make the experiment in the original simulator, which lacks the hidden effects."""
     return _part(experiment, PLAIN, experiment.settings)
 
 
@@ -163,6 +175,13 @@ def make_extended_experiment(experiment: Experiment, effects: dict[str, list[flo
 
 
 def _part(experiment: Experiment, model: str, settings: Mapping[str, Any]) -> Experiment:
+    """Make the experiment of one of the two comparisons: the same targets in another simulator.
+
+    Args:
+        experiment: the experiment of the study.
+        model: `PLAIN` or `EXTENDED`, which is added to name and title.
+        settings: settings of the simulator, such as its fixed effects.
+    """
     return replace(
         experiment,
         name=f"{experiment.name}-{model}",

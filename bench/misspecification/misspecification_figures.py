@@ -147,6 +147,14 @@ def draw_rank_slope_figure(
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    """Make a grid of panels, at most three in a row, one per study.
+
+    Args:
+        count: number of studies.
+
+    Returns:
+        The figure and its panels; surplus panels of the last row are empty.
+    """
     columns = min(count, _COLUMNS)
     rows = -(-count // columns)
     figure, axes = make_panel_grid(rows, columns, (1.6 + 3.4 * columns, 1.3 + 2.9 * rows))
@@ -159,7 +167,13 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def _compared(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
-    """Draw one row per tuner with both simulators and their intervals."""
+    """Draw one row per tuner with its mean and 95 % interval in both simulators.
+
+    Args:
+        panel: axes to draw on.
+        study: the study, which determines the order of the tuners.
+        lines: rows of the score table for one metric and study.
+    """
     tuners = study.tuners()
     for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
         part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
@@ -195,6 +209,16 @@ def _most_biased(lines: pd.DataFrame) -> str:
 
 
 def _slope(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
+    """Draw a line for each tuner between its mean ranks in the original and extended simulator.
+
+    Crossing lines are tuners whose order changes. Colours are given by rank in the original
+    simulator.
+
+    Args:
+        panel: axes to draw on.
+        study: the study, which determines the styles of the tuners.
+        ranks: rows of the rank table for one metric and study.
+    """
     style_axis(panel)
     style = TunerStyles(study.experiment, list(ranks.sort_values("plain", kind="stable")["tuner"]))
     for tuner, before, after in zip(ranks["tuner"], ranks["plain"], ranks["extended"], strict=True):
@@ -204,17 +228,27 @@ def _slope(panel: Axes, study: StudyResult, ranks: pd.DataFrame) -> None:
 
 
 def _lacks(study: StudyResult) -> str:
+    """Format which effects the original simulator lacks, and the number of targets."""
     names = list(study.experiment.world.get("fixed", {}))
     return f"lacks {', '.join(names) or 'nothing'}; {len(study.targets())} targets"
 
 
 def _targets(systems: Sequence[StudyResult]) -> str:
+    """Format the number of targets of all studies, as one number or a range."""
     counts = sorted({len(study.targets()) for study in systems})
     many = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
     return f"{many} targets"
 
 
 def _finished(figure: Figure, panel: Axes, heading: str, caption: str) -> Figure:
+    """Add legend, heading and caption to a figure, and return it.
+
+    Args:
+        figure: the figure.
+        panel: a panel whose legend entries serve for all panels.
+        heading: title of the figure.
+        caption: text below the figure.
+    """
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8, frameon=False)
     figure.suptitle(heading, fontsize=11, x=0.01, ha="left")

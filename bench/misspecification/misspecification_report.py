@@ -111,7 +111,14 @@ def _written(
     say: PrintLine,
     is_joint: bool,
 ) -> None:
-    """Write tables and figures of one study, or of all together, and print a summary."""
+    """Write tables and figures of one study, or of all together, and print a summary.
+
+    Args:
+        folder: folder to write to.
+        outcomes: scores of each study.
+        say: prints a line.
+        is_joint: whether several studies are reported together.
+    """
     experiment: Experiment = outcomes[0].experiment
     frames = {
         "table": pd.concat([misspecification_scores.build_score_table(one) for one in outcomes]),
@@ -144,6 +151,17 @@ def _said(
     frames: dict[str, pd.DataFrame],
     is_joint: bool,
 ) -> list[str]:
+    """List the texts of the printed summary.
+
+    For each study they are the hidden effects with the verdict of explain, the errors of the
+    tuners, and the rank agreement. For several studies the mean ranks over them follow.
+
+    Args:
+        folder: result folder of the study, or the folder that contains the studies.
+        outcomes: scores of each study.
+        frames: tables by name: ``table``, ``ranks`` and ``ranking``.
+        is_joint: whether several studies are reported together.
+    """
     texts = []
     for scores in outcomes:
         study_folder = folder / scores.experiment.name if is_joint else folder
@@ -190,6 +208,14 @@ def _table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> 
 
 
 def _tau(row: pd.Series) -> str:
+    """Format how well the rankings of the tuners in both simulators agree, by one metric.
+
+    Kendall's tau is 1 for equal rankings and -1 for reversed ones. The agreement between two halves
+    of the targets shows how much a ranking varies by chance.
+
+    Args:
+        row: row of the table of rank agreement.
+    """
     what = "parameters" if row["metric"] == misspecification_scores.PARAMETERS else "prediction"
     return (
         f"ranking by {what}: Kendall's tau {row['tau']:.2f} ({row['low']:.2f} to {row['high']:.2f})"
@@ -199,7 +225,12 @@ def _tau(row: pd.Series) -> str:
 
 
 def _together(ranked: pd.DataFrame, metric: str) -> str:
-    """Format the mean ranks over several systems."""
+    """Format the mean ranks over several systems, with tests of Friedman and Nemenyi.
+
+    Args:
+        ranked: rows of the rank tables of all studies.
+        metric: one of `misspecification_scores.RANKED_METRICS`.
+    """
     joint = misspecification_scores.compute_joint_ranks(ranked, metric)
     means = pd.DataFrame({model: joint.ranked[model].mean() for model in MODEL_LABELS})
     means = means.sort_values(EXTENDED).rename_axis(index=None)

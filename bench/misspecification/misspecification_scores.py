@@ -144,7 +144,11 @@ def load_scores(folder: Path, experiment: Experiment) -> StudyScores:
 def _whole(errors: pd.DataFrame) -> pd.DataFrame:
     """Select the targets that every tuner finished in both simulators with all of its seeds.
 
-    In an interrupted study, other targets would compare different sets of targets.
+    In an interrupted study, other targets would compare different sets of targets. A tuner that was
+    skipped in one simulator is left out of both.
+
+    Args:
+        errors: rows of `StudyScores.errors` of both simulators.
     """
     seed_counts = errors.groupby(["model", "tuner"])["runs"].transform("max")
     # A tuner that was skipped in one simulator is excluded from both.
@@ -156,7 +160,17 @@ def _whole(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Array) -> pd.DataFrame:
-    """Build the rows of `StudyScores.errors` for one of the comparisons."""
+    """Build the rows of `StudyScores.errors` for one of the comparisons.
+
+    The errors are those of the last recommendation of each run. They are averaged over the seeds of
+    a target; a target with a failed seed has no errors.
+
+    Args:
+        folder: result folder of the comparison.
+        model: `PLAIN` or `EXTENDED`.
+        parameters: the tuned parameters.
+        widths: width of the training range of each parameter, (p,).
+    """
     stored = read_comparison(folder)
     rows = RunRowTable(stored.runs, stored.statuses, stored.experiment.budget)
     frame = rows.keys[["tuner", "target"]].copy()
@@ -245,7 +259,17 @@ def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
 
 
 def _friedman(errors: Array) -> float:
-    """Compute the p-value of Friedman's test over targets; NaN if there are too few."""
+    """Compute the p-value of Friedman's test that all tuners perform equally, over targets.
+
+    A tuner that failed on a target has the worst rank there. Errors are compared as rounded
+    logarithms, so that rounding errors do not break ties.
+
+    Args:
+        errors: errors, (targets, tuners); NaN for a failed run.
+
+    Returns:
+        The p-value; NaN with too few targets or fewer than three tuners.
+    """
     from scipy.stats import friedmanchisquare
 
     targets, tuners = errors.shape
@@ -275,7 +299,10 @@ class JointRanks:
 
 
 def compute_joint_ranks(ranked: pd.DataFrame, metric: str) -> JointRanks:
-    """Compute the ranks over systems.
+    """Compute the ranks of the tuners over several systems, each of which counts once.
+
+    The differences between tuners are tested by Friedman's test over the systems, followed by
+    Nemenyi's test of each pair.
 
     Args:
         ranked: rows of `build_rank_table` of several systems.

@@ -164,11 +164,19 @@ class MisspecificationStudy:
         step()
 
     def _salt(self) -> str:
+        """Return the salt of the calibration recording: the secret one, or else the public one."""
         experiment = self.configuration.experiment
         return read_salt(self.folder, experiment) or experiment.salt
 
     def _comparison(self, model: str, jobs: int) -> Comparison:
-        """Create or resume the comparison in one of the simulators."""
+        """Create or resume the comparison in one of the simulators.
+
+        Its tuners must read neither its own folder nor the rest of the study.
+
+        Args:
+            model: `PLAIN` or `EXTENDED`.
+            jobs: number of worker processes.
+        """
         folder, experiment = self.folder / model, self.configuration.experiment
         if (folder / CONFIGURATION_FILE).is_file():
             comparison = Comparison.resume(folder, self.plugins)
@@ -189,7 +197,11 @@ class MisspecificationStudy:
     def get_experiment(self, model: str) -> Experiment:
         """Return the experiment of the comparison in one of the simulators.
 
-        The extended simulator must exist for its experiment.
+        That of the extended simulator contains the coefficients that explain fitted, so
+        `EXTENDED_MODEL_FILE` must exist.
+
+        Args:
+            model: `PLAIN` or `EXTENDED`.
         """
         from bench.benchmark.problem.model_file_simulator import get_simulator_class
 
