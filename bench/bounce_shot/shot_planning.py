@@ -214,7 +214,12 @@ def make_tuning_experiment(
 def _side(recording: Recording, experiment: Experiment) -> ObservedRuns:
     """Convert the recorded run to fitting data of the experiment's simulator.
 
-    The ball is released at rest at time 0, even if it is first seen later.
+    The ball is released at rest at time 0, even if it is first seen later. Heights are shifted to
+    the radius of the experiment, because one trained network serves balls of all sizes.
+
+    Args:
+        recording: recording of the ball's drop.
+        experiment: the experiment.
     """
     (run,) = recording.runs
     scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)

@@ -139,7 +139,14 @@ def _say_faults(
 
 
 def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
-    """Build the rows of status.csv: one per method and shot, and one per tuner that was skipped."""
+    """Build the rows of status.csv: one per method and shot, and one per tuner that was skipped.
+
+    The columns are those of all comparisons; the seed is always 0, because a shot is planned once.
+
+    Args:
+        rows: rows of shots.csv.
+        skipped: reasons why tuners cannot be used here, by label.
+    """
     statuses = pd.DataFrame(
         {
             "run": rows["method"] + "/" + rows["shot"],

@@ -144,7 +144,15 @@ def _check(document: dict[str, Any], name: str, columns: Columns) -> None:
 
 
 def _check_effects(row: int, effects: Any) -> None:
-    """Validate the coefficients of a model's effects."""
+    """Validate the coefficients of a model's effects.
+
+    Args:
+        row: index of the model, for the message.
+        effects: coefficients by name of the effect, as read from JSON.
+
+    Raises:
+        CellError: a coefficient is not a number.
+    """
     coefficient = ColumnSpec("effects", float)
     for values in effects.values():
         try:
@@ -155,7 +163,7 @@ def _check_effects(row: int, effects: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value for JSON: numbers that are not finite become null."""
+    """Convert a value for JSON: numbers that are not finite become null, tuples become lists."""
     if isinstance(value, dict):
         return {key: _plain(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

@@ -69,6 +69,7 @@ class BounceShotStudy:
     """
 
     def __init__(self, folder: Path) -> None:
+        """Read the stored configuration of the study."""
         self.folder = folder
         self.configuration = read_configuration(folder)
         self.plugins = self.configuration.plugins

@@ -146,7 +146,11 @@ class _Flight:
         return _sampled(np.array(rows), times)
 
     def _advance(self) -> None:
-        """Make one step, a short one if the ball touches the ground or soon will."""
+        """Make one step, a short one if the ball touches the ground or soon will.
+
+        At the begin of an impact the contact damping is set; it stays until the ball has left the
+        ground.
+        """
         data = self._data
         position = data.qpos[:3].tolist()
         velocity = data.qvel.tolist()

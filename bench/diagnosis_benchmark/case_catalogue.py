@@ -109,7 +109,13 @@ def list_coefficient_names(system: str, name: str) -> list[str]:
 
 
 def render_recording(item: BenchmarkCase) -> RecordingFiles:
-    """Render the recording of a case as texts."""
+    """Render the recording of a case as texts, for the process of a diagnoser.
+
+    The process receives these texts and no path, so that it cannot find other files of the case.
+
+    Args:
+        item: the case; its truth is not among the texts.
+    """
     with tempfile.TemporaryDirectory() as folder:
         if item.system in machines.MACHINE_NAMES:
             path = machines.write_case(item, Path(folder))

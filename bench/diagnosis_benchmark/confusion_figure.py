@@ -94,7 +94,15 @@ def _answers(rows: pd.DataFrame) -> list[str]:
 
 
 def _answer(row: dict[Any, Any], is_right: bool) -> str:
-    """Return the family that an answer names, or the label of an answer without a family."""
+    """Return the family that an answer names, or the label of an answer without a family.
+
+    An answer that is correct because its small set contains the cause counts as the hidden family,
+    otherwise the leading name counts.
+
+    Args:
+        row: row of the answer.
+        is_right: whether the answer is correct.
+    """
     if row["status"] != "done":
         return "no answer"
     if row["verdict"] == "adequate":
@@ -110,7 +118,13 @@ def _answer(row: dict[Any, Any], is_right: bool) -> str:
 
 
 def _panel(axis: Axes, counts: pd.DataFrame, name: str) -> None:
-    """Draw the confusion matrix of one diagnoser."""
+    """Draw the confusion matrix of one diagnoser in per cent; frames mark correct answers.
+
+    Args:
+        axis: axes to draw on.
+        counts: number of answers, hidden families in rows and named families in columns.
+        name: name of the diagnoser.
+    """
     from matplotlib.patches import Rectangle
 
     totals = counts.sum(axis=1).to_numpy()

@@ -214,7 +214,11 @@ class DiagnosisStudy:
         return read_answers(self.folder)
 
     def status(self) -> StudyProgress:
-        """Return which answers are stored and which are missing."""
+        """Return which answers are stored and which are missing, one entry per case and diagnoser.
+
+        Cases whose hidden cause the sensors cannot show count as done, because nothing is asked
+        then.
+        """
         held = self.answers
         ends = []
         for question in self.cases:
@@ -420,7 +424,11 @@ def _lost(question: CaseSpec, labels: Sequence[str], error: BaseException) -> di
 
 
 def make_diagnoser_spec(name: str) -> TunerSpec:
-    """Return the code location of a diagnoser and the modules to preload for it."""
+    """Return where the code of a diagnoser is, and the packages to preload for it.
+
+    Args:
+        name: registered name of the diagnoser, of simgap, a plugin file or an installed package.
+    """
     kind, place = diagnosers.get(name), diagnosers.place(name)
     module = getattr(kind, "module", "") or kind.__module__
     file = str(place) if place else ""

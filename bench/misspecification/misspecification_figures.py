@@ -199,7 +199,11 @@ def _compared(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
 def _most_biased(lines: pd.DataFrame) -> str:
     """Return the parameter with the largest bias in the simulator as it is.
 
-    The bias is that of the reference tuner, or of all tuners without it.
+    The bias is that of the reference tuner, least squares, or of all tuners if it did not take
+    part.
+
+    Args:
+        lines: rows of the score table of one study, with the metric "bias".
     """
     before = lines[lines["model"] == "plain"]
     reference = before[before["tuner"] == _REFERENCE]

@@ -194,7 +194,14 @@ def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Arr
 
 
 def build_score_table(scores: StudyScores) -> pd.DataFrame:
-    """Build the table of means with intervals; columns as in `SCORE_COLUMNS`."""
+    """Build the table of means over targets with 95 % bootstrap intervals.
+
+    Args:
+        scores: the scores of a study.
+
+    Returns:
+        One row per simulator, tuner, metric and parameter; columns as in `SCORE_COLUMNS`.
+    """
     lines = []
     for (model, tuner), part in scores.errors.groupby(["model", "tuner"], sort=False):
         metrics = [
@@ -237,7 +244,14 @@ def build_rank_table(scores: StudyScores) -> pd.DataFrame:
 
 
 def build_rank_agreement_table(scores: StudyScores) -> pd.DataFrame:
-    """Build the table of rank agreement between simulators; columns as `RANK_AGREEMENT_COLUMNS`."""
+    """Build the table of rank agreement between simulators; columns as `RANK_AGREEMENT_COLUMNS`.
+
+    The agreement is Kendall's tau between the mean ranks of the tuners, with an interval and the
+    p-value that the ranking does not change. Friedman's p-values tell whether tuners differ at all.
+
+    Args:
+        scores: the scores of a study.
+    """
     tuners, targets = scores.tuners(), scores.targets()
     lines = []
     for metric in RANKED_METRICS:

@@ -65,6 +65,7 @@ class MisspecificationStudy:
     """
 
     def __init__(self, folder: Path) -> None:
+        """Read the stored configuration of the study."""
         self.folder = folder
         self.configuration = read_configuration(folder)
         self.plugins = self.configuration.plugins
@@ -150,7 +151,14 @@ class MisspecificationStudy:
         return runs * experiment.targets * len(experiment.ranges)
 
     def _extend(self, jobs: int, progress: ProgressFactory) -> None:
-        """Record the true system and extend the simulator by explain, unless done already."""
+        """Record the true system and extend the simulator by explain, unless done already.
+
+        If `EXTENDED_MODEL_FILE` exists, this step was completed before an interruption.
+
+        Args:
+            jobs: number of worker processes.
+            progress: makes progress callbacks.
+        """
         if (self.folder / EXTENDED_MODEL_FILE).is_file():
             return
         experiment = self.configuration.experiment

@@ -218,6 +218,7 @@ def _fly(
     middle = 0.5 * (now + end)
 
     def rate(t: float, y: Array) -> tuple[float, ...]:
+        """Return the time derivatives of position and velocity; a resting ball does not sink."""
         ax, ay, az = air.compute_acceleration(t, y.tolist(), middle)
         return (y[3], y[4], y[5], ax, ay, max(az, 0.0) if resting else az)
 

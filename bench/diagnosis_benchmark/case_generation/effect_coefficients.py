@@ -141,7 +141,20 @@ def _wind(
 def _stribeck(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw Stribeck friction with a large static part, at speeds that often occur in the motion."""
+    """Draw Stribeck friction with a large static part, at speeds that often occur in the motion.
+
+    The friction at rest is 3 to 7 times the Coulomb friction, and the Stribeck speed is 0.15 to 0.5
+    of the median speed.
+
+    Args:
+        far: Coulomb friction at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to Coulomb friction, additional friction at rest, and Stribeck
+        speed.
+    """
     extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_speeds(setting)))
     speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
     return lambda s: (far * s, extra * far * s, speed)
@@ -192,7 +205,18 @@ def _quadratic(
 def _draw_position_friction(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw position-dependent friction whose period the motion passes one to four times."""
+    """Draw position-dependent friction whose period the motion passes one to four times.
+
+    The periodic part is half to almost all of the friction, with a random phase.
+
+    Args:
+        far: friction at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to constant part, sine and cosine amplitude, and period.
+    """
     travel = float(np.median(_ranges(setting)))
     low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
     period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
@@ -248,7 +272,17 @@ def _hysteresis(
 def _stop(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw an end stop within the travel, near its upper or lower end."""
+    """Draw an end stop near an end of the travel: 5 to 20 % of the samples are beyond it.
+
+    Args:
+        far: stiffness at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to stiffness (its sign is the side of the stop), place, and
+        damping.
+    """
     side, within = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
     place = float(
         np.quantile(

@@ -386,6 +386,14 @@ class BacklashReferenceLoad(ReferenceLoad):
     """Load behind backlash, with stiff damped flanks that never pull."""
 
     def __init__(self, inertia: float, weight: GravityForce, gap: float, share: float) -> None:
+        """Store the gap and the share of the load.
+
+        Args:
+            inertia: inertia of drive side and load together.
+            weight: gravity force of both together, as a function of position.
+            gap: whole width of the gap, m or rad.
+            share: fraction of inertia and weight that belongs to the load.
+        """
         super().__init__(inertia, weight, share)
         self.gap = gap
 
@@ -394,7 +402,13 @@ class BacklashReferenceLoad(ReferenceLoad):
         return x, v
 
     def compute_load_acceleration(self, x: float, v: float, y: float, w: float) -> float:
-        """Compute the acceleration of the load by the flank in contact; see `ReferenceLoad`."""
+        """Compute the acceleration of the load by the flank in contact; see `ReferenceLoad`.
+
+        The flank is a spring with a damper. With the excess d over half of the gap, the relative
+        velocity w in the direction of contact and k = 150 rad/s, the acceleration is
+
+            (1 - share) (k^2 d + 4 k w d / (d + gap / 100)), but never a pull.
+        """
         over = abs(x - y) - self.gap / 2
         if over <= 0:
             return 0.0
@@ -412,6 +426,14 @@ class DahlReferenceFriction:
     def __init__(
         self, inertia: float, weight: GravityForce, limit: float, deflection: float
     ) -> None:
+        """Store the friction limit, and the deflection over which friction builds up.
+
+        Args:
+            inertia: unused; the parameter exists for all hidden-state effects.
+            weight: unused.
+            limit: largest friction force.
+            deflection: distance, m or rad.
+        """
         self.most, self.deflection = limit, deflection
 
     def get_initial_state(self, x: float, v: float) -> tuple[float, float]:
@@ -429,7 +451,10 @@ class DahlReferenceFriction:
         return -self.most * strain
 
     def rates(self, x: float, v: float, _: float, strain: float) -> tuple[float, float]:
-        """Compute the time derivatives of the two states.
+        """Compute the time derivatives of the two states by Dahl's law.
+
+        The law is strain' = (sign v - strain) |v| / deflection. The first state is unused, because
+        every hidden-state effect has two.
 
         Args:
             x: position.
@@ -675,6 +700,7 @@ def _integrate_stuck(joint: JointDynamics, now: float, state: Array) -> SegmentR
         return [0.0, 0.0, *joint.compute_hidden_rates(*y)]
 
     def excess(t: float, y: Array) -> float:
+        """Return by how much the force exceeds the friction limit; zero is the break-away event."""
         return abs(joint.compute_force(t, *y)) - joint.compute_friction_limit(t, *y[:2]) * (
             1 + 1e-9
         )

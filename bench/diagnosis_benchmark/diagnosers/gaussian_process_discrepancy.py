@@ -33,7 +33,10 @@ class GaussianProcessDiscrepancy(Diagnoser):
     name = "gp"
 
     def diagnose(self, case: DiagnosisCase) -> Answer:
-        """Return "unknown" if the process predicts held-out runs better than zero does."""
+        """Return "unknown" if the process predicts held-out runs better than zero does.
+
+        Otherwise the verdict is "adequate": a residual that cannot be predicted is noise.
+        """
         evidence = RegressionEvidence(case)
         try:
             rows = evidence.build_acceleration_regression()

@@ -55,7 +55,14 @@ class LanguageModel(Diagnoser):
 
 
 def summarise_case(case: DiagnosisCase) -> dict[str, Any]:
-    """Summarise a recording and the residual of its fitted base model as a JSON document."""
+    """Summarise a recording and the residual of its fitted base model as a JSON document.
+
+    Series are thinned to at most `_MAX_SAMPLES` samples, and numbers rounded to four digits, so
+    that the prompt stays short.
+
+    Args:
+        case: the case.
+    """
     evidence = RegressionEvidence(case)
     try:
         names = list(evidence.world.channels)

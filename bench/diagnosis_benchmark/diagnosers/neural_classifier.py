@@ -67,7 +67,16 @@ class NeuralClassifier(Diagnoser):
         return "nobody knows a robot's file before it is asked" if kind.has_model else ""
 
     def train(self, lesson: DiagnoserTrainingTask) -> Mapping[str, Array]:
-        """Simulate recordings until the budget is used up, and train the network."""
+        """Simulate recordings until the budget is used up, and train the network.
+
+        Class 0 is "no effect", the others are the effects of the library in alphabetical order.
+
+        Args:
+            lesson: system, effects, budget and random generator.
+
+        Returns:
+            Weights of the network; empty if there are too few examples.
+        """
         classes = ["", *sorted(lesson.library)]
         images, labels = [], []
         for number in count():
@@ -92,7 +101,12 @@ class NeuralClassifier(Diagnoser):
         )
 
     def diagnose(self, case: DiagnosisCase) -> Answer:
-        """Name the most probable effects."""
+        """Name the most probable effects.
+
+        The answer is "adequate" unless "no effect" is less probable than
+        `CLEAN_PROBABILITY_THRESHOLD`. Effects at least `ALTERNATIVE_PROBABILITY_RATIO` as probable
+        as the best are its alternatives. Without trained weights the answer is "unidentifiable".
+        """
         if not case.learned:
             return Answer("unidentifiable")
         classes = ["", *sorted(library_of(case.kind.system))]

@@ -168,7 +168,7 @@ class RegressionEvidence:
         return [EffectColumn(effect, tuple(members)) for (effect, *_), members in places.items()]
 
     def build_trajectory_regression(self) -> RegressionData:
-        """Build the regression (1) with one row per sample."""
+        """Build the regression r = J delta + D c + noise, equation (1), with one row per sample."""
         fit = self.base.fit
         runs, length, channels, _ = fit.jacobian.shape
         return self._rows(
@@ -182,7 +182,10 @@ class RegressionEvidence:
     def build_acceleration_regression(
         self, seconds: float = POLYNOMIAL_WINDOW_SECONDS
     ) -> RegressionData:
-        """Build the regression (2) of accelerations, in units of their noise.
+        """Build the regression of accelerations: the operator L of (2) applied to equation (1).
+
+        Accelerations show forces at the moment at which they act, while trajectories integrate
+        them.
 
         Args:
             seconds: window of the local polynomials.
@@ -227,7 +230,10 @@ class RegressionEvidence:
         )
 
     def _states(self) -> Array:
-        """Return time, channels of the base model and inputs, (R, T, F)."""
+        """Return time, channels of the base model and inputs, (R, T, F).
+
+        They are the arguments of a discrepancy function, such as a Gaussian process.
+        """
         world = self.world
         runs, length, channels = world.observed.shape
         names = [channel.name for channel in world.simulator.inputs]

@@ -55,7 +55,12 @@ class _SparseRegression(Diagnoser):
     requires: ClassVar[tuple[str, ...]] = ("pysindy",)
 
     def diagnose(self, case: DiagnosisCase) -> Answer:
-        """Name the terms that predict the accelerations of the held-out runs."""
+        """Name the terms that predict the accelerations of the held-out runs.
+
+        The regression is repeated with windows of several lengths, and the one whose prediction is
+        most significant gives the answer. More than `MAX_TERMS` terms mean that no small model
+        exists: "unknown".
+        """
         evidence = RegressionEvidence(case)
         try:
             found = [self._found(evidence, window) for window in POLYNOMIAL_WINDOWS_SECONDS]

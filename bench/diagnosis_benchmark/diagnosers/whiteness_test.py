@@ -34,7 +34,12 @@ class WhitenessTest(Diagnoser):
     name = "ljung-box"
 
     def diagnose(self, case: DiagnosisCase) -> Answer:
-        """Name the effects with the highest correlation if the residual is not white."""
+        """Name the effects with the highest correlation if the residual is not white.
+
+        A white residual gives "adequate". If no effect correlates by at least `MIN_CORRELATION`,
+        the answer is "unknown"; effects that correlate almost as well as the best are its
+        alternatives.
+        """
         evidence = RegressionEvidence(case)
         try:
             chance = _compute_whiteness_p_value(evidence)

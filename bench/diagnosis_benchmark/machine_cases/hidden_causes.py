@@ -169,6 +169,7 @@ def _per_force(bottom: Callable[[dict[str, float]], float]) -> Callable[..., Coe
     """
 
     def made(typical: dict[str, float], rng: np.random.Generator) -> CoefficientFunction:
+        """Draw the effect from the typical scales of its joint; `rng` is not used."""
         far = 2.0 * typical["force"] / bottom(typical)
         return lambda s: (far * s,)
 

@@ -186,7 +186,17 @@ def _single(
 def _find_sized_coefficients(
     name: str, made: MachineRecordingConditions, wanted: float, rng: np.random.Generator
 ) -> tuple[float, ...] | None:
-    """Find coefficients at which a cause has the requested size; None if there are none."""
+    """Find coefficients at which a cause has the requested size, with a strength of at most 1.
+
+    Args:
+        name: ``effect@place``, or ``effect`` alone.
+        made: recording conditions.
+        wanted: size in units of the noise.
+        rng: random generator for the shape of the effect.
+
+    Returns:
+        The coefficients; None if the size is not reached.
+    """
     of = hidden_causes.draw_effect_shape(name, made, rng)
     gauge = _ResidualGauge(made)
     strength = find_strength_for_size(
@@ -376,6 +386,7 @@ class _ResidualGauge:
         return float(np.sqrt(np.mean(rest**2)) / self.made.noise_sigmas)
 
     def _size(self, change: Array) -> float:
+        """Return the RMS of a flattened change in units of the noise, parameters projected out."""
         if not np.isfinite(change).all():
             return float("inf")
         return float(np.sqrt(np.mean(self._rest(change) ** 2)) / self.made.noise_sigmas)

@@ -246,7 +246,13 @@ def compute_applied_inputs(runs: MachineRuns, plant: MachineDynamics, times: Arr
 
 
 def _apply_static_effects(name: str, c: float, u: Array) -> Array:
-    """Apply an effect without memory to a command."""
+    """Apply an effect without memory to a command; any other effect leaves it unchanged.
+
+    Args:
+        name: name of the effect.
+        c: its coefficient.
+        u: command, (T,).
+    """
     match name:
         case "input.gain":
             return (1 + c) * u
@@ -280,6 +286,7 @@ def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) 
     at = times - late
 
     def integral(t: Array) -> Array:
+        """Return the integral of the held input from 0 to t; before 0 it has its first level."""
         held: Array = np.interp(t, np.append(stamps, ends[-1]), area)
         return np.where(t < 0, levels[0] * t, held)
 
