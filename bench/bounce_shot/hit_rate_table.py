@@ -132,6 +132,7 @@ def make_success_panel(lines: pd.DataFrame) -> tuple[Panel, pd.DataFrame]:
     balls = [ALL_BALLS, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL_BALLS)]
     places = {ball: place for place, ball in enumerate(balls)}
     methods = list(dict.fromkeys(lines["method"]))
+    # The last number of each series shifts its points sideways, so that they do not overlap.
     series = tuple(
         Series(
             method,

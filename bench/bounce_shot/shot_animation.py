@@ -195,6 +195,7 @@ def _film(path: Path) -> FilmFrames:
     except InputError:
         return FilmFrames([], [])
     times = np.array([time for time, _ in frames]) - frames[0][0]
+    # 1e-6 s below is a tolerance for rounded times.
     frame_times = np.arange(0.0, times[-1], 1.0 / _FRAMES_PER_SECOND)
     track = np.stack([run.extra["u"], run.extra["v"]], axis=1)
     pictures = [frames[int(np.searchsorted(times, time - 1e-6))][1] for time in frame_times]

@@ -140,6 +140,7 @@ def _panel(axis: Axes, counts: pd.DataFrame, name: str) -> None:
                 )
         for j, share in enumerate(shares[i]):
             if share >= _MIN_LABELLED_PERCENT:
+                # White text on dark cells.
                 ink = "white" if share > 55 else style.NEUTRAL_MARK
                 axis.text(j, i, f"{share:.0f}", ha="center", va="center", fontsize=5.5, color=ink)
     axis.set_title(name, fontsize=9)

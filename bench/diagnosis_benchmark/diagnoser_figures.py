@@ -120,6 +120,7 @@ def draw_power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
             own = part[part["diagnoser"] == name].sort_values("size")
             if own.empty:
                 continue
+            # Shifted sideways, so that the error bars of the diagnosers do not overlap.
             x = own["size"].to_numpy() * (1 + 0.025 * (place - (len(order) - 1) / 2))
             y, low, high = (100 * own[key].to_numpy() for key in ("share", "low", "high"))
             axis.errorbar(
@@ -187,6 +188,7 @@ def draw_outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figur
             label=says,
         )
         for place, width, begin, count in zip(places, widths, left, counts, strict=True):
+            # A narrower part has no room for its number.
             if width > 4:
                 dark = colour in (style.BLACK, style.BLUE, style.VERMILION)
                 axis.text(

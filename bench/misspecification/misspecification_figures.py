@@ -175,6 +175,7 @@ def _compared(panel: Axes, study: StudyResult, lines: pd.DataFrame) -> None:
         lines: rows of the score table for one metric and study.
     """
     tuners = study.tuners()
+    # The two simulators are shifted vertically, so that their bars do not overlap.
     for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
         part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
         mean = part["mean"].to_numpy(dtype=np.float64)

@@ -187,6 +187,7 @@ def simulate_ball(world: TrueSystem, scenario: Scenario, number: int, instants: 
         if looks and solved.t_events[0].size:
             state, resting = _bounce(world, now, state)
             state[2] = world.constants["radius"]
+            # Seconds of the rise, 0.4 of the time to its top, in which no impact is possible.
             rising = (
                 0.0
                 if resting

@@ -121,6 +121,7 @@ def _stops(setting: RecordingConditions, path: Array) -> Iterator[tuple[float, f
         path: positions, of any shape; only the smallest and the largest are used.
     """
     low, high = float(path.min()), float(path.max())
+    # Scale of the stiffness, N m/rad for a pendulum and N/m for a slider.
     far = 20.0 if setting.system == "pendulum" else 5000.0
     for share, part in product((0.03, 0.15), (0.001, 0.01, 0.1)):
         within = share * (high - low)
@@ -162,6 +163,7 @@ def _linear_least_squares_step(
     theta = np.array([*bare.theta, *[0.0] * (scaled - base), *shape])
     rest, slope = fit.linearise(observed, theta, bare.starts)
     slope = np.delete(slope, np.s_[scaled:count], axis=1)
+    # Almost no damping, because the model is linear here.
     step = fit.compute_step(rest, slope, 1e-9)
     theta[:scaled] += step[:scaled] * fit.scales[:scaled]
     return float(np.sqrt(np.mean((rest - slope @ step) ** 2))), np.clip(theta, fit.low, fit.high)

@@ -237,12 +237,14 @@ def find_strength_for_size(
     Returns:
         The strength, or None if it is not below `largest`.
     """
+    # Bracket: (strength, size) below and above the requested size.
     low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(12):
         now = left(strength)
         if abs(now / wanted - 1) < SIZE_TOLERANCE:
             return strength
         if now < wanted:
+            # Too small even if the size grew with the square of the strength.
             if strength >= largest or now * (largest / strength) ** 2 < wanted:
                 return None
             low = strength, now

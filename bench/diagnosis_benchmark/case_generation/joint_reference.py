@@ -134,6 +134,7 @@ def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
     Returns:
         Levels and begins of the parts.
     """
+    # The last level is held for another second, in which it may still be approached.
     ends = [*edges[1:].tolist(), edges[-1] + 1.0]
     values, begins, state = [], [], float(levels[0])
     for level, begin, end in zip(levels.tolist(), edges.tolist(), ends, strict=True):
@@ -412,6 +413,7 @@ class BacklashReferenceLoad(ReferenceLoad):
         over = abs(x - y) - self.gap / 2
         if over <= 0:
             return 0.0
+        # 22500 = k^2 and 600 = 4 k; at the depth gap / 100, half of the damping acts.
         side = copysign(1.0, x - y)
         damped = 600 * (v - w) * over / (over + self.gap / 100)
         push = side * (1 - self.share) * (22500 * side * over + damped)
@@ -461,6 +463,7 @@ class DahlReferenceFriction:
             v: velocity.
             strain: friction force as a fraction of its limit.
         """
+        # At most 400 1/s, as in the library: far above visible rates, but it can be integrated.
         speed = min(abs(v) / self.deflection, 400.0)
         return 0.0, speed * (copysign(1.0, v) - strain)
 
@@ -544,6 +547,7 @@ def compute_end_stop_force(
         place: position of the stop.
         loss: damping, as a factor of the approach velocity.
     """
+    # 0.1 is the root of the depth 0.01, so that the force there is stiffness times depth.
     side = copysign(1.0, stiffness)
     depth = max(side * (x - place), 0.0)
     push: float = depth**1.5
@@ -701,6 +705,7 @@ def _integrate_stuck(joint: JointDynamics, now: float, state: Array) -> SegmentR
 
     def excess(t: float, y: Array) -> float:
         """Return by how much the force exceeds the friction limit; zero is the break-away event."""
+        # Slightly above the limit: at the limit, the coordinate would still count as held.
         return abs(joint.compute_force(t, *y)) - joint.compute_friction_limit(t, *y[:2]) * (
             1 + 1e-9
         )
@@ -728,6 +733,7 @@ def _find_break_away(joint: JointDynamics, now: float, x: float) -> float:
     grid: Sequence[float] = np.linspace(now, end, max(3, int(500 * (end - now)))).tolist()
     for before, after in pairwise(grid):
         if excess(after) > 0:
+            # Slightly after the root: at the root, the coordinate would still count as held.
             return min(
                 brentq(excess, before, after, xtol=1e-13) + 1e-12 if excess(before) < 0 else after,
                 end,

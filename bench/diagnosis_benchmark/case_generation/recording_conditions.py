@@ -171,6 +171,7 @@ def draw_conditions(
         short: whether there are always three runs.
         asked: conditions that are not drawn.
     """
+    # Rate in Hz and length of a run in s.
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
     seconds = float(rng.choice([2.0, 3.0, 4.0, 5.0, 6.0], p=[0.1, 0.2, 0.4, 0.2, 0.1]))
     runs = 3 if short else int(rng.choice([3, 4, 5, MAX_RUNS], p=[0.25, 0.4, 0.2, 0.15]))

@@ -147,6 +147,7 @@ def _example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | N
     system = kind.system
     low, high = _NOISES[system.kind]
     sigma = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    # In SI units a rate is 5 times as noisy as a position, as in many cases of the benchmark.
     noise = {c.name: sigma * (5.0 if c.name in system.rates else 1.0) for c in kind.channels}
     effects = {name: _coefficients(lesson, name)} if name else {}
     parameters = {p.name: float(rng.uniform(*p.training_range)) for p in system.parameters}

@@ -151,6 +151,7 @@ class SequentialThresholdedLeastSquares(_SparseRegression):
         from pysindy import optimizers
 
         size = float(np.abs(np.linalg.lstsq(library, left, rcond=1e-6)[0]).max())
+        # The threshold of the best model is unknown, so it is varied over three decades.
         for threshold in size * np.geomspace(1.0, 1e-3, 16):
             model = optimizers.STLSQ(threshold=threshold, alpha=RIDGE_PENALTY * len(left))
             yield model.fit(library, left[:, None]).coef_[0]

@@ -110,6 +110,7 @@ class MachineDynamics(ABC):
             limit += self.extra * np.exp(-((v / self.speed) ** 2))
         if self.patch:
             joint, most, centre, half = self.patch
+            # Friction rises linearly over a tenth of the half width at each border.
             inside = (half - np.abs(q[:, joint] - centre)) / (0.1 * half)
             limit[:, joint] += most * np.clip(inside, 0.0, 1.0)
         return limit

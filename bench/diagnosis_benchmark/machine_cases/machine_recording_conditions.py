@@ -255,6 +255,7 @@ def _runs(
     commands = np.moveaxis(waves, 1, 2)
     begun = rng.uniform(-0.4, 0.4, (count, joints))
     turned = 0.4 * np.ones((1, joints))
+    # Amplitude of the commands: rad for a servo, N m for an arm.
     size = (
         0.7 if plant.motors == ("goal",) else np.abs(plant.compute_gravity_force(turned))[0] * 1.5
     )
