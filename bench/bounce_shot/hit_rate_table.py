@@ -101,7 +101,14 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
 
 
 def format_result_table(lines: pd.DataFrame) -> str:
-    """Format the table for the terminal: hits by ball, hit rate with interval, prediction error."""
+    """Format the table for the terminal: hits by ball, hit rate with interval, prediction error.
+
+    Args:
+        lines: table of `build_result_table`.
+
+    Returns:
+        A header line and one line per method.
+    """
     balls = [ball for ball in lines["ball"].unique() if ball != ALL_BALLS]
     width = max(len(m) for m in lines["method"])
     head = (

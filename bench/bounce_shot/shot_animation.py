@@ -152,7 +152,14 @@ def write_animation(
 
 
 def _shot_panel(axis: Any, setup: ShotSetup, method: str, shot: ExampleShot) -> _Moving:
-    """Draw the panel of one method in the initial state."""
+    """Draw the panel of one method in its initial state: the planned path, no flown path yet.
+
+    Args:
+        axis: axes to draw on.
+        setup: the shot.
+        method: label of the method.
+        shot: the executed example.
+    """
     draw_shot_panel(axis, setup, method, shot)
     line = axis.lines[-1]
     line.set_data([], [])

@@ -89,7 +89,13 @@ def draw_figures(
 
 
 def get_method_group(method: str) -> str:
-    """Return the group of a method: untuned, tuned or extended."""
+    """Return the group of a method, which determines its colour: untuned, tuned or extended.
+
+    Extended methods use the simulator with the effects that explain added.
+
+    Args:
+        method: label of the method.
+    """
     if method == UNTUNED_METHOD:
         return "untuned"
     return "extended" if method == EXPLAIN_METHOD or method.endswith(EXPLAIN_SUFFIX) else "tuned"

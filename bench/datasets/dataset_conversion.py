@@ -69,7 +69,15 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
 
 
 def _joined_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order."""
+    """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order.
+
+    Args:
+        name: name of the file, for messages.
+        content: content of the file.
+
+    Raises:
+        InputError: the file is damaged or has another form.
+    """
     from scipy.io import loadmat
 
     try:

@@ -205,7 +205,14 @@ def _list_calibration(own: pd.DataFrame) -> Iterator[TableRow]:
 
 
 def _list_set_sizes(own: pd.DataFrame) -> Iterator[TableRow]:
-    """List answers about single effects, and those that contain the truth, by largest set size."""
+    """Yield the lines of sets.csv: answers about single effects by the size of their largest set.
+
+    The fraction is that of the answers whose sets contain the true cause. Large sets contain it
+    more easily but tell less.
+
+    Args:
+        own: rows of one diagnoser.
+    """
     answered = select_single_effects(own)
     for label, (low, high) in SET_SIZE_BINS.items():
         part = answered[answered["largest_set"].between(low, high)]

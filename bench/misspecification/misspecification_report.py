@@ -175,7 +175,12 @@ def _said(
 
 
 def _explained(scores: misspecification_scores.StudyScores, folder: Path) -> str:
-    """Format the effects of the true system and the causes that explain named."""
+    """Format which effects the true system has, and which verdict and causes explain gave.
+
+    Args:
+        scores: the scores of the study.
+        folder: its result folder, with the verdict of explain.
+    """
     hidden = scores.experiment.world.get("fixed", {})
     world = ", ".join(f"{name} {value}" for name, value in hidden.items()) or "nothing more"
     path = folder / VERDICT_FILE
@@ -185,7 +190,12 @@ def _explained(scores: misspecification_scores.StudyScores, folder: Path) -> str
 
 
 def _table(scores: misspecification_scores.StudyScores, lines: pd.DataFrame) -> str:
-    """Format the errors of parameters and of prediction by tuner, in both simulators."""
+    """Format the errors of parameters and of prediction by tuner, in both simulators.
+
+    Args:
+        scores: the scores of the study.
+        lines: score table of this study, or of several.
+    """
     study_lines = lines[
         (lines["experiment"] == scores.experiment.name)
         & lines["metric"].isin(misspecification_scores.RANKED_METRICS)

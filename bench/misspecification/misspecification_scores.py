@@ -228,7 +228,13 @@ def build_score_table(scores: StudyScores) -> pd.DataFrame:
 
 
 def build_rank_table(scores: StudyScores) -> pd.DataFrame:
-    """Build the table of each tuner's mean rank in both simulators; columns as `RANK_COLUMNS`."""
+    """Build the table of each tuner's mean rank in both simulators; columns as `RANK_COLUMNS`.
+
+    Tuners are ranked on each target, 1 for the smallest error; ranks are averaged over targets.
+
+    Args:
+        scores: the scores of a study.
+    """
     tuners, targets = scores.tuners(), scores.targets()
     lines = []
     for metric in RANKED_METRICS:

@@ -143,7 +143,7 @@ class MisspecificationStudy:
         return StudyOutcome(finished, planned)
 
     def _planned(self) -> int:
-        """Return the number of runs in each simulator."""
+        """Return the number of runs in each simulator: all seeds, times targets and ranges."""
         from bench.benchmark.runner.experiment_runner import count_seeds
 
         experiment = self.configuration.experiment

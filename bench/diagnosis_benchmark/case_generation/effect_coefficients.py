@@ -91,7 +91,16 @@ def _direction(
 def _level(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw a horizontal direction: along x, and along y if the system has it."""
+    """Draw a horizontal direction: along x, and along y if the system has it.
+
+    Args:
+        far: magnitude at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to the components along x and y, or along x alone.
+    """
     if setting.system == "ball":
         return _direction(far, setting, rng)
     sign = float(rng.choice([-1, 1]))
@@ -101,7 +110,19 @@ def _level(
 def _ripple(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw a ripple whose period the motion passes several times."""
+    """Draw a ripple whose period the motion passes several times.
+
+    A ripple is a force that is periodic in the position. The period is at most 1 m for a slider and
+    6.28 rad for a pendulum.
+
+    Args:
+        far: amplitude at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to sine amplitude, cosine amplitude and period.
+    """
     travel = np.median(_ranges(setting))
     period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
     return _direction(far, setting, rng, float(period))
@@ -110,7 +131,18 @@ def _ripple(
 def _periodic(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw a periodic force with at least 1.5 periods in a run."""
+    """Draw a periodic force with at least 1.5 periods in a run.
+
+    The frequency is drawn log-uniformly up to 4 Hz.
+
+    Args:
+        far: amplitude at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to sine amplitude, cosine amplitude and frequency.
+    """
     low, high = 1.5 / setting.seconds, 4.0
     return _direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
 
@@ -163,7 +195,18 @@ def _stribeck(
 def _saturation(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Return an input limit: at strength 0 the peak of the input, at strength 1 zero."""
+    """Return an input limit: at strength 0 the peak of the input, at strength 1 zero.
+
+    The effect vanishes at strength 0, because the input never exceeds its own peak.
+
+    Args:
+        far: unused here.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to the limit.
+    """
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak * (1 - s)),)
 
@@ -171,7 +214,16 @@ def _saturation(
 def _one_way(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw friction that is several times larger in one direction."""
+    """Draw friction that is several times larger in one direction.
+
+    Args:
+        far: coefficient of the larger direction at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to the coefficients of both directions.
+    """
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)
     return lambda s: (far * shares[0] * s, far * shares[1] * s)
@@ -180,7 +232,18 @@ def _one_way(
 def _power(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Return a power law of the input that keeps the peak of the input unchanged."""
+    """Return a power law of the input that keeps the peak of the input unchanged.
+
+    The gain that keeps the peak is peak^-s - 1 at the strength s, which is also the power.
+
+    Args:
+        far: unused here.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to gain and power.
+    """
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak**-s - 1), s)
 
@@ -188,7 +251,16 @@ def _power(
 def _rate(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength."""
+    """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength.
+
+    Args:
+        far: unused here.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to the maximum rate of the input.
+    """
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak / (0.8 * s)),)
 
@@ -196,7 +268,18 @@ def _rate(
 def _quadratic(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw friction whose quadratic part exceeds the linear one at the peak force."""
+    """Draw friction whose quadratic part exceeds the linear one at the peak force.
+
+    It is friction that depends on the transmitted load.
+
+    Args:
+        far: linear coefficient at strength 2.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to the linear and the quadratic coefficient.
+    """
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     square = float(far * rng.uniform(2.0, 6.0) / peak)
     return lambda s: (0.5 * far * s, square * s)
@@ -228,7 +311,18 @@ def _draw_position_friction(
 def _warming(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous."""
+    """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous.
+
+    Friction is largest at the begin of a run and decays exponentially.
+
+    Args:
+        far: Coulomb friction at the begin, at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to Coulomb friction, viscous friction and time constant.
+    """
     time = float(setting.seconds * rng.uniform(0.2, 0.8))
     viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_speeds(setting))))
     return lambda s: (far * s, viscous * s, max(time, 0.5))
@@ -237,7 +331,18 @@ def _warming(
 def _slip(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw a sensor slip at a time well within each run."""
+    """Draw a sensor slip at a time well within each run.
+
+    From that time on, the reading is shifted by a constant.
+
+    Args:
+        far: shift at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to shift and time, s.
+    """
     sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * setting.seconds)
     return lambda s: (sign * far * s, instant)
 
@@ -245,7 +350,18 @@ def _slip(
 def _flexibility(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw a flexible load: from four oscillations per run to a fifth of the sampling rate."""
+    """Draw a flexible load: from four oscillations per run to a fifth of the sampling rate.
+
+    The frequency and the damping ratio are drawn log-uniformly.
+
+    Args:
+        far: share of the load at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to share of the load, frequency in rad/s, and damping ratio.
+    """
     low, high = 2 * np.pi * 4 / setting.seconds, 2 * np.pi * min(0.2 * setting.rate, 40.0)
     frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     ratio = float(np.exp(rng.uniform(np.log(0.01), np.log(0.3))))
@@ -255,7 +371,16 @@ def _flexibility(
 def _play(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw backlash: at strength 1 the gap is 0.3 of the travel."""
+    """Draw backlash between drive and load: at strength 1 the gap is 0.3 of the travel.
+
+    Args:
+        far: unused here.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to gap and share of the load.
+    """
     share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_ranges(setting)))
     return lambda s: (0.3 * travel * s, share)
 
@@ -263,7 +388,18 @@ def _play(
 def _hysteresis(
     far: float, setting: RecordingConditions, rng: np.random.Generator
 ) -> CoefficientFunction:
-    """Draw hysteresis with a deflection of 0.02 to 0.2 of the travel."""
+    """Draw hysteresis with a deflection of 0.02 to 0.2 of the travel.
+
+    The deflection is the distance over which friction builds up after a reversal.
+
+    Args:
+        far: friction limit at strength 1.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to friction limit and deflection.
+    """
     travel = float(np.median(_ranges(setting)))
     deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
     return lambda s: (far * s, deflection)
@@ -360,7 +496,15 @@ def _draw_onsets(
 
 
 def _patch(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
-    """Draw a region of dry friction, 0.14 to 0.3 of the central 80 % of positions wide."""
+    """Draw a region of dry friction, 0.14 to 0.3 of the central 80 % of positions wide.
+
+    Args:
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to friction limit, centre and half width of the region.
+    """
     low, high = np.quantile(np.concatenate(_simulate_base_motion(setting)), [0.1, 0.9])
     half = float((high - low) * rng.uniform(0.07, 0.15))
     centre = float(rng.uniform(low + half, high - half))
@@ -393,7 +537,17 @@ def _ageing(setting: RecordingConditions, rng: np.random.Generator) -> Coefficie
 
 
 def _latch(setting: RecordingConditions, rng: np.random.Generator) -> CoefficientFunction:
-    """Draw a soft stop in every other run, which the motion reaches for a short time."""
+    """Draw a soft stop in every other run, which the motion reaches for a short time.
+
+    It is a spring beyond a place that 15 to 30 % of the samples pass.
+
+    Args:
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Function from the strength to stiffness (N m/rad or N/m) and place.
+    """
     place = float(
         np.quantile(np.concatenate(_simulate_base_motion(setting)), rng.uniform(0.7, 0.85))
     )

@@ -68,7 +68,7 @@ class _ForwardSelection(Diagnoser):
     """Base class of the forward selections."""
 
     def diagnose(self, case: DiagnosisCase) -> Answer:
-        """Name the selected effects, with alternatives of equal quality."""
+        """Name the selected effects, with alternatives that the criterion cannot exclude."""
         evidence = RegressionEvidence(case)
         try:
             return self._selected(evidence)
@@ -404,6 +404,11 @@ def _intervals(
 def _of(
     ends: dict[str, tuple[float | None, float | None]], effect: str
 ) -> dict[str, tuple[float | None, float | None]]:
-    """Select the intervals of one effect's coefficients, by the name of the coefficient."""
+    """Select the intervals of one effect's coefficients, by the name of the coefficient alone.
+
+    Args:
+        ends: intervals by ``effect.coefficient``, or by the name of a base parameter.
+        effect: name of the effect.
+    """
     begin = f"{effect}."
     return {name.removeprefix(begin): e for name, e in ends.items() if name.startswith(begin)}

@@ -186,7 +186,15 @@ def _example(lesson: DiagnoserTrainingTask, name: str, number: int) -> Array | N
 
 
 def _coefficients(lesson: DiagnoserTrainingTask, name: str) -> tuple[float, ...]:
-    """Draw coefficients of an effect: sizes log-uniformly, shape parameters uniformly."""
+    """Draw coefficients of an effect for a training example.
+
+    The first coefficient, the size, is drawn log-uniformly down to 0.3 % of its maximum; the others
+    uniformly. Coefficients that must be positive, such as a period, are always drawn log-uniformly.
+
+    Args:
+        lesson: the training task.
+        name: name of the effect.
+    """
     rng = lesson.rng
     values = []
     for place, parameter in enumerate(

@@ -158,7 +158,11 @@ class RegressionEvidence:
 
     @cached_property
     def effect_columns(self) -> list[EffectColumn]:
-        """Columns of all effects, one for each point of their parameter grids."""
+        """Columns of all effects, one for each point of their parameter grids.
+
+        A nonlinear parameter, such as a period, has a grid of values; the directions at one value
+        form one column.
+        """
         places: dict[tuple[str, int, int], list[int]] = {}
         for i, probe in enumerate(self.sensitivity_directions.candidates):
             # Each direction of a fixed size is a column of its own, because such directions do not

@@ -285,13 +285,23 @@ class ServoDynamics(MachineDynamics):
         return total
 
     def compute_gravity_force(self, q: Array) -> Array:
-        """Compute the gravity force; see `MachineDynamics`."""
+        """Compute the gravity force -m g l sin q of equation (1), (L, 1).
+
+        Args:
+            q: angle from hanging down, rad, (L, 1).
+        """
         n = self.numbers
         weight: Array = -n["mass"] * n["gravity"] * n["length"] * np.sin(q[:, 0])
         return weight[:, None]
 
     def compute_base_acceleration_force(self, q: Array) -> Array:
-        """Compute the force of a unit acceleration along x, to the right where q is positive."""
+        """Compute the force m l cos q of a unit acceleration along x, (L, 1).
+
+        It is positive where a mass at positive q is on the right.
+
+        Args:
+            q: angle from hanging down, rad, (L, 1).
+        """
         n = self.numbers
         sideways: Array = n["mass"] * n["length"] * np.cos(q[:, 0])
         return sideways[:, None]

@@ -41,7 +41,16 @@ def render_arm_mjcf(numbers: Mapping[str, float]) -> str:
 
 
 def _link(body: str, joint: str, n: Mapping[str, float]) -> str:
-    """Render the inertia and joint of a link; it is slender along its own axis."""
+    """Render the inertia and joint of a link; it is slender along its own axis.
+
+    The moment of inertia about that axis is a tenth of the others. It does not matter, because the
+    link never turns about it.
+
+    Args:
+        body: name of the link.
+        joint: name of its joint.
+        n: mass, centre, inertia, damping and armature of the link.
+    """
     moments = f"{n['inertia']!r} {n['inertia']!r} {0.1 * n['inertia']!r}"
     return (
         f'<inertial pos="0 0 {-n["centre"]!r}" mass="{n["mass"]!r}" diaginertia="{moments}"/>\n'

@@ -142,7 +142,14 @@ def list_better_diagnosers(data: DiagnoserReportData) -> list[dict[Hashable, Any
 
 
 def write_warnings(data: DiagnoserReportData) -> Iterator[str]:
-    """Yield sentences about limitations of the results."""
+    """Yield sentences about limitations of the results.
+
+    They concern diagnosers without isolation, missing cases, failed answers, unsupported cases, and
+    skipped diagnosers.
+
+    Args:
+        data: the data of the report.
+    """
     if data.experiment.trusted:
         yield f"{TRUSTED_TUNERS_NOTE.capitalize()}."
     if data.case_count < data.planned:
