@@ -196,11 +196,10 @@ class JointDynamics:
     def __init__(self, world: TrueSystem, number: int) -> None:
         """Collect the laws of the system and of its hidden causes, for one run.
 
-        Besides the public attributes, `sideways` is the generalised force of a unit horizontal
-        acceleration, `latched` tells whether the cause `latch` acts in this run (every other run),
-        `breaks` are the times at which a gust jumps, and `restless` tells whether forces change
-        with time while the coordinate rests. The inertia of driven loads is subtracted from that of
-        the drive side.
+        Further attributes are `sideways`, the generalised force of a unit horizontal acceleration;
+        `latched`, whether the cause `latch` acts in this run (every other run); `breaks`, the times
+        at which a gust begins and ends; and `restless`, whether forces change with time while the
+        coordinate rests. The inertia of driven loads is subtracted from that of the drive side.
 
         Args:
             world: the true system.

@@ -66,10 +66,9 @@ class MachineDynamics(ABC):
     def __init__(self, numbers: MachineParameters, effects: Effects, foreign: Effects) -> None:
         """Store the parameters and add the hidden causes.
 
-        Besides the public attributes, `added` is additional rotor inertia (N,), `patch` is (joint,
-        friction limit, centre, half width) of dry friction in a region, and `dull` is the deadband
-        of a servo in rad. Effects on commands and sensors stay in `effects`; `reference_motion`
-        applies them.
+        Further attributes are `added`, additional rotor inertia (N,); `patch`, (joint, friction
+        limit, centre, half width) of dry friction in a region; and `dull`, the deadband of a servo
+        in rad. Effects on commands and sensors stay in `effects`; `reference_motion` applies them.
         """
         self.numbers = {name: np.asarray(value, dtype=float) for name, value in numbers.items()}
         self.effects, self.foreign = effects, foreign
