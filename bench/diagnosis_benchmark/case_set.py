@@ -94,7 +94,7 @@ class CaseSpec:
             seed: seed of the public case set; unused with a secret salt.
             salt: secret salt, or `PUBLIC_SALT`. With a secret salt the seed is a part of the
                 SHA-256 hash
-                of salt and name, so that nobody can compute the case without the salt.
+                of salt and name, so that the case cannot be computed without the salt.
         """
         if salt in ("", PUBLIC_SALT):
             return _SEED_STRIDE * seed + 10 * self.index

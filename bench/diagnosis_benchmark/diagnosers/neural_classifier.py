@@ -71,9 +71,6 @@ class NeuralClassifier(Diagnoser):
 
         Class 0 is "no effect", the others are the effects of the library in alphabetical order.
 
-        Args:
-            lesson: system, effects, budget and random generator.
-
         Returns:
             Weights of the network; empty if there are too few examples.
         """
@@ -190,10 +187,6 @@ def _coefficients(lesson: DiagnoserTrainingTask, name: str) -> tuple[float, ...]
 
     The first coefficient, the size, is drawn log-uniformly down to 0.3 % of its maximum; the others
     uniformly. Coefficients that must be positive, such as a period, are always drawn log-uniformly.
-
-    Args:
-        lesson: the training task.
-        name: name of the effect.
     """
     rng = lesson.rng
     values = []

@@ -85,8 +85,7 @@ class _MachineIntegrator:
     Attributes:
         q: positions, (L, N).
         v: velocities, (L, N).
-        rubs: whether each joint has dry friction, (N,).
-        dry: whether any joint has.
+        dry: whether any joint has dry friction.
         way: direction of motion of joints with dry friction: -1, 0 or 1, (L, N).
         held: whether each joint is stuck, (L, N).
     """
