@@ -307,7 +307,11 @@ def select_transferable_effects(
 
 
 def make_planning_simulator(model: TunedModel) -> BounceShot:
-    """Make the planning simulator of a model."""
+    """Make the simulator in which a shot is planned, a bounce shot with the effects of a model.
+
+    Args:
+        model: tuned model; its effects act with fixed coefficients.
+    """
     return BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
 
 
@@ -326,7 +330,7 @@ def get_planning_constants(settings: ShotConfig, radius: float) -> dict[str, flo
 
 
 def get_planning_theta(model: TunedModel) -> Array:
-    """Return the parameters of a model's planning simulator."""
+    """Return the parameters of the planning simulator, (1,): the tuned restitution."""
     return np.array([model.restitution])
 
 

@@ -8,9 +8,8 @@ A free rigid sphere flies through still air with quadratic drag and the lift of 
 (C_L = r omega / v; G. Robinson, I. Robinson, Physica Scripta 88, 018101, 2013,
 doi:10.1088/0031-8949/88/01/018101), integrated by MuJoCo's Runge-Kutta 4. Contact takes time:
 MuJoCo's spring and damper between ball and ground act for about `CONTACT_SECONDS` seconds. The
-damping
-gives the restitution at the impact's speed: with damping ratio D, contact that ends when the force
-becomes zero gives
+damping gives the restitution at the impact's speed: with damping ratio D, contact that ends when
+the force becomes zero gives
 
     e = exp(-D / w atan2(2 D w, 2 D^2 - 1)),        w = sqrt(1 - D^2)      for D < 1    (3)
     e = exp(-D / s log((D + s) / (D - s))),         s = sqrt(D^2 - 1)      for D > 1    (4)

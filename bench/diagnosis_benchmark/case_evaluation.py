@@ -86,7 +86,7 @@ def evaluate_case(
     limits: AnswerLimits,
     hidden: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Draw a case and evaluate it with several diagnosers.
+    """Draw a case and evaluate it with several diagnosers, one after the other.
 
     Args:
         question: case specification as JSON.
@@ -99,7 +99,8 @@ def evaluate_case(
         hidden: folders that no diagnoser may read.
 
     Returns:
-        JSON document with the name of the case, the case, and one row per diagnoser.
+        JSON document with the name of the case (``question``), the case with its truth (``item``,
+        {} if the sensors cannot show the cause), and one row per diagnoser (``rows``).
     """
     asked = CaseSpec.from_json(question)
     item = (

@@ -455,6 +455,9 @@ def _refuse_unreachable(names: Sequence[str]) -> None:
 def _announced(name: str, trusted: bool) -> None:
     """Register a stub for a diagnoser of another package, without importing its code here.
 
+    The truths of the cases are in the memory of this process, so foreign code must not run in it
+    unless it is trusted.
+
     Args:
         name: registered name of the diagnoser.
         trusted: whether diagnosers run in this process.

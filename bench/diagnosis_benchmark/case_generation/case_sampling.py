@@ -1,9 +1,8 @@
 """Sampling of cases for ball, pendulum and slider.
 
 `draw_case` chooses what is hidden and how strongly. `write_case` writes the recording and, in a
-separate
-file, the truth. Everything that is drawn follows from the name of the case; a case is a recipe
-without data.
+separate file, the truth. Everything that is drawn follows from the name of the case; a case is a
+recipe without data.
 """
 
 from __future__ import annotations
@@ -233,9 +232,9 @@ def _draw_single(
 ) -> BenchmarkCase | None:
     """Hide one effect of the library, with coefficients that give the requested size.
 
-    If the effect has a simpler form, the case is rejected unless that form leaves a visible
-    residual (`beyond`, at least `MIN_SIMPLER_RESIDUAL`): otherwise the simpler form would be a
-    correct answer.
+    If the effect has a simpler form and at least the size of the noise, the case is rejected unless
+    that form leaves a visible residual (`beyond`, at least `MIN_SIMPLER_RESIDUAL`): otherwise the
+    simpler form would be a correct answer.
 
     Args:
         item: the case without its hidden cause.

@@ -65,7 +65,11 @@ def _list_shares(data: DiagnoserReportData) -> list[str]:
 
 
 def make_charts(data: DiagnoserReportData) -> dict[str, list[Panel]]:
-    """Make the panels of every chart by name; without data, a chart has none."""
+    """Make the panels of every chart by name; a chart without data has none.
+
+    Args:
+        data: the data of the report.
+    """
     tables = build_chart_tables(data)
     return {
         "board": _make_board(data) if len(tables["board"]) else [],
@@ -92,7 +96,12 @@ def _make_board(data: DiagnoserReportData) -> list[Panel]:
 
 
 def _make_shares(data: DiagnoserReportData, table: pd.DataFrame) -> list[Panel]:
-    """Make the chart of all shares of table.csv, one category per metric."""
+    """Make the chart of the fractions in table.csv that have answers, one category per metric.
+
+    Args:
+        data: the data of the report.
+        table: rows of table.csv of these metrics.
+    """
     counts = table.groupby("metric")["of"].max()
     names = tuple(f"{_SHARES[name]}\nn={int(counts[name])}" for name in _list_shares(data))
     across = Axis("what is counted; at most n answers or intervals", names=names)
@@ -113,7 +122,13 @@ def _make_power(data: DiagnoserReportData) -> list[Panel]:
 
 
 def _make_calibration(data: DiagnoserReportData) -> list[Panel]:
-    """Make the chart of the share of clean recordings with a p-value below each level."""
+    """Make the chart of the fraction of clean recordings with a p-value of at most each level.
+
+    For a calibrated p-value the fraction equals the level; a grey line shows this ideal.
+
+    Args:
+        data: the data of the report.
+    """
     ideal = Series(
         "calibrated p-value", "share", make_mark_style(GREY, (4.0, 3.0)), {"diagnoser": ""}
     )
