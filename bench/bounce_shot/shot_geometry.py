@@ -54,7 +54,7 @@ def compute_hoop_crossings(path: Array, scene: ShotGeometry) -> Array:
     With the sample before the plane at height z1 and the one after it at z2, the hoop's plane at
     height h is crossed on the chord between them, at the share
 
-            (z1 - h) / (z1 - z2)                                               (1)
+        (z1 - h) / (z1 - z2)                                               (1)
 
     Args:
         path: Centres x, y, z of the ball (n, T, 3), m.

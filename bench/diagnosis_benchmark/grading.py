@@ -8,8 +8,7 @@ An answer is a dictionary as `explain` writes it (DESIGN §6).
 | set | single, double | the cause is in a set of effects that the data cannot distinguish |
 | class | single, double | an effect equivalent in any data is named (`EQUIVALENT_EFFECTS`) |
 | one | double | one of the two is named (alone or in a set), the other is not |
-| wrong | single, double, foreign | another effect is named; foreign: an effect as full explanation
-|
+| wrong | single, double, foreign | another effect is named; foreign: as full explanation |
 | extra | single | the cause is named, and another one in addition |
 | unnamed | single, double | a discrepancy is detected, no cause named |
 | missed | single, double, foreign | nothing is detected |

@@ -479,7 +479,7 @@ def build_description(item: BenchmarkCase, made: MachineRecordingConditions) -> 
 
 
 def _stated_constants(made: MachineRecordingConditions) -> dict[str, float]:
-    """Return the parameters of a servo that the recording states, because nobody fits them."""
+    """Return the parameters of a servo that its recording states and that are not fitted."""
     return {name: v for name, v in made.numbers.items() if name not in made.free_parameters}
 
 
