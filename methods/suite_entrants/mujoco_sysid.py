@@ -28,11 +28,7 @@ class MuJoCoSysId(Tuner):
         """Pass the toolbox's points to the harness, finite differences in one batch."""
 
         def minimise(residuals: Callable[[Array], Array]) -> str:
-            """Minimise the residuals with mujoco.sysid; return why it stopped.
-
-            `residuals` maps points (n, dim) to residuals (n, N); mujoco.sysid has points in columns
-            (dim, n).
-            """
+            """Minimise residuals (n, N) of points (n, dim); mujoco.sysid has points in columns."""
             # MuJoCo would look for a display in a process of its own, which isolation forbids.
             os.environ.setdefault("MUJOCO_GL", "disable")
             sysid = importlib.import_module("mujoco.sysid")  # it has no types

@@ -118,7 +118,7 @@ def test_allowed_uses_are_dropped(glossary):
     def kept(path: str) -> int:
         return len(glossary.drop_allowed(check_source("def f(pieces): ...", path, glossary)))
 
-    assert kept("bench/api/explain.py") == 0
+    assert kept("bench/diagnosis/explain_options.py") == 0
     assert kept("bench/api/compare.py") == 1
 
 

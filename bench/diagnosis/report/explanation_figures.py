@@ -293,7 +293,8 @@ class _FigureLayout(NamedTuple):
             inches: Distance from the left edge.
             text: Text of the heading.
         """
-        room = self.width - inches - 0.1
+        # Hinting makes letters wider on the page than their outlines.
+        room = self.width - inches - 0.3
         size = _HEADING_SIZE * min(1.0, room / text_width([text], _HEADING_SIZE))
         y = 1 - self.up(_HEADING)
         self.figure.text(self.across(inches), y, text, fontsize=size, va="center")
@@ -337,8 +338,8 @@ def _where(report: DiagnosisReportData) -> Figure:
     channel_text = (
         f" of {sanitise(profiles[0].channel, LONGEST_NAME)}" if len(channels) == 1 else ""
     )
-    layout.heading(profiles_from, f"Residual{channel_text} against other variables: means in bins")
-    note = "residual: measured − simulated; bars: ±2 standard errors"
+    layout.heading(profiles_from, f"Residual{channel_text} against other variables")
+    note = "means in bins, bars: ±2 standard errors; residual: measured − simulated"
     figure.text(layout.across(profiles_from), layout.up(0.2), note, fontsize=8.5, va="center")
     grid = figure.add_gridspec(
         rows,

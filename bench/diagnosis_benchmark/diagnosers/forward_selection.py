@@ -298,7 +298,8 @@ def _refit_with_one_more_effect(
     names = [name for name in world.library if name not in at.effects]
     evidence = _with_model(evidence, at)
     found = compute_directions(world, at, names)
-    evidence.__dict__["directions"] = found
+    # The cached property; its value for the base model would include the effects of the model.
+    evidence.__dict__["sensitivity_directions"] = found
     left, effects = evidence.build_trajectory_regression().project_out_base()
     best = find_strongest_columns(left, effects, evidence.effect_columns)
     order = sorted(best, key=lambda name: -best[name][0])[:REFITS_PER_ROUND]

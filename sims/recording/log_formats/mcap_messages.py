@@ -20,7 +20,7 @@ ENCODINGS = ("json", "protobuf")
 INSTALL_HINT = (
     ""
     if find_spec("mcap")
-    else "; if its messages are JSON or Protobuf: pip install 'simgap[mcap]'"
+    else '; if its messages are JSON or Protobuf: pip install ".[mcap]" in the clone'
 )
 """Advice for a file that rosbags cannot read, where mcap is not installed."""
 
@@ -76,7 +76,7 @@ def _decoder(path: Path, encoding: str, schema: Any) -> Callable[[bytes], Any]:
     except ImportError:
         raise InputError(
             f"{path}: needs mcap-protobuf-support to read Protobuf messages, not installed "
-            "(pip install 'simgap[mcap]')"
+            '(pip install ".[mcap]" in the clone of simgap)'
         ) from None
     decode: Callable[[bytes], Any] | None = DecoderFactory().decoder_for(encoding, schema)
     if decode is None:

@@ -60,9 +60,16 @@ def world(recorded, **options):
 
 def white(world, sigma):
     """Return a white noise model with one sigma for all channels or one per channel."""
-    count = len(world.channels)
-    values = np.broadcast_to(np.asarray(sigma, dtype=float), (count,)).copy()
-    return NoiseModel(values, np.zeros(count))
+    return autoregressive(world, sigma, 0.0)
+
+
+def autoregressive(world, sigma, phi):
+    """Return an AR(1) noise model; sigma and phi are for all channels, or one per channel."""
+    shape = (len(world.channels),)
+    sigmas, correlations = (
+        np.broadcast_to(np.asarray(value, dtype=float), shape).copy() for value in (sigma, phi)
+    )
+    return NoiseModel(sigmas, correlations)
 
 
 def marked(world, stated):

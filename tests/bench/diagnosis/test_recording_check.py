@@ -89,7 +89,7 @@ def test_what_is_mixed_up_is_named(tmp_path, capsys):
 def test_free_numbers_are_asked_about_with_the_check_alone(tmp_path, capsys):
     path = recorded(tmp_path)
     assert main(["inspect", str(path), "--free", "mass", "--out", str(tmp_path / "out")]) == 2
-    assert "give --check besides" in capsys.readouterr().err
+    assert "add --check, or leave out --free" in capsys.readouterr().err
     with pytest.raises(InputError, match="no such file"):
         check_identifiability(tmp_path / "none.csv")
 

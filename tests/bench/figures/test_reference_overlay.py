@@ -41,7 +41,9 @@ def test_references_are_found_by_name_by_their_last_name_and_by_folder(tmp_path)
     assert find_reference("ball-drop").name == "ball-drop"
     shutil.copytree(find_reference("ball-wind").folder, tmp_path / "mine")
     assert find_reference(str(tmp_path / "mine")).table.equals(find_reference("ball-wind").table)
-    with pytest.raises(InputError, match="unknown reference 'ball-drip'; there are: ball-cross"):
+    with pytest.raises(
+        InputError, match=r"unknown reference 'ball-drip'; did you mean ball-drop\?"
+    ):
         find_reference("ball-drip")
 
 

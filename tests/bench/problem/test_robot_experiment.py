@@ -129,9 +129,7 @@ def test_an_effect_at_a_place_is_hashed_as_the_effect_that_it_is():
 
 
 def test_names_that_do_not_exist_come_with_those_that_do(arm):
-    with pytest.raises(
-        InputError, match=r"number of robot .*'dampng'; there are: .* damping, drag"
-    ):
+    with pytest.raises(InputError, match=r"number of robot .*'dampng'; did you mean damping\?"):
         get_simulator_class(arm(free=["dampng@*"]))
     with pytest.raises(InputError, match=r"'elbo'; there are: \*, elbow, shoulder"):
         get_simulator_class(arm(free=["damping@elbo"]))

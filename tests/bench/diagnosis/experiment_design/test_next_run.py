@@ -131,8 +131,10 @@ def test_what_is_asked_wrongly_is_one_line(tmp_path, capsys):
     assert main(["design", str(path), "--out", str(out)]) == 2
     assert "next.csv" in capsys.readouterr().err
     assert out.read_text() == "mine"
-    with pytest.raises(InputError, match="seconds: expected 0 to 600, found -1"):
+    with pytest.raises(InputError, match="seconds: expected a number of seconds above 0, found -1"):
         simgap.design(path, seconds=-1)
+    with pytest.raises(InputError, match="seconds: expected 0 to 600, found 601"):
+        simgap.design(path, seconds=601)
     with pytest.raises(InputError, match="longest: expected 4 to 600, found 2"):
         simgap.design(path, longest=2)
 

@@ -10,7 +10,14 @@ from bench.diagnosis.fitting.trajectory_fit import TrajectoryFitter
 from bench.diagnosis.search.effect_search import EffectSearch
 from bench.diagnosis.validation.gain_and_intervals import compute_intervals
 from sims.systems.slider import Slider
-from tests.bench.diagnosis.explained_samples import correlated, marked, recorded, white, world
+from tests.bench.diagnosis.explained_samples import (
+    autoregressive,
+    correlated,
+    marked,
+    recorded,
+    white,
+    world,
+)
 
 MASS, DRAG, SIGMA = 1.3, 0.4, 0.004
 NAME = "drag.linear"
@@ -50,7 +57,7 @@ def test_it_is_where_generalised_least_squares_ends(there, phi):
     begun = entered(search, [1.1, 0.1], 2)
     told = search.fit_to_convergence(begun)
     assert told.likelihood.phi[0] == pytest.approx(phi, abs=0.12)
-    noise = white(there, told.likelihood.sigma[0]).with_correlation(told.likelihood.phi)
+    noise = autoregressive(there, told.likelihood.sigma[0], told.likelihood.phi)
     start = FitStart((NAME,), np.array([1.1, 0.1]), there.guess)
     best = search._of(TrajectoryFitter(there, noise, exact=True).fit_models([start], 60)[0])
     assert off(search, told, best) < 0.05
@@ -90,7 +97,7 @@ def test_what_is_left_over_and_is_no_noise_does_not_pull_it_away(there):
     times = np.arange(there.observed.shape[1]) / 60
     there.observed[...] += 0.5 * (times / times[-1])[None, :, None] ** 3
     begun = entered(search, [MASS, DRAG], 60, exact=True)
-    noise = white(there, begun.likelihood.sigma[0]).with_correlation(begun.likelihood.phi)
+    noise = autoregressive(there, begun.likelihood.sigma[0], begun.likelihood.phi)
     (fit,) = TrajectoryFitter(there, noise, exact=True).fit_models([begun.fit.make_start()], 60)
     pulled = search._of(replace(fit, cost=TrajectoryFitter(there, search.noise).compute_cost(fit)))
     assert pulled.penalised_log_likelihood > begun.penalised_log_likelihood

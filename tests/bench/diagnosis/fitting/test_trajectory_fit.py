@@ -13,6 +13,7 @@ from bench.diagnosis.fitting.trajectory_fit import (
 from sims.systems.ball import Ball
 from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis.explained_samples import (
+    autoregressive,
     changed,
     recorded,
     recording,
@@ -225,10 +226,10 @@ def test_least_squares_with_coloured_noise_is_generalised():
         run = changed(clean.runs[0], q=lambda v, noise=noise: v + 0.02 * noise)
         there = world(replace(clean, runs=(run,)))
         start = FitStart((), there.get_nominal_theta(), there.guess)
-        plain = white(there, 0.02)
         # The noise is treated once as white and once as AR(1).
         fitters = [
-            TrajectoryFitter(there, noise) for noise in (plain, plain.with_correlation(0.95))
+            TrajectoryFitter(there, noise)
+            for noise in (white(there, 0.02), autoregressive(there, 0.02, 0.95))
         ]
         fits = [fitter.fit_models([start], 20)[0] for fitter in fitters]
         errors.append([fit.theta[0] / TRUTH - 1 for fit in fits])

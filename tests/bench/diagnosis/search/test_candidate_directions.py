@@ -25,7 +25,7 @@ from bench.diagnosis.search.initial_values import (
     generate_event_times,
     generate_neighbouring_end_stops,
 )
-from bench.diagnosis.search.score_test import score_candidates
+from bench.diagnosis.search.score_test import ScoreTest
 from sims.core.simulator import Scenario
 from sims.systems.pendulum import Pendulum
 from tests.bench.diagnosis.explained_samples import recording, searched, white, world
@@ -200,7 +200,7 @@ def test_a_change_that_explodes_is_none_and_multiplies_without_a_warning(swing, 
     assert not found.responses[:, 10:, :, first].any()
     seen = np.isfinite(there.observed)
     left = np.where(seen, there.observed - fit.simulated, 0.0)
-    scores = score_candidates(fit, left, found, seen, white(there, 0.003))
+    scores = ScoreTest(fit, found, seen, white(there, 0.003)).compute_scores(left, None)
     assert np.isfinite(scores.score).all()
     np.testing.assert_allclose(found.responses[..., 0, second][seen[..., 0]], 1.0, atol=1e-4)
 

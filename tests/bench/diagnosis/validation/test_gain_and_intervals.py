@@ -18,6 +18,7 @@ from bench.diagnosis.validation.held_out_runs import HeldOutRuns
 from sims.systems.pendulum import Pendulum
 from sims.systems.slider import Slider
 from tests.bench.diagnosis.explained_samples import (
+    autoregressive,
     correlated,
     marked,
     recorded,
@@ -140,7 +141,7 @@ def test_intervals_cover_the_truth(phi):
         Slider(fixed={"drag.linear": 0.4}, observe=["x"]), [1.3], [({}, {"u": push})], times
     )
     there = world(made, candidates=["drag.linear"])
-    clean, noise = there.observed.copy(), white(there, 0.004).with_correlation(phi)
+    clean, noise = there.observed.copy(), autoregressive(there, 0.004, phi)
     theta = np.array([1.3, 0.4])
     for _ in range(60):
         there.observed[...] = clean + correlated(rng, phi, 0.004, clean.shape)

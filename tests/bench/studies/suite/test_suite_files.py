@@ -94,7 +94,10 @@ def test_problems_without_their_data_are_left_out_with_the_reason(without_data_s
 
 
 def test_a_suite_without_any_data_is_refused(without_data_sets):
-    suite = load_experiment("suite").chosen(experiments=("suite/measured-swing.toml",))
+    suite = load_experiment("suite")
+    measured = tuple(file for file in suite.experiments if "measured-swing" in file)
+    assert measured
+    suite = suite.chosen(experiments=measured)
     with pytest.raises(InputError, match="no problem can run here: measured-swing needs"):
         leave_out_missing_problems(suite)
 
