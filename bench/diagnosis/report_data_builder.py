@@ -167,7 +167,7 @@ class DiagnosisReportDataBuilder:
 
     @property
     def _is_cross_validated(self) -> bool:
-        """Whether the gain was measured by cross-validation instead of on held-out runs."""
+        """True if the gain was measured by cross-validation instead of on held-out runs."""
         validation = self.assessor.validation
         return validation is not None and validation.is_cross_validation
 

@@ -52,7 +52,7 @@ def _of(diagnoser: str, answered: AnswersByCase) -> Iterator[dict[str, Any]]:
 def build_answer_row(
     question: str, item: BenchmarkCase, given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Build the result row of one answer: its case, truth, answer, grade and cost.
+    """Build the result row of one answer: its case, true causes, answer, grade and cost.
 
     The rows of all answers are the file items.csv, from which all tables and figures are computed.
 
@@ -65,7 +65,7 @@ def build_answer_row(
         Values by column. ``found`` and ``found_class`` tell whether the cause was identified
         without and with equivalent effects counted as one. ``alarm`` tells whether the diagnoser
         says that something is missing; a missing answer counts as an alarm. ``intervals`` is the
-        number of closed 95 % intervals, ``holding`` how many of them contain the truth.
+        number of closed 95 % intervals, ``holding`` how many of them contain the true value.
     """
     answer = given["answer"]
     mark = grade_answer(item, answer)

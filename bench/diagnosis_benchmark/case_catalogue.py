@@ -114,7 +114,7 @@ def render_recording(item: BenchmarkCase) -> RecordingFiles:
     The process receives these texts and no path, so that it cannot find other files of the case.
 
     Args:
-        item: the case; its truth is not among the texts.
+        item: the case; its true causes are not among the texts.
     """
     with tempfile.TemporaryDirectory() as folder:
         if item.system in machines.MACHINE_NAMES:

@@ -99,8 +99,8 @@ def evaluate_case(
         hidden: folders that no diagnoser may read.
 
     Returns:
-        JSON document with the name of the case (``question``), the case with its truth (``item``,
-        {} if the sensors cannot show the cause), and one row per diagnoser (``rows``).
+        JSON document with the name of the case (``question``), the case with its true causes
+        (``item``, {} if the sensors cannot show the cause), and one row per diagnoser (``rows``).
     """
     asked = CaseSpec.from_json(question)
     item = (

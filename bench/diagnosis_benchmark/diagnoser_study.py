@@ -258,8 +258,8 @@ class _EvaluationRun:
     def __init__(self, study: DiagnosisStudy, kept: AnswerStore, progress: ProgressFactory) -> None:
         """Collect what the run needs: salt, limits of an answer, and hidden folders.
 
-        Diagnosers must not read the hidden folders: the result folder, which contains the truths,
-        and the cache of trained weights.
+        Diagnosers must not read the hidden folders: the result folder, which contains the true
+        causes, and the cache of trained weights.
 
         Args:
             study: the study.
@@ -455,8 +455,8 @@ def _refuse_unreachable(names: Sequence[str]) -> None:
 def _announced(name: str, trusted: bool) -> None:
     """Register a stub for a diagnoser of another package, without importing its code here.
 
-    The truths of the cases are in the memory of this process, so foreign code must not run in it
-    unless it is trusted.
+    The true causes of the cases are in the memory of this process, so foreign code must not run
+    in it unless it is trusted.
 
     Args:
         name: registered name of the diagnoser.

@@ -71,7 +71,7 @@ def grade_answer(item: BenchmarkCase, verdict: Mapping[str, Any] | None) -> Grad
     """Grade one answer.
 
     Args:
-        item: the case with its truth.
+        item: the case with its true causes.
         verdict: the answer as a dictionary; None for a missing answer.
     """
     if verdict is None:
@@ -200,16 +200,16 @@ def _count_classes(names: Sequence[str], equivalents: EquivalentEffects) -> int:
 def _count_covered_intervals(
     item: BenchmarkCase, verdict: Mapping[str, Any], sets: NamedSets
 ) -> dict[str, bool | None]:
-    """Compare the intervals of base parameters and of leading causes with the truth.
+    """Compare the intervals of base parameters and of leading causes with the true values.
 
     Args:
-        item: the case with its truth.
+        item: the case with its true causes.
         verdict: the answer as a dictionary.
         sets: the named sets; the first name of each is its leading cause.
 
     Returns:
-        By parameter or coefficient, whether the 95 % interval contains the truth; see `Grade`. It
-        is empty if a leading cause is wrong.
+        By parameter or coefficient, whether the 95 % interval contains the true value; see
+        `Grade`. It is empty if a leading cause is wrong.
     """
     truth, said = dict(item.parameters), dict(verdict["parameters"])
     led = {names[0] for names in sets}

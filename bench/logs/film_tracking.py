@@ -149,7 +149,7 @@ def _heights(
     """Convert the track of the ball from pixels to heights in metres.
 
     The best available scale is used unless `scale` names one: a calibrated camera whose file lies
-    beside the film, the known diameter of the ball (m), or the acceleration of free fall.
+    next to the film, the known diameter of the ball (m), or the acceleration of free fall.
     """
     known = get_camera_file_path(video)
     if scale == "camera" or (scale is None and known.is_file()):

@@ -221,7 +221,7 @@ def _tau(row: pd.Series) -> str:
     """Format how well the rankings of the tuners in both simulators agree, by one metric.
 
     Kendall's tau is 1 for equal rankings and -1 for reversed ones. The agreement between two halves
-    of the targets shows how much a ranking varies by chance.
+    of the targets shows how much a ranking varies with the drawn targets.
 
     Args:
         row: row of the table of rank agreement.

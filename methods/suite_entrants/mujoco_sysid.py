@@ -1,7 +1,6 @@
 """Least squares of mujoco.sysid, the system identification toolbox of MuJoCo.
 
-Sources: E. Todorov, T. Erez, Y. Tassa, MuJoCo: a physics engine for model-based control, IROS
-2012; https://github.com/google-deepmind/mujoco, python/mujoco/sysid.
+Sources: E. Todorov et al., IROS 2012; https://github.com/google-deepmind/mujoco, python/sysid.
 """
 
 import importlib
@@ -29,7 +28,7 @@ class MuJoCoSysId(Tuner):
 
         def minimise(residuals: Callable[[Array], Array]) -> str:
             """Minimise residuals (n, N) of points (n, dim); mujoco.sysid has points in columns."""
-            # MuJoCo would look for a display in a process of its own, which isolation forbids.
+            # MuJoCo would look for a display in another process.
             os.environ.setdefault("MUJOCO_GL", "disable")
             sysid = importlib.import_module("mujoco.sysid")  # it has no types
             unknown = sysid.ParameterDict()

@@ -165,7 +165,7 @@ class Experiment:
         same_targets_as: another experiment whose targets are met; its own where empty.
         training_budget: simulations that a learned tuner may train with.
         timeout: seconds a run may take.
-        memory: MiB that a run may take beside what its worker holds; 0 is no limit.
+        memory: MiB that a run may take in addition to its worker; 0 is no limit.
         noise: standard deviation of the sensor noise added to simulated targets, by channel.
         resolution: step to which the noisy samples of simulated targets are rounded, by channel.
         settings: the simulator's own settings, e.g. its time step.

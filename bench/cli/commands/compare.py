@@ -54,7 +54,7 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=_run_compare)
 
 
-def _begin_or_resume(options: argparse.Namespace, say: PrintLine) -> list[Study]:
+def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list[Study]:
     """Begin or resume the study, or the studies of a sweep.
 
     Problems of a suite that cannot run here are printed with what they need.
@@ -83,7 +83,7 @@ def _begin_or_resume(options: argparse.Namespace, say: PrintLine) -> list[Study]
     chosen = build_experiment(options.experiment, comparison)
     chosen, missing = leave_out_missing_problems(chosen)
     for name, reason in missing.items():
-        say(f"skipped: {name}: {reason}")
+        print_line(f"skipped: {name}: {reason}")
     with prefix_errors_with_option("--out", options.out):
         return begin_studies(chosen, comparison)
 

@@ -216,7 +216,7 @@ def _fitted(
 
 
 class _Shown:
-    """What the runs show about the coefficients of absent effects, at a fitted model."""
+    """Information in the runs about the coefficients of absent effects, at a fitted model."""
 
     def __init__(
         self,

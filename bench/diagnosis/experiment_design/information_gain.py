@@ -232,7 +232,7 @@ class RunRanker:
         return _LinearisedRun(lanes[0], numbers.T, initial.T / STATE_STEP_SHARE)
 
     def _told(self, run: CandidateRun, true: _Known, rival: _Known) -> float:
-        """Compute the discrimination T of eq. (1) of a run, to which the rival is refitted.
+        """Compute the discrimination T of eq. (1) of a run, to which the competitor is refitted.
 
         The prediction of the model `true` takes the place of the recording. The fit of `rival` by
         Levenberg-Marquardt may move its parameters as far as the present data allow.

@@ -187,7 +187,7 @@ class ModelSet:
     def get_effect_penalty(self, name: str) -> float:
         """Return the part of the last term of eq. (1), the merit, that belongs to an effect.
 
-        An effect with many shapes gains likelihood by chance. The part of this gain that the
+        An effect with many shapes gains likelihood from noise alone. The part of this gain that the
         penalty of its coefficients does not cover is subtracted.
         """
         slot = self.world.slots[name]

@@ -194,7 +194,7 @@ def _nearly_as_likely(
     """Return the sets whose likelihood in the filter is too close to that of the best set.
 
     The filter uses a linearised model, so these sets are then fitted by simulation. The likeliest
-    is the first; at least `MAX_FIRST_EFFECTS` sets are returned if there are so many.
+    is the first; at least `MAX_FIRST_EFFECTS` sets are returned if there are that many.
     """
     if not larger_sets:
         return ()

@@ -88,7 +88,7 @@ class Confirmation(Inquiry):
         return self._finding(verdict, base, model, causes, lack_of_fit)
 
     def _measure(self) -> None:
-        """Predict held-out runs with the model and its rivals, and drop unhelpful effects."""
+        """Predict held-out runs with the model and its competitors, and drop unhelpful effects."""
         if self._held_out is None or self._model is None:
             return
         search, model = self._robot, self._model

@@ -147,7 +147,7 @@ def _name(report: DiagnosisReportData, candidate: Candidate) -> str:
 def _label_rows(
     axis: Axes, report: DiagnosisReportData, candidates: Sequence[Candidate], names: Sequence[str]
 ) -> None:
-    """Write the names of the candidates beside their rows, the first at the top.
+    """Write the names of the candidates next to their rows, the first at the top.
 
     A name is bold unless the status of the candidate is "not needed".
     """

@@ -120,9 +120,9 @@ class AlternativeFinder:
     def _rivals(self, model: FittedModel, effect: str) -> list[tuple[float, str]]:
         """List the effects that explain the data as well as the given one, with their distance.
 
-        A rival is tested by the fitted models in which it replaces the effect and everything else
-        is equal. The distance is how far such a model is behind, in twice the log-likelihood; the
-        effect itself has the distance 0.
+        A competing effect is tested by the fitted models in which it replaces the effect and
+        everything else is equal. The distance is how far such a model is behind, in twice the
+        log-likelihood; the effect itself has the distance 0.
         """
         shared = set(model.effects) - {effect}
         rivals = [(0.0, effect)]

@@ -170,7 +170,7 @@ class Inquiry:
         return None
 
     def _try(self) -> None:
-        """Compare the model with its rivals on held-out runs, and drop effects that do not help.
+        """Compare the model with competitors on held-out runs, and drop effects that do not help.
 
         It does nothing if there are no held-out runs and too few runs for cross-validation.
         """

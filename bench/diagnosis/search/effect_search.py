@@ -245,7 +245,7 @@ class EffectSearch(ModelMoves):
 
     @cached_property
     def _forgets(self) -> bool:
-        """Whether the motion forgets its initial state quickly, as strongly damped systems do.
+        """True if the motion forgets its initial state quickly, as strongly damped systems do.
 
         Segments of the runs are then no easier to fit than whole runs.
         """

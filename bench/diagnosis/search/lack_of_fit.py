@@ -133,12 +133,12 @@ class LackOfFitResult:
 
     @property
     def has_structure(self) -> bool:
-        """Whether the residual contains more than noise, by the test or by its size."""
+        """True if the residual contains more than noise, by the test or by its size."""
         return has_structure(self.p_value, self.p_value_threshold, self.channels_above_noise)
 
 
 def list_hat_effects(kind: type[SystemSimulator]) -> list[type[Effect]]:
-    """Return the effects with which `assess_lack_of_fit` simulates a force of any shape.
+    """Return the effects with which `assess_lack_of_fit` simulates an arbitrary force.
 
     Run evaluators need them in their library. A robot has a hat force for each joint.
     """

@@ -426,7 +426,7 @@ def _scored(
     """Return the scores of a residual, with a p-value from surrogate residuals.
 
     The surrogates are random noise with the spectrum of the residual `against` (R, T, C); they show
-    which scores such noise reaches by chance.
+    which scores such noise reaches without any effect.
     """
     return compute_calibrated_scores(
         test,
