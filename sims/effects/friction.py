@@ -80,7 +80,7 @@ class CoulombFriction(Friction):
 
     name = "friction.coulomb"
     noun = "Coulomb friction"
-    says = "a constant friction opposes motion, and holds still what pulls less"
+    says = "a constant friction opposes motion, and smaller forces do not start it"
     source = _SURVEY
     needs = "guide"
     coefficients = (Coefficient("coefficient", _USUAL, _DRY),)
