@@ -297,7 +297,8 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
         parser.refuse_unknown("command", chosen, names)
     options, unknown = parser.parse_known_args(words)
     for word in unknown:
-        command = options.command_parser
+        # Without a command in the first place, as with an option before it, the program's parser.
+        command = getattr(options, "command_parser", parser)
         if word.startswith("-"):
             name = word.partition("=")[0]
             command.refuse_unknown("option", name, command._option_string_actions)

@@ -220,7 +220,7 @@ def make_cost_chart(view: ComparisonView) -> ComparisonChart:
         rank = table.groupby(["range", "tuner"]).cumcount()
         parts.append(table[rank % _THINNING_STEP == 0].assign(threshold=level))
         for kind in view.ranges:
-            winners = list(find_cheapest_tuners(costs[kind], TARGETS_PER_TRAINING))
+            winners = list(find_cheapest_tuners(costs.get(kind, {}), TARGETS_PER_TRAINING))
             looks = dict(view.get_tuner_styles(tuner for _, _, tuner in winners))
             spans = tuple(
                 AxisSpan(low, high, tuner, looks[tuner], foot=True) for low, high, tuner in winners

@@ -180,7 +180,12 @@ class ConventionComparison:
         hypotheses = [difference.hypothesis for difference in differences]
         parts = self._parts(corrected)
         explained = _log_likelihood(self._follow(parts)) + _log_scales(hypotheses, parts)
-        if explained < self._log_likelihood_of_causes(corrected) + CAUSES_MARGIN:
+        causes = self._log_likelihood_of_causes(corrected)
+        if explained < causes + CAUSES_MARGIN:
+            return []
+        # If the filter diverges on the log as described, causes cannot be compared: only a
+        # correction that leaves nothing unexplained is certain.
+        if np.isinf(causes) and self._largest_missing_force(corrected) > MIN_MISSING_FORCE:
             return []
         if not self._removes_missing_force(described, corrected):
             return []

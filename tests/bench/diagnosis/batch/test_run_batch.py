@@ -72,7 +72,7 @@ def test_every_log_has_its_folder_and_its_row(logs, tmp_path, capsys):
     assert "friction.coulomb: in 3 of 3 logs, 0.3" in said
     assert f"report  {out / 'report.html'}" in said
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "3 logs, each explained by itself" in page
+    assert "3 logs, each explained separately" in page
     assert page.count('<a href="day') == 3
     environment = json.loads((out / "environment.json").read_text())
     assert environment["settings"]["each"] is True
