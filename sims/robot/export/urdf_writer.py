@@ -96,14 +96,10 @@ class UrdfWriter:
         joint = self.joints.get(cause.place)
         if joint is None:
             return _NO_JOINT
-        stated = _child(joint, "dynamics")
-        before = float((stated.get_attribute(attribute) if stated else None) or 0.0)
-        value = format_number(float(add_to_stated(before, cause.coefficients[0])))
-        self._add_comment(stated or joint, cause)
-        if stated:
-            stated.new[attribute] = value
-        else:
-            _insert(joint, "dynamics", attribute, value)
+        dynamics = _child_or_new(joint, "dynamics")
+        before = float(dynamics.get_attribute(attribute) or 0.0)
+        self._add_comment(dynamics, cause)
+        dynamics.new[attribute] = format_number(float(add_to_stated(before, cause.coefficients[0])))
         return None
 
     def _add_comment(self, tag: XmlElement, cause: FittedCause) -> None:
@@ -168,14 +164,7 @@ class UrdfWriter:
         for name, inertial in inertials:
             self._add_comment(inertial, cause)
             moved = self._axes(name, body).T @ cause.coefficients  # (2)
-            origin = _child(inertial, "origin")
-            if origin is None:
-                inertial.within.append(
-                    ([], f'<origin xyz="{format_numbers(tuple(moved))}" rpy="0 0 0"/>')
-                )
-                continue
-            before = _vector(origin.get_attribute("xyz"))
-            origin.new["xyz"] = format_numbers(tuple(float(v) for v in before + moved))
+            _set(inertial, "origin", "xyz", _origin(inertial, "xyz") + moved)
         return None
 
     def _zero(self, cause: FittedCause) -> str | None:
@@ -191,11 +180,10 @@ class UrdfWriter:
         axis = _axis_of(joint)
         axes = _turn(_origin(joint, "rpy"))
         if joint.get_attribute("type") == "prismatic":
-            moved = _origin(joint, "xyz") - axes @ axis * c
-            _set(joint, "origin", "xyz", tuple(moved.tolist()))
+            _set(joint, "origin", "xyz", _origin(joint, "xyz") - axes @ axis * c)
         else:
             turned = Rotation.from_matrix(axes) * Rotation.from_rotvec(-c * axis)
-            _set(joint, "origin", "rpy", tuple(turned.as_euler("xyz").tolist()))  # (3)
+            _set(joint, "origin", "rpy", turned.as_euler("xyz"))  # (3)
         return None
 
     def _axis(self, cause: FittedCause) -> str | None:
@@ -207,8 +195,8 @@ class UrdfWriter:
         if joint is None:
             return _NO_JOINT
         self._add_comment(joint, cause)
-        axis = Rotation.from_rotvec(cause.coefficients).apply(_axis_of(joint))
-        _set(joint, "axis", "xyz", tuple(axis.tolist()))
+        turn = Rotation.from_rotvec(cause.coefficients)
+        _set(joint, "axis", "xyz", turn.apply(_axis_of(joint)))
         return None
 
     def _length(self, cause: FittedCause) -> str | None:
@@ -226,7 +214,7 @@ class UrdfWriter:
         axes = self._axes(_names(joints[0], "parent"), carrier)
         moved = axes.T @ model.body_pos[body.id] * cause.coefficients[0]  # (4)
         self._add_comment(joints[0], cause)
-        _set(joints[0], "origin", "xyz", tuple((_origin(joints[0], "xyz") + moved).tolist()))
+        _set(joints[0], "origin", "xyz", _origin(joints[0], "xyz") + moved)
         return None
 
     def _payload(self, cause: FittedCause) -> str | None:
@@ -261,7 +249,7 @@ class UrdfWriter:
         mass_tag.new["value"] = format_number(mass + more)
         for key, value in zip(_TENSOR, tensor[np.triu_indices(3)].tolist(), strict=True):
             tensor_tag.new[key] = format_number(value)
-        _set(inertial, "origin", "xyz", tuple(middle.tolist()))
+        _set(inertial, "origin", "xyz", middle)
         return None
 
     def _axes(self, link: str, body: str) -> Array:
@@ -269,8 +257,7 @@ class UrdfWriter:
         axes = np.eye(3)
         while link != body:
             (joint,) = [tag for tag in self.joints.values() if _names(tag, "child") == link]
-            origin = _child(joint, "origin")
-            axes = _turn(_vector(origin.get_attribute("rpy") if origin else None)) @ axes
+            axes = _turn(_origin(joint, "rpy")) @ axes
             link = _names(joint, "parent")
         return axes
 
@@ -292,27 +279,22 @@ def _axis_of(joint: XmlElement) -> Array:
     return result
 
 
-def _set(tag: XmlElement, name: str, attribute: str, values: tuple[float, ...]) -> None:
+def _set(tag: XmlElement, name: str, attribute: str, vector: Array) -> None:
     """Set a vector of a child element, which is added if there is none."""
+    _child_or_new(tag, name).new[attribute] = format_numbers(tuple(vector.tolist()))
+
+
+def _child_or_new(tag: XmlElement, name: str) -> XmlElement:
+    """Return the child element with a name, which is added if there is none."""
     child = _child(tag, name)
     if child is None:
-        _insert(tag, name, attribute, format_numbers(values))
-    else:
-        child.new[attribute] = format_numbers(values)
-
-
-def _insert(tag: XmlElement, name: str, attribute: str, value: str) -> None:
-    """Insert a child element, or add an attribute to a child inserted before."""
-    begin = f"<{name} "
-    for i, (comments, element) in enumerate(tag.within):
-        if element.startswith(begin):
-            tag.within[i] = (comments, f'{begin}{attribute}="{value}" {element[len(begin) :]}')
-            return
-    tag.within.append(([], f'{begin}{attribute}="{value}"/>'))
+        child = XmlElement(name, {}, tag.inside)
+        tag.inserted.append(child)
+    return child
 
 
 def _child(tag: XmlElement, name: str) -> XmlElement | None:
-    return next((child for child in tag.children if child.name == name), None)
+    return next((c for c in (*tag.children, *tag.inserted) if c.name == name), None)
 
 
 def _names(joint: XmlElement, end: str) -> str:
@@ -343,11 +325,5 @@ def _vector(text: str | None) -> Array:
 
 def _turn(rpy: Array) -> Array:
     """Return the axes (3, 3) rotated about fixed x, y and z in turn, as URDF defines ``rpy``."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+    axes: Array = Rotation.from_euler("xyz", rpy).as_matrix()
+    return axes

@@ -32,6 +32,7 @@ class XmlElement:
         renamed: new name of the element.
         before: comments to insert before it.
         within: elements with comments to insert as its first children.
+        inserted: new children, whose attributes may still change; written after `within`.
         after: elements to insert after it.
         text: text that replaces the element.
     """
@@ -47,17 +48,16 @@ class XmlElement:
     renamed: str = ""
     before: list[str] = field(default_factory=list)
     within: list[tuple[list[str], str]] = field(default_factory=list)
+    inserted: list[XmlElement] = field(default_factory=list)
     after: list[str] = field(default_factory=list)
     text: bytes | None = None
 
     @property
     def has_changes(self) -> bool:
         """Whether the element or any of its descendants has changes."""
-        own = self.new or self.removed or self.renamed or self.before or self.within
-        replaced = self.text is not None
-        return bool(own or self.after or replaced) or any(
-            child.has_changes for child in self.children
-        )
+        own = self.new or self.removed or self.renamed or self.before or self.after
+        replaced = self.within or self.inserted or self.text is not None
+        return bool(own or replaced) or any(child.has_changes for child in self.children)
 
     def get_attribute(self, name: str) -> str | None:
         """Return the value of an attribute, including changes; None if it is missing."""
@@ -173,7 +173,7 @@ class XmlText:
         comments = [self._comment(text) + self._newline + indent for text in tag.before]
         if tag.text is not None:
             return b"".join([*comments, tag.text])
-        if self._closed(tag) and tag.within:
+        if self._closed(tag) and (tag.within or tag.inserted):
             raise NotEditableError(f"{tag.name} has nothing in it")
         closing = self.text[tag.end : self._after(tag)] if not self._closed(tag) else b""
         if tag.renamed:
@@ -187,7 +187,8 @@ class XmlText:
         """Return the text of the elements inserted before all children."""
         below = self._indent(tag.children[0].begin) if tag.children else indent + b"  "
         parts = []
-        for comments, element in tag.within:
+        inserted = [(child.before, _render_new_element(child)) for child in tag.inserted]
+        for comments, element in [*tag.within, *inserted]:
             for line in [*map(self._comment, comments), *([element.encode()] if element else [])]:
                 parts += [self._newline + below, line]
         return b"".join(parts)
@@ -221,6 +222,11 @@ class XmlText:
         """Return the indentation of an element; empty if other text precedes it on its line."""
         line = self.text[self.text.rfind(b"\n", 0, begin) + 1 : begin]
         return line if not line.strip() else b""
+
+
+def _render_new_element(tag: XmlElement) -> str:
+    attributes = [_attribute(name, value).decode() for name, value in tag.new.items()]
+    return f"<{' '.join([tag.name, *attributes])}/>"
 
 
 def _attribute(name: str, value: str) -> bytes:

@@ -171,6 +171,21 @@ def test_a_urdf_states_geometry(tmp_path: Path) -> None:
     ]
 
 
+def test_causes_that_add_the_same_element_to_a_urdf_combine(tmp_path: Path) -> None:
+    """The file states neither the origin of the inertial, nor the origin and axis of the joint."""
+    path = tmp_path / "arm.urdf"
+    text = urdf(link("base"), link("a"), joint("i", "base", "a"))
+    path.write_text(text.replace('<axis xyz="1 0 0"/>', ""))
+    arm = read_robot(path)
+    causes: CauseCoefficients = {
+        "joint.axis@i": {"y": number(0.1, "rad"), "z": number(0.3, "rad")},
+        "joint.zero@i": one(0.2),
+        "mass.offset@a": {"y": number(0.1, "m")},
+        "payload@a": {"mass": number(0.4, "kg"), "y": number(0.3, "m")},
+    }
+    check_written_files(arm, causes, write_model_files(arm, causes))
+
+
 def test_small_masses_at_points_add_up_to_a_payload(tmp_path: Path) -> None:
     """Their mass and first moment are those of the payload (Steiner, for the moment of inertia)."""
     payload = make_robot_simulator(robot(tmp_path)).system.effect("payload@fore")()
