@@ -84,13 +84,21 @@ class RobotSystem(System):
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
-        """Return the effect at each of its places, without effects that are free parameters."""
+        """Return the effect at each of its places, without effects that are free parameters.
+
+        A payload is also left out on a body whose mass is free, since the log cannot tell the
+        two masses apart.
+        """
         if effect.name not in cls._placed:
-            found = effect_places.make_effect_classes(
-                effect, cls.places, MODEL_FIELD_EFFECTS, cls._compiles
+            cls._placed[effect.name] = tuple(
+                effect_places.make_effect_classes(
+                    effect, cls.places, MODEL_FIELD_EFFECTS, cls._compiles
+                )
             )
-            cls._placed[effect.name] = tuple(found)
-        return [one for one in cls._placed[effect.name] if not cls.is_free(one)]
+        found = [one for one in cls._placed[effect.name] if not cls.is_free(one)]
+        if effect.name == "payload":
+            return [one for one in found if f"mass.scale@{one.place}" not in cls.freed_parameters]
+        return found
 
     @classmethod
     def _compiles(cls, effect: type[Effect]) -> bool:
@@ -111,12 +119,8 @@ class RobotSystem(System):
 
     @classmethod
     def is_free(cls, effect: type[Effect]) -> bool:
-        """Return whether a coefficient of an effect is a parameter; then it cannot be a cause.
-
-        The mass of a payload is also one of a body whose mass is free.
-        """
+        """Return whether a coefficient of an effect is a parameter; then it cannot be a cause."""
         names = {effect.name, *(member.name for member in getattr(effect, "members", ()))}
-        names |= {name.replace("payload@", "mass.scale@") for name in names}
         return not cls.freed_parameters.isdisjoint(names)
 
     @classmethod
