@@ -74,13 +74,7 @@ class BenchCache:
         """Return a batch from the cache, or create it.
 
         Creating a batch compiles the model, which takes much longer than a simulation. A model that
-                                                                                        MuJoCo
-                                                                                        rejects is
-                                                                                        stored with
-                                                                                        the reason,
-                                                                                        and is not
-                                                                                        compiled
-                                                                                        again.
+        MuJoCo rejects is stored with the reason, and is not compiled again.
 
         Args:
             series: effects in series with joints.

@@ -8,7 +8,6 @@ step of a small robot. Here the compiled program of the effects runs in the call
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -119,22 +118,21 @@ class _Contexts:
         program = compiled.program_layout
         places = compiled.addresses
         joints = places.velocities.size
-        states = program.next_states
-        shared = {
-            "code": program.code,
-            "positions": _integers(places.positions),
-            "velocities": _integers(places.velocities),
-            "forces": _integers(program.forces),
-            "limits": _integers(program.limits),
-            "next_states": _integers(states),
-            "step": np.array([compiled.step]),
+        layout = program._asdict()
+        layout |= {"positions": places.positions, "velocities": places.velocities}
+        shared: dict[str, NDArray[Any]] = {
+            name: np.ascontiguousarray(values, dtype=np.int64)
+            for name, values in layout.items()
+            if isinstance(values, np.ndarray)
         }
-        self._arrays: list[NDArray[Any]] = list(shared.values())
+        shared["step"] = np.array([compiled.step])
+        self._arrays = list(shared.values())
         self._registers: list[Array] = []
         self._a = slice(program.a, program.a + joints)
         self._accelerations: Array = bench.batch.bind("qacc")
         self._dofs = places.velocities
-        common = {name: values.ctypes.data for name, values in shared.items()}
+        common = layout | {name: values.ctypes.data for name, values in shared.items()}
+        rubs = bool(compiled.has_dry_friction.any())
         inputs = compiled.input_values
         loss = bench.fields["dof_frictionloss"]
         table = []
@@ -144,31 +142,20 @@ class _Contexts:
                 "registers": registers,
                 "losses": np.ascontiguousarray(losses[lane]),
                 "input_values": np.ascontiguousarray(inputs[:, :, lane]),
-                "scratch": np.zeros(joints + states.size + 1),
+                "scratch": np.zeros(joints + program.next_states.size + 1),
             }
             self._registers.append(registers)
             self._arrays += own.values()
             addresses = {name: values.ctypes.data for name, values in own.items()}
-            rubs = bool(compiled.has_dry_friction.any())
             context = CallbackContext(
                 **common,
                 **addresses,
                 code_rows=len(program.code),
-                begin=program.begin,
-                end=program.end,
                 register_count=len(registers),
                 joints=joints,
                 friction_rows=int((loss[lane] > 0).sum()) if rubs else 0,
-                states=states.size,
-                first_state=program.first_state,
+                states=program.next_states.size,
                 inputs=inputs.shape[1],
-                first_input=program.first_input,
-                t=program.t,
-                midpoint=program.midpoint,
-                past=program.past,
-                x=program.x,
-                v=program.v,
-                a=program.a,
                 steps=steps,
                 evaluations_per_step=4 if bench.model.opt.integrator == RK4_INTEGRATOR_ID else 1,
                 evaluation=0,
@@ -189,10 +176,6 @@ class _Contexts:
         self._words[:, HAS_ACCELERATION] = 0
         for lane, registers in enumerate(self._registers):
             registers[self._a] = self._accelerations[lane, self._dofs, None] if first else 0.0
-
-
-def _integers(values: Sequence[int] | NDArray[Any]) -> NDArray[np.int64]:
-    return np.ascontiguousarray(values, dtype=np.int64)
 
 
 @cache

@@ -26,7 +26,7 @@ from sims.engines.compiled.force_program import (
     emit_instructions,
     make_input_vector,
 )
-from sims.engines.compiled.kernel import CompiledKernel, get_kernel
+from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.node_arrays import NotTraceableError
 from sims.robot.dynamics.effect_forces import (
     EffectForces,
@@ -128,7 +128,7 @@ class _Tracing:
         Effects are called with these snapshots instead of numbers, which records their
         arithmetic. There are two instants: the beginning of a step, and its middle with the
         predicted state (midpoint rule). Time, states and inputs change in each step; the servo
-                                         stiffness is constant for a batch element.
+        stiffness is constant for a batch element.
         """
         graph = ExpressionGraph()
         joints = len(system.coordinates)
@@ -249,10 +249,9 @@ class CompiledForces:
     Args:
         forces: effects to evaluate.
         program: program of these effects.
-        run_by: functions that execute programs.
     """
 
-    def __init__(self, forces: EffectForces, program: _Program, run_by: CompiledKernel) -> None:
+    def __init__(self, forces: EffectForces, program: _Program) -> None:
         """Allocate registers (n, L) for L batch elements, and write everything that stays constant.
 
         Constant are the step length, the servo stiffness and the coefficients. Instructions
@@ -278,8 +277,9 @@ class CompiledForces:
         coefficients = [own[:, :, 0] for _, own in _effects(forces)]
         r[c:states] = np.concatenate(coefficients)
         first, moment, end, _ = written.ends.tolist()
-        run_by.make_instruction_runner(written.code, first, moment, r)()
-        self._run = run_by.make_instruction_runner(written.code, moment, end, r)
+        kernel = get_kernel()
+        kernel.make_instruction_runner(written.code, first, moment, r)()
+        self._run = kernel.make_instruction_runner(written.code, moment, end, r)
 
     @cached_property
     def _felt(self) -> Array:
@@ -374,7 +374,6 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
     The result is None if there is nothing to compile, if an effect cannot be traced, or if the
     program would be too large; then the caller evaluates `forces` with NumPy.
     """
-    run_by = get_kernel()
     groups = [[effect for effect, _ in group] for group in _groups(forces)]
     if not any(groups):
         return None
@@ -383,17 +382,15 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
     if inputs not in tracings:
         tracings[inputs] = _Tracing(forces.system, inputs)
     tracing = tracings[inputs]
-    if not all(_compiles(tracing, forces, effect, run_by) for effect, _ in _effects(forces)):
+    if not all(_compiles(tracing, forces, effect) for effect, _ in _effects(forces)):
         return None
     try:
-        return CompiledForces(forces, tracing.program(groups), run_by)
+        return CompiledForces(forces, tracing.program(groups))
     except NotTraceableError:  # The program is too large; the effects themselves are valid.
         return None
 
 
-def _compiles(
-    tracing: _Tracing, forces: EffectForces, effect: Effect, run_by: CompiledKernel
-) -> bool:
+def _compiles(tracing: _Tracing, forces: EffectForces, effect: Effect) -> bool:
     """Return whether an effect can be traced, and then gives the same numbers as with NumPy.
 
     Each class of effects is tested once; a failure is reported on standard error.
@@ -402,7 +399,7 @@ def _compiles(
     if kind not in tracing.known:
         tracing.known[kind] = False
         try:
-            _check(tracing, _alone(forces, effect), run_by)
+            _check(tracing, _alone(forces, effect))
             tracing.known[kind] = True
         # An effect of a user may raise any exception when it is evaluated with traced values.
         except Exception as reason:
@@ -413,7 +410,7 @@ def _compiles(
     return tracing.known[kind]
 
 
-def _check(tracing: _Tracing, forces: EffectForces, run_by: CompiledKernel) -> None:
+def _check(tracing: _Tracing, forces: EffectForces) -> None:
     """Compare an effect's program with numpy at random states.
 
     Positions, velocities and loads are random numbers of different sizes, with a fixed seed, so
@@ -423,7 +420,7 @@ def _check(tracing: _Tracing, forces: EffectForces, run_by: CompiledKernel) -> N
         NotTraceableError: the results differ.
     """
     program = tracing.program([[effect for effect, _ in group] for group in _groups(forces)])
-    quick = CompiledForces(forces, program, run_by)
+    quick = CompiledForces(forces, program)
     rng = np.random.default_rng(0)
     steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.felt.values())])
     for k in range(steps):

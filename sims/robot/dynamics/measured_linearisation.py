@@ -229,7 +229,7 @@ class MeasuredLinear(RunLinearisation):
         """Compose the steps between samples into the linear maps (3), and the readings (4).
 
         The maps give the deviation at the next sample from that at a sample, which a Kalman
-        smoother needs. The integration error of each step is composed in the same way.
+        smoother needs. The defect of each step is composed in the same way.
         """
         tangent, size = self._tangent, self._tangent.state_size
         forces = tangent.quotients.forces.shape[2]
