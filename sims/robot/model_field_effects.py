@@ -340,9 +340,9 @@ def _add_payload(fields: Fields, robot: RobotModel, place: str, c: Array) -> Non
     mass, centre = fields["body_mass"][loaded, number], fields["body_ipos"][loaded, number]
     total = mass + c[0, loaded]
     middle = (mass[:, None] * centre + c[0, loaded, None] * point) / total[:, None]
-    axes = _rotation_matrices(fields["body_iquat"][loaded, number])
-    moments = fields["body_inertia"][loaded, number]
-    tensor = np.einsum("lij,lj,lkj->lik", axes, moments, axes)
+    tensor = compute_inertia_tensors(
+        fields["body_iquat"][loaded, number], fields["body_inertia"][loaded, number]
+    )
     tensor += mass[:, None, None] * compute_point_inertias(centre - middle)
     tensor += c[0, loaded, None, None] * compute_point_inertias(point - middle)  # (7)
     moments, axes = np.linalg.eigh(tensor)
@@ -368,12 +368,17 @@ def compute_point_inertias(arms: Array) -> Array:
     return result
 
 
-def _rotation_matrices(quaternions: Array) -> Array:
-    """Return rotation matrices (L, 3, 3) of unit quaternions (L, 4)."""
+def compute_inertia_tensors(quaternions: Array, moments: Array) -> Array:
+    """Compute inertia tensors (L, 3, 3) in the axes of the bodies.
+
+    Args:
+        quaternions: (L, 4) orientations of the principal axes, MuJoCo's w first.
+        moments: (L, 3) principal moments.
+    """
     from scipy.spatial.transform import Rotation
 
-    w, *xyz = np.moveaxis(quaternions, 1, 0)
-    result: Array = Rotation.from_quat(np.stack([*xyz, w], axis=1)).as_matrix()
+    axes = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
+    result: Array = np.einsum("lij,lj,lkj->lik", axes, moments, axes)
     return result
 
 

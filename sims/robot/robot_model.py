@@ -51,7 +51,7 @@ class Joint:
     @property
     def has_one_coordinate(self) -> bool:
         """Whether the joint has one coordinate."""
-        return self.kind in ("hinge", "slide")
+        return self.motion is not None
 
     @property
     def motion(self) -> Literal["hinge", "slide"] | None:
@@ -103,10 +103,11 @@ class Actuator:
     @property
     def control_unit(self) -> str:
         """Unit of the control."""
-        length = {"hinge": "rad", "slide": "m"}.get(self.motion or "", "1")
-        force = {"hinge": "N*m", "slide": "N"}.get(self.motion or "", "1")
+        if self.motion is None:
+            return "1"
+        length, force = ("rad", "N*m") if self.motion == "hinge" else ("m", "N")
         units = {"position": length, "velocity": f"{length}/s", "motor": force}
-        return units.get(self.kind, "1") if self.motion else "1"
+        return units.get(self.kind, "1")
 
 
 @dataclass(frozen=True)

@@ -270,7 +270,7 @@ COMMAND_WRITERS: Mapping[str, CommandWriter] = {
 """Writers by effect: model changes, then effects in the order in which a command passes them."""
 
 
-def get_application_order(cause: FittedCause) -> Any:
+def get_application_order(cause: FittedCause) -> tuple[int, int]:
     """Return the sort key of a cause in the order of application.
 
     Integrator settings come first, then causes in the model, then input effects in the order in
@@ -278,10 +278,8 @@ def get_application_order(cause: FittedCause) -> Any:
     """
     # The stiffness of dry friction depends on the time step.
     if cause.effect.startswith("numerics."):
-        return -2.0
+        return 0, 0
     names = list(COMMAND_WRITERS)
-    return (
-        names.index(cause.effect)
-        if cause.effect in names
-        else -1.0 + 0.5 * get_write_order(cause.effect)
-    )
+    if cause.effect in names:
+        return 2, names.index(cause.effect)
+    return 1, get_write_order(cause.effect)

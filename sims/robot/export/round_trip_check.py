@@ -18,6 +18,7 @@ from sims.robot.export.write_model_file import (
     WrittenModelFiles,
 )
 from sims.robot.fitted_causes import expand_families
+from sims.robot.model_field_effects import compute_inertia_tensors
 from sims.robot.mujoco_messages import capture_mujoco_warnings
 from sims.robot.parsing.inertia_repair import MIN_MOMENT
 from sims.robot.robot_model import RobotModel
@@ -33,7 +34,6 @@ MAX_COMPARED_STEPS = 2000
 
 _OF_URDF = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
 """Model fields that a URDF specifies, in addition to the inertia tensors."""
-
 
 _NOT_OF_URDF = (
     *("dof_solref", "dof_solimp", "body_inertia", "body_iquat"),
@@ -100,7 +100,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
         ):
             raise RuntimeError(f"extended.urdf is not as it was meant: {name}")
     # The axes of two equal moments are arbitrary, so whole tensors are compared.
-    one, other = _tensors(found), _tensors(wanted)
+    one, other = (compute_inertia_tensors(m.body_iquat, m.body_inertia) for m in (found, wanted))
     if not np.allclose(
         one,
         other,
@@ -115,18 +115,6 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
         for name in _NOT_OF_URDF:
             getattr(model, name)[:] = getattr(found, name)
     _compare_motion(found, wanted, "extended.urdf")
-
-
-def _tensors(model: Any) -> Array:
-    """Compute inertia tensors (N, 3, 3) about the centres of mass, in the axes of the bodies."""
-    import mujoco
-
-    turns = np.zeros((model.nbody, 9))
-    for turn, quat in zip(turns, model.body_iquat, strict=True):
-        mujoco.mju_quat2Mat(turn, quat)
-    axes = turns.reshape(-1, 3, 3)
-    result: Array = np.einsum("nij,nj,nkj->nik", axes, model.body_inertia, axes)
-    return result
 
 
 def _without_contacts(model: Any) -> None:

@@ -102,7 +102,7 @@ def write_model_files(
 
 
 def render_with_series_joints(applied: ModifiedModel) -> bytes:
-    """Render the model file with joints in series with its own, and tendons of coupled drives.
+    """Render the model file with joints in series, tendons of coupled drives, and a fixed base.
 
     Args:
         applied: model with the causes applied.

@@ -411,12 +411,6 @@ def _for_one(effect: type[Effect]) -> bool:
     return alone and issubclass(effect, Force | Friction)
 
 
-def _takes(effect: type[Effect], place: EffectPlace) -> bool:
-    """Return whether an actuator takes commands of the kind that an effect changes."""
-    # A power effect is undefined for a set point.
-    return effect.name != "input.power" or place.unit.startswith(("N", "1"))
-
-
 def _acts_at(
     effect: type[Effect], spot: EffectPlace, found: Mapping[str, Sequence[EffectPlace]]
 ) -> bool:
@@ -436,16 +430,17 @@ def _acts_at(
         return False
     if effect.name == "joint.coupling" and not spot.coupled:
         return False
-    # On a tendon or a site, only the command and the numbers of the actuator are defined.
-    if effect.at == "actuator" and spot.coordinate is None:
+    if effect.at == "actuator":
         if issubclass(effect, ModelValueEffect):
             return spot.stated.get(effect.name, 1.0) != 0.0
-        return issubclass(effect, Input) and effect.needs != "servo" and _takes(effect, spot)
+        # A power effect is undefined for a set point.
+        if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):
+            return False
+        # On a tendon or a site, only the command is defined.
+        return spot.coordinate is not None or issubclass(effect, Input)
     if effect.name == "link.length" and not spot.stated["link.length"]:
         return False
     if effect.name == "joint.axis" and not spot.tilts:
-        return False
-    if effect.at == "actuator" and not _takes(effect, spot):
         return False
     if effect.name in POSITION_SENSOR_EFFECTS and not spot.name.startswith("q."):
         return False
@@ -454,6 +449,4 @@ def _acts_at(
         unit = effect.coefficients[0].unit(_KINDS[spot.kind])
         if unit is None or (unit == "rad" and spot.unit != "rad"):
             return False
-    if issubclass(effect, ModelValueEffect) and effect.at == "actuator":
-        return spot.stated.get(effect.name, 1.0) != 0.0
     return True

@@ -34,9 +34,8 @@ MUJOCO_EFFECT_WORDS = {
 }
 """MuJoCo's words for numbers of a model file, and the effects that change them."""
 
-
 STANDARD_GRAVITY = 9.81
-"""Acceleration in m/s^2 by which a mass has its typical weight."""
+"""Acceleration of gravity in m/s^2, which gives the typical weight of a mass."""
 
 
 class EffectPlace(NamedTuple):
