@@ -72,16 +72,16 @@ def _fetched(
     """Fetch a file from the folder or address that the user gave, or from the public repository.
 
     Args:
-        data_set: the data set.
-        file: the file.
-        source: folder, or http or https address; empty for the public repository.
-        advance: called with the number of bytes received.
+        data_set: Data set that has the file.
+        file: File to read.
+        source: Folder, or http or https address; empty for the public repository.
+        advance: Called with the number of bytes received.
 
     Returns:
         Path or address of the file, for messages, and its content, which is not checked yet.
 
     Raises:
-        InputError: the source is of another form, or the file cannot be read.
+        InputError: The source is of another form, or the file cannot be read.
     """
     if source and "://" not in source:
         return _read(data_set, file, Path(source), advance)
@@ -97,16 +97,16 @@ def _read(data_set: DataSet, file: SourceFile, folder: Path, advance: Advance) -
     At most one byte more than expected is read: enough to see that the file is too long.
 
     Args:
-        data_set: the data set.
-        file: the file.
-        folder: the folder that the user gave.
-        advance: called with the number of bytes read.
+        data_set: Data set that has the file.
+        file: File to read.
+        folder: Folder that the user gave.
+        advance: Called with the number of bytes read.
 
     Returns:
         Path and content of the file.
 
     Raises:
-        InputError: the file is not there, or cannot be read.
+        InputError: The file is not there, or cannot be read.
     """
     if not folder.is_dir():
         raise InputError(f"--from {folder}: no such folder")
@@ -129,13 +129,13 @@ def _received(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -
     At most one byte more than expected is received: enough to see that the file is too long.
 
     Args:
-        url: address of the file.
-        data_set: the data set, for the advice in messages.
-        file: the file.
-        advance: called with the number of bytes received.
+        url: Address of the file.
+        data_set: Data set, for the advice in messages.
+        file: Expected size of the content.
+        advance: Called with the number of bytes received.
 
     Raises:
-        InputError: the file cannot be downloaded.
+        InputError: The file cannot be downloaded.
     """
     remedy = f"get it elsewhere and give its folder with `{data_set.command} --from FOLDER`"
     request = urllib.request.Request(url, headers={"User-Agent": f"simgap/{__version__}"})
@@ -161,12 +161,12 @@ def _checked(file: SourceFile, where: str, content: bytes) -> bytes:
     """Return the content of a file if it is the published one.
 
     Args:
-        file: the file with its published size and SHA-256.
-        where: path or address from which it was fetched, for messages.
-        content: its content.
+        file: File with its published size and SHA-256.
+        where: Path or address from which it was fetched, for messages.
+        content: Content of the file.
 
     Raises:
-        InputError: size or SHA-256 differ.
+        InputError: Size or SHA-256 differ.
     """
     found = len(content)
     if found > file.bytes:
@@ -202,11 +202,11 @@ def _write(target: Path, contents: dict[str, Content]) -> None:
     """Write the folder of a data set as a whole, or not at all.
 
     Args:
-        target: folder of the data set, which must be empty or missing.
-        contents: files by name; text is written as UTF-8.
+        target: Folder of the data set, which must be empty or missing.
+        contents: Files by name; text is written as UTF-8.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: The folder cannot be written.
     """
     try:
         with atomic_new_folder(target) as partial:

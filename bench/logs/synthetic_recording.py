@@ -176,7 +176,7 @@ def simulate_recording(options: SimulationSpec) -> SimulatedRecording:
 class _RecordingSimulation:
     """A checked specification, and its simulation."""
 
-    def __init__(self, wish: SimulationSpec) -> None:
+    def __init__(self, options: SimulationSpec) -> None:
         """Check the specification, and build the simulator with the true effects and constants.
 
         What the specification leaves open is taken from the default recording of the system
@@ -186,30 +186,30 @@ class _RecordingSimulation:
         Raises:
             InputError: The specification names something unknown or has implausible numbers.
         """
-        self.wish = wish
-        self.kind = kind = _kind(wish)
-        self.name = wish.system or kind.name
+        self.options = options
+        self.kind = kind = _kind(options)
+        self.name = options.system or kind.name
         self.usual = _get_default_recording(kind)
-        self.held_out = _held_out(wish)
-        self.theta = _theta({} if wish.parameters is None else wish.parameters, kind)
+        self.held_out = _held_out(options)
+        self.theta = _theta({} if options.parameters is None else options.parameters, kind)
         self.effects = {
-            name: _coefficients(name, c, kind) for name, c in (wish.effects or {}).items()
+            name: _coefficients(name, c, kind) for name, c in (options.effects or {}).items()
         }
-        self.engine = wish.engine
+        self.engine = options.engine
         if not self.engine and issubclass(kind, SystemSimulator) and not kind.own_engine:
             self.engine = "batch"
         self.simulator = self._simulator()
-        self.noise = _noise(wish.noise, [c.name for c in self.simulator.channels])
-        initial, inputs = wish.initial or {}, wish.inputs or {}
+        self.noise = _noise(options.noise, [c.name for c in self.simulator.channels])
+        initial, inputs = options.initial or {}, options.inputs or {}
         check_known_names("initial state", initial, list(kind.states))
         given = {name: _range(name, value) for name, value in initial.items()}
         self.ranges = {**self.usual.initial, **given}
         check_known_names("input", inputs, [c.name for c in kind.inputs])
         inputs = {**self.usual.inputs, **inputs}
         self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
-        samples = _samples(wish)
-        check_simulation_size(wish.runs, samples, wish.seconds, self.simulator, wish.force)
-        self.times = _times(samples, wish.rate)
+        samples = _samples(options)
+        check_simulation_size(options.runs, samples, options.seconds, self.simulator, options.force)
+        self.times = _times(samples, options.rate)
 
     def make(self) -> SimulatedRecording:
         """Simulate all runs, add noise, and return the recording with its true model.
@@ -217,25 +217,23 @@ class _RecordingSimulation:
         `truth` has everything that produced the recording, so that a diagnosis can be compared with
         it.
         """
-        scenarios = {str(number): self._scenario(number) for number in range(1, self.wish.runs + 1)}
-        runs: list[Run] = []
-        for name, scenario in scenarios.items():
-            runs.append(self._run(int(name), scenario))
+        scenarios = {
+            str(number): self._scenario(number) for number in range(1, self.options.runs + 1)
+        }
+        runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
         stated = {name: sigma for name, sigma in self.noise.items() if sigma}
         constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
-        model = self.wish.model and ModelFileReference(
-            Path(self.wish.model), self.wish.actuators or {}, {}
+        model = self.options.model and ModelFileReference(
+            Path(self.options.model), self.options.actuators or {}, {}
         )
         title = f"{system}, simulated"
-        recording = Recording(
-            path, system, title, constants, stated, tuple(runs), model=model or None
-        )
+        recording = Recording(path, system, title, constants, stated, runs, model=model or None)
         truth = {
             "system": system,
-            **({"model": str(Path(self.wish.model).resolve())} if self.wish.model else {}),
+            **({"model": str(Path(self.options.model).resolve())} if self.options.model else {}),
             "engine": self.engine or "its own",
-            "seed": self.wish.seed,
+            "seed": self.options.seed,
             "parameters": self.theta,
             "effects": self.effects,
             "noise": self.noise,
@@ -248,10 +246,10 @@ class _RecordingSimulation:
 
     def _simulator(self) -> Simulator:
         """Build the simulator with the specified constants, channels, engine and true effects."""
-        constants = self.wish.constants or {}
+        constants = self.options.constants or {}
         check_known_names("constant", constants, [c.name for c in self.kind.constants])
         values = {n: _number("constant", n, value) for n, value in constants.items()}
-        observe = list(self.wish.observe) or list(self.usual.observe) or None
+        observe = list(self.options.observe) or list(self.usual.observe) or None
         if issubclass(self.kind, SystemSimulator):
             return self.kind(values, observe, engine=self.engine, fixed=self.effects)
         if self.effects or self.engine:
@@ -292,29 +290,29 @@ class _RecordingSimulation:
         for (name, sigma), values in zip(self.noise.items(), observed.T, strict=True):
             rng = self._rng("noise", name, number)
             channels[name] = values + sigma * rng.standard_normal(values.size)
-        held_out = number > self.wish.runs - self.held_out
+        held_out = number > self.options.runs - self.held_out
         # The pose of a floating body is never estimated, so it need not be hidden.
         states = {**self.kind.states, **scenario.initial}
         begun = {name: states[name] for name in get_floating_state_units(self.kind)}
         return Run(str(number), self.times, channels, scenario.inputs, {}, begun, held_out)
 
     def _rng(self, what: str, name: str, number: int) -> np.random.Generator:
-        return make_rng("simulate", self.name, what, name, self.wish.seed, number)
+        return make_rng("simulate", self.name, what, name, self.options.seed, number)
 
 
-def _kind(wish: SimulationSpec) -> type[Simulator]:
+def _kind(options: SimulationSpec) -> type[Simulator]:
     """Return the simulator class that a specification names, by its system or its robot model file.
 
     Raises:
         InputError: It names both or neither.
     """
-    if bool(wish.system) == (wish.model is not None):
-        found = "both" if wish.system else "neither"
+    if bool(options.system) == (options.model is not None):
+        found = "both" if options.system else "neither"
         raise InputError(f"expected a system (see `simgap list systems`) or a model, found {found}")
     return (
-        simulators.get(wish.system)
-        if wish.model is None
-        else make_robot_simulator(wish.model, wish.actuators or {})
+        simulators.get(options.system)
+        if options.model is None
+        else make_robot_simulator(options.model, options.actuators or {})
     )
 
 
@@ -329,29 +327,31 @@ def _get_default_recording(kind: type[Simulator]) -> DefaultRecording:
     return usual if kind.name == kind.system.name else replace(usual, observe=())
 
 
-def _held_out(wish: SimulationSpec) -> int:
+def _held_out(options: SimulationSpec) -> int:
     """Return how many runs, the last ones, are held out for validation; by default a third."""
-    if wish.runs < 1:
-        raise InputError(f"runs = {wish.runs}: expected at least 1")
-    if wish.held_out is None:
+    if options.runs < 1:
+        raise InputError(f"runs = {options.runs}: expected at least 1")
+    if options.held_out is None:
         # A single run is divided when it is read.
-        return 0 if wish.runs == 1 else max(1, wish.runs // 3)
-    if not 0 <= wish.held_out < wish.runs:
-        raise InputError(f"held_out = {wish.held_out}: expected fewer than the {wish.runs} runs")
-    return wish.held_out
+        return 0 if options.runs == 1 else max(1, options.runs // 3)
+    if not 0 <= options.held_out < options.runs:
+        raise InputError(
+            f"held_out = {options.held_out}: expected fewer than the {options.runs} runs"
+        )
+    return options.held_out
 
 
-def _samples(wish: SimulationSpec) -> int:
+def _samples(options: SimulationSpec) -> int:
     """Return the number of samples of a run: duration (s) times rate (Hz), rounded.
 
     Raises:
         InputError: The number is below 2 or too large, the run too short, or the rate too high.
     """
-    product = wish.seconds * wish.rate
+    product = options.seconds * options.rate
     samples = round(product) if 0 < product < _MOST_SAMPLES else 0
-    if samples < 2 or wish.seconds < MIN_RUN_SECONDS or wish.rate > MAX_SAMPLING_RATE_HZ:
+    if samples < 2 or options.seconds < MIN_RUN_SECONDS or options.rate > MAX_SAMPLING_RATE_HZ:
         raise InputError(
-            f"seconds = {wish.seconds:g}, rate = {wish.rate:g}: expected at least 2 samples "
+            f"seconds = {options.seconds:g}, rate = {options.rate:g}: expected at least 2 samples "
             f"and below {_MOST_SAMPLES:g}"
         )
     return samples

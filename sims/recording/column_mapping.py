@@ -303,14 +303,15 @@ class _FolderLogs:
         An extra column without a stated file is searched for in the files of the signals.
         """
         self._time, self._rate, self._second = sources.time, sources.rate, sources.second
-        self._channels, self._inputs = channels, inputs
-        self._sources = {name: sources.signals[name] for name in (*channels, *inputs)}
-        self._extra = dict(sources.extra)
-        files = {name: source.file or default_file for name, source in self._sources.items()}
-        for name, source in self._extra.items():
+        self._channels, self._inputs, self._extra = channels, inputs, list(sources.extra)
+        self._sources = {
+            **{name: sources.signals[name] for name in (*channels, *inputs)},
+            **sources.extra,
+        }
+        files = {name: self._sources[name].file or default_file for name in (*channels, *inputs)}
+        for name, source in sources.extra.items():
             (column,) = source.columns
             files[name] = source.file or _find_file(folder, column, list(files.values()))
-        self._sources |= self._extra
         wanted: dict[str, set[str]] = {}
         for name, file in files.items():
             columns = wanted.setdefault(file, set() if self._rate else {self._time})
@@ -361,10 +362,8 @@ class _FolderLogs:
             inside = (places < times.size) & (stamps >= times[0] - SAME_INSTANT_SECONDS)
             cells[places[inside]] = values[inside]
             columns[channel] = make_read_only(cells)
-        for name in self._inputs:
+        for name in (*self._inputs, *self._extra):
             columns[name] = make_read_only(self._hold(name, rows_of, times, name in linear))
-        for name in self._extra:
-            columns[name] = make_read_only(self._hold(name, rows_of, times, False))
         return CsvRun(run, times, columns, tuple(notes))
 
     def _select_rows(self, run_rows: Mask | None) -> tuple[dict[Path, _LogRows], list[str]]:
@@ -499,9 +498,7 @@ class _FolderLogs:
 
 
 def _find_file(folder: Path, column: str, files: Sequence[str]) -> str:
-    """Return the first of some files that has a column.
-
-    Extra columns need not state their file.
+    """Return the first of some files that has a column, for an extra column without a file.
 
     Raises:
         InputError: No file has it.

@@ -448,10 +448,10 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     """Check the table of one channel or input, and compute its conversion to SI units.
 
     Args:
-        path: path of the description, for messages.
-        kind: channel or input.
-        name: name of the signal.
-        value: table from the description.
+        path: Path of the description, for messages.
+        kind: ``channel`` or ``input``.
+        name: Name of the signal.
+        value: Table from the description.
         unit: SI unit of the signal.
 
     With scale s and offset o of the log, and the conversion of the unit x -> g x + b, a value x

@@ -111,7 +111,7 @@ def described(
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
     switches = [switch.column for switch in read_switches(path, result)]
-    (stamps,) = _columns("t", time)[:1]
+    stamps = _columns("t", time)[0]
     taken = {stamps, *extra}
     for name, own in (*channels.items(), *inputs.items(), *extra.items()):
         taken.update(_columns(name, own))

@@ -92,8 +92,8 @@ def _table(runs: Sequence[Run], digits: int) -> str:
     """Return the text of the CSV table with all runs.
 
     Args:
-        runs: runs with the same signals; those of the first determine the columns.
-        digits: number of significant digits.
+        runs: Runs with the same signals; those of the first determine the columns.
+        digits: Number of significant digits.
     """
     inputs, channels = list(runs[0].inputs), list(runs[0].channels)
     text = io.StringIO()

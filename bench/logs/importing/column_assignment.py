@@ -11,8 +11,8 @@ from bench.logs.importing import column_guessing
 from bench.logs.importing.column_guessing import LogColumn, Role
 from bench.logs.importing.import_result import MAX_NAMES, ImportOptions, ImportResult
 from bench.logs.importing.normalised_positions import (
-    LARGEST,
-    REMEDY,
+    MAX_NORMALISED,
+    UNIT_REMEDY,
     NormalisedPositions,
     is_lerobot,
     normalised_positions,
@@ -22,7 +22,7 @@ from bench.logs.importing.signal_assignment import (
     Placement,
     Signal,
     SignalAssignment,
-    converts,
+    is_convertible,
 )
 from sims.core.simulator import InputError
 from sims.robot.robot_model import Actuator, Joint
@@ -109,7 +109,7 @@ class ColumnAssigner:
             self._result.guessed.append(f"positions: {self.normalised.description}")
         elif (
             not options.position_unit
-            and largest <= LARGEST
+            and largest <= MAX_NORMALISED
             and is_lerobot(path, (column.name for column, _ in placed))
             and any(
                 column_guessing.guess_position_unit(column.values, joint) in ("deg", None)
@@ -118,7 +118,7 @@ class ColumnAssigner:
         ):
             self._result.checks.append(
                 "positions lie within -100 to 100: they are taken for degrees and may be LeRobot's "
-                f"normalised positions; {REMEDY}"
+                f"normalised positions; {UNIT_REMEDY}"
             )
 
     def _position_signal(
@@ -130,7 +130,7 @@ class ColumnAssigner:
         joint. Return None, with a message, if there is no such unit.
         """
         if column.unit:
-            if not converts(column.unit, joint.unit):
+            if not is_convertible(column.unit, joint.unit):
                 expected = "an angle" if joint.kind == "hinge" else "a length"
                 self._result.leave_out(
                     column,
@@ -226,7 +226,7 @@ class ColumnAssigner:
             self._add(self._signals.inputs, name, column, signal)
         else:
             si = f"{joint.unit}/s"
-            unit = column.unit if converts(column.unit, si) else si
+            unit = column.unit if is_convertible(column.unit, si) else si
             signal = Signal(column, unit, placement, f"; in {unit}")
             self._add(self._signals.inputs, name, column, signal)
 
@@ -252,7 +252,7 @@ class ColumnAssigner:
     ) -> None:
         """Assign the torque of a motor, or a force along a joint."""
         unit = column.unit or joint.force_unit
-        if not converts(unit, joint.force_unit):
+        if not is_convertible(unit, joint.force_unit):
             self._result.leave_out(column, f"is in {unit}, expected {joint.force_unit}")
             return
         stated = "as its file states" if column.unit else "which no file states"
@@ -275,7 +275,7 @@ class ColumnAssigner:
             if name not in signals.inputs:
                 torques.setdefault(name, []).append((column, joint, placement))
         for name, candidates in torques.items():
-            measured = [one for one in candidates if column_guessing.is_measured(one[0])]
+            measured = [c for c in candidates if column_guessing.is_measured(c[0])]
             # A log may also contain a controller's desired torque and a friction estimate.
             if len(candidates) > 1 and len(measured) != 1:
                 continue
@@ -288,7 +288,7 @@ class ColumnAssigner:
     def find_switches(self) -> None:
         """Keep the columns of zeros and ones that change: one may say when a drive is on."""
         for column in self._with_role("other", "command"):
-            if self._is_used(column) or self._is_reported(column):
+            if self._is_used(column) or self._result.is_left_out(column):
                 continue
             values = np.concatenate([column.values, *self._logs.read_runs(column)[1:]])
             if set(np.unique(values[np.isfinite(values)]).tolist()) == {0.0, 1.0}:
@@ -319,7 +319,7 @@ class ColumnAssigner:
     def report_unused(self) -> None:
         """Report the columns that were neither used nor mentioned before."""
         for column in self._logs.columns:
-            if self._is_used(column) or self._is_reported(column):
+            if self._is_used(column) or self._result.is_left_out(column):
                 continue
             reason = "its meaning is unknown"
             if column_guessing.guess_role(column) == "force":
@@ -339,12 +339,7 @@ class ColumnAssigner:
         """Return whether a column is a signal or a switch."""
         signals = (*self._signals.channels.values(), *self._signals.inputs.values())
         used = [signal.column for signal in signals] + self._signals.switches
-        return (column.file, column.name) in {(one.file, one.name) for one in used}
-
-    def _is_reported(self, column: LogColumn) -> bool:
-        """Return whether a message says that a column is left out."""
-        start = f"{column.file}, column {column.name}: "
-        return any(line.startswith(start) for line in self._result.untold)
+        return (column.file, column.name) in {(c.file, c.name) for c in used}
 
 
 def _is_torque(column: LogColumn) -> bool:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.logs.importing.import_result import ImportOptions, ImportResult
-from bench.logs.importing.run_logs import RunLogs
+from bench.logs.importing.run_logs import RunLogs, hold
 from bench.logs.importing.servo_estimation import ServoResponse, estimate_servo_response
 from bench.logs.importing.signal_assignment import Signal, SignalAssignment
 from sims.core.simulator import Array
@@ -199,16 +199,9 @@ class DescriptionWriter:
             measured = self._logs.read(run, position.column)
             if given is None or measured is None:
                 continue
-            # A command holds until the next one.
-            places = np.searchsorted(given[0], measured[0], side="right") - 1
-            held = given[1][np.clip(places, 0, given[1].size - 1)]
-            samples.append(
-                (
-                    measured[0],
-                    command.convert(joint.unit, held),
-                    position.convert(joint.unit, measured[1]),
-                )
-            )
+            times, values = measured
+            u = command.convert(joint.unit, hold(*given, times))
+            samples.append((times, u, position.convert(joint.unit, values)))
         return samples
 
     def _relative(self, path: Path) -> str:
@@ -218,5 +211,5 @@ class DescriptionWriter:
         """
         try:
             return Path(os.path.relpath(path, self._folder)).as_posix()
-        except ValueError:  # on another drive
+        except ValueError:
             return path.resolve().as_posix()

@@ -49,7 +49,13 @@ class ImportResult:
     guessed: list[str] = field(default_factory=list)
     untold: list[str] = field(default_factory=list)
     checks: list[str] = field(default_factory=list)
+    _left_out: set[tuple[str, str]] = field(default_factory=set, init=False, repr=False)
 
     def leave_out(self, column: LogColumn, reason: str) -> None:
         """Report a column that is left out."""
+        self._left_out.add((column.file, column.name))
         self.untold.append(f"{column.file}, column {column.name}: {reason}; left out")
+
+    def is_left_out(self, column: LogColumn) -> bool:
+        """Return whether a column has been reported as left out."""
+        return (column.file, column.name) in self._left_out

@@ -19,14 +19,15 @@ class _ServoSignals(NamedTuple):
     Attributes:
         joints: Names of the joints.
         inputs: Name of the input of each servo.
-        commands: (T,) command of each servo, SI units; None if files have different times.
-        positions: (T,) position of each joint, SI units; None if files have different times.
+        commands: (T,) command of each servo, SI units; empty if orders cannot or need not be
+            compared.
+        positions: (T,) position of each joint, SI units; empty like `commands`.
     """
 
     joints: list[str]
     inputs: list[str]
-    commands: list[Array] | None
-    positions: list[Array] | None
+    commands: list[Array]
+    positions: list[Array]
 
 
 def assign_order(
@@ -51,20 +52,17 @@ def assign_order(
             (signals.channels, [f"q.{joint}" for joint in servos.joints]),
         )
     ]
-    is_following = False
-    if servos.commands is not None and servos.positions is not None:
-        exchanged: Mapping[str, str] = {}
-        if any(by_order):
-            exchanged = _follow_commands(signals, servos, by_order[0])
-        is_following = follow(servos.commands, servos.positions) or bool(exchanged)
-        if all(by_order) and is_following and not exchanged and not is_normalised:
-            preferred = _prefer_model(logs, signals, servos, result)
-            if preferred:
-                return preferred
-        _report_order(signals, servos.joints if is_following else [], result)
-        return exchanged if by_order[1] and not by_order[0] else {}
-    _report_order(signals, [], result)
-    return {}
+    if not servos.commands:
+        _report_order(signals, [], result)
+        return {}
+    exchanged = _follow_commands(signals, servos, by_order[0]) if any(by_order) else {}
+    is_following = follow(servos.commands, servos.positions) or bool(exchanged)
+    if all(by_order) and is_following and not exchanged and not is_normalised:
+        preferred = _prefer_model(logs, signals, servos, result)
+        if preferred:
+            return preferred
+    _report_order(signals, servos.joints if is_following else [], result)
+    return exchanged if by_order[1] and not by_order[0] else {}
 
 
 def _servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
@@ -89,7 +87,7 @@ def _servo_signals(logs: RunLogs, signals: SignalAssignment) -> _ServoSignals:
     held = [logs.hold_command(u.column, q.column) for u, q in pairs]
     # Positions of one file share their sample times; those of several files may not.
     if len(joints) < 2 or not is_guess or len({u.size for u, _ in held}) > 1:
-        return _ServoSignals(names, inputs, None, None)
+        return _ServoSignals(names, inputs, [], [])
     commands, positions = [], []
     for joint, (command, position), (u, q) in zip(joints, pairs, held, strict=True):
         commands.append(command.convert(joint.unit, u))
@@ -107,8 +105,6 @@ def _follow_commands(
     Returns:
         For each joint, the joint at whose index its column is; empty if nothing is exchanged.
     """
-    assert servos.commands is not None
-    assert servos.positions is not None
     order = order_of_commands(servos.commands, servos.positions)
     if order is None:
         return {}
@@ -132,8 +128,6 @@ def _prefer_model(
     Returns:
         For each joint, the joint at whose index its column is; empty if the order is not changed.
     """
-    assert servos.commands is not None
-    assert servos.positions is not None
     joints = servos.joints
     actuators = [signals.actuator_of(joint) for joint in joints]
     driven = [

@@ -30,9 +30,9 @@ from sims.recording.recording import Recording
 if TYPE_CHECKING:  # A recording without a robot needs no model.
     from sims.robot.robot_model import Joint
 
-LARGEST = 100.0 + 1e-3
+MAX_NORMALISED = 100.0 + 1e-3
 """Largest magnitude of a normalised position, including the rounding of 32-bit floats."""
-REMEDY = (
+UNIT_REMEDY = (
     "if they are normalised, import them with --calibration FILE (LeRobot keeps it in "
     "~/.cache/huggingface/lerobot/calibration) or with --position-unit normalised (by the model's "
     "ranges); if they are degrees, with --position-unit deg"
@@ -96,7 +96,7 @@ def normalised_positions(
     Raises:
         InputError: Positions stated as normalised are out of range, or the file cannot be read.
     """
-    is_within = largest <= LARGEST
+    is_within = largest <= MAX_NORMALISED
     is_requested = stated_unit == "normalised" or calibration is not None
     if is_requested and not is_within:
         raise InputError(
@@ -155,10 +155,10 @@ def may_be_normalised(recording: Recording) -> Iterator[Anomaly]:
         if name in run.channels
     ]
     largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=np.inf)
-    if np.degrees(largest) <= LARGEST:
+    if np.degrees(largest) <= MAX_NORMALISED:
         yield Anomaly(
             "positions of a LeRobot dataset are taken for degrees and lie within -100 to 100, as "
-            f"normalised ones do; {REMEDY} (scale = 1 in the description)",
+            f"normalised ones do; {UNIT_REMEDY} (scale = 1 in the description)",
             False,
         )
 

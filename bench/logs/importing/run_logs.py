@@ -104,10 +104,9 @@ class RunLogs:
         """
         if command.file == position.file:
             return command.values, position.values
-        stamps = self.seconds[command.file]
         offset = self._starts[command.file] - self._starts[position.file]
-        places = np.searchsorted(stamps + offset, self.seconds[position.file], side="right") - 1
-        return command.values[np.clip(places, 0, stamps.size - 1)], position.values
+        stamps = self.seconds[command.file] + offset
+        return hold(stamps, command.values, self.seconds[position.file]), position.values
 
     # -- files
 
@@ -261,6 +260,19 @@ class RunLogs:
                 else:
                     columns.append(column)
         return columns
+
+
+def hold(stamps: Array, values: Array, times: Array) -> Array:
+    """Return a signal at given times (T,) with a zero-order hold; its first value before that.
+
+    Args:
+        stamps: (N,) increasing times of the values, s.
+        values: (N,) values of the signal.
+        times: (T,) times of the result, s.
+    """
+    places = np.searchsorted(stamps, times, side="right") - 1
+    held: Array = values[np.clip(places, 0, values.size - 1)]
+    return held
 
 
 def _all_columns(file: str, log: LogFile) -> list[LogColumn]:

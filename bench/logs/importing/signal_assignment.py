@@ -156,7 +156,7 @@ class SignalAssignment:
         return next((signal.column.bare for signal in signals), "")
 
 
-def converts(unit: str, target: str) -> bool:
+def is_convertible(unit: str, target: str) -> bool:
     """Return whether a unit converts to another one."""
     try:
         compute_unit_scale(unit, target)

@@ -19,7 +19,7 @@ from bench.logs.importing.signal_assignment import (
     Placement,
     Signal,
     SignalAssignment,
-    converts,
+    is_convertible,
 )
 from bench.logs.quality.velocity_consistency import MIN_CORRELATION, VelocityComparison
 from sims.recording.recording import Run
@@ -85,7 +85,7 @@ def assign_velocities(
             placement = Placement.POSITIONS
         position = signals.position_of(joint.name)
         if position is None or position.column.file != column.file:
-            result.leave_out(column, f"no position of {joint.name} beside it tells its unit")
+            result.leave_out(column, f"no position of {joint.name} in the same file shows its unit")
             continue
         comparison = _compare(logs, column, position, joint)
         unit = _confirmed_unit(comparison, column, joint)
@@ -110,8 +110,8 @@ def _compare(
         seconds, values = velocities
         is_new = np.diff(seconds, prepend=-np.inf) > 0
         angles = position.convert(joint.unit, positions[1])
-        shown = {"q": angles[is_new], "v": values[is_new]}
-        runs.append(Run(name, seconds[is_new], shown, {}, {}, {}, False))
+        channels = {"q": angles[is_new], "v": values[is_new]}
+        runs.append(Run(name, seconds[is_new], channels, {}, {}, {}, False))
     return VelocityComparison.measure(runs, "q", "v")
 
 
@@ -120,7 +120,7 @@ def _confirmed_unit(comparison: VelocityComparison | None, column: LogColumn, jo
     if comparison is None or comparison.correlation < MIN_CORRELATION:
         return ""
     si = f"{joint.unit}/s"
-    stated = [column.unit] if converts(column.unit, si) else []
+    stated = [column.unit] if is_convertible(column.unit, si) else []
     for unit in (*stated, *UNITS["hinge" if joint.kind == "hinge" else "slide"]):
         gain = compute_unit_scale(unit, si).gain
         if SLOPE_RANGE[0] < gain / comparison.slope < SLOPE_RANGE[1]:
@@ -143,7 +143,7 @@ def _assign_kind(
     delay = VelocityComparison.pool(comparisons).delay() if comparisons else None
     for column, joint, placement, position, comparison, confirmed_unit in candidates:
         name, source = f"qd.{joint.name}", position.column.name
-        stated = column.unit if converts(column.unit, f"{joint.unit}/s") else ""
+        stated = column.unit if is_convertible(column.unit, f"{joint.unit}/s") else ""
         unit = confirmed_unit or (usual_unit if comparison is None else "")
         if name in signals.channels:
             reason = f"{name} is {signals.channels[name].column.name} already"

@@ -116,26 +116,17 @@ def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
     Returns:
         (N, D) accelerations at up to `CHECKED_INSTANTS` times of the run.
     """
-    import mujoco
-
-    robot = kind.robot  # type: ignore[attr-defined]
-    model = robot.compiled
-    data = mujoco.MjData(model)
-    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
-    accelerations = []
-    with capture_mujoco_warnings():
-        for row in np.unique(np.linspace(0, run.times.size - 1, CHECKED_INSTANTS).astype(np.intp)):
-            mujoco.mj_resetData(model, data)
-            for joint in joints:
-                positions = run.channels.get(f"q.{joint.name}")
-                if positions is not None and np.isfinite(positions[row]):
-                    data.qpos[joint.position] = positions[row]
-                data.qfrc_applied[joint.velocity] = _input_value(run, f"force.{joint.name}", row)
-            for actuator in robot.actuators:
-                data.ctrl[actuator.control] = _input_value(run, f"u.{actuator.name}", row)
-            mujoco.mj_forward(model, data)
-            accelerations.append([data.qacc[joint.velocity] for joint in joints])
-    return np.array(accelerations)
+    joints = [
+        joint
+        for joint in kind.robot.joints  # type: ignore[attr-defined]
+        if joint.has_one_coordinate
+    ]
+    return np.array(
+        [
+            [data.qacc[joint.velocity] for joint in joints]
+            for data in _place(kind, run.channels, run.inputs)
+        ]
+    )
 
 
 def find_contacts(
@@ -157,7 +148,8 @@ def find_contacts(
 def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
     """Find bodies of a robot that overlap in most of the recorded poses.
 
-    Their contact forces act all the time, and no measured robot can be so.
+    Contact forces would then act all the time, which is not possible in a real robot: the shapes
+    in the model file are too large.
 
     Args:
         recording: Recording to check.
@@ -180,53 +172,58 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
             for pair, depth in deepest.items():
                 if depth > MIN_OVERLAP_METRES:
                     depths.setdefault(pair, []).append(depth)
-    for (one, other), values in depths.items():
+    for (body, other_body), values in depths.items():
         if len(values) > MIN_OVERLAP_SHARE * count:
-            line = f'<contact><exclude body1="{one}" body2="{other}"/></contact>'
-            remedy = f"add {line}"
+            remedy = f'add <contact><exclude body1="{body}" body2="{other_body}"/></contact>'
             if robot.format == "urdf":
                 remedy = "make their collision shapes smaller"
             yield QualityFinding(
                 "overlap",
-                f"bodies {one} and {other} overlap by up to {1e3 * max(values):.3g} mm in "
+                f"bodies {body} and {other_body} overlap by up to {1e3 * max(values):.3g} mm in "
                 f"{len(values) / count:.0%} of the recorded poses, so that a contact pushes them "
                 "apart all the time",
                 f"{remedy} in {robot.path.name}",
             )
 
 
-def _place(kind: type[Simulator], positions: Mapping[str, Array]) -> Iterator[Any]:
-    """Yield MuJoCo's data (mujoco.MjData) of a robot at some of its recorded poses.
+def _place(
+    kind: type[Simulator], positions: Mapping[str, Array], inputs: Mapping[str, Array] | None = None
+) -> Iterator[Any]:
+    """Yield MuJoCo's data (mujoco.MjData) of a robot at rest at some of its recorded poses.
 
     The same object is yielded each time, with up to `CHECKED_INSTANTS` poses one after another.
+    Commands and forces that `inputs` lacks are zero.
     """
     import mujoco
 
     robot = kind.robot  # type: ignore[attr-defined]
+    inputs = inputs or {}
     model = robot.compiled
     data = mujoco.MjData(model)
+    joints = [joint for joint in robot.joints if joint.has_one_coordinate]
     count = max((values.size for values in positions.values()), default=0)
     rows = np.unique(np.linspace(0, max(count - 1, 0), CHECKED_INSTANTS).astype(np.intp))
     with capture_mujoco_warnings():
         for row in rows:
             mujoco.mj_resetData(model, data)
-            for joint in robot.joints:
+            for joint in joints:
                 values = positions.get(f"q.{joint.name}")
-                if joint.has_one_coordinate and values is not None and np.isfinite(values[row]):
+                if values is not None and np.isfinite(values[row]):
                     data.qpos[joint.position] = values[row]
+                if f"force.{joint.name}" in inputs:
+                    data.qfrc_applied[joint.velocity] = inputs[f"force.{joint.name}"][row]
+            for actuator in robot.actuators:
+                if f"u.{actuator.name}" in inputs:
+                    data.ctrl[actuator.control] = inputs[f"u.{actuator.name}"][row]
             mujoco.mj_forward(model, data)
             yield data
-
-
-def _input_value(run: Run, name: str, row: int) -> float:
-    return float(run.inputs[name][row]) if name in run.inputs else 0.0
 
 
 class _Pair(NamedTuple):
     """Slope and correlation of a position against a command, equation (1)."""
 
     slope: float
-    like: float
+    correlation: float
 
 
 def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
@@ -247,21 +244,21 @@ def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
     for command, position in servo_signals:
         pair = pairs[command, position]
         if (
-            pair.like > MIN_FOLLOWING_CORRELATION
+            pair.correlation > MIN_FOLLOWING_CORRELATION
             and DEGREE_SLOPE_RANGE[0] < pair.slope < DEGREE_SLOPE_RANGE[1]
         ):
             ratio_text = f"{pair.slope:.3g} times as far as {command} says"
             message = f"moves {ratio_text}; is its unit degrees?"
             yield Anomaly(f"column {position}: {message}", True)
         elif (
-            pair.like > MIN_FOLLOWING_CORRELATION
+            pair.correlation > MIN_FOLLOWING_CORRELATION
             and 1.0 / DEGREE_SLOPE_RANGE[1] < pair.slope < 1.0 / DEGREE_SLOPE_RANGE[0]
         ):
             ratio_text = f"1/{1.0 / pair.slope:.3g} of what {command} says"
             yield Anomaly(
                 f"column {position}: moves {ratio_text}; is the unit of {command} degrees?", False
             )
-        elif pair.like < -MIN_FOLLOWING_CORRELATION and pair.slope < MAX_REVERSED_SLOPE:
+        elif pair.correlation < -MIN_FOLLOWING_CORRELATION and pair.slope < MAX_REVERSED_SLOPE:
             yield Anomaly(f"column {position}: moves against {command}; is a sign wrong?", False)
     yield from _check_exchanged(servo_signals, pairs)
 
@@ -275,11 +272,11 @@ def _check_exchanged(
     """
     for i, (command, position) in enumerate(servo_signals):
         for other_command, other in servo_signals[i + 1 :]:
-            crossed_correlations = pairs[command, other].like, pairs[other_command, position].like
-            own_correlations = pairs[command, position].like, pairs[other_command, other].like
+            crossed = pairs[command, other], pairs[other_command, position]
+            own = pairs[command, position], pairs[other_command, other]
             if (
-                min(crossed_correlations) > MIN_FOLLOWING_CORRELATION
-                and max(map(abs, own_correlations)) < MAX_UNRELATED_CORRELATION
+                min(pair.correlation for pair in crossed) > MIN_FOLLOWING_CORRELATION
+                and max(abs(pair.correlation) for pair in own) < MAX_UNRELATED_CORRELATION
             ):
                 subject = f"columns {position} and {other}: each follows the other's command"
                 yield Anomaly(f"{subject}; are they swapped?", False)

@@ -121,13 +121,13 @@ class VelocityComparison(NamedTuple):
             The comparison, or None if the motion is too short or too small.
         """
         series = [_Series.read(run, position, rate) for run in runs]
-        noise = estimate_noise((one.times, one.position) for one in series)
+        noise = estimate_noise((part.times, part.position) for part in series)
         sigma = max(float(np.nan_to_num(noise.sigma)), noise.step)
-        steps = np.concatenate([np.diff(one.times) for one in series]) if series else np.empty(0)
-        if not steps.size or not max(np.abs(one.velocity).max(initial=0.0) for one in series) > 0:
+        steps = np.concatenate([np.diff(part.times) for part in series]) if series else np.empty(0)
+        if not steps.size or not max(np.abs(part.velocity).max(initial=0.0) for part in series) > 0:
             return None
         interval = float(np.median(steps))
-        moves = np.concatenate([np.diff(one.position) for one in series])
+        moves = np.concatenate([np.diff(part.position) for part in series])
         usual_move = float(np.sqrt(np.mean(moves**2)))
         if not usual_move > 0:
             return None
@@ -135,8 +135,8 @@ class VelocityComparison(NamedTuple):
         # vanish.
         wanted = np.ceil(MIN_POSITION_CHANGE_SIGMAS * sigma / usual_move)
         length = int(np.clip(wanted, MIN_SEGMENT_SAMPLES, 50))
-        parts = [one.integrate(length, MAX_INTERVAL_RATIO * interval) for one in series]
-        dq, s, dv = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+        integrated = [part.integrate(length, MAX_INTERVAL_RATIO * interval) for part in series]
+        dq, s, dv = (np.concatenate(rows) for rows in zip(*integrated, strict=True))
         known = np.isfinite(s)
         dq, s, dv = dq[known], s[known], dv[known]
         if known.sum() < MIN_SEGMENTS or not (s @ s > 0 and dq @ dq > 0):
@@ -153,14 +153,14 @@ class VelocityComparison(NamedTuple):
         """
         scaled = [
             VelocityComparison(
-                one.position_changes,
-                one.slope * one.velocity_integrals,
-                one.slope * one.velocity_changes,
-                one.interval,
+                comparison.position_changes,
+                comparison.slope * comparison.velocity_integrals,
+                comparison.slope * comparison.velocity_changes,
+                comparison.interval,
             )
-            for one in comparisons
+            for comparison in comparisons
         ]
-        interval = float(np.median([one.interval for one in scaled]))
+        interval = float(np.median([comparison.interval for comparison in scaled]))
         dq, s, dv = (np.concatenate(rows) for rows in list(zip(*scaled, strict=True))[:3])
         return VelocityComparison(dq, s, dv, interval)
 

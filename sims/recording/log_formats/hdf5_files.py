@@ -17,6 +17,7 @@ import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats.parquet_columns import MAX_COLUMNS
+from sims.recording.log_formats.read_errors import convert_read_errors
 
 ENDINGS = (".h5", ".hdf5", ".hdf")
 """Endings of the names of HDF5 files."""
@@ -103,18 +104,8 @@ def _opened(path: Path) -> Iterator[Any]:
         raise InputError(
             f"{path}: needs h5py to read it, not installed (pip install h5py)"
         ) from None
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (InputError, KeyboardInterrupt):
-        raise
-    except MemoryError:  # A damaged file may claim any size.
-        raise InputError(
-            f"{path}: the file is damaged, or its content does not fit into the memory"
-        ) from None
-    except Exception as error:  # with a damaged file, h5py raises many kinds of errors
-        what = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not an HDF5 file that can be read: {what[:200]}") from None
+    with convert_read_errors(path, "an HDF5 file"), h5py.File(path, "r") as file:
+        yield file
 
 
 def _items(group: Any) -> list[tuple[str, Any]]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sims.core.simulator import InputError
+from sims.recording.log_formats.read_errors import convert_read_errors
 
 ENCODINGS = ("json", "protobuf")
 """Encodings of messages that are read here."""
@@ -25,23 +26,17 @@ INSTALL_HINT = (
 """Advice for a file that rosbags cannot read, where mcap is not installed."""
 
 
-def is_readable(path: Path) -> bool:
-    """Return whether a path is an MCAP file with messages in JSON or Protobuf."""
-    if path.suffix.lower() != ".mcap" or not path.is_file() or find_spec("mcap") is None:
-        return False
-    try:
-        return bool(_topics(path))
-    except InputError:  # Reported by the reader of ROS bags.
-        return False
-
-
 def list_topics(path: Path) -> list[str]:
-    """List the topics with messages in JSON or Protobuf, without a leading slash.
+    """List the topics of an MCAP file with messages in JSON or Protobuf, without a leading slash.
 
-    Raises:
-        InputError: The file cannot be read.
+    The list is empty for any other file, and for one that cannot be read.
     """
-    return sorted({topic.lstrip("/") for topic in _topics(path)})
+    if path.suffix.lower() != ".mcap" or not path.is_file() or find_spec("mcap") is None:
+        return []
+    try:
+        return sorted({topic.lstrip("/") for topic in _topics(path)})
+    except InputError:  # Reported by the reader of ROS bags.
+        return []
 
 
 def read_messages(path: Path, topic: str) -> Iterator[tuple[Any, int]]:
@@ -100,15 +95,5 @@ def _opened(path: Path) -> Iterator[Any]:
     """Open an MCAP file, and convert the errors of its reader to one line."""
     from mcap.reader import make_reader
 
-    try:
-        with path.open("rb") as file:
-            yield make_reader(file)
-    except (InputError, KeyboardInterrupt):
-        raise
-    except MemoryError:  # A damaged file may claim any size.
-        raise InputError(
-            f"{path}: the file is damaged, or its content does not fit into the memory"
-        ) from None
-    except Exception as error:  # a damaged file or message raises many kinds of errors
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not an MCAP file that can be read: {reason[:300]}") from None
+    with convert_read_errors(path, "an MCAP file"), path.open("rb") as file:
+        yield make_reader(file)

@@ -100,7 +100,7 @@ def _fields(value: Any) -> dict[str, Any] | None:
         return {str(name): entry for name, entry in value.items()}
     descriptor = getattr(value, "DESCRIPTOR", None)
     if descriptor is not None:
-        # An alternative that is not set has a default value, which nobody measured.
+        # An alternative (oneof) that is not set has a default value, which is not a measurement.
         names = [
             field.name
             for field in descriptor.fields

@@ -17,6 +17,7 @@ from typing import Any
 from sims.core.simulator import Array, InputError
 from sims.recording.log_formats import mcap_messages
 from sims.recording.log_formats.message_table import MessageTable
+from sims.recording.log_formats.read_errors import convert_read_errors
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """File name endings of bags that are single files."""
@@ -45,8 +46,9 @@ def list_topics(bag: Path) -> list[str]:
     Raises:
         InputError: The bag cannot be read, or rosbags is not installed.
     """
-    if mcap_messages.is_readable(bag):
-        return mcap_messages.list_topics(bag)
+    topics = mcap_messages.list_topics(bag)
+    if topics:
+        return topics
     with _opened(bag) as reader:
         return sorted({connection.topic.lstrip("/") for connection in reader.connections})
 
@@ -66,8 +68,8 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
         InputError: The bag has no such topic, or its messages cannot be read.
     """
     table = MessageTable(wanted)
-    if mcap_messages.is_readable(bag):
-        topics = mcap_messages.list_topics(bag)
+    topics = mcap_messages.list_topics(bag)
+    if topics:
         # Topics of other loggers need not begin with a slash.
         if topic.lstrip("/") not in topics:
             raise _unknown_topic(bag, topic, topics)
@@ -75,9 +77,9 @@ def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str,
             table.add(message, stamp)
         return table.columns()
     with _opened(bag) as reader:
-        connections = [one for one in reader.connections if one.topic == topic]
+        connections = [c for c in reader.connections if c.topic == topic]
         if not connections:
-            topics = sorted({one.topic.lstrip("/") for one in reader.connections})
+            topics = sorted({c.topic.lstrip("/") for c in reader.connections})
             raise _unknown_topic(bag, topic, topics)
         for connection, stamp, raw in reader.messages(connections=connections):
             table.add(reader.deserialize(raw, connection.msgtype), stamp)
@@ -92,7 +94,7 @@ def _unknown_topic(bag: Path, topic: str, topics: list[str]) -> InputError:
 
 @contextmanager
 def _opened(bag: Path) -> Iterator[Any]:
-    """Open a bag for reading with rosbags, and turn its many kinds of errors into one.
+    """Open a bag for reading with rosbags, and convert the errors of its reader to one line.
 
     Raises:
         InputError: rosbags is not installed, or the bag cannot be read.
@@ -104,19 +106,10 @@ def _opened(bag: Path) -> Iterator[Any]:
         raise InputError(
             f"{bag}: needs rosbags to read it, not installed (pip install rosbags)"
         ) from None
-    try:
+    hint = mcap_messages.INSTALL_HINT if bag.suffix.lower() == ".mcap" else ""
+    with convert_read_errors(bag, "a bag", hint):
         # Bags of ROS 2 store their message types only since Iron; older ones are read with
         # Humble's.
         usual = get_typestore(Stores.ROS2_HUMBLE)
         with AnyReader([bag], default_typestore=usual) as reader:
             yield reader
-    except (InputError, KeyboardInterrupt):
-        raise
-    except MemoryError:  # A damaged file may claim any size.
-        raise InputError(
-            f"{bag}: the file is damaged, or its content does not fit into the memory"
-        ) from None
-    except Exception as error:  # the readers of the three formats raise many kinds of errors
-        what = " ".join(str(error).split()) or type(error).__name__
-        hint = mcap_messages.INSTALL_HINT if bag.suffix.lower() == ".mcap" else ""
-        raise InputError(f"{bag}: not a bag that can be read: {what[:300]}{hint}") from None

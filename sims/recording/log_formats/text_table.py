@@ -31,7 +31,7 @@ from sims.recording.log_formats.table_layout import (
 )
 
 BOOLEAN_VALUES = {"true": 1.0, "false": 0.0}
-"""Numbers that booleans in a table, such as those of a drive that is enabled, are read as."""
+"""Number for each text of a boolean, such as whether a drive is enabled."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 
 from sims.core.simulator import Array, InputError, make_read_only
 from sims.recording.log_formats.parquet_columns import MAX_COLUMNS
+from sims.recording.log_formats.read_errors import make_memory_error
 
 ENDINGS = (".pt", ".pth")
 """File name endings of PyTorch files."""
@@ -83,12 +84,10 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
             f"{path}: expected a PyTorch file as a zip archive, found another format; save it "
             "again with torch.save of PyTorch 1.6 or newer"
         ) from None
-    except (InputError, KeyboardInterrupt):
+    except InputError:
         raise
-    except MemoryError:  # A damaged file may claim any size.
-        raise InputError(
-            f"{path}: the file is damaged, or its content does not fit into the memory"
-        ) from None
+    except MemoryError:
+        raise make_memory_error(path) from None
     except Exception as error:  # a damaged archive or program can fail in any step
         raise InputError(
             f"{path}: not a PyTorch file that can be read ({type(error).__name__})"

@@ -11,6 +11,7 @@ import simgap
 from bench.logs.inspection import load_recording
 from sims.core.simulator import InputError
 from sims.recording.log_formats.log_files import list_logs, read_log
+from tests.sims.recording.two_joint_arm import ARM
 
 mcap = pytest.importorskip("mcap", reason="mcap is not installed: extra mcap")
 mcap_protobuf = pytest.importorskip("mcap_protobuf", reason="extra mcap")
@@ -18,12 +19,6 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # 
 from mcap.writer import Writer  # noqa: E402
 from mcap_protobuf.writer import Writer as ProtobufWriter  # noqa: E402
 
-ARM = """<mujoco model="arm"><compiler angle="radian" autolimits="true"/><worldbody>
-<body><joint name="hip" axis="0 1 0" range="-2 2"/><geom size="0.1" pos="0 0 -0.3"/>
-<body pos="0 0 -0.6"><joint name="knee" axis="0 1 0" range="-2 2"/>
-<geom size="0.1" pos="0 0 -0.3"/></body></body></worldbody>
-<actuator><position name="m_hip" joint="hip" kp="100" kv="10"/>
-<position name="m_knee" joint="knee" kp="100" kv="10"/></actuator></mujoco>"""
 TIMES = 1.7e9 + np.arange(200) * 0.02
 NANO = 1_000_000_000
 

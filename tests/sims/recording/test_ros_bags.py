@@ -13,18 +13,13 @@ from sims.core.simulator import InputError
 from sims.recording.log_formats import ros_bags
 from sims.recording.log_formats.log_files import list_logs, read_log
 from sims.recording.log_formats.message_table import MessageTable
+from tests.sims.recording.two_joint_arm import ARM
 
 rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: extra bags")
 from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
 from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
-ARM = """<mujoco model="arm"><compiler angle="radian" autolimits="true"/><worldbody>
-<body><joint name="hip" axis="0 1 0" range="-2 2"/><geom size="0.1" pos="0 0 -0.3"/>
-<body pos="0 0 -0.6"><joint name="knee" axis="0 1 0" range="-2 2"/>
-<geom size="0.1" pos="0 0 -0.3"/></body></body></worldbody>
-<actuator><position name="m_hip" joint="hip" kp="100" kv="10"/>
-<position name="m_knee" joint="knee" kp="100" kv="10"/></actuator></mujoco>"""
 TIMES = 1.7e9 + np.arange(200) * 0.02
 
 
