@@ -264,10 +264,10 @@ class RobotSimulator(SystemSimulator):
             return []
         # A sensor at the end needs a further step, since MuJoCo computes its reading within the
         # step that begins then.
-        felt = self._feels()
+        extra_steps = int(self._reads_sensors())
         sizes = [self.count_steps(list_last_read_times(work)) for work in works]
         given = [
-            self.compute_controls(work, size + felt)
+            self.compute_controls(work, size + extra_steps)
             for work, size in zip(works, sizes, strict=True)
         ]
         whole = BatchInputs.concatenate(given)
@@ -312,7 +312,7 @@ class RobotSimulator(SystemSimulator):
             a.id for a in self.robot.actuators if a.name in self.robot.rate_controlled_actuators
         )
 
-    def _feels(self) -> bool:
+    def _reads_sensors(self) -> bool:
         """Return whether a recorded channel is computed by MuJoCo within a step."""
         return any(c.name.startswith(("tau.", "s.")) for c in self.channels)
 
@@ -328,8 +328,12 @@ class RobotSimulator(SystemSimulator):
         """
         n = len(work.x)
         of_run = self.time_step, work.scenario, work.commands, work.acting, n, steps
-        felt = compute_inputs_over_steps(*of_run)
-        instant = compute_inputs_over_steps(*of_run, SAME_INSTANT_SHARE) if self._drives else felt
+        applied_inputs = compute_inputs_over_steps(*of_run)
+        instant = (
+            compute_inputs_over_steps(*of_run, SAME_INSTANT_SHARE)
+            if self._drives
+            else applied_inputs
+        )
         begins: Array = self.time_step * np.arange(float(steps))
         model = self.robot.compiled
         controls = np.zeros((n, steps, model.nu))
@@ -337,17 +341,20 @@ class RobotSimulator(SystemSimulator):
         given = np.zeros_like(controls) if self._drives else controls
         for actuator in self.robot.actuators:
             name = f"u.{actuator.name}"
-            controls[:, :, actuator.control] = felt[name]
+            controls[:, :, actuator.control] = applied_inputs[name]
             if self._drives:
                 given[:, :, actuator.control] = instant[name]
             # A derivative gain on the error's rate needs the rate of the command.
             if actuator.id in self._rated:
-                rate = np.diff(felt[name], axis=1, prepend=felt[name][:, :1]) / self.time_step
+                rate = (
+                    np.diff(applied_inputs[name], axis=1, prepend=applied_inputs[name][:, :1])
+                    / self.time_step
+                )
                 controls[:, :, actuator.control + 1] = rate
                 given[:, :, actuator.control + 1] = rate
         for joint in self.robot.joints:
             if joint.has_one_coordinate:
-                forces[:, :, joint.velocity] = felt[f"force.{joint.name}"]
+                forces[:, :, joint.velocity] = applied_inputs[f"force.{joint.name}"]
         dofs = self.addresses.velocities
         forces[:, :, dofs] += compute_time_dependent_forces(
             self.robotic, work.acting, begins, len(dofs), n
@@ -358,10 +365,10 @@ class RobotSimulator(SystemSimulator):
             begun[:, one.address] = self._first_activation(one, work, taken)
             # The servo's effective set point is the activation instead of the command.
             activations = self._activations(one, taken, begun[:, one.address])
-            felt = {**felt, f"u.{one.actuator.name}": activations[:, :-1]}
+            applied_inputs = {**applied_inputs, f"u.{one.actuator.name}": activations[:, :-1]}
         off = off_steps(self.robot, work.scenario, self.time_step, steps)
         return BatchInputs(
-            controls, forces, felt, given, begun, np.broadcast_to(off, (n, *off.shape))
+            controls, forces, applied_inputs, given, begun, np.broadcast_to(off, (n, *off.shape))
         )
 
     def _first_activation(
@@ -388,8 +395,10 @@ class RobotSimulator(SystemSimulator):
         scenario, steps = history
         commands = self.run_inputs(scenario)
         n = len(work.x)
-        felt = compute_inputs_over_steps(self.time_step, scenario, commands, work.acting, n, steps)
-        earlier = felt[f"u.{one.actuator.name}"]
+        applied_inputs = compute_inputs_over_steps(
+            self.time_step, scenario, commands, work.acting, n, steps
+        )
+        earlier = applied_inputs[f"u.{one.actuator.name}"]
         last: Array = self._activations(one, earlier, one.clipped(earlier[:, 0]))[:, -1]
         return last
 
@@ -486,27 +495,26 @@ class RobotSimulator(SystemSimulator):
         behind = bench.set_initial_state(start.x, start.v, start.floating_state)
         bench.activate(given.activations)
         record = ["qpos", "qvel", *more]
-        if self._feels():
+        if self._reads_sensors():
             record.append("sensordata")
         record = list(dict.fromkeys(record))
         if asked:
             stiffness = bench.get_servo_stiffness(places)[:n]
-            asking = EffectForces(
+            effect_forces = EffectForces(
                 self.robotic, start.acting, given.applied_inputs, places, stiffness, self.time_step
             )
             forces = bench.map_forces(given.forces)
-            asked_of = None
+            compiled = done = None
             if given.off.any():
                 # Compiled effects assume a constant servo stiffness over all steps.
-                asking.working = working_servos(bench.robot, places.velocities, given.off)
+                effect_forces.working = working_servos(bench.robot, places.velocities, given.off)
             else:
-                asked_of = compile_forces(asking)
-            done = None
-            if asked_of is not None:
-                done = step_in_callback(bench, given.controls, forces, asked_of, record)
+                compiled = compile_forces(effect_forces)
+            if compiled is not None:
+                done = step_in_callback(bench, given.controls, forces, compiled, record)
             if done is None:
                 done = bench.step_with_forces(
-                    given.controls, forces, asked_of or asking, record, given.off
+                    given.controls, forces, compiled or effect_forces, record, given.off
                 )
         else:
             forces = bench.map_forces(given.forces)

@@ -104,7 +104,7 @@ def compute_inputs_over_steps(
     usual = NO_SUBDIVISION if aligned else STEP_SUBDIVISION
     if share < 1.0:
         usual = np.array([share, 1.0])
-    felt: dict[str, Array] = {}
+    applied_inputs: dict[str, Array] = {}
     asked: list[_InputRequest] = []
     for name, signal in commands.items():
         earlier = scenario.before[name].tobytes() if name in scenario.before else b""
@@ -114,7 +114,7 @@ def compute_inputs_over_steps(
         plain = _applied_input_cache.get(
             key, partial(_given, step, scenario, [bare], steps, seen, usual)
         )
-        felt[name] = np.repeat(plain, n, axis=0)
+        applied_inputs[name] = np.repeat(plain, n, axis=0)
         passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
         # Inputs are grouped by effects, so that the value of a batch element does not depend on
         # others.
@@ -124,8 +124,8 @@ def compute_inputs_over_steps(
         values = _given(step, scenario, group, steps, seen, cuts)
         ends = np.cumsum([one.lanes.size for one in group])
         for one, rows in zip(group, np.split(values, ends[:-1]), strict=True):
-            felt[one.name][one.lanes] = rows
-    return felt
+            applied_inputs[one.name][one.lanes] = rows
+    return applied_inputs
 
 
 class _InputRequest(NamedTuple):
@@ -194,7 +194,7 @@ def _together(asked: Sequence[_InputRequest]) -> ActiveEffects:
 def _given(
     step: float,
     scenario: Scenario,
-    asked: Sequence[_InputRequest],
+    requests: Sequence[_InputRequest],
     steps: int,
     seen: Mask,
     cuts: Array,
@@ -205,11 +205,11 @@ def _given(
     at which it is divided for them. With the cuts of `STEP_SUBDIVISION` the parts are combined to
     one value per step; with fewer cuts, the first part is returned.
     """
-    acting = _together(asked)
-    of = np.repeat(np.arange(len(asked)), [one.lanes.size for one in asked])
-    runs = ScenarioGroups(tuple(_alone(scenario, one.name) for one in asked), of)
+    acting = _together(requests)
+    of = np.repeat(np.arange(len(requests)), [one.lanes.size for one in requests])
+    runs = ScenarioGroups(tuple(_alone(scenario, one.name) for one in requests), of)
     plan = _parts_of_steps(step, steps, of.size, cuts, alike=not acting)
-    commands = [{SINGLE_INPUT_NAME: one.signal} for one in asked]
+    commands = [{SINGLE_INPUT_NAME: one.signal} for one in requests]
     values = compute_applied_inputs(plan, runs, commands, acting)[SINGLE_INPUT_NAME]
     parts = values.reshape(of.size, steps, cuts.size)
     return parts[:, :, 0] if cuts.size < STEP_SUBDIVISION.size else compute_step_inputs(parts, seen)

@@ -282,9 +282,11 @@ class CompiledForces:
         self._run = kernel.make_instruction_runner(written.code, moment, end, r)
 
     @cached_property
-    def _felt(self) -> Array:
+    def _stacked_inputs(self) -> Array:
         """Applied inputs (S, U, L)."""
-        return np.ascontiguousarray(np.stack(list(self._of.felt.values())).transpose(2, 0, 1))
+        return np.ascontiguousarray(
+            np.stack(list(self._of.applied_inputs.values())).transpose(2, 0, 1)
+        )
 
     @property
     def registers(self) -> Array:
@@ -294,9 +296,9 @@ class CompiledForces:
     @property
     def input_values(self) -> Array:
         """Applied inputs (S, U, L) over S steps: U inputs of L batch elements."""
-        if not self._of.felt:
+        if not self._of.applied_inputs:
             return np.zeros((1, 0, self._r.shape[1]))
-        return self._felt
+        return self._stacked_inputs
 
     @property
     def step(self) -> float:
@@ -355,8 +357,8 @@ class CompiledForces:
             r[rows] = values.T
         r[self._t] = k * self._of.step
         r[self._after] = (k + 0.5) * self._of.step
-        if self._of.felt:
-            r[self._u] = self._felt[k]
+        if self._of.applied_inputs:
+            r[self._u] = self._stacked_inputs[k]
         hidden = self._of.hidden
         if hidden and k < 2:
             r[self._past] = self._of.step if k else 0.5 * self._of.step
@@ -377,7 +379,7 @@ def compile_forces(forces: EffectForces) -> CompiledForces | None:
     groups = [[effect for effect, _ in group] for group in _groups(forces)]
     if not any(groups):
         return None
-    inputs = tuple(forces.felt)
+    inputs = tuple(forces.applied_inputs)
     tracings = forces.system.traced
     if inputs not in tracings:
         tracings[inputs] = _Tracing(forces.system, inputs)
@@ -405,7 +407,8 @@ def _compiles(tracing: _Tracing, forces: EffectForces, effect: Effect) -> bool:
         except Exception as reason:
             text = str(reason) or type(reason).__name__
             sys.stderr.write(
-                f"simgap: effect {effect.name} is asked without the compiler: {text}\n"
+                f"simgap: effect {effect.name} is evaluated with NumPy, "
+                f"since it cannot be compiled: {text}\n"
             )
     return tracing.known[kind]
 
@@ -422,7 +425,7 @@ def _check(tracing: _Tracing, forces: EffectForces) -> None:
     program = tracing.program([[effect for effect, _ in group] for group in _groups(forces)])
     quick = CompiledForces(forces, program)
     rng = np.random.default_rng(0)
-    steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.felt.values())])
+    steps = min([CHECKED_INSTANTS, *(u.shape[1] for u in forces.applied_inputs.values())])
     for k in range(steps):
         seen = (len(JointStates._fields), *forces.stiffness.shape)
         look = JointStates(*(rng.normal(size=seen) * rng.choice([0.01, 1.0, 10.0])))
@@ -446,5 +449,5 @@ def _alone(forces: EffectForces, effect: Effect) -> EffectForces:
     """Return the forces of one effect without the others, to test whether it can be compiled."""
     own = tuple(pair for pair in _effects(forces) if pair[0] is effect)
     return EffectForces(
-        forces.system, own, forces.felt, forces.addresses, forces.stiffness, forces.step
+        forces.system, own, forces.applied_inputs, forces.addresses, forces.stiffness, forces.step
     )

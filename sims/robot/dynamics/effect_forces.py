@@ -101,7 +101,7 @@ class EffectForces:
         has_dry_friction: (L, D) whether an effect adds dry friction.
         loaded: (L,) whether an effect depends on the loads of transmissions.
         system: system of the robot.
-        felt: applied inputs (L, S) by name.
+        applied_inputs: applied inputs (L, S) by name.
         addresses: addresses of the joints.
         stiffness: (L, D) stiffness of the position servos.
         step: step length in seconds.
@@ -114,7 +114,7 @@ class EffectForces:
     Args:
         system: see the attributes.
         acting: effects at one place each.
-        felt: see the attributes.
+        applied_inputs: see the attributes.
         addresses: see the attributes.
         stiffness: see the attributes.
         step: see the attributes.
@@ -124,7 +124,7 @@ class EffectForces:
         self,
         system: RobotSystem,
         acting: ActiveEffects,
-        felt: Mapping[str, Array],
+        applied_inputs: Mapping[str, Array],
         addresses: JointAddresses,
         stiffness: Array,
         step: float,
@@ -136,7 +136,7 @@ class EffectForces:
         with joints.
         """
         self.system = system
-        self.felt = felt
+        self.applied_inputs = applied_inputs
         self.addresses = addresses
         self.stiffness = stiffness
         self.step = step
@@ -195,7 +195,7 @@ class EffectForces:
         """Return the snapshot after a number of steps, with the inputs of step k."""
         x, v, *sides = motion
         now = np.full((len(x), 1), steps * self.step)
-        inputs = {name: u[:, k, None] for name, u in self.felt.items()}
+        inputs = {name: u[:, k, None] for name, u in self.applied_inputs.items()}
         stiffness = self.stiffness
         if self.working is not None:
             stiffness = stiffness * self.working[:, k]

@@ -370,7 +370,7 @@ class MujocoBatch:
         self,
         controls: Array,
         forces: Array,
-        asking: StepwiseForces,
+        step_forces: StepwiseForces,
         record: Sequence[str],
         off: Mask | None = None,
     ) -> dict[str, Array]:
@@ -379,7 +379,7 @@ class MujocoBatch:
         Args:
             controls: (n, S, nu) controls.
             forces: (n, S, nv) generalised forces.
-            asking: effects to evaluate.
+            step_forces: effects to evaluate.
             record: fields of MuJoCo's data to record.
             off: (n, S, K) whether each actuator is switched off; none is by default.
 
@@ -387,18 +387,20 @@ class MujocoBatch:
             Recorded fields (n, S, ...) by name.
         """
         n, steps, _ = controls.shape
-        dofs = asking.addresses.velocities
+        dofs = step_forces.addresses.velocities
         bind = self.batch.bind
         ctrl, applied = bind("ctrl"), bind("qfrc_applied")
         loss = self.fields["dof_frictionloss"]
-        rubs = bool(asking.has_dry_friction.any())
-        own = self.begin_dry_friction(asking, n)
+        rubs = bool(step_forces.has_dry_friction.any())
+        own = self.begin_dry_friction(step_forces, n)
         result = self._begun(n, steps, record)
         shown = {name: bind(name)[:n] for name in record}
         ids = self._ids(n)
         # This precedes MuJoCo's first evaluation, since fields that are bound later would not
         # contain it.
-        lanes_at = MidpointPredictor(self.batch, asking.addresses.positions, dofs, asking.loaded)
+        lanes_at = MidpointPredictor(
+            self.batch, step_forces.addresses.positions, dofs, step_forces.loaded
+        )
         changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
         of = lanes_at.of
         ctrl[:n] = controls[:, 0]
@@ -416,7 +418,7 @@ class MujocoBatch:
             if ranges is not None and k in switches:
                 ranges.write(switches[k])
                 changes[:, k] = True
-            force, limit = asking.compute(k, lanes_at.read_joint_states(changes[:, k]))
+            force, limit = step_forces.compute(k, lanes_at.read_joint_states(changes[:, k]))
             applied[:n] = forces[:, k]
             applied[:n, of] += force
             if rubs:
@@ -429,25 +431,25 @@ class MujocoBatch:
         self._fails(n)
         return result
 
-    def begin_dry_friction(self, asking: StepwiseForces, n: int) -> Array:
+    def begin_dry_friction(self, step_forces: StepwiseForces, n: int) -> Array:
         """Set the solver parameters of dry friction where effects add it.
 
         Where no effect adds friction, the file's friction keeps its solver parameters.
 
         Args:
-            asking: effects to evaluate in every step.
+            step_forces: effects to evaluate in every step.
             n: number of batch elements in use.
 
         Returns:
             Dry friction (n, D) of the joints without these effects.
         """
-        dofs = asking.addresses.velocities
-        own: Array = self.fields["dof_frictionloss"][:n, dofs].copy()
-        if asking.has_dry_friction.any():
-            lanes, joints = np.nonzero(asking.has_dry_friction)
+        dofs = step_forces.addresses.velocities
+        file_friction: Array = self.fields["dof_frictionloss"][:n, dofs].copy()
+        if step_forces.has_dry_friction.any():
+            lanes, joints = np.nonzero(step_forces.has_dry_friction)
             write_friction_form(self.fields, self.robot, lanes, dofs[joints])
             self._changed.update(MODEL_FIELD_EFFECTS["friction.coulomb"].fields)
-        return own
+        return file_friction
 
     def get_servo_stiffness(self, places: JointAddresses) -> Array:
         """Return the force of position servos per unit of their errors, with effects.

@@ -318,8 +318,8 @@ class RunLinearisation:
         steps = len(self._motion.controls)
         simulator = self._simulator
         given = self._work.scenario, self._work.commands, tuple(acting.values()), count, steps
-        felt = compute_inputs_over_steps(simulator.time_step, *given)
-        instant = felt
+        applied_inputs = compute_inputs_over_steps(simulator.time_step, *given)
+        instant = applied_inputs
         if any(name.startswith("tau.") for name in self._names):
             instant = compute_inputs_over_steps(simulator.time_step, *given, SAME_INSTANT_SHARE)
         numbers = {f"u.{a.name}": a.control for a in simulator.robot.actuators}
@@ -328,7 +328,7 @@ class RunLinearisation:
             if one.signal not in numbers:
                 continue
             column = numbers[one.signal]
-            series = felt[one.signal][lane] - self._motion.controls[:, column]
+            series = applied_inputs[one.signal][lane] - self._motion.controls[:, column]
             at_once = instant[one.signal][lane] - self._motion.instant[:, column]
             change = Perturbation(number, actuator=column, series=series, instant=at_once)
             result.setdefault(number, []).append(change)

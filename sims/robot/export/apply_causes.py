@@ -55,7 +55,7 @@ MAX_CORRECTION_ROUNDS = 4
 ROUNDING_TOLERANCE = 1e-13
 """Relative difference between compiled numbers that counts as rounding."""
 
-KEPT_VALUE_NOTE = "as it was: it would move along with another change"
+KEPT_VALUE_NOTE = "unchanged: without this line another change would alter it"
 
 KEYFRAMES_OMITTED_NOTE = "keyframes are left out: they lack the coordinates of joints in series"
 
@@ -229,7 +229,7 @@ def _write(
     if cause.effect in COMMAND_WRITERS:
         return COMMAND_WRITERS[cause.effect](wanted, robot, cause)
     if cause.effect.startswith(("sensor.", "clock.")):
-        return "what a sensor shows is no part of the model"
+        return "a model file does not state sensor errors"
     return "MuJoCo has no such element"
 
 

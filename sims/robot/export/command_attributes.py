@@ -120,7 +120,7 @@ def _gain(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableRe
     if not scaled:
         return _NOT_LINEAR
     if 1.0 + a < MIN_GAIN_FACTOR:
-        return "a gain below zero turns the control range round"
+        return "a factor of zero or less cannot be stated by a control range"
     low, high = actuator.limits()
     actuator.limit(low / (1.0 + a), high / (1.0 + a))  # (2)
     actuator.gain[0] *= 1.0 + a  # (1)
@@ -158,7 +158,7 @@ def _saturation(fields: Fields, robot: RobotModel, cause: FittedCause) -> Unstat
     low, high = actuator.limits()
     low, high = max(low, (-s - b) / share), min(high, (s - b) / share)
     if low >= high:
-        return "nothing is left of the control range"
+        return "the control range would be empty"
     actuator.limit(low, high)  # (2)
     return None
 
@@ -173,7 +173,7 @@ def _delay(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableR
     if delay == 0:
         return None
     if delay < 0:
-        return "a control cannot be felt before it is set"
+        return "a control cannot act before it is set"
     if fields["actuator_delay"][0, actuator.id] > 0:
         return "the file states a delay already"
     fields["actuator_delay"][0, actuator.id] = delay
@@ -237,7 +237,9 @@ def _force(fields: Fields, robot: RobotModel, cause: FittedCause) -> UnstatableR
             gear = robot.compiled.actuator_gear[actuator.id]
             if not fields["actuator_forcelimited"][0, actuator.id] and gear[0]:
                 actuator.shift(float(force / gear[0]))
-                return f"+it stands as a bias of actuator {driving.name}, and counts as its force"
+                return (
+                    f"+it is written as a bias of actuator {driving.name}, and is part of its force"
+                )
     return "MuJoCo has no constant force at a joint without a spring or an actuator free of limits"
 
 

@@ -98,7 +98,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
         if one.shape != other.shape or not np.allclose(
             one, other, rtol=EQUAL_NUMBERS_TOLERANCE, atol=EQUAL_NUMBERS_TOLERANCE
         ):
-            raise RuntimeError(f"extended.urdf is not as it was meant: {name}")
+            raise RuntimeError(f"extended.urdf differs from the intended model: {name}")
     # The axes of two equal moments are arbitrary, so whole tensors are compared.
     one, other = (compute_inertia_tensors(m.body_iquat, m.body_inertia) for m in (found, wanted))
     if not np.allclose(
@@ -107,7 +107,7 @@ def _check_urdf(robot: RobotModel, causes: CauseCoefficients, path: Path) -> Non
         rtol=EQUAL_NUMBERS_TOLERANCE,
         atol=max(MOTION_TOLERANCE * np.abs(other).max(), MIN_MOMENT),
     ):
-        raise RuntimeError("extended.urdf is not as it was meant: body_inertia")
+        raise RuntimeError("extended.urdf differs from the intended model: body_inertia")
     for model in (wanted, found):
         # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
         # elsewhere.
@@ -132,7 +132,7 @@ def _compare(found: Any, wanted: Any, name: str) -> None:
     """
     differs = find_first_difference(found, wanted, EQUAL_NUMBERS_TOLERANCE)
     if differs:
-        raise RuntimeError(f"{name} is not as it was meant: {differs}")
+        raise RuntimeError(f"{name} differs from the intended model: {differs}")
     _compare_motion(found, wanted, name)
 
 
@@ -147,7 +147,7 @@ def _compare_motion(found: Any, wanted: Any, name: str) -> None:
     one, other = simulate_test_motion(found, pose), simulate_test_motion(wanted, pose)
     if not np.allclose(one, other, rtol=MOTION_TOLERANCE, atol=MOTION_TOLERANCE, equal_nan=True):
         error = float(np.nanmax(np.abs(one - other)))
-        raise RuntimeError(f"{name} does not move as it was meant: qpos differs by {error:.2g}")
+        raise RuntimeError(f"{name} does not move as intended: qpos differs by {error:.2g}")
 
 
 def displace_reference_pose(model: Any) -> Array:

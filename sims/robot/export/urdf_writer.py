@@ -73,7 +73,7 @@ class UrdfWriter:
             "payload": self._payload,
         }
         if cause.effect not in known:
-            return "URDF has no word for it"
+            return "a URDF cannot state it"
         return known[cause.effect](cause)
 
     def to_text(self, lines: list[str]) -> str:

@@ -112,14 +112,14 @@ def test_freed_numbers_and_numerics_are_written(arm):
 
 def test_a_fault_in_a_file_costs_the_file_alone(arm, monkeypatch):
     def differs(*_):
-        raise RuntimeError("extended.xml is not as it was meant: dof_damping")
+        raise RuntimeError("extended.xml differs from the intended model: dof_damping")
 
     monkeypatch.setattr(round_trip_check, "check_written_files", differs)
     files, said, _, _ = build_robot_files(extended_of(arm, effects=FRICTION))
     assert files == {}
     assert said == (
         "no model file is written, by a fault of simgap: "
-        "extended.xml is not as it was meant: dof_damping",
+        "extended.xml differs from the intended model: dof_damping",
     )
 
 

@@ -127,7 +127,11 @@ def test_what_does_not_trace_is_told_once_and_asked_by_numpy(
     told = capsys.readouterr().err
     assert told.count("\n") == (1 if says else 0)
     assert says in told
-    assert not says or f"effect {effect.name}@elbow is asked without the compiler" in told
+    assert (
+        not says
+        or f"effect {effect.name}@elbow is evaluated with NumPy, since it cannot be compiled"
+        in told
+    )
 
 
 def test_an_effect_alone_and_the_same_one_in_its_family_act_side_by_side(arm, monkeypatch):

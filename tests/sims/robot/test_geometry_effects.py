@@ -167,7 +167,7 @@ def test_a_urdf_states_geometry(tmp_path: Path) -> None:
     check_written_files(arm, causes, done)
     assert done.urdf is not None
     assert [note for note in done.notes if "not in the URDF" in note] == [
-        "gravity.compensation@d: 0.5 (95 %: 0.45 to 0.55): not in the URDF: URDF has no word for it"
+        "gravity.compensation@d: 0.5 (95 %: 0.45 to 0.55): not in the URDF: a URDF cannot state it"
     ]
 
 

@@ -116,9 +116,9 @@ def test_a_constant_force_is_a_spring_or_a_bias(place: str, force: float, tmp_pa
     ("name", "why"),
     [
         ("backlash@m_elbow", "no such element"),
-        ("sensor.bias@q.elbow", "no part of the model"),
+        ("sensor.bias@q.elbow", "does not state sensor errors"),
         ("input.delay@m_elbow", "before it is set"),
-        ("input.gain@m_spin", "turns the control range"),
+        ("input.gain@m_spin", "a factor of zero or less"),
     ],
 )
 def test_what_a_file_cannot_say_is_said(name: str, why: str, tmp_path: Path) -> None:
