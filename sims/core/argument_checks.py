@@ -109,10 +109,10 @@ def bind_checked(
     for name, value in bound.arguments.items():
         if name in hints:
             try:
-                bound.arguments[name] = _fitted(name, value, hints[name])
+                bound.arguments[name] = _convert(name, value, hints[name])
             except _MismatchError as error:
                 raise InputError(
-                    f"{error.place}: expected {error.words}, found {_shown(error.value)}"
+                    f"{error.place}: expected {error.words}, found {_format_value(error.value)}"
                 ) from None
     return bound
 
@@ -160,7 +160,7 @@ def _bind(
         for name, parameter in signature.parameters.items():
             required = parameter.default is parameter.empty
             if required and "missing" in str(error) and f"'{name}'" in str(error):
-                wanted = _words(hints[name])
+                wanted = _describe_type(hints[name])
                 raise InputError(f"{called}: expected {name}, {wanted}; found none") from None
         most = sum(p.kind is not p.KEYWORD_ONLY for p in signature.parameters.values())
         plural = "s" * (most != 1)
@@ -168,7 +168,7 @@ def _bind(
         raise InputError(f"{called}: {found}; name the others, as {names[-1]}=...") from None
 
 
-def _fitted(place: str, value: Any, hint: Any) -> Any:
+def _convert(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to the type of its annotation.
 
     `place` names the argument or its entry in messages, such as ``runs[2]``. The result may
@@ -179,76 +179,76 @@ def _fitted(place: str, value: Any, hint: Any) -> Any:
     """
     origin = get_origin(hint)
     if origin is Annotated:
-        return _expected(place, value, hint)
+        return _convert_annotated(place, value, hint)
     if origin in (Union, UnionType):
-        return _one_of(place, value, hint)
+        return _convert_to_union(place, value, hint)
     if origin is not None and origin is not type:
-        fitted = _FITS[origin](place, value, hint)
+        converted = _CONVERTERS[origin](place, value, hint)
     elif hint is Any:
         return value
     else:
-        fitted = _plain(value, hint, get_args(hint))
-    if fitted is _NOTHING:
-        raise _MismatchError(place, _words(hint), value)
-    return fitted
+        converted = _convert_to_type(value, hint, get_args(hint))
+    if converted is _NO_MATCH:
+        raise _MismatchError(place, _describe_type(hint), value)
+    return converted
 
 
-_NOTHING = object()
+_NO_MATCH = object()
 """Marker for a value that does not match."""
 
 
-def _expected(place: str, value: Any, hint: Any) -> Any:
+def _convert_annotated(place: str, value: Any, hint: Any) -> Any:
     """Convert a value annotated with `Expected`, whose words replace the default ones."""
     inner, expected = get_args(hint)[:2]
     try:
-        fitted = _fitted(place, value, inner)
+        converted = _convert(place, value, inner)
     except _MismatchError as error:
         if error.place != place:
             raise
         raise _MismatchError(place, expected.words, value) from None
-    if fitted is not None and not expected.allows(fitted):
+    if converted is not None and not expected.allows(converted):
         raise _MismatchError(place, expected.words, value)
-    return fitted
+    return converted
 
 
-def _one_of(place: str, value: Any, hint: Any) -> Any:
+def _convert_to_union(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to the first of several types that accepts it.
 
     Raises:
         _MismatchError: no type accepts it; the error names a wrong entry of a list or dict.
     """
-    inside = []
+    entry_errors = []
     for kind in get_args(hint):
         try:
-            return _fitted(place, value, kind)
+            return _convert(place, value, kind)
         except _MismatchError as error:
             if error.place != place:
-                inside.append(error)
+                entry_errors.append(error)
     # For a list or dict, report the entry that is wrong.
-    if len(inside) == 1:
-        raise inside[0]
-    raise _MismatchError(place, _words(hint), value)
+    if len(entry_errors) == 1:
+        raise entry_errors[0]
+    raise _MismatchError(place, _describe_type(hint), value)
 
 
-def _plain(value: Any, hint: Any, inner: tuple[Any, ...]) -> Any:
-    """Convert a value to a single type; `_NOTHING` if it does not match."""
+def _convert_to_type(value: Any, hint: Any, inner: tuple[Any, ...]) -> Any:
+    """Convert a value to a single type; `_NO_MATCH` if it does not match."""
     if hint is NoneType:
-        return None if value is None else _NOTHING
+        return None if value is None else _NO_MATCH
     if get_origin(hint) is type:
-        return value if inspect.isclass(value) and issubclass(value, inner[0]) else _NOTHING
+        return value if inspect.isclass(value) and issubclass(value, inner[0]) else _NO_MATCH
     if hint is bool:
         is_bool = isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1))
-        return bool(value) if is_bool else _NOTHING
+        return bool(value) if is_bool else _NO_MATCH
     if hint is int:
-        return int(value) if _is_number(value) and _is_whole(value) else _NOTHING
+        return int(value) if _is_number(value) and _is_whole(value) else _NO_MATCH
     if hint is float:
         if not _is_number(value):
-            return _NOTHING
+            return _NO_MATCH
         # Keep integers, because hashes of experiments contain numbers as they are written.
         return int(value) if isinstance(value, Integral) else float(value)
     if hint is Path:
-        return Path(value) if isinstance(value, PathLike) else _NOTHING
-    return value if isinstance(value, hint) else _NOTHING
+        return Path(value) if isinstance(value, PathLike) else _NO_MATCH
+    return value if isinstance(value, hint) else _NO_MATCH
 
 
 def _is_number(value: object) -> bool:
@@ -259,62 +259,62 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, Integral) or float(value).is_integer()
 
 
-def _list(place: str, value: Any, hint: Any) -> Any:
+def _convert_to_list(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to a list; a single entry becomes a list of one."""
     (entry,) = get_args(hint)
     if isinstance(value, str):
         # Paths may contain commas, names may not.
-        one = get_origin(entry) in (Union, UnionType) and Path in get_args(entry)
-        parts = [value] if one else [part.strip() for part in value.split(",")]
+        is_path = get_origin(entry) in (Union, UnionType) and Path in get_args(entry)
+        parts = [value] if is_path else [part.strip() for part in value.split(",")]
     elif isinstance(value, Iterable) and not isinstance(value, Mapping | bytes):
         parts = list(value)
-    elif _fits(value, entry):
+    elif _is_convertible(value, entry):
         parts = [value]
     else:
-        return _NOTHING
-    if isinstance(value, str) and not all(_fits(part, entry) for part in parts):
-        return _NOTHING
-    return [_fitted(f"{place}[{number}]", part, entry) for number, part in enumerate(parts)]
+        return _NO_MATCH
+    if isinstance(value, str) and not all(_is_convertible(part, entry) for part in parts):
+        return _NO_MATCH
+    return [_convert(f"{place}[{number}]", part, entry) for number, part in enumerate(parts)]
 
 
-def _fits(value: Any, hint: Any) -> bool:
+def _is_convertible(value: Any, hint: Any) -> bool:
     """Return whether a value has the annotated type, or can be converted to it."""
     try:
-        _fitted("", value, hint)
+        _convert("", value, hint)
     except _MismatchError:
         return False
     return True
 
 
-def _dict(place: str, value: Any, hint: Any) -> Any:
+def _convert_to_dict(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to a dict with texts as keys."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
-        return _NOTHING
+        return _NO_MATCH
     return {
-        key: _fitted(f"{place}[{key!r}]", entry, get_args(hint)[1]) for key, entry in value.items()
+        key: _convert(f"{place}[{key!r}]", entry, get_args(hint)[1]) for key, entry in value.items()
     }
 
 
-def _tuple(place: str, value: Any, hint: Any) -> Any:
+def _convert_to_tuple(place: str, value: Any, hint: Any) -> Any:
     """Convert a value to a tuple of the annotated length."""
     inner = get_args(hint)
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(inner):
-        return _NOTHING
-    return tuple(_fitted(place, entry, kind) for entry, kind in zip(value, inner, strict=True))
+        return _NO_MATCH
+    return tuple(_convert(place, entry, kind) for entry, kind in zip(value, inner, strict=True))
 
 
-def _function(_place: str, value: Any, _hint: Any) -> Any:
-    return value if callable(value) else _NOTHING
+def _convert_to_function(_place: str, value: Any, _hint: Any) -> Any:
+    return value if callable(value) else _NO_MATCH
 
 
-_FITS: Mapping[Any, Callable[[str, Any, Any], Any]] = {
-    Sequence: _list,
-    Mapping: _dict,
-    tuple: _tuple,
-    Callable: _function,
+_CONVERTERS: Mapping[Any, Callable[[str, Any, Any], Any]] = {
+    Sequence: _convert_to_list,
+    Mapping: _convert_to_dict,
+    tuple: _convert_to_tuple,
+    Callable: _convert_to_function,
 }
 """Conversion for each generic type, by the type's origin."""
-_WORDS: Mapping[Any, str] = {
+_TYPE_DESCRIPTIONS: Mapping[Any, str] = {
     str: "text",
     int: "a whole number",
     float: "a number",
@@ -327,7 +327,7 @@ _WORDS: Mapping[Any, str] = {
 """Description of each type in messages."""
 
 
-def _words(hint: Any) -> str:
+def _describe_type(hint: Any) -> str:
     """Describe in words what an annotation expects.
 
     The words follow "expected" in a message, for example "a list (a number each)".
@@ -338,18 +338,20 @@ def _words(hint: Any) -> str:
     if origin in (Union, UnionType):
         # Text is accepted for a path, too.
         implied = {NoneType, str} if Path in inner else {NoneType}
-        return " or ".join(dict.fromkeys(_words(kind) for kind in inner if kind not in implied))
+        return " or ".join(
+            dict.fromkeys(_describe_type(kind) for kind in inner if kind not in implied)
+        )
     if origin is Sequence:
-        return f"a list ({_words(inner[0])} each)"
+        return f"a list ({_describe_type(inner[0])} each)"
     if origin is Mapping and inner[1] is not Any:
-        return f"a dict ({_words(inner[1])} for each name)"
+        return f"a dict ({_describe_type(inner[1])} for each name)"
     if origin is type:
         return f"a subclass of {inner[0].__name__}"
     kind = origin or hint
-    return _WORDS.get(kind) or f"a {kind.__name__}"
+    return _TYPE_DESCRIPTIONS.get(kind) or f"a {kind.__name__}"
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
     """Format a value for a message: small ones literally, others by their type."""
     if value is None or isinstance(value, str | bool | Real | list | tuple | dict | Path):
         return truncate_text(repr(value))
