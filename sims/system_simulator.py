@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims import effects as library
 from sims.core.effect import (
@@ -23,7 +22,7 @@ from sims.core.effect import (
 )
 from sims.core.engine import Engine, IntegrationBatch, Trajectories
 from sims.core.simulation_counter import SIMULATION_COUNTER
-from sims.core.simulator import Array, InputError, Parameter, Scenario, Simulator
+from sims.core.simulator import Array, Indices, InputError, Parameter, Scenario, Simulator
 from sims.core.system import System
 from sims.core.toml_validation import format_value
 from sims.core.value_limits import is_plausible_number
@@ -78,10 +77,11 @@ class SystemSimulator(Simulator):
         super().__init__(constants, observe)
         self._declared = self.system()
         self.engine = self._engine(engine, settings)
-        _check_given(effects, fixed)
+        _check_effect_types(effects, fixed)
         self.effects = [self._effect(effect) for effect in effects]
         self.fixed = [
-            (self._effect(name), _row(name, value)) for name, value in (fixed or {}).items()
+            (self._effect(name), _read_coefficients(name, value))
+            for name, value in (fixed or {}).items()
         ]
         named = [effect.name for effect in self.effects]
         doubled = [name for name in named if name in (fixed or {}) or named.count(name) > 1]
@@ -133,8 +133,8 @@ class SystemSimulator(Simulator):
             )
         if issubclass(effect, HiddenStateEffect) and self.engine.name not in HIDDEN_STATE_ENGINES:
             raise InputError(
-                f"engine {self.engine.name} cannot carry effect {effect.name}, which has a state of"
-                f" its own; choose engine {' or '.join(HIDDEN_STATE_ENGINES)}"
+                f"engine {self.engine.name} cannot simulate effect {effect.name}, which has a"
+                f" hidden state; choose engine {' or '.join(HIDDEN_STATE_ENGINES)}"
             )
         return effect()
 
@@ -148,9 +148,7 @@ class SystemSimulator(Simulator):
         Returns:
             Observations (n, T, C), SI units.
         """
-        scenarios = [scenario] * len(theta)
-        theta = self._count_elements(theta, scenarios)
-        return self._simulated(theta, scenarios, {}) if len(theta) else self._nothing()
+        return self.simulate_batch(theta, [scenario] * len(theta))
 
     def simulate_batch(
         self,
@@ -175,26 +173,14 @@ class SystemSimulator(Simulator):
             InputError: A shape is wrong, or a scenario names a constant, input or state that the
                 system does not have.
         """
-        theta = self._count_elements(theta, scenarios)
-        return self._simulated(theta, scenarios, initial or {}) if len(theta) else self._nothing()
-
-    def _count_elements(self, theta: Array, scenarios: Sequence[Scenario]) -> Array:
-        """Count the simulations of parameter vectors, and return the vectors after a check.
-
-        Raises:
-            InputError: Their shape is wrong.
-        """
         theta = np.asarray(theta, dtype=np.float64)
         expected = (len(scenarios), len(self.parameters))
         if theta.shape != expected:
             raise InputError(f"theta must have shape {expected}, found {theta.shape}")
-        if len(theta):
-            SIMULATION_COUNTER.count(len(theta))
-        return theta
-
-    def _nothing(self) -> Array:
-        """Return the observations of no batch element."""
-        return np.empty((0, 0, len(self.channels)))
+        if not len(theta):
+            return np.empty((0, 0, len(self.channels)))
+        SIMULATION_COUNTER.count(len(theta))
+        return self._simulated(theta, scenarios, initial or {})
 
     def _simulated(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
@@ -217,31 +203,31 @@ class SystemSimulator(Simulator):
         commands = [self.run_inputs(s) for s in runs.unique_scenarios]
         with np.errstate(all="ignore"):  # batch elements that overflow become NaN
             plan = build_time_grid(
-                runs, commands, _of(acting, (Input, Sensor)), self.engine.largest_step
+                runs, commands, _select_effects(acting, (Input, Sensor)), self.engine.largest_step
             )
             inputs = (
-                compute_applied_inputs(plan, runs, commands, _of(acting, Input))
+                compute_applied_inputs(plan, runs, commands, _select_effects(acting, Input))
                 if self.inputs
                 else {}
             )
-            sensors = tuple((effect, c) for effect, c in _of(acting, Sensor) if c.any())
+            sensors = tuple((effect, c) for effect, c in _select_effects(acting, Sensor) if c.any())
             # A sensor filter needs every step; other sensor effects need the samples only.
             filtered = any(_filters(effect) for effect, _ in sensors)
             every = 1 if filtered else plan.steps_per_sample
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
             constants, x, v = self._known(scenarios, initial)
-            forces = _of(acting, (Force, Friction, Contact, HiddenStateEffect, Level))
-            lanes = IntegrationBatch(
+            forces = _select_effects(acting, (Force, Friction, Contact, HiddenStateEffect, Level))
+            batch = IntegrationBatch(
                 self._declared, own, constants, x, v, plan.steps, inputs, forces, every
             )
             clock = np.array([s.times[0] for s in runs.unique_scenarios])[runs.scenario_index, None]
             has_hidden_states = any(isinstance(effect, HiddenStateEffect) for effect, _ in forces)
             motion = (
-                integrate_with_hidden_states(self.engine, lanes)
+                integrate_with_hidden_states(self.engine, batch)
                 if has_hidden_states
-                else self.engine.integrate(lanes)
+                else self.engine.integrate(batch)
             )
-            observations = self._read(motion, lanes, plan, sensors, clock)
+            observations = self._read(motion, batch, plan, sensors, clock)
         # Readings of a shorter run while it waits at its end are not samples.
         sizes = np.array([s.times.size for s in runs.unique_scenarios])
         if sizes.min() < sizes.max():
@@ -278,17 +264,17 @@ class SystemSimulator(Simulator):
         distinct, of = group_by_identity(scenarios)
         known = [self.run_constants(s) for s in distinct]
         began = [self.run_initial(s) for s in distinct]
-        constants = {name: values[of, None] for name, values in _columns(known).items()}
-        states = {name: values[of] for name, values in _columns(began).items()}
+        constants = {name: values[of, None] for name, values in _group_by_name(known).items()}
+        states = {name: values[of] for name, values in _group_by_name(began).items()}
         states = self._checked("initial state", states, initial)
-        x = _stacked(states, self.system.coordinates, of.size)
-        v = _stacked(states, self.system.rates, of.size)
+        x = _stack_states(states, self.system.coordinates, of.size)
+        v = _stack_states(states, self.system.rates, of.size)
         return constants, x, v
 
     def _read(
         self,
         motion: Trajectories,
-        lanes: IntegrationBatch,
+        batch: IntegrationBatch,
         plan: TimeGrid,
         sensors: ActiveEffects,
         clock: Array,
@@ -297,7 +283,7 @@ class SystemSimulator(Simulator):
 
         Args:
             motion: Result of the engine.
-            lanes: Work of the engine.
+            batch: Batch that the engine integrated.
             plan: Time grid.
             sensors: Active sensor effects.
             clock: (L, 1) first time stamp of each run, s.
@@ -305,13 +291,13 @@ class SystemSimulator(Simulator):
         Returns:
             Observations (L, T, C).
         """
-        channels = self._declared.observe(motion.x, motion.v, motion.a, lanes.constants)
+        channels = self._declared.observe(motion.x, motion.v, motion.a, batch.constants)
         names = [c.name for c in self.channels]
         valued = self.system.reading(names)
-        times = _kept(plan, lanes.steps_per_sample)
+        times = _compute_state_times(plan, batch.steps_per_sample)
         steps = np.diff(times, axis=1, prepend=0.0)
         # Convert the rows: with a sensor filter, more states than the samples are stored.
-        rows = plan.rows * (plan.steps_per_sample // lanes.steps_per_sample)
+        rows = plan.rows * (plan.steps_per_sample // batch.steps_per_sample)
         observations = np.empty((*rows.shape, len(names)))
         for place, name in enumerate(names):
             values = channels[name]
@@ -319,7 +305,7 @@ class SystemSimulator(Simulator):
             reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
             if reading:
                 values = apply_sensor_effects(reading, values, steps, times, clock)
-            observations[:, :, place] = _chosen(values, rows)
+            observations[:, :, place] = _select_rows(values, rows)
         observations += 0.0  # turn negative zeros into positive ones
         return observations
 
@@ -352,29 +338,29 @@ def apply_sensor_effects(
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
         # An effect may be active in few of the batch elements; evaluate only these.
-        lanes = np.flatnonzero(is_active(c))
-        own, begin = c[:, lanes], start[lanes]
+        elements = np.flatnonzero(is_active(c))
+        own, begin = c[:, elements], start[elements]
         nothing = np.zeros_like(begin)
-        first = clock[lanes]
-        signal = Signal(values[lanes], steps[lanes], begin, times[lanes], first)
-        values[lanes] = effect.read(own, signal)
-        start[lanes] = effect.read(own, Signal(begin, nothing, begin, nothing, first))
+        first = clock[elements]
+        signal = Signal(values[elements], steps[elements], begin, times[elements], first)
+        values[elements] = effect.read(own, signal)
+        start[elements] = effect.read(own, Signal(begin, nothing, begin, nothing, first))
     return values
 
 
-def _kept(plan: TimeGrid, every: int) -> Array:
+def _compute_state_times(plan: TimeGrid, every: int) -> Array:
     """Return the times (L, R) since the start of the states that the engine stores, s."""
     start = np.zeros((len(plan.ends), 1))
     return np.concatenate([start, plan.ends[:, every - 1 :: every]], axis=1)
 
 
-def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
+def _select_rows(values: Array, rows: Indices) -> Array:
     """Return values[l, rows[l, t]], without a copy if the first values are selected in order."""
     in_order = (rows[:1] == np.arange(rows.shape[1])).all()
     if in_order and (rows.strides[0] == 0 or (rows == rows[:1]).all()):
         return values[:, : rows.shape[1]]
-    chosen: Array = np.take_along_axis(values, rows, axis=1)
-    return chosen
+    selected: Array = np.take_along_axis(values, rows, axis=1)
+    return selected
 
 
 def make_effect_parameters(
@@ -398,12 +384,12 @@ def make_effect_parameters(
     return tuple(result)
 
 
-def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
+def _group_by_name(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
     """Convert rows of numbers by name to one array (N,) per name."""
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:
+def _stack_states(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:
     """Return the states with these names as columns, (L, D) for L = `count` batch elements."""
     if not names:
         return np.empty((count, 0))
@@ -412,24 +398,24 @@ def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> A
     return result
 
 
-def _check_given(effects: object, fixed: object) -> None:
+def _check_effect_types(effects: object, fixed: object) -> None:
     """Check the types of effects and fixed coefficients, which may come from an experiment's file.
 
     Raises:
         InputError: A type is wrong.
     """
-    if not isinstance(effects, list | tuple) or not all(map(_names_effect, effects)):
+    if not isinstance(effects, list | tuple) or not all(map(_is_effect_reference, effects)):
         raise InputError(f"effects: expected a list of names, found {format_value(effects)}")
     if fixed is not None and not isinstance(fixed, Mapping):
         wanted = "a table of coefficients by effect"
         raise InputError(f"fixed: expected {wanted}, found {format_value(fixed)}")
 
 
-def _names_effect(value: object) -> bool:
+def _is_effect_reference(value: object) -> bool:
     return isinstance(value, str) or (isinstance(value, type) and issubclass(value, Effect))
 
 
-def _row(name: str, value: Any) -> tuple[float, ...]:
+def _read_coefficients(name: str, value: Any) -> tuple[float, ...]:
     """Return the coefficients of a fixed effect as a tuple of numbers.
 
     Raises:
@@ -467,5 +453,5 @@ def _coefficients(effect: Effect, rows: Array) -> Array:
     return result
 
 
-def _of(acting: ActiveEffects, kind: Any) -> ActiveEffects:
+def _select_effects(acting: ActiveEffects, kind: Any) -> ActiveEffects:
     return tuple((effect, c) for effect, c in acting if isinstance(effect, kind))

@@ -23,6 +23,7 @@ from sims.core.value_limits import (
 )
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 
 class InputError(ValueError):

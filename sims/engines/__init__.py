@@ -49,8 +49,6 @@ def missing_packages(name: str) -> list[str]:
 def make_engine(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
     """Make a new engine for one simulator.
 
-    The function `engine(system, **settings)` of the engine's module makes it.
-
     Args:
         name: name of the engine in `ENGINE_MODULES`.
         system: system that the engine will integrate.
@@ -80,5 +78,5 @@ def make_engine(name: str, system: type[System], settings: Mapping[str, Any]) ->
             raise make_unknown_name_error(f"setting of engine {name}", setting, known)
     engine: Engine = module.make_engine(system, **settings)
     if reason := engine.find_unsupported_reason(system):
-        raise InputError(f"engine {name} cannot carry system {system.name}: {reason}")
+        raise InputError(f"engine {name} cannot simulate system {system.name}: {reason}")
     return engine

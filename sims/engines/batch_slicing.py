@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sims.core.engine import IntegrationBatch, Trajectories
-from sims.engines.ground_contact import Indices
+from sims.core.simulator import Indices
 
 
 def slice_batch(batch: IntegrationBatch, i: Indices) -> IntegrationBatch:

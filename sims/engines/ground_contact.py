@@ -19,18 +19,13 @@ with speed n' under a downward acceleration f lasts
 
 Bouncing is treated as finished when this time is less than `MIN_FLIGHT_SECONDS`, or after more than
 `MAX_SHORT_FLIGHTS` consecutive flights shorter than `SHORT_FLIGHT_SECONDS`. The omitted bounces
-have impact speeds n', e
-n', e^2 n', ..., and the tangential speed that they would remove is removed at once:
+have impact speeds n', e n', e^2 n', ..., and the tangential speed that they would remove is removed
+at once:
 
     mu (1 + e) (n' + e n' + e^2 n' + ...) = mu (1 + e) n' / (1 - e)        (4)
 """
 
 from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
-
-Indices = NDArray[np.intp]
 
 MIN_FLIGHT_SECONDS = 5e-5
 """Minimum duration of a flight in seconds; a flight of this duration rises 3 nm."""

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Effect, Input, Sensor, Signal
-from sims.core.simulator import Array, Scenario
+from sims.core.simulator import Array, Indices, Scenario
 
 _ROUNDING = 1e-6
 """Fraction of a step by which an interval may exceed an integer number of steps."""
@@ -39,7 +39,6 @@ _ROUNDING = 1e-6
 MAX_LEAD_IN_STEP_SECONDS = 2e-3
 """Maximum step before the run in seconds, unless a step within the run is longer."""
 
-Indices = NDArray[np.intp]
 Number = TypeVar("Number", np.float64, np.intp)
 
 
@@ -231,9 +230,9 @@ def _divide_intervals(instants: Array, largest_step: float) -> tuple[Array, Arra
     # numbers of its steps in the interval.
     interval = np.repeat(np.arange(elements * samples), blocks.ravel())
     element = interval // samples
-    in_lane = rows[:, -1]
-    in_lanes_before = np.cumsum(in_lane) - in_lane
-    block = np.arange(interval.size) - in_lanes_before[element]
+    element_blocks = rows[:, -1]
+    first_blocks = np.cumsum(element_blocks) - element_blocks
+    block = np.arange(interval.size) - first_blocks[element]
     blocks_before = (rows - blocks).ravel()[interval]
     in_interval = (block - blocks_before)[:, None]
     number = in_interval * every + np.arange(every)

@@ -427,7 +427,7 @@ def test_constants_of_one_run_do_not_stay(settings):
     [
         (
             lambda: Ball(linear_damping=0.1),
-            "linear_damping belongs to Bullet's own contact: set native_contact = true",
+            "linear_damping applies to Bullet's native contact only: set native_contact = true",
         ),
         (
             lambda: Ball(**NATIVE, plane_restitution=-1.0),
@@ -435,7 +435,7 @@ def test_constants_of_one_run_do_not_stay(settings):
         ),
         (
             lambda: Ball(engine="mujoco", stiffness=1e4),
-            "stiffness belongs to MuJoCo's contact .* native_contact = true",
+            "stiffness applies to MuJoCo's native contact .* native_contact = true",
         ),
         (
             lambda: Ball(engine="mujoco", native_contact=True, stiffness=-1.0),

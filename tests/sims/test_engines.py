@@ -422,7 +422,7 @@ def test_what_an_engine_cannot_carry_is_named(engine):
 
     with pytest.raises(
         InputError,
-        match=f"engine {engine} cannot carry system elsewhere: no module .*_world beside a_",
+        match=f"engine {engine} cannot simulate system elsewhere: no module .*_world next to a_",
     ):
         Ours(engine=engine)
     with pytest.raises(InputError, match="system slider does not bounce: leave native_contact out"):

@@ -91,8 +91,8 @@ def simulate_slider(effect, c=0.3):
 @pytest.mark.parametrize(
     ("effect", "equal", "reason"),
     [
-        (Branching, lambda c, moment: c[0] * moment.v, "asks whether a number is true"),
-        (Stateful, lambda c, moment: 2.0 * c[0] * np.ones_like(moment.v), "state of its own"),
+        (Branching, lambda c, moment: c[0] * moment.v, "tests whether a number is true"),
+        (Stateful, lambda c, moment: 2.0 * c[0] * np.ones_like(moment.v), "instance attributes"),
         (
             Tabulated,
             lambda c, moment: c[0] * (0.5 + 0.5 * np.clip(moment.x, -1, 1)),
@@ -120,7 +120,7 @@ def test_an_effect_with_a_hidden_counter_gives_other_numbers_when_traced(capsys)
 
 def test_traced_and_evaluated_friction_agree(capsys):
     traced, evaluated = (simulate_slider(e, 0.6) for e in (SpeedFriction, BranchingFriction))
-    assert "asks whether a number is true" in capsys.readouterr().err
+    assert "tests whether a number is true" in capsys.readouterr().err
     np.testing.assert_allclose(evaluated, traced, rtol=1e-12)
     assert not np.allclose(traced[:2], simulate_slider(SpeedFriction, 1e-9)[:2], atol=1e-3)
 

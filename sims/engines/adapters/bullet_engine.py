@@ -83,7 +83,7 @@ def make_engine(
     if not native_contact:
         if given:
             raise InputError(
-                f"setting {next(iter(given))} belongs to Bullet's own contact: set"
+                f"setting {next(iter(given))} applies to Bullet's native contact only: set"
                 " native_contact = true"
             )
         return BulletEngine(system, resolve_time_step(time_step, system))

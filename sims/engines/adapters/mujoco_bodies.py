@@ -248,8 +248,8 @@ class MujocoBall(MujocoMover):
         self.set_step(_IMPACT)
         self.set_state((x[0], x[1], self._floor - ball_rollout.CONTACT_PENETRATION), v)
         self._set_contact_parameters(0.0, (1.0 + restitution) * self._inverse_step)  # (3)
-        # The impact removes tangential speed mu (1 + e) |vn| (`engines.ground_contact`), in this
-        # one # step.
+        # The impact removes tangential speed mu (1 + e) |vn| (`engines.ground_contact`), in
+        # this one step.
         along = math.hypot(v[0], v[1])
         share = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) if along else 0.0
         deceleration = share * self._inverse_step

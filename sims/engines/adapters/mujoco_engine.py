@@ -83,7 +83,7 @@ def make_engine(
     if not native_contact:
         if stiffness is not None:
             raise InputError(
-                "setting stiffness belongs to MuJoCo's contact as it comes: set"
+                "setting stiffness applies to MuJoCo's native contact only: set"
                 " native_contact = true"
             )
         return MujocoEngine(system, step, threads=threads)

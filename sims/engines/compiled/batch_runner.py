@@ -9,14 +9,13 @@ import numpy as np
 
 from sims.core.effect import Contact, Effect, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Indices
 from sims.engines.compiled.compilability import get_force_program
 from sims.engines.compiled.data_layout import GUIDED_COUNT, HAS_FRICTION, BatchArrays
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram
 from sims.engines.compiled.kernel import get_kernel
 from sims.engines.compiled.kernel_entry import FLY_ELEMENTS, STEP_BLOCK, STEP_IN_LOCKSTEP
 from sims.engines.compiled.step_size import MAX_STEP_DIVISIONS
-from sims.engines.ground_contact import Indices
 from sims.engines.time_grid import is_active
 
 _SIMD_WIDTH = 8
@@ -52,8 +51,8 @@ class _BatchRunner:
         records: (L, R, 3 D) recorded positions, velocities and accelerations.
 
     Args:
-        lanes: whole batch.
-        turn: maximum phase of an oscillation per step in radians; see `step_size`.
+        batch: whole batch.
+        max_phase: maximum phase of an oscillation per step in radians; see `step_size`.
         patience: maximum number of steps; see `sims.engines.batch.BatchEngine`.
         jobs: number of threads.
     """
@@ -81,7 +80,7 @@ class _BatchRunner:
         self._planned_counts = np.count_nonzero(self._steps, axis=1) * ones
         self._inputs = _stack_inputs(list(batch.inputs.values()), self._steps.shape[1])
         self._mass = _to_column(batch.system.mass(batch.theta, batch.constants), count)
-        self._get_ground_parameters = _get_ground_parameters(batch)
+        self._ground = _get_ground_parameters(batch)
         record_count = self._steps.shape[1] // batch.steps_per_sample + 1
         self.records = np.empty((count, record_count, 3 * dimensions))
         self._max_steps = self._spans.copy()
@@ -113,7 +112,7 @@ class _BatchRunner:
             inputs=self._inputs,
             max_steps=self._max_steps,
             planned_counts=self._planned_counts,
-            ground=self._get_ground_parameters,
+            ground=self._ground,
             steps_per_record=batch.steps_per_sample,
             patience=self._patience,
             records=self.records,
@@ -133,7 +132,7 @@ class _BatchRunner:
         elements = arrays.order
         all_parts = np.ceil(self._batch.system.fastest * self._spans / self._max_phase)
         all_parts = np.clip(all_parts, 1.0, MAX_STEP_DIVISIONS)
-        width = _width(program, arrays)
+        width = _count_slots(program, arrays)
         prepared = program.prepare(width)
         self._kernel.choose_step_divisions(
             prepared.arrays, arrays, prepared.block, width, self._spans, self._max_phase, all_parts
@@ -164,11 +163,8 @@ class _BatchRunner:
         threads = min(self._jobs, max(count // _MIN_ELEMENTS_PER_THREAD, 1))
 
         def run(part: BatchArrays) -> None:
-            """Run one thread's part of the elements, with program buffers of its own.
-
-            `width` is the number of elements that the kernel steps side by side.
-            """
-            width = _width(program, part)
+            """Run one thread's part of the elements, in separate program buffers."""
+            width = _count_slots(program, part)
             prepared = program.prepare(width)
             self._kernel.integrate(function, prepared.arrays, part, prepared.block, width)
             prepared.raise_error()
@@ -176,13 +172,11 @@ class _BatchRunner:
         # Every thread gets some elements with many steps and its own buffers. No two threads write
         # the same element, and the result of an element does not depend on any other.
         parts = [_select(arrays, np.arange(k, count, threads)) for k in range(threads)]
-        if not count:
-            return
-        if threads == 1:
+        if threads > 1:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(run, parts))
+        elif count:
             run(arrays)
-            return
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, parts))
 
 
 def _select(arrays: BatchArrays, places: Indices) -> BatchArrays:
@@ -192,7 +186,7 @@ def _select(arrays: BatchArrays, places: Indices) -> BatchArrays:
     return arrays._replace(order=arrays.order[places], parameters=arrays.parameters[places])
 
 
-def _width(program: ForceProgram | NumpyForceProgram, arrays: BatchArrays) -> int:
+def _count_slots(program: ForceProgram | NumpyForceProgram, arrays: BatchArrays) -> int:
     """Return the number of slots in use."""
     needed = -(-len(arrays.order) // _SIMD_WIDTH) * _SIMD_WIDTH
     return min(program.block_width, needed)
@@ -234,21 +228,21 @@ def _group_by_effects(batch: IntegrationBatch) -> list[tuple[Indices, list[tuple
     Returns:
         Indices (n,) of each group's elements, and its effects with coefficients (K, L, 1).
     """
-    hooks = (Force, Friction, Contact)
-    there: list[tuple[Effect, Array]] = [(e, c) for e, c in batch.effects if isinstance(e, hooks)]
-    on = [is_active(c)[:, 0] for _, c in there]
-    if not on:
+    effects: list[tuple[Effect, Array]] = [
+        (e, c) for e, c in batch.effects if isinstance(e, Force | Friction | Contact)
+    ]
+    if not effects:
         return [(np.arange(len(batch.x)), [])]
-    patterns = np.ascontiguousarray(np.array(on).T)
+    patterns = np.stack([is_active(c)[:, 0] for _, c in effects], axis=1)
     # Most calls have one group, and NumPy's search for equal rows costs as much as a few elements.
     if (patterns == patterns[0]).all():
         groups = {0: np.arange(len(patterns))}
     else:
-        lanes_of: dict[bytes, list[int]] = {}
-        for lane, pattern in enumerate(patterns):
-            lanes_of.setdefault(pattern.tobytes(), []).append(lane)
-        groups = {members[0]: np.array(members) for members in lanes_of.values()}
+        elements_of: dict[bytes, list[int]] = {}
+        for element, pattern in enumerate(patterns):
+            elements_of.setdefault(pattern.tobytes(), []).append(element)
+        groups = {members[0]: np.array(members) for members in elements_of.values()}
     return [
-        (members, [pair for pair, is_on in zip(there, patterns[first], strict=True) if is_on])
+        (members, [pair for pair, is_on in zip(effects, patterns[first], strict=True) if is_on])
         for first, members in groups.items()
     ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from sims.core.effect import Effect
 from sims.core.engine import IntegrationBatch
-from sims.core.simulator import Array
+from sims.core.simulator import Array, Indices
 from sims.core.system import System
 from sims.engines.compiled.data_layout import (
     HAS_FRICTION,
@@ -27,7 +27,6 @@ from sims.engines.compiled.data_layout import (
 )
 from sims.engines.compiled.force_program import ForceProgram, NumpyForceProgram, SystemTracer
 from sims.engines.compiled.node_arrays import NotTraceableError
-from sims.engines.ground_contact import Indices
 
 _tracers: dict[tuple[type[System], InputNames], SystemTracer | None] = {}
 _effects: dict[tuple[type[System], InputNames, type[Effect]], bool] = {}
@@ -132,10 +131,10 @@ def _check(
         effect: effect under test; None to test the system.
 
     Raises:
-        NotTraceableError: the results differ, or the traced object has its own state.
+        NotTraceableError: the results differ, or the traced object has instance attributes.
     """
     if getattr(effect or batch.system, "__dict__", None):
-        raise NotTraceableError("it has a state of its own")
+        raise NotTraceableError("it has instance attributes, which a trace cannot follow")
     effects = [] if effect is None else [effect]
     first = elements[:1]
     coefficients = [c[:, first, 0].T for active, c in batch.effects if active is effect]
@@ -152,7 +151,7 @@ def _check(
     for value, expected in zip(values, expected_values, strict=True):
         size = _TOLERANCE * np.abs(expected).max()
         if not np.allclose(value, expected, rtol=_TOLERANCE, atol=size, equal_nan=True):
-            raise NotTraceableError("compiled it gives other numbers")
+            raise NotTraceableError("its compiled form gives other numbers")
 
 
 def _evaluate(
@@ -170,18 +169,18 @@ def _evaluate(
     """
     prepared = program.prepare(1)
     (_, _, rows, out, flags), r = prepared.arrays, prepared.block.r
-    run_lane, run_moment, run_impact = prepared.make_runners()
+    compute_constants, compute_forces, compute_impact = prepared.make_runners()
     r[rows[IN_P] : rows[IN_P] + parameters.size, 0] = parameters
-    run_lane()
+    compute_constants()
     results = []
     for state in states:
         r[rows[IN_T] : rows[IN_P], 0] = state
-        run_moment()
+        compute_forces()
         results.append(r[out, 0])
         if flags[HAS_FRICTION]:
             results.append(r[rows[OUT_LIMIT], :1].copy())
     for speed in (0.3, 2.0):
         r[rows[IN_E] : rows[IN_E] + 3, 0] = _RESTITUTION, _FRICTION, speed
-        run_impact()
+        compute_impact()
         results.append(r[rows[[OUT_E, OUT_MU]], 0])
     return results

@@ -206,34 +206,32 @@ def check_array_layout(
     steps = arrays.steps.shape[1]
     width = block.r.shape[1]
     rows = program.rows
+    step_rows = 1 if len(arrays.steps) == 1 else element_count
+    input_rows = 1 if arrays.inputs.shape[1] == 1 else element_count
     int_arrays = [
-        *((program.code, (len(program.code), 5)), (program.ends, (4,)), (rows, (11,))),
-        *((program.out, (d,)), (program.flags, (5,))),
-        *((arrays.order, (selected_count,)), (block.n, (STATE_ROW_COUNT, width))),
+        (program.code, (len(program.code), 5)),
+        (program.ends, (4,)),
+        (rows, (11,)),
+        (program.out, (d,)),
+        (program.flags, (5,)),
+        (arrays.order, (selected_count,)),
+        (block.n, (STATE_ROW_COUNT, width)),
     ]
     real_arrays = [
-        *(
-            (arrays.parameters, (selected_count, columns)),
-            (arrays.x, (element_count, d)),
-            (arrays.v, (element_count, d)),
-        ),
-        *(
-            (arrays.mass, (element_count,)),
-            (arrays.max_steps, (element_count,)),
-            (arrays.planned_counts, (element_count,)),
-        ),
-        *(
-            (spans, (element_count,)),
-            (divisions, (element_count,)),
-            (arrays.ground, (4, element_count)),
-        ),
-        (arrays.steps, (1 if len(arrays.steps) == 1 else element_count, steps)),
-        (
-            arrays.inputs,
-            (len(arrays.inputs), 1 if arrays.inputs.shape[1] == 1 else element_count, steps),
-        ),
+        (arrays.parameters, (selected_count, columns)),
+        (arrays.x, (element_count, d)),
+        (arrays.v, (element_count, d)),
+        (arrays.mass, (element_count,)),
+        (arrays.max_steps, (element_count,)),
+        (arrays.planned_counts, (element_count,)),
+        (spans, (element_count,)),
+        (divisions, (element_count,)),
+        (arrays.ground, (4, element_count)),
+        (arrays.steps, (step_rows, steps)),
+        (arrays.inputs, (len(arrays.inputs), input_rows, steps)),
         (arrays.records, (element_count, steps // arrays.steps_per_record + 1, 3 * d)),
-        *((block.r, (len(block.r), width)), (block.a, (NUMBER_ROW_COUNT, width))),
+        (block.r, (len(block.r), width)),
+        (block.a, (NUMBER_ROW_COUNT, width)),
     ]
     for group, kind in ((int_arrays, np.int64), (real_arrays, np.float64)):
         for array, shape in group:
@@ -246,7 +244,7 @@ def check_array_layout(
         or not 0 <= arrays.order.min() <= arrays.order.max() < element_count
         or not uses_registers(program.code, len(block.r))
     ):
-        raise ValueError("the program is not one for these lanes")
+        raise ValueError("the force program does not match the arrays of the batch")
 
 
 def uses_registers(code: IntTable, count: int) -> bool:

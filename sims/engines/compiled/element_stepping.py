@@ -19,9 +19,9 @@ the midpoint rule, v + h/2 (k2 + k3), per second:
 Steps are the planned ones, divided where the motion of an element is too fast for them
 (`step_size`). Steps in which friction or the forces of effects are too nonlinear (Stribeck's peak,
 the ripples of a fast motor) are rejected and shortened, and steps that contain an event are cut
-(`events`). The slot of a finished
-element is given to the next one, so that slots stay in use although elements need different numbers
-of steps. The result of an element does not depend on any other.
+(`events`). The slot of a finished element is given to the next one, so that slots stay in use
+although elements need different numbers of steps. The result of an element does not depend on any
+other.
 """
 
 from __future__ import annotations
@@ -241,7 +241,7 @@ def try_step(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
 
 
 def detect_possible_events(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
-    """Mark the elements as busy that may have an event in the step just tried.
+    """Set MAY_HAVE_EVENT for the elements that may have an event in the step just tried.
 
     Args:
         program: program of the system and its effects.
@@ -278,9 +278,9 @@ def detect_possible_events(program: ProgramArrays, block: BlockBuffers, w: int) 
 
 
 def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) -> None:
-    """Mark the elements as busy that may have a friction event in the step just tried.
+    """Set MAY_HAVE_EVENT for the elements that may have a friction event in the step just tried.
 
-    In several dimensions all elements are busy.
+    In several dimensions it is set for all elements.
 
     Args:
         program: program of the system and its effects.
@@ -308,7 +308,7 @@ def detect_friction_events(program: ProgramArrays, block: BlockBuffers, w: int) 
 
 
 def accept_steps(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffers, w: int) -> None:
-    """Accept the steps just tried of elements that are not busy.
+    """Accept the steps just tried of elements that have no event in them.
 
     Args:
         program: program of the system and its effects.
@@ -330,8 +330,8 @@ def accept_steps(program: ProgramArrays, arrays: BatchArrays, block: BlockBuffer
         doubled = 2.0 * a[STEP_LIMIT, i]
         doubled = doubled if doubled < a[MAX_STEP, i] else a[MAX_STEP, i]
         a[T, i] += h
-        # By rounding, parts of a step may add up to more than its length; a negative rest would run
-        # backwards in time.
+        # By rounding, parts of a step may add up to more than its length; a negative remaining time
+        # would run backwards.
         a[REMAINING_TIME, i] = remaining if remaining > 0.0 else 0.0
         # The limit doubles with each accepted step of that length, as the nonlinearity may still be
         # near.
@@ -368,8 +368,8 @@ def accept_or_retry(
         a[V + k, i] = a[NEXT_V + k, i]
     h = a[H, i]
     a[T, i] += h
-    # By rounding, parts of a step may add up to more than its length; a negative rest would run
-    # backwards in time.
+    # By rounding, parts of a step may add up to more than its length; a negative remaining time
+    # would run backwards.
     a[REMAINING_TIME, i] = nan_maximum(a[REMAINING_TIME, i] - h, 0.0)
     if n[PENDING_EVENT, i] != NO_EVENT:
         handle_event(program, arrays, block, i)

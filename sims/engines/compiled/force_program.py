@@ -347,7 +347,7 @@ def emit_instructions(
                 [OPERATION_CODES[node.operation], place[node], *args]
             )
     if len(place) > MAX_REGISTERS:
-        raise NotTraceableError("it computes too much")
+        raise NotTraceableError(f"it needs more than {MAX_REGISTERS} registers")
     lines = [line for part in parts.values() for line in part]
     ends = np.cumsum([0, *(len(part) for part in parts.values())])
     code = np.array(lines, dtype=np.int64).reshape(-1, 5)

@@ -67,16 +67,8 @@ class CompiledKernel:
             max_phase: maximum phase of an oscillation per step in radians.
             divisions: (L,) numbers of parts, updated in place.
         """
-        self._call(
-            kernel_entry.CHOOSE_STEP_DIVISIONS,
-            program,
-            arrays,
-            block,
-            w,
-            spans,
-            max_phase,
-            divisions,
-        )
+        function = kernel_entry.CHOOSE_STEP_DIVISIONS
+        self._call(function, program, arrays, block, w, spans, max_phase, divisions)
 
     def integrate(
         self,
@@ -106,7 +98,7 @@ class CompiledKernel:
             code: (n, 5) instructions; see `ProgramArrays`.
             first: index of the first instruction.
             last: index after the last instruction.
-            r: (registers, lanes) registers.
+            r: (registers, W) registers.
 
         Returns:
             The function without arguments.
@@ -147,33 +139,16 @@ class CompiledKernel:
         element_count, dimensions = arrays.x.shape
         selected_count, columns = arrays.parameters.shape
         sizes = [
-            function,
-            element_count,
-            selected_count,
-            dimensions,
-            len(program.code),
-            columns,
-            *arrays.steps.shape,
-        ]
-        sizes += [
-            *arrays.inputs.shape[:2],
-            arrays.steps_per_record,
-            len(block.r),
-            w,
-            block.r.shape[1],
+            *(function, element_count, selected_count, dimensions, len(program.code), columns),
+            *(*arrays.steps.shape, *arrays.inputs.shape[:2], arrays.steps_per_record),
+            *(len(block.r), w, block.r.shape[1]),
         ]
         limits = np.array([arrays.patience, max_phase])
         ints = [*program, arrays.order, block.n]
         reals = [
             *(block.r, block.a, arrays.parameters, arrays.mass, arrays.x, arrays.v, arrays.steps),
-            *(
-                arrays.inputs,
-                arrays.max_steps,
-                arrays.planned_counts,
-                arrays.ground,
-                arrays.records,
-            ),
-            *(spans, divisions, limits),
+            *(arrays.inputs, arrays.max_steps, arrays.planned_counts, arrays.ground),
+            *(arrays.records, spans, divisions, limits),
         ]
         arguments = np.array([*sizes, *map(_address, ints), *map(_address, reals)], dtype=np.int64)
         self._function(_address(arguments))

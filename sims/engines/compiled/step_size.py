@@ -60,7 +60,7 @@ def choose_step_divisions(
     max_phase: float,
     divisions: Row,
 ) -> None:
-    """Raise `parts` to the number of parts into which steps must be divided.
+    """Raise `divisions` to the number of parts into which steps must be divided.
 
     Args:
         program: program of the system and its effects.

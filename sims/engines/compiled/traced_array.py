@@ -140,13 +140,13 @@ class TracedArray(NDArrayOperatorsMixin):
         self.nodes[index] = _to_nodes(self.graph, value)
 
     def __bool__(self) -> bool:
-        raise NotTraceableError("it asks whether a number is true, which differs from lane to lane")
+        raise NotTraceableError("it tests whether a number is true, which differs between elements")
 
     def __float__(self) -> float:
-        raise NotTraceableError("it asks for a number's value, which differs from lane to lane")
+        raise NotTraceableError("it reads the value of a number, which differs between elements")
 
     def __array__(self, *_: Any, **__: Any) -> Any:
-        raise NotTraceableError("it turns what it is given into an array of its own")
+        raise NotTraceableError("it converts its arguments to a new array")
 
     def __array_ufunc__(self, ufunc: Any, method: str, *args: Any, **kwargs: Any) -> TracedArray:
         """Trace a NumPy ufunc; NumPy calls this method for an operation on a traced array.
@@ -161,7 +161,7 @@ class TracedArray(NDArrayOperatorsMixin):
             return result
         out = kwargs.pop("out", None)
         if method != "__call__" or kwargs or (out and not isinstance(out[0], TracedArray)):
-            raise NotTraceableError(f"numpy.{ufunc.__name__} is traced in its plain form only")
+            raise NotTraceableError(f"numpy.{ufunc.__name__} is traced only as a plain call")
         result = _apply_elementwise(self.graph, ufunc.__name__, args)
         if not out:
             return result
@@ -209,7 +209,7 @@ def _check_index(index: Any) -> None:
     """Reject a traced index, whose number of selected elements would not be constant."""
     for part in index if isinstance(index, tuple) else (index,):
         if isinstance(part, TracedArray):
-            raise NotTraceableError("it chooses elements by what it computes")
+            raise NotTraceableError("it selects elements by computed values")
 
 
 def _to_nodes(graph: ExpressionGraph, value: Any) -> Any:
@@ -319,7 +319,7 @@ def _sum(x: TracedArray, axis: Any = None, keepdims: bool = False, **_: Any) -> 
 def _norm(x: TracedArray, ord: Any = None, axis: Any = None, keepdims: bool = False) -> TracedArray:  # noqa: A002
     """Trace numpy.linalg.norm as the root of the sum of squares (Euclidean or Frobenius norm)."""
     if ord is not None:
-        raise NotTraceableError("numpy.linalg.norm of a kind of its own is not traced")
+        raise NotTraceableError("numpy.linalg.norm with the argument ord is not traced")
     squares = _apply_elementwise(x.graph, "multiply", (x, x)).sum(axis, keepdims)
     return _apply_elementwise(x.graph, "sqrt", (squares,))
 

@@ -35,7 +35,7 @@ class ElementForces:
         acts: whether forces act in addition to gravity.
 
     Args:
-        lane: batch element.
+        element: batch element.
         states: number of states that are evaluated in one call.
     """
 
@@ -49,7 +49,7 @@ class ElementForces:
         rows, flags = prepared.arrays.rows, prepared.arrays.flags
         r = prepared.block.r
         r[rows[IN_P] : rows[IN_E]] = element.parameters[:, None]
-        run_lane, self._run_moment, self._run_impact = prepared.make_runners()
+        compute_constants, self._run_moment, self._run_impact = prepared.make_runners()
         # Single numbers are read and written much faster by a memory view than by an array.
         self._numbers = memoryview(r.data).cast("B").cast("d")
         offsets = (rows * states).tolist()
@@ -67,7 +67,7 @@ class ElementForces:
         is_driven = bool(element.inputs) or type(element.system).passive is not System.passive
         self.acts = is_driven or any(isinstance(e, Force | Friction) for e, _ in element.effects)
         self.set_inputs(0)
-        run_lane()
+        compute_constants()
 
     def set_inputs(self, step: int) -> bool:
         """Set the inputs of a step; return whether any differs from the previous step."""

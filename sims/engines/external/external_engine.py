@@ -27,11 +27,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims.core.effect import ActiveEffects, Contact, Force, Friction
 from sims.core.engine import IntegrationBatch, Trajectories
-from sims.core.simulator import Array, InputError
+from sims.core.simulator import Array, Indices, InputError
 from sims.core.system import StateSnapshot, System
 from sims.core.value_limits import is_plausible_number, truncate_text
 from sims.engines.compiled.compilability import get_force_program
@@ -46,7 +45,6 @@ Recordings round their time stamps.
 DEFAULT_MAX_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
 """Default longest step in seconds, by the system's kind."""
 
-Indices = NDArray[np.intp]
 Trajectory = tuple[Array, Array, Array]
 """Trajectory of one batch element: positions, velocities and accelerations, each (N, D)."""
 

@@ -126,7 +126,7 @@ def find_world_module(
         if package and find_spec(path) is not None:
             break
     else:
-        return None, f"no module {name} beside {system.__module__} builds it"
+        return None, f"no module {name} next to {system.__module__} builds it"
     module = import_module(path)
     if reason := describe_missing_members(module, protocol):
         return None, f"module {path} {reason}"
@@ -134,7 +134,7 @@ def find_world_module(
 
 
 def describe_missing_members(module: ModuleType, protocol: type) -> str:
-    """Describe which member of the protocol `asked` a module does not have.
+    """Describe which member of a protocol a module does not have.
 
     A type checker covers the modules of this project; this function covers external modules as
     well, when they are loaded.
@@ -163,7 +163,7 @@ def describe_missing_members(module: ModuleType, protocol: type) -> str:
 
 
 def _accepts_arguments(member: Any, protocol: Callable[..., Any]) -> bool:
-    """Return whether `found` can be called with the arguments of the protocol's function."""
+    """Return whether a member can be called with the arguments of the protocol's function."""
     if not callable(member):
         return False
     parameters = list(inspect.signature(protocol).parameters.values())[1:]  # the first is self

@@ -222,7 +222,7 @@ class _Tracing:
         kind = type(effect), number
         if kind not in self._asked:
             if getattr(effect, "__dict__", None):
-                raise NotTraceableError("it has a state of its own")
+                raise NotTraceableError("it has instance attributes, which a trace cannot follow")
             c = make_input_vector(self._graph, len(effect.coefficients), LANE).T[:, :, None]
             state = None
             if isinstance(effect, HiddenStateEffect):

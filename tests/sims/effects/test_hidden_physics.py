@@ -143,5 +143,5 @@ def test_a_share_beyond_all_leaves_something_to_either_side():
 @pytest.mark.parametrize("engine", ["mujoco", "pybullet"])
 def test_engines_of_one_coordinate_say_that_they_cannot(engine):
     pytest.importorskip(engine)
-    with pytest.raises(InputError, match=f"engine {engine} cannot carry .*choose engine batch"):
+    with pytest.raises(InputError, match=f"engine {engine} cannot simulate .*choose engine batch"):
         Slider(engine=engine, fixed={"joint.flexibility": (0.3, 20.0, 0.1)})
