@@ -14,13 +14,9 @@ from bench.diagnosis_benchmark.case_generation.reference_simulation import (
     simulate_with_scipy,
 )
 from sims.core.simulator import Scenario
-from sims.systems.ball import Ball
-from sims.systems.pendulum import Pendulum
-from sims.systems.servo import Servo
-from sims.systems.slider import Slider
+from tests.sims.engine_agreement import SIMULATORS
 
 REFERENCE_TOLERANCES = {"rtol": 1e-9, "atol": 1e-11}
-SIMULATORS = {"ball": Ball, "pendulum": Pendulum, "slider": Slider, "servo": Servo}
 # Ranges of coefficients, slightly wider than plausible where that makes the test harder.
 FORCES = {
     "ball": {

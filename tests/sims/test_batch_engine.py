@@ -166,7 +166,7 @@ def test_friction_stops_where_it_should_and_then_holds_exactly_still():
     np.testing.assert_allclose(seen[T > 1.5, 1], 0.5 * c / m * (T[T > 1.5] - 1.5), atol=1e-12)
 
 
-def test_what_sticks_breaks_loose_within_a_step():
+def test_a_sticking_body_breaks_away_within_a_step():
     c, a, f = 1.0, 1.5, 0.5
     slider = Slider(
         engine="batch", fixed={"friction.coulomb": c, "force.periodic": [a, 0.0, f]}, time_step=0.05
@@ -324,7 +324,7 @@ def test_a_ball_in_closed_form_and_a_stepped_one_differ_by_rounding():
     assert np.abs(small - large).max() < 5e-3 * np.abs(large).max()
 
 
-def test_a_lane_that_overflows_is_nan_and_spoils_no_other():
+def test_only_an_element_that_overflows_is_nan():
     slider = Slider(engine="batch", effects=["spring.cubic"])
     theta = np.array([[1.0, 2.0], [0.1, -5e4], [1.0, 2.0]])
     seen = slider.simulate(theta, Scenario(T, {"x": 1.0}))
@@ -359,7 +359,7 @@ def test_refuses_settings_it_cannot_use(settings, says):
         Ball(engine="batch", **settings)
 
 
-def test_a_lane_that_needs_too_many_steps_is_given_up_and_no_other():
+def test_only_an_element_that_needs_too_many_steps_is_abandoned():
     times = np.arange(201) / 100.0
     kinds = {"drag.linear": 0.1, "friction.stribeck": (0.02, 4.0, 0.02)}
     whole = Slider(engine="batch", effects=list(kinds), time_step=0.01)

@@ -187,7 +187,7 @@ def test_the_servo_is_stable_over_all_its_bounds():
 @pytest.mark.parametrize(
     "friction", [{"friction.coulomb": 1.0}, {"friction.stribeck": [0.6, 0.4, 0.1]}]
 )
-def test_what_sticks_stays_put_and_breaks_loose_at_its_limit(engine, friction):
+def test_a_sticking_body_breaks_away_at_the_friction_limit(engine, friction):
     t = np.arange(400) / 100
     slider = SIMULATORS["slider"](engine=engine, fixed=friction)
 
@@ -293,7 +293,7 @@ def test_non_finite_parameters_give_nan_lanes(system, engine, settings, broken):
 
 
 @pytest.mark.parametrize(("system", "engine", "settings"), BUILDS)
-def test_a_numerical_failure_gives_nan_and_harms_nobody(system, engine, settings):
+def test_a_numerical_failure_gives_nan_in_that_element_only(system, engine, settings):
     kind = SIMULATORS[system]
     simulator, theta = (
         kind(engine=engine, effects=["drag.quadratic"], **settings),
@@ -409,7 +409,7 @@ def test_rounded_time_stamps_are_forgiven(engine):
 
 
 @pytest.mark.parametrize("engine", OTHERS)
-def test_what_an_engine_cannot_carry_is_named(engine):
+def test_a_system_without_a_world_module_is_refused(engine):
     from sims.system_simulator import SystemSimulator
     from sims.systems.slider import SliderSystem
 

@@ -52,7 +52,7 @@ def functions_of(protocol):
 
 
 @pytest.mark.parametrize(("system", "name", "asked"), CASES)
-def test_every_world_module_fulfils_what_its_engine_asks(system, name, asked):
+def test_every_world_module_fulfils_its_protocol(system, name, asked):
     module, reason = world_interface.find_world_module(SIMULATORS[system].system, name, asked)
     assert (module.__name__, reason) == (f"sims.systems.{system}_{name}", "")
     assert functions_of(asked)
@@ -93,7 +93,7 @@ def test_a_whole_module_lacks_nothing_whatever_its_arguments_are_called():
 
 
 @pytest.mark.parametrize(("change", "reason"), BROKEN)
-def test_a_broken_module_is_told_what_it_lacks(change, reason):
+def test_a_missing_member_of_a_module_is_named(change, reason):
     assert (
         world_interface.describe_missing_members(
             module_with(**{**WHOLE, **change}), world_interface.BulletJointWorldModule

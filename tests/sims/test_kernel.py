@@ -23,11 +23,11 @@ from sims.engines.compiled import (
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def nobody():
-    raise AssertionError("nobody waits")
+def fail_if_called():
+    raise AssertionError("another process was waited for or the content was made")
 
 
-def test_all_that_the_code_is_made_of_is_in_its_name():
+def test_the_cache_name_depends_on_every_compiled_source_file():
     sources = {str(path) for path in kernel.list_source_files()}
     assert all(Path(path).is_file() for path in sources)
     for module in (*kernel_build.KERNEL_MODULES, kernel_build):
@@ -38,28 +38,28 @@ def test_all_that_the_code_is_made_of_is_in_its_name():
                 assert importlib.import_module(of).__file__ in sources, (module, of)
 
 
-def test_it_is_kept_whole_or_made_anew(tmp_path):
+def test_a_damaged_cache_file_is_made_again(tmp_path):
     path = tmp_path / "deep" / "code.bin"
     assert code_cache.read_cached(path) is None
-    assert code_cache.make_cached(path, lambda: b"code", nobody) == b"code"
-    assert code_cache.make_cached(path, nobody, nobody) == b"code"
+    assert code_cache.make_cached(path, lambda: b"code", fail_if_called) == b"code"
+    assert code_cache.make_cached(path, fail_if_called, fail_if_called) == b"code"
     data = path.read_bytes()
     path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     assert code_cache.read_cached(path) is None
-    assert code_cache.make_cached(path, lambda: b"anew", nobody) == b"anew"
+    assert code_cache.make_cached(path, lambda: b"anew", fail_if_called) == b"anew"
 
 
-def test_an_interrupted_making_leaves_nothing(tmp_path):
+def test_an_interrupted_compilation_leaves_no_file(tmp_path):
     def interrupted():
         raise KeyboardInterrupt
 
     path = tmp_path / "code.bin"
     with pytest.raises(KeyboardInterrupt):
-        code_cache.make_cached(path, interrupted, nobody)
+        code_cache.make_cached(path, interrupted, fail_if_called)
     assert [p.name for p in tmp_path.iterdir()] == ["code.lock"]
 
 
-def test_a_killed_making_holds_nobody_up_and_one_makes_while_the_others_wait(tmp_path):
+def test_one_process_compiles_while_others_wait_and_a_killed_one_blocks_none(tmp_path):
     code = (
         "import os, sys, time; from pathlib import Path; "
         "from sims.engines.compiled import code_cache\n"
@@ -71,20 +71,20 @@ def test_a_killed_making_holds_nobody_up_and_one_makes_while_the_others_wait(tmp
         "print(code_cache.make_cached(path, make, lambda: print('waits')).decode())\n"
     )
 
-    def begun(seconds):
+    def start_process(seconds):
         command = [sys.executable, "-c", code, tmp_path / "code.bin", str(seconds)]
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         while not (tmp_path / "at-it").exists():
             assert process.poll() is None
         return process
 
-    killed = begun(60.0)
+    killed = start_process(60.0)
     killed.send_signal(signal.SIGKILL)
     killed.wait(timeout=10)
     killed.stdout.close()
     (tmp_path / "at-it").unlink()
-    first = begun(0.5)
-    second = begun(60.0)
+    first = start_process(0.5)
+    second = start_process(60.0)
     assert first.communicate(timeout=20)[0].split() == [str(first.pid)]
     assert second.communicate(timeout=20)[0].split()[-1] == str(first.pid)
 
@@ -115,7 +115,7 @@ def test_code_that_cannot_be_stored_is_compiled_again(monkeypatch, tmp_path, cap
     assert "set SIMGAP_COMPILED to a folder that can be written" in capsys.readouterr().err
 
 
-def test_code_that_calls_what_is_not_there_is_not_loaded():
+def test_code_with_a_missing_symbol_is_not_loaded():
     path = code_cache.get_cache_folder() / f"stepping-{kernel._key()}.bin"
     code = llvm_code.MachineCode.unpack(code_cache.read_cached(path))
     assert llvm_code.MachineCode.unpack(code.pack()) == code
@@ -123,7 +123,7 @@ def test_code_that_calls_what_is_not_there_is_not_loaded():
         llvm_code.load_machine_code(code._replace(needs=(*code.needs, "frobnicate")))
 
 
-def test_stepping_imports_no_translator():
+def test_loading_the_kernel_does_not_import_numba():
     code = (
         "import sys; from sims.engines.compiled import kernel; assert kernel.get_kernel();"
         "sys.exit('numba' in sys.modules)"
@@ -131,7 +131,7 @@ def test_stepping_imports_no_translator():
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-def small():
+def make_small_arrays():
     """Return the arrays of an empty program for two elements."""
     program = data_layout.ProgramArrays(
         code=np.zeros((0, 5), dtype=np.int64),
@@ -164,8 +164,8 @@ def small():
         ("v", np.ones((2, 2))),
     ],
 )
-def test_arrays_of_other_shapes_never_reach_the_machine(name, value):
-    program, work, block, w, spans, parts = small()
+def test_arrays_of_wrong_shape_are_refused(name, value):
+    program, work, block, w, spans, parts = make_small_arrays()
     data_layout.check_array_layout(program, work, block, w, spans, parts)
     with pytest.raises(ValueError, match=r"expected \(|does not match the arrays"):
         data_layout.check_array_layout(
@@ -178,7 +178,7 @@ def test_arrays_of_other_shapes_never_reach_the_machine(name, value):
         data_layout.check_array_layout(far, work, block, w, spans, parts)
 
 
-def test_instructions_run_on_registers_of_any_width_and_are_looked_at_before():
+def test_instructions_are_checked_and_run_on_any_number_of_slots():
     run_by = kernel.get_kernel()
     ops = {name: code for code, name in enumerate(expression_graph.OPERATIONS)}
     code = np.array([[ops["add"], 2, 0, 1, 0], [ops["tanh"], 3, 2, 2, 2]], dtype=np.int64)
@@ -191,7 +191,7 @@ def test_instructions_run_on_registers_of_any_width_and_are_looked_at_before():
             np.testing.assert_allclose(r[3], np.tanh(r[0] + r[1]), rtol=1e-14)
     held = np.zeros((4, 8))
     run_by.make_instruction_runner(code, 1, 1, held)()
-    assert not held.any(), "of no instruction nothing comes"
+    assert not held.any(), "an empty program wrote to registers"
     wrong = code.copy()
     wrong[1, 1] = 4
     for bad in (

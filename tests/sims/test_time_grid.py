@@ -94,7 +94,7 @@ def test_a_delayed_command_changes_between_steps():
     np.testing.assert_allclose(felt, [[1, 1, 3, 3], [1, 3, 3, 3]], rtol=1e-12)
 
 
-def test_felt_input_is_the_mean_of_the_command_over_the_step():
+def test_the_applied_input_is_the_mean_of_the_command_over_the_step():
     runs = group_scenarios([Scenario(np.array([0.0, 0.01, 0.02]), {}, {"u": [1.0, 5.0, 2.0]})])
     steps = np.array([[0.015, 0.01, 0.0, 0.02]])
     plan = TimeGrid(steps, np.cumsum(steps, axis=1), 1, np.array([[0, 1, 2]]))
@@ -127,7 +127,7 @@ def test_input_effects_act_in_order_on_the_first_input_and_where_they_are_on():
     assert felt["w"].tolist() == [[7.0], [7.0], [7.0]]
 
 
-def test_effects_on_signals_are_asked_only_of_the_lanes_on_which_they_act():
+def test_signal_effects_are_evaluated_only_on_elements_where_they_are_active():
     asked = []
 
     class Raised(Input):
@@ -154,7 +154,7 @@ def test_effects_on_signals_are_asked_only_of_the_lanes_on_which_they_act():
     assert seen.tolist() == [0.0, 0.0, 0.25, 0.5, 0.0]
 
 
-def test_waiting_feels_nothing_new():
+def test_the_input_does_not_change_while_an_element_waits():
     runs = group_scenarios([Scenario(np.array([0.0, 0.01, 0.02]), {}, {"u": [0.0, 1.0, 0.0]})])
     commands, play = (
         [dict(runs.unique_scenarios[0].inputs)],
@@ -255,7 +255,7 @@ def felt_in(run, name, step=0.005):
 @pytest.mark.parametrize("linear", [frozenset(), frozenset({"u"})])
 @pytest.mark.parametrize("offset", [0.0, 0.03, -0.03])
 @pytest.mark.parametrize("name", REMEMBERING)
-def test_a_part_of_a_run_feels_what_was_commanded_before_it(name, offset, linear):
+def test_a_part_of_a_run_uses_the_commands_before_it(name, offset, linear):
     whole, later = part(0, linear=linear, offset=offset), part(111, linear=linear, offset=offset)
     wanted = felt_in(whole, name)[-(later.times.size - 1) * 4 :]
     # Tolerance for the effect's result with another step size.
@@ -265,14 +265,14 @@ def test_a_part_of_a_run_feels_what_was_commanded_before_it(name, offset, linear
     assert np.abs(forgets - wanted).max() > 0.15
 
 
-def test_a_part_of_a_part_remembers_as_much():
+def test_a_part_of_a_part_has_the_same_command_history():
     one, other = part(110, 140), part(60).part(slice(50, 80))
     np.testing.assert_allclose(other.before["u"], one.before["u"], atol=1e-12)
     assert one.before["u"][0, [0, -1]] == pytest.approx([-2.0, -0.02])
     assert not part(0).before["u"].size
 
 
-def test_lanes_that_remember_stand_beside_those_that_do_not():
+def test_elements_with_and_without_a_command_history_share_a_batch():
     runs = [part(102), part(0, 30), part(20)]
     own = [felt_in(run, "input.lag") for run in runs]
     scenarios = [Scenario(r.times, {}, r.inputs, before=r.before) for r in runs]
@@ -286,6 +286,6 @@ def test_lanes_that_remember_stand_beside_those_that_do_not():
         np.testing.assert_allclose(row[: values.size], values, atol=1e-12)
 
 
-def test_instants_before_a_run_lie_before_it():
+def test_times_of_earlier_commands_must_be_negative():
     with pytest.raises(InputError, match="must be negative and increasing"):
         Scenario(STAMPS, {}, {"u": JUMPS}, before={"u": np.array([[-0.1, 0.0], [1.0, 2.0]])})
