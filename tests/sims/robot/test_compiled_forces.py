@@ -110,7 +110,11 @@ class Changing(Plain):
 
 @pytest.mark.parametrize(
     ("effect", "says"),
-    [(Plain, ""), (Branching, "turns what it is given into an array"), (Changing, "other numbers")],
+    [
+        (Plain, ""),
+        (Branching, "converts its arguments to a new array"),
+        (Changing, "other numbers"),
+    ],
 )
 def test_what_does_not_trace_is_told_once_and_asked_by_numpy(
     arm, effect, says, capsys, monkeypatch
