@@ -129,12 +129,9 @@ def sweep(experiment: ExperimentSource, options: StudyOptions) -> list[Compariso
         InputError: An argument is invalid; the message is one line, and nothing has been run then.
     """
     shared = ComparisonOptions(**vars(options))
-    chosen, missing = leave_out_missing_problems(build_experiment(experiment, shared))
-    for name, reason in missing.items():
-        warnings.warn(f"{name} is left out: {reason}", stacklevel=2)
-    studies = begin_studies(chosen, shared)
+    studies = begin_studies(build_experiment(experiment, shared), shared)
     with pdf_figures(options.pdf):
-        results = [_report(one, one.run(options.jobs, options.progress)) for one in studies]
+        results = [_report(begun, begun.run(options.jobs, options.progress)) for begun in studies]
         if len(studies) > 1:
             study.report_jointly(studies[0].folder.parent, _discard_line)
     return results
@@ -153,7 +150,7 @@ def build_experiment(
     Raises:
         InputError: The experiment, a tuner or a plugin does not exist or cannot be used.
     """
-    # A command of the user's cannot run where processes are forbidden.
+    # An isolated process cannot start the user's command.
     trust = options.trust or not options.jobs or options.model_command is not None
     source = resolve_experiment(experiment, options)
     loaded = load_experiment_plugins(source, _list_plugin_files(options), trust, options.isolation)
@@ -172,20 +169,35 @@ def _list_plugin_files(options: ComparisonOptions) -> list[str]:
     return files + ([str(language_model.__file__)] if options.model_command is not None else [])
 
 
-def begin_studies(chosen: Experiment, options: ComparisonOptions) -> list[study.Study]:
+def _warn_of_missing_problem(name: str, reason: str) -> None:
+    """Warn the caller of `sweep` that a problem of its suite is left out."""
+    warnings.warn(f"{name} is left out: {reason}", stacklevel=5)
+
+
+def begin_studies(
+    experiment: Experiment,
+    options: ComparisonOptions,
+    report_missing: Callable[[str, str], None] = _warn_of_missing_problem,
+) -> list[study.Study]:
     """Plan the studies of an experiment in new folders, without running them.
 
     Args:
-        chosen: Experiment, from `build_experiment`.
+        experiment: Experiment, from `build_experiment`.
         options: Options of the comparison.
+        report_missing: Called with name and reason for each problem of a suite that cannot run on
+            this machine, and is left out.
 
     Raises:
-        InputError: They need more than this machine has, or the folder is not free.
+        InputError: No problem can run here, the studies need more than this machine has, or the
+            folder is not free.
     """
+    experiment, missing_problems = leave_out_missing_problems(experiment)
+    for name, reason in missing_problems.items():
+        report_missing(name, reason)
     folder = None if options.out is None else Path(options.out)
     jobs, files = options.jobs, _list_plugin_files(options)
-    check_comparison_size(chosen, folder, jobs, options.cluster is not None, options.force)
-    return study.begin_studies(chosen, files, folder, jobs, options.salt)
+    check_comparison_size(experiment, folder, jobs, options.cluster is not None, options.force)
+    return study.begin_studies(experiment, files, folder, jobs, options.salt)
 
 
 def resolve_experiment(
@@ -469,7 +481,7 @@ class ComparisonResult:
         if self._in_files:
             raise InputError(f"figures of {self._what} are files: {self.folder / 'figures'}")
         names = [behind] if isinstance(behind, str) else behind
-        references = [find_reference(one) for one in names]
+        references = [find_reference(reference) for reference in names]
         return comparison_figures.draw_figure(self._stored, self._labels, name, behind=references)
 
     def summary(self) -> pd.DataFrame:

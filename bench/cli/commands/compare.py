@@ -64,7 +64,6 @@ def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list
     """
     from bench.api.compare import begin_studies, build_experiment
     from bench.api.comparison_options import ComparisonOptions
-    from bench.benchmark.problem.availability import leave_out_missing_problems
     from bench.studies.study import list_study_folders, resume_study
     from sims.core.argument_checks import check_options
     from sims.core.simulator import InputError
@@ -80,12 +79,11 @@ def _begin_or_resume(options: argparse.Namespace, print_line: PrintLine) -> list
             )
         return [resume_study(part, options.plugin) for part in list_study_folders(options.resume)]
     comparison = check_options(ComparisonOptions, values)
-    chosen = build_experiment(options.experiment, comparison)
-    chosen, missing = leave_out_missing_problems(chosen)
-    for name, reason in missing.items():
-        print_line(f"skipped: {name}: {reason}")
+    experiment = build_experiment(options.experiment, comparison)
     with prefix_errors_with_option("--out", options.out):
-        return begin_studies(chosen, comparison)
+        return begin_studies(
+            experiment, comparison, lambda name, reason: print_line(f"skipped: {name}: {reason}")
+        )
 
 
 def _run_compare(options: argparse.Namespace, say: PrintLine) -> CommandResult:
@@ -137,13 +135,13 @@ def _run_study(
 
     with ProgressBars() as bars:
         outcome = study.run(options.jobs, bars.start_bar, pool)
-    standing: JsonDocument = {**outcome._asdict(), "complete": outcome.is_complete}
+    progress: JsonDocument = {**outcome._asdict(), "complete": outcome.is_complete}
     if outcome.skipped:
         say(f"skipped: {outcome.skipped}")
-        return CommandResult({**summarise_study(study), **standing, "failed": 0, "resume": None})
+        return CommandResult({**summarise_study(study), **progress, "failed": 0, "resume": None})
     failed = study.report(say)
     resume = None if outcome.is_complete else f"simgap compare --resume {study.folder}"
-    document = {**summarise_study(study), **standing, "failed": failed, "resume": resume}
+    document = {**summarise_study(study), **progress, "failed": failed, "resume": resume}
     if resume:
         return CommandResult(document, _report_missing(study, outcome, resume))
     return CommandResult(
