@@ -196,9 +196,8 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise a usage error with a one-line message; argparse would print its usage and exit."""
-        from sims.core.simulator import (
-            InputError,  # its message is printable, whatever the user typed
-        )
+        # InputError makes the message printable, whatever the user typed.
+        from sims.core.simulator import InputError
 
         raise _UsageError(f"{InputError(message)}; see {self.prog} --help")
 
@@ -297,8 +296,7 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
         parser.refuse_unknown("command", chosen, names)
     options, unknown = parser.parse_known_args(words)
     for word in unknown:
-        # Without a command in the first place, as with an option before it, the program's parser.
-        command = getattr(options, "command_parser", parser)
+        command = options.command_parser
         if word.startswith("-"):
             name = word.partition("=")[0]
             command.refuse_unknown("option", name, command._option_string_actions)
@@ -321,6 +319,8 @@ def build_parser(only: str | None = "") -> _Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"simgap {__version__}")
+    # If an option precedes the command, the program's parser reports it.
+    parser.set_defaults(command_parser=parser)
     commands = parser.add_subparsers(required=True, metavar="COMMAND", title="commands")
     for name, place, summary, example in COMMANDS:
         command = commands.add_parser(
