@@ -45,15 +45,16 @@ class NextRecording:
         """Format the recommended run and its expected benefit as text."""
         design = self.design
         if design is None:
-            return ["no run could be simulated that stays within the limits of what moves"]
+            return ["no run could be simulated that stays within the limits of joints and commands"]
         begin = ", ".join(f"{name} = {value:.4g}" for name, value in design.initial.items())
-        lasting = f"{design.times[-1]:.3g} s"
-        lines = [f"record next, {lasting}: {design.says}; begin near {begin}"]
+        lines = [f"record next, {design.times[-1]:.3g} s: {design.says}; begin near {begin}"]
         if design.by == "T":
             return [*lines, *_format_discrimination(design)]
         factor = math.exp(min(design.gain, 50.0))
-        benefit = f"it narrows what is known of all numbers together {factor:.3g} times"
-        return [*lines, f"nothing is open: {benefit}"]
+        benefit = (
+            f"it shrinks the joint confidence region of all numbers by a factor of {factor:.3g}"
+        )
+        return [*lines, f"no question is open: {benefit}"]
 
     @check_arguments
     def write(self, path: str | Path) -> None:
@@ -80,25 +81,29 @@ class NextRecording:
 
 def _format_discrimination(design: NextRunDesign) -> list[str]:
     """Format which causes a run distinguishes, and which it does not."""
-    lines = []
+    lines, discrimination = [], design.discrimination
     if design.distinguished_effects:
-        sizes = [
-            f"{name} ({math.sqrt(design.told[name]):.3g})" for name in design.distinguished_effects
+        distances = [
+            f"{name} ({math.sqrt(discrimination[name]):.3g})"
+            for name in design.distinguished_effects
         ]
         lines.append(
-            f"it tells {design.effect} from {', '.join(sizes)}: by so many noises, once every "
-            "number is fitted again, whichever is true"
+            f"it distinguishes {design.effect} from {', '.join(distances)}; in brackets the "
+            "distance of the motions in units of the noise, after all numbers are fitted again"
         )
-    stays = [name for name in design.told if name not in design.distinguished_effects]
-    if stays:
-        lines.append(f"no run of this kind tells it from {', '.join(stays)}")
-    best = max((design.told[name] for name in stays), default=0.0)
-    if best > 0 and (times := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
-        lines.append(f"recorded {times} times it would tell it from one more of these")
+    remaining = [name for name in discrimination if name not in design.distinguished_effects]
+    if remaining:
+        lines.append(f"no run of this kind distinguishes it from {', '.join(remaining)}")
+    best = max((discrimination[name] for name in remaining), default=0.0)
+    if best > 0 and (repeats := math.ceil(DISCRIMINATION_THRESHOLD / best)) <= MAX_REPEATS:
+        lines.append(f"recorded {repeats} times, it would distinguish it from one more of these")
     if design.settles_all:
-        lines.append("that settles it")
+        lines.append("all open questions are then answered")
     others = [group for group in design.groups if len(group) > 1 and design.effect not in group]
-    lines += [f"should it be one of {', '.join(group)}: these stay open" for group in others]
+    lines += [
+        f"if the cause is one of {', '.join(group)}, it does not distinguish these"
+        for group in others
+    ]
     return lines
 
 

@@ -1,8 +1,8 @@
 """Design of the next recording: commands that decide what the present recording leaves open.
 
-Runs that an experimenter could make (`rig.plans`), within the limits of the rig (`rig.limits`), are
-simulated and ranked by their value (`rig.worth`). The best plans are then varied, one property at a
-time.
+Runs that an experimenter could make (`candidate_runs`), within the limits of the robot
+(`safety_limits`), are simulated and ranked by their value (`information_gain`). The best plans are
+then varied, one property at a time.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class NextRunDesign:
     Attributes:
         says: Commands in words.
         by: Criterion: ``T`` if the run distinguishes models, ``D`` if it narrows parameters.
-        gain: For ``D``, (2) of `rig.worth`, the logarithm of the factor by which the volume of the
-            confidence region shrinks; for ``T``, the smallest value of `told`.
+        gain: For ``D``, (2) of `information_gain`, the logarithm of the factor by which the volume
+            of the confidence region shrinks; for ``T``, the smallest `discrimination`.
         effect: Effect of the present model that is to be distinguished; empty for ``D``.
-        told: Discrimination, (1) of `rig.worth`, from each alternative effect; empty for ``D``.
+        discrimination: (1) of `information_gain` from each alternative effect; empty for ``D``.
         times: (T,) sample times in seconds.
         inputs: (T,) values by input, each held until the next sample.
         initial: Initial states by name.
@@ -53,7 +53,7 @@ class NextRunDesign:
     by: Literal["T", "D"]
     gain: float
     effect: str
-    told: Mapping[str, float]
+    discrimination: Mapping[str, float]
     times: Array
     inputs: Mapping[str, Array]
     initial: Mapping[str, float]
@@ -63,12 +63,14 @@ class NextRunDesign:
     @property
     def distinguished_effects(self) -> tuple[str, ...]:
         """Alternative effects that the run would distinguish from the present effect."""
-        return tuple(name for name, value in self.told.items() if value > DISCRIMINATION_THRESHOLD)
+        return tuple(
+            name for name, value in self.discrimination.items() if value > DISCRIMINATION_THRESHOLD
+        )
 
     @property
     def settles_all(self) -> bool:
         """Return whether the run would distinguish all effects, whichever is true."""
-        return len(self.groups) == len(self.told) + 1
+        return len(self.groups) == len(self.discrimination) + 1
 
     def to_document(self) -> dict[str, Any]:
         """Return the design as JSON data; the command signals are written as a table instead."""
@@ -77,7 +79,7 @@ class NextRunDesign:
             "by": self.by,
             "gain": self.gain,
             "effect": self.effect,
-            "told": dict(self.told),
+            "told": dict(self.discrimination),
             "split": self.distinguished_effects,
             "settles": self.settles_all,
             "seconds": float(self.times[-1]),
@@ -175,7 +177,7 @@ def _made(
         entry: Best run with its value.
     """
     run, rivals = entry.run, among[1:]
-    told: dict[str, float] = {}
+    discrimination: dict[str, float] = {}
     groups: tuple[tuple[str, ...], ...] = ()
     effect, gain = "", float(entry.values[0]) if not rivals else 0.0
     if rivals:
@@ -183,16 +185,18 @@ def _made(
         stands = among[0]
         names = [_other(one, stands) for one in rivals]
         effect = _other(stands, rivals[0])
-        told = {name: float(value) for name, value in zip(names, least[0, 1:], strict=True)}
+        discrimination = {
+            name: float(value) for name, value in zip(names, least[0, 1:], strict=True)
+        }
         groups = tuple(_connected_groups([effect, *names], least))
-        gain = min(told.values())
+        gain = min(discrimination.values())
     constants = dict(run.plan.constants)
     return NextRunDesign(
         says=run.says,
         by="T" if rivals else "D",
         gain=gain,
         effect=effect,
-        told=told,
+        discrimination=discrimination,
         times=run.scenario.times,
         inputs=dict(run.scenario.inputs),
         initial=dict(zip(models.world.states, run.states.tolist(), strict=True)),

@@ -81,7 +81,7 @@ def test_the_proposed_run_splits_the_set(tmp_path):
     assert {"input.lag", "input.delay"} <= ambiguous
     design = proposed.design
     assert design.by == "T"
-    assert {design.effect, *design.told} == ambiguous
+    assert {design.effect, *design.discrimination} == ambiguous
     assert design.distinguished_effects
     assert design.times[-1] <= 4.0
     after = write(tmp_path, "after", drawn(design), lag=0.04, seed=1)
@@ -101,7 +101,7 @@ def test_what_no_run_can_split_is_said(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "force.bias" in said
     assert "input.bias" in said
-    assert "no run of this kind tells it from" in said
+    assert "no run of this kind distinguishes it from" in said
 
 
 def test_what_is_known_is_narrowed(tmp_path, capsys):
@@ -110,8 +110,8 @@ def test_what_is_known_is_narrowed(tmp_path, capsys):
     out = tmp_path / "next.csv"
     assert main(["design", str(path), "--out", str(out), "--seconds", "3"]) == 0
     said = capsys.readouterr().out
-    assert "nothing is open: it narrows" in said
-    factor = float(said.split("together ")[1].split(" times")[0])
+    assert "no question is open: it shrinks" in said
+    factor = float(said.split("factor of ")[1].split()[0])
     columns = np.genfromtxt(out, delimiter=",", names=True)
     assert columns.dtype.names == ("t", "u")
     assert columns["t"][-1] == pytest.approx(2.98, abs=0.021)
