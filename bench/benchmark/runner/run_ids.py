@@ -31,33 +31,33 @@ from bench.core.plugin_registries import PartUnavailableError, tuners
 from sims.core.simulator import InputError
 
 RUN_IRRELEVANT_KEYS = {
-    "title": "words",
-    "says": "words",
-    "tags": "words",
-    "identifiable": "words",
-    "suite": "words",
-    "problem_hashes": "what is run names no others",
-    "resolution": "which targets there are; their observations are hashed",
-    "ranges": "which targets there are; each run's id has its own",
-    "targets": "how many there are",
-    "same_targets_as": "which targets there are; their scenarios and observations are hashed",
+    "title": "descriptive text",
+    "says": "descriptive text",
+    "tags": "descriptive text",
+    "identifiable": "descriptive text",
+    "suite": "descriptive text",
+    "problem_hashes": "an experiment that is run names no other experiments",
+    "resolution": "rounds observations, which are hashed with the target",
+    "ranges": "selects targets; each run's id covers its own target",
+    "targets": "number of targets; each run's id covers its own target",
+    "same_targets_as": "selects targets; their scenarios and observations are hashed",
     "held_out": "scenarios and observations of the held-out side are hashed with the target",
-    "seeds": "how many there are; each run's id has its own",
-    "budget": "each run's id has its own, which the tuner's entry may change",
-    "training_budget": "matters to learned tuners alone, and is hashed with their entries",
-    "negligible_error": "ranks tuners when all runs are made",
-    "identifiability": "is found beside the runs, which know nothing of it",
-    "recording": "where it lies; what it holds is hashed",
-    "model": "where it lies; what it holds is hashed",
-    "calibration": "what it comes to is in the settings of what is tuned",
-    "shot": "what is done with a tuned model afterwards",
-    "diagnosis": "who diagnoses what, where nothing is tuned",
-    "salt": "which targets there are; their scenarios and observations are hashed",
-    "salt_sha256": "which targets there are; their scenarios and observations are hashed",
-    "sweep": "what is run sweeps over nothing; it has values of its own",
-    "experiments": "what is run names no others",
-    "nuisance": "matters to entries that are randomised alone, and is hashed with them",
-    "tuners": "who else runs; each run's id has its own tuner with its options",
+    "seeds": "number of seeds; each run's id covers its own seed",
+    "budget": "each run's id covers its own budget, which the tuner's entry may change",
+    "training_budget": "affects learned tuners only, and is hashed with their entries",
+    "negligible_error": "used in the ranking, after all runs",
+    "identifiability": "computed separately from the runs",
+    "recording": "path of the file; its content is hashed",
+    "model": "path of the file; its content is hashed",
+    "calibration": "its result is in the settings of the tuned simulator",
+    "shot": "uses the tuned model, after the runs",
+    "diagnosis": "comparison of diagnosers, which tunes nothing",
+    "salt": "selects targets; their scenarios and observations are hashed",
+    "salt_sha256": "selects targets; their scenarios and observations are hashed",
+    "sweep": "an experiment that is run has single values",
+    "experiments": "an experiment that is run names no other experiments",
+    "nuisance": "affects randomised entries only, and is hashed with them",
+    "tuners": "each run's id covers its own tuner with its options",
 }
 """Keys of an experiment that do not change any run by themselves, each with the reason."""
 
@@ -132,8 +132,8 @@ def check_unchanged(folder: Path, initial: dict[str, str], present: dict[str, st
         if initial.get(what) != hashed:
             raise InputError(
                 f"{folder}: its {what} changed since it was begun ({initial.get(what)} then, "
-                f"{hashed} now); runs of two kinds are not mixed: put it back as it was, or start "
-                "a new comparison"
+                f"{hashed} now); all runs need the same configuration: restore it, or start a new "
+                "comparison"
             )
 
 
