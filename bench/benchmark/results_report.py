@@ -99,7 +99,7 @@ def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None
     for name, frame in made.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
     pictures = _drawn(stored, labels, statistics)
-    figures = _kept(folder, pictures)
+    figures = _write_figures(folder, pictures)
     results = ComparisonReportData(
         ComparisonView(stored, labels, statistics),
         made,
@@ -203,8 +203,8 @@ def _drawn(
     }
 
 
-def _kept(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Path]:
-    """Write the figures to the folder ``figures`` as PNG and PDF; return the paths of the PNGs."""
+def _write_figures(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Path]:
+    """Write the figures to the folder ``figures``; return the paths of the PNG files."""
     return [
         write_figure_files(
             folder / "figures" / comparison_figures.FIGURE_FILES[name], picture.png, picture.pdf

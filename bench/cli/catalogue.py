@@ -83,7 +83,7 @@ def list_tuners() -> list[JsonDocument]:
     """List every tuner: whether it learns, whether it is stochastic, and what it requires."""
     from bench.core.plugin_registries import tuners as registry
 
-    def told(kind: Any) -> JsonDocument:
+    def describe_kind(kind: Any) -> JsonDocument:
         """Return the properties of one tuner class, `kind`, that only tuners have."""
         return {
             "learned": bool(kind.learned),
@@ -91,7 +91,7 @@ def list_tuners() -> list[JsonDocument]:
             "requires": list(getattr(kind, "requires", ())),
         }
 
-    return [_part(registry, name, told) for name in registry.names()]
+    return [_part(registry, name, describe_kind) for name in registry.names()]
 
 
 def list_simulators() -> list[JsonDocument]:
@@ -182,10 +182,10 @@ def list_diagnosers() -> list[JsonDocument]:
     """List every diagnoser: whether it learns, and what it requires."""
     from bench.core.plugin_registries import diagnosers as registry
 
-    def told(kind: Any) -> JsonDocument:
+    def describe_kind(kind: Any) -> JsonDocument:
         return {"learned": bool(kind.learned), "requires": list(kind.requires)}
 
-    return [_part(registry, name, told) for name in registry.names()]
+    return [_part(registry, name, describe_kind) for name in registry.names()]
 
 
 def list_experiments() -> list[JsonDocument]:
@@ -243,10 +243,10 @@ def list_schemas() -> list[JsonDocument]:
     return [{"name": name, "says": load_schema(name)["title"]} for name in list_schema_names()]
 
 
-def _part(registry: Any, name: str, told: Callable[[Any], JsonDocument]) -> JsonDocument:
+def _part(registry: Any, name: str, describe_kind: Callable[[Any], JsonDocument]) -> JsonDocument:
     """Describe a registered part, or why it cannot be used here.
 
-    `told` returns further properties of the part's class, which depend on the kind of part.
+    `describe_kind` returns the properties that only parts of this kind have, from the class.
     """
     from bench.core.plugin_registries import PartUnavailableError
 
@@ -254,7 +254,7 @@ def _part(registry: Any, name: str, told: Callable[[Any], JsonDocument]) -> Json
         part = registry.get(name)
     except PartUnavailableError as error:
         return {"name": name, "says": None, "skipped": error.reason}
-    return {"name": name, "says": registry.describe(name), "skipped": None, **told(part)}
+    return {"name": name, "says": registry.describe(name), "skipped": None, **describe_kind(part)}
 
 
 CATALOGUE_SECTIONS: dict[str, Callable[[], list[JsonDocument]]] = {

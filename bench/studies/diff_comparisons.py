@@ -311,8 +311,8 @@ class ComparisonDiff:
         experiments = [s.stored.experiment for s in (self.a, self.b)]
         environments = [read_environment(s.folder) for s in (self.a, self.b)]
         sides = [
-            describe_side(s.folder, e.name, told)
-            for s, e, told in zip((self.a, self.b), experiments, environments, strict=True)
+            describe_side(s.folder, e.name, environment)
+            for s, e, environment in zip((self.a, self.b), experiments, environments, strict=True)
         ]
         return {
             "kind": "comparison",

@@ -156,10 +156,9 @@ def enter_process_namespace() -> list[str]:
 
 
 def lock_down(policy: AccessPolicy, has_user_namespace: bool) -> list[str]:
-    """Apply the remaining restrictions to this process permanently.
+    """Apply the remaining restrictions to this process permanently, before it runs a tuner's code.
 
-    This comes before code of a tuner runs in it. They concern the file system, memory, open files
-    and system calls.
+    They concern the file system, memory, open files and system calls.
 
     Args:
         policy: what the process may still access.

@@ -77,7 +77,7 @@ def serve_requests(channel: MessageChannel, policy: AccessPolicy, active_layers:
 
 
 def _report_written_files(channel: MessageChannel, folder: str, reported_paths: set[str]) -> None:
-    """Report files that the tuner has written and that are not in `told`; add them to `told`.
+    """Report files that the tuner has written since the last report; add them to `reported_paths`.
 
     Hidden files and compiled Python files are left out, because libraries write them and they are
     not needed.

@@ -36,11 +36,12 @@ def availability(experiment: Experiment) -> Availability:
     if experiment.experiments:
         return _together(experiment)
     data_set = _missing_data_set(experiment)
-    skipped = "" if data_set else find_missing_model_file(experiment)
-    skipped = skipped or ("" if data_set else _missing_recording(experiment))
+    missing_file = (
+        "" if data_set else find_missing_model_file(experiment) or _missing_recording(experiment)
+    )
     return Availability(
         data_set,
-        skipped or _missing_simulator(experiment) or _missing_engine(experiment),
+        missing_file or _missing_simulator(experiment) or _missing_engine(experiment),
         _missing_tuners(experiment),
     )
 
@@ -107,9 +108,9 @@ def _missing_data_set(experiment: Experiment) -> DataSet | None:
     if experiment.recording:
         wanted.append(("recording", experiment.recording.path))
     for kind, path in wanted:
-        found = datasets.providing(kind, path)
-        if found and datasets.find(kind, path) is None:
-            return found
+        data_set = datasets.providing(kind, path)
+        if data_set and datasets.find(kind, path) is None:
+            return data_set
     return None
 
 

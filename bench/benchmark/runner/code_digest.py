@@ -234,12 +234,12 @@ def _place(kind: type) -> Any:
     if (own := vars(kind).get("source_digest")) is not None:
         return own
     if not _under_its_name(kind):
-        raise _untold(kind)
+        raise _make_source_error(kind)
     if kind.__module__ == "__main__":
         return _text(kind)
     file = getattr(sys.modules[kind.__module__], "__file__", None)
     if file is None:
-        raise _untold(kind)
+        raise _make_source_error(kind)
     path = Path(file).resolve()
     if any(
         path.is_relative_to(PROJECT_ROOT / source_folder)
@@ -259,7 +259,7 @@ def _text(kind: type) -> str:
     for function in filter(inspect.isfunction, vars(kind).values()):
         if cell := linecache.getlines(function.__code__.co_filename):
             return "".join(cell)
-    raise _untold(kind)
+    raise _make_source_error(kind)
 
 
 def _package(kind: type, path: Path) -> Any:
@@ -270,12 +270,12 @@ def _package(kind: type, path: Path) -> Any:
     return path.name, path.read_bytes()
 
 
-def _untold(kind: type) -> InputError:
+def _make_source_error(kind: type) -> InputError:
     """Make the error for a class whose source code cannot be found, so that it cannot be hashed."""
     return InputError(
         f"class {kind.__qualname__} of {kind.__module__}: expected a class of a module, a plugin "
-        "file or a notebook's cell, found one whose source cannot be told; define it there under "
-        "its own name, or give it a text source_digest that changes with all that went into it"
+        "file or a notebook's cell, found one whose source cannot be determined; define it there "
+        "under its own name, or give it a text source_digest that changes with its content"
     )
 
 

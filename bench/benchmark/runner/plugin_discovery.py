@@ -185,13 +185,12 @@ def _check_no_shared_file(plugins: Iterable[Plugin], experiment: Experiment) -> 
 def _make_untrusted_code_error(label: str, file: object) -> InputError:
     """Make the error for a tuner whose code has been loaded into this process.
 
-    This process has the true parameters. Such a tuner could read the true parameters, so its
-    results would prove nothing.
+    Such a tuner could read the true parameters, so its results would prove nothing.
     """
     return InputError(
-        f"tuner {label}: the code of {file} runs in this process, where the truths are: a "
-        "simulator or effect in it is used here, or it was loaded by hand; put the tuner into a "
-        "file of its own, or trust the tuners"
+        f"tuner {label}: the code of {file} runs in this process, which has the true "
+        "parameters: a simulator or effect in it is used here, or it was loaded by hand; put the "
+        "tuner into a separate file, or use --trust"
     )
 
 

@@ -94,7 +94,7 @@ def _parse_progress(document: Any) -> tuple[str, int, int, float, float]:
         stage, epoch, epochs, loss, held_out = document
         return to_printable(str(stage)[:80]), int(epoch), int(epochs), float(loss), float(held_out)
     except (TypeError, ValueError, OverflowError):
-        raise ProtocolError("it told of no epoch") from None
+        raise ProtocolError("its report of progress is not valid") from None
 
 
 def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) -> None:

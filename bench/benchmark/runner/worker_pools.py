@@ -371,8 +371,9 @@ class _WorkerSlot:
         """
         self._futile += 1
         if self._futile > _MAX_IMMEDIATE_DEATHS:
-            hint = "what they say stands above, if anything"
-            raise InputError(f"worker processes die as soon as they start; {hint}")
+            raise InputError(
+                "worker processes die as soon as they start; see the messages above, if any"
+            )
         self.given.clear()
         self.stop()
         self._births.close()

@@ -170,7 +170,7 @@ def execute_run(
     hidden_simulations = problem.simulated - simulated - len(trace.losses)
     # A simulator that raises an error has counted simulations without a result.
     if hidden_simulations > 0 and trace.status != "crashed":
-        raise HiddenSimulationError(f"{hidden_simulations} simulations beside the budget")
+        raise HiddenSimulationError(f"{hidden_simulations} simulations outside the budget")
     if trace.status == "crashed":
         # The stderr of a worker is discarded; without workers the author of the tuner sees it.
         sys.stderr.write(trace.reason)

@@ -247,17 +247,17 @@ def check_rows_match_statuses(
     raise_for_first_bad_row(
         made & ~held, fault, lambda row: f"run: {ids[row]} has no rows in {file.path.name}"
     )
-    told, used = statuses.iloc[places].reset_index(drop=True), runs["used"]
+    run_statuses, used = statuses.iloc[places].reset_index(drop=True), runs["used"]
     raise_for_first_bad_row(
-        told["simulations"] != used,
+        run_statuses["simulations"] != used,
         lambda i, says: fault(int(places[i]), says),
         lambda i: (
             f"simulations: expected {used[i]}, the last k of {names[i]} in {file.path.name}, "
-            f"found {told['simulations'][i]}"
+            f"found {run_statuses['simulations'][i]}"
         ),
     )
     for name in ("tuner", "simulator", "target", "seed"):
-        check_equal(runs[name], told[name], name, f"as in {source}", at)
+        check_equal(runs[name], run_statuses[name], name, f"as in {source}", at)
 
 
 def check_runs(runs: pd.DataFrame, file: RunsTable, experiment: Experiment) -> None:

@@ -89,7 +89,7 @@ def write_explanation_environment(
     Returns:
         Path of environment.json.
     """
-    told = {
+    environment = {
         "simgap": __version__,
         "command": "explain",
         "settings": {key: value for key, value in settings.items() if value not in (None, [], "")},
@@ -104,17 +104,17 @@ def write_explanation_environment(
         "packages": list_package_versions(),
     }
     path = folder / ENVIRONMENT_FILE
-    write_atomically(path, json.dumps(told, indent=1, default=str) + "\n")
+    write_atomically(path, json.dumps(environment, indent=1, default=str) + "\n")
     return path
 
 
 def read_environment(folder: Path) -> dict[str, Any]:
     """Read environment.json; return an empty dict if there is none, as for old explanations."""
     try:
-        told = json.loads((folder / ENVIRONMENT_FILE).read_text(encoding="utf-8"))
+        environment = json.loads((folder / ENVIRONMENT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return told if isinstance(told, dict) else {}
+    return environment if isinstance(environment, dict) else {}
 
 
 def compute_sha256(path: Path) -> str:

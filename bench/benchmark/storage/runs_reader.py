@@ -153,19 +153,19 @@ def read_checked_runs(
 
     # Without runs there are no columns.
     there = select_declared_columns(names, declare_run_columns(names, experiment)) if names else []
-    told: list[pd.DataFrame] = []
+    summaries: list[pd.DataFrame] = []
     before: pa.Table | None = None
     offset = 0
     for batch in batches:
         if not len(batch):
             continue
         rows = _checked(batch, there, before, offset)
-        told.append(_summarise_new_runs(rows, before is not None, offset))
+        summaries.append(_summarise_new_runs(rows, before is not None, offset))
         offset += len(batch)
         before = rows.slice(len(rows) - 1)
     runs = (
-        pd.concat(told, ignore_index=True)
-        if told
+        pd.concat(summaries, ignore_index=True)
+        if summaries
         else pd.DataFrame(columns=["run", *RUN_CONSTANT_COLUMNS, "row"])
     )
     # k counts without gaps, so the number of rows gives the last k.
@@ -288,5 +288,5 @@ def _summarise_new_runs(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFr
         new[0] = False
     places = np.flatnonzero(new)
     keys = rows.select(["run", *_described(rows)])
-    told: pd.DataFrame = keys.take(places).to_pandas()
-    return told.assign(row=places + offset - goes_on)
+    summary: pd.DataFrame = keys.take(places).to_pandas()
+    return summary.assign(row=places + offset - goes_on)

@@ -91,11 +91,11 @@ def _format_isolation(seal: JsonDocument) -> str:
     if seal["trusted"]:
         return "trusted: its tuners run without isolation"
     missing, salt = seal["missing"], seal["salt_sha256"]
-    kept = "isolated: a process for each "
-    kept += "run" if seal["isolation"] == "run" else "tuner and seed"
-    without = f", WITHOUT the layers {', '.join(missing)}" if missing else ", all layers active"
-    told = f"; salt with SHA-256 {salt[:12]}" if salt else "; its salt is public"
-    return kept + without + told + (", revealed" if seal["revealed"] else "")
+    processes = "isolated: a process for each "
+    processes += "run" if seal["isolation"] == "run" else "tuner and seed"
+    layers = f", WITHOUT the layers {', '.join(missing)}" if missing else ", all layers active"
+    salt_note = f"; salt with SHA-256 {salt[:12]}" if salt else "; its salt is public"
+    return processes + layers + salt_note + (", revealed" if seal["revealed"] else "")
 
 
 def _print_progress(study: Study, every: bool, say: PrintLine) -> JsonDocument:

@@ -125,5 +125,5 @@ def _train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     trust = " --trust" if options.trust else ""
     command = f"simgap compare {options.experiment or experiment.name}{budget}{trust}"
     say(f"found by: {command}")
-    told = {"tuner": entry.label, "experiment": experiment.name, "found_by": command}
-    return CommandResult({**told, "trainings": trained, "files": files})
+    document = {"tuner": entry.label, "experiment": experiment.name, "found_by": command}
+    return CommandResult({**document, "trainings": trained, "files": files})

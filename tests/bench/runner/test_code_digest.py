@@ -272,7 +272,7 @@ def test_class_of_a_script_or_a_notebook_takes_the_digest_of_its_text(monkeypatc
 
     one = cell(1, 1)
     cell(2, 2)
-    with pytest.raises(InputError, match="whose source cannot be told"):
+    with pytest.raises(InputError, match="whose source cannot be determined"):
         hash_class_source(one)  # another class has this name now
     digests = [hash_class_source(cell(number, step)) for number, step in ((3, 1), (4, 2), (5, 1))]
     assert digests[0] == digests[2] != digests[1]
@@ -308,7 +308,7 @@ def made(number):
 @pytest.mark.parametrize(
     "kind", [made(1), type("Nobody", (Tuner,), {}), type("Random", (tuners.get("random"),), {})]
 )
-def test_class_whose_source_cannot_be_told_is_refused_with_one_line(kind, monkeypatch):
+def test_class_whose_source_cannot_be_found_is_refused_with_one_line(kind, monkeypatch):
     monkeypatch.setattr(kind, "name", "nobody", raising=False)
     tuners.register(kind)
     for ask in (
@@ -316,7 +316,7 @@ def test_class_whose_source_cannot_be_told_is_refused_with_one_line(kind, monkey
         lambda: compute_training_key(spring_experiment(), TunerEntry("nobody", "nobody"), 0),
         lambda: prepare_experiment(spring_experiment(tuners={"nobody": {}})),
     ):
-        with pytest.raises(InputError, match="whose source cannot be told") as error:
+        with pytest.raises(InputError, match="whose source cannot be determined") as error:
             ask()
         assert "\n" not in str(error.value)
 
@@ -326,7 +326,7 @@ def test_class_made_at_run_time_carries_its_digest_and_a_subclass_does_not_inher
         type("Made", (Tuner,), {"source_digest": text}) for text in ("one", "two", "one")
     )
     assert hash_class_source(one) == hash_class_source(again) != hash_class_source(two)
-    with pytest.raises(InputError, match="cannot be told"):
+    with pytest.raises(InputError, match="cannot be determined"):
         hash_class_source(type("Sub", (one,), {}))
 
 
@@ -374,8 +374,8 @@ def test_every_key_of_an_experiment_matters_or_has_its_reason(module, but):
     assert set(reasons) <= names
     assert all(reason.strip() for reason in reasons.values())
     mattering = names - set(reasons)
-    assert mattering <= set(CHANGES), "say in CHANGES how it changes, or why it does not matter"
-    assert set(CHANGES) - mattering == NO_MATTER[module], "what is done does hang on it"
+    assert mattering <= set(CHANGES), "add it to CHANGES, or to the irrelevant keys"
+    assert set(CHANGES) - mattering == NO_MATTER[module], "an irrelevant key changes the digest"
     plain = spring_experiment()
     before = select_relevant_keys(plain, reasons)
     for name in mattering:
