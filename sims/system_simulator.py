@@ -261,14 +261,13 @@ class SystemSimulator(Simulator):
     ) -> tuple[dict[str, Array], Array, Array]:
         """Return constants (L, 1) by name, and initial positions and velocities (L, D)."""
         # Check each scenario object once, not each of hundreds of batch elements.
-        distinct, of = group_by_identity(scenarios)
-        known = [self.run_constants(s) for s in distinct]
-        began = [self.run_initial(s) for s in distinct]
-        constants = {name: values[of, None] for name, values in _group_by_name(known).items()}
-        states = {name: values[of] for name, values in _group_by_name(began).items()}
+        distinct, object_index = group_by_identity(scenarios)
+        run_constants = _expand_rows([self.run_constants(s) for s in distinct], object_index)
+        constants = {name: values[:, None] for name, values in run_constants.items()}
+        states = _expand_rows([self.run_initial(s) for s in distinct], object_index)
         states = self._checked("initial state", states, initial)
-        x = _stack_states(states, self.system.coordinates, of.size)
-        v = _stack_states(states, self.system.rates, of.size)
+        x = _stack_states(states, self.system.coordinates, object_index.size)
+        v = _stack_states(states, self.system.rates, object_index.size)
         return constants, x, v
 
     def _read(
@@ -374,9 +373,9 @@ def make_effect_parameters(
         observed: Names of the observed channels, which may determine units; all if empty.
     """
     result = []
-    there = effect.on(system)
-    for c in there:
-        name = effect.name if len(there) == 1 else f"{effect.name}.{c.name}"
+    coefficients = effect.on(system)
+    for c in coefficients:
+        name = effect.name if len(coefficients) == 1 else f"{effect.name}.{c.name}"
         low, high = c.range(system.kind)
         unit = c.unit_on(system, observed) or ""
         off = min(max(0.0, low), high)  # zero, or the nearest value of the range
@@ -384,9 +383,9 @@ def make_effect_parameters(
     return tuple(result)
 
 
-def _group_by_name(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
-    """Convert rows of numbers by name to one array (N,) per name."""
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+def _expand_rows(rows: Sequence[Mapping[str, float]], index: Indices) -> dict[str, Array]:
+    """Convert rows of numbers by name to one array per name, of the rows at `index` (L,)."""
+    return {name: np.array([row[name] for row in rows])[index] for name in rows[0]}
 
 
 def _stack_states(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:

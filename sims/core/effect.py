@@ -99,8 +99,8 @@ class Coefficient:
 class EffectType(ABCMeta):
     """Type of effect classes: abstract base classes without virtual subclasses.
 
-    Each robot has hundreds of effect classes, one for each place. `ABCMeta` asks all of them
-    whether a class is their subclass, which took a twentieth of the time of an explanation.
+    Each robot has hundreds of effect classes, one for each place. `ABCMeta` checks all of
+    them for virtual subclasses, which took 5 % of the time of an explanation.
     """
 
     __instancecheck__ = type.__instancecheck__

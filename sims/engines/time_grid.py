@@ -95,23 +95,23 @@ def group_scenarios(scenarios: Sequence[Scenario], by_initial: bool = False) -> 
         by_initial: Whether grouped scenarios must also state the same initial states.
     """
     # Compare objects first, because comparing the contents of each scenario is slow.
-    objects, of = group_by_identity(scenarios)
+    objects, object_index = group_by_identity(scenarios)
     by_content: dict[object, int] = {}
     distinct: list[Scenario] = []
     groups = []
     for scenario in objects:
         signals = sorted(scenario.inputs.items())
         earlier = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
-        read = tuple(sorted(scenario.linear)), scenario.offset, earlier
-        stated = tuple(sorted(scenario.initial.items())) if by_initial else ()
+        interpretation = tuple(sorted(scenario.linear)), scenario.offset, earlier
+        initial_states = tuple(sorted(scenario.initial.items())) if by_initial else ()
         signals_content = ((name, u.tobytes()) for name, u in signals)
         off = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
-        content = scenario.times.tobytes(), read, stated, off, *signals_content
+        content = scenario.times.tobytes(), interpretation, initial_states, off, *signals_content
         group = by_content.setdefault(content, len(distinct))
         if group == len(distinct):
             distinct.append(scenario)
         groups.append(group)
-    return ScenarioGroups(tuple(distinct), np.array(groups, dtype=np.intp)[of])
+    return ScenarioGroups(tuple(distinct), np.array(groups, dtype=np.intp)[object_index])
 
 
 def group_by_identity(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], Indices]:
@@ -119,8 +119,8 @@ def group_by_identity(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], In
     # One dictionary lookup per batch element, of which there may be thousands.
     objects = {id(scenario): scenario for scenario in scenarios}
     index = {key: i for i, key in enumerate(objects)}
-    of = np.array([index[id(scenario)] for scenario in scenarios], dtype=np.intp)
-    return list(objects.values()), of
+    object_index = np.array([index[id(scenario)] for scenario in scenarios], dtype=np.intp)
+    return list(objects.values()), object_index
 
 
 Commands = Sequence[Mapping[str, Array]]
@@ -459,13 +459,15 @@ def _average_command(
     for elements in np.split(by_run, borders):
         run = runs.scenario_index[elements[0]]
         scenario = runs.unique_scenarios[run]
-        means = (
+        average_signal = (
             _average_linear_signal if (name in scenario.linear) != other else _average_held_signal
         )
-        to, of = (slice(run, run + 1), elements[:1]) if has_uniform_steps else (elements, elements)
+        target_rows, source_rows = (
+            (slice(run, run + 1), elements[:1]) if has_uniform_steps else (elements, elements)
+        )
         instants = np.concatenate([_history_times(scenario, name), _command_times(scenario)])
         signal = _command_values(scenario, name, commands[run][name])
-        result[to] = means(instants, signal, begin[of], end[of])
+        result[target_rows] = average_signal(instants, signal, begin[source_rows], end[source_rows])
     return runs.expand_rows(result) if has_uniform_steps else result
 
 
@@ -490,8 +492,8 @@ def _average_held_signal(times: Array, values: Array, begin: Array, end: Array) 
         area = np.concatenate([[0.0], np.cumsum(held)])
         a = begin[crossing]
         b = end[crossing]
-        over = _held_integral(times, values, area, b) - _held_integral(times, values, area, a)
-        value[crossing] = over / (b - a)  # (1)
+        integral = _held_integral(times, values, area, b) - _held_integral(times, values, area, a)
+        value[crossing] = integral / (b - a)  # (1)
     return value
 
 
@@ -514,8 +516,10 @@ def _average_linear_signal(times: Array, values: Array, begin: Array, end: Array
     crossing = np.searchsorted(times, end, side="left") > first
     if crossing.any():
         a, b = begin[crossing], end[crossing]
-        over = _linear_integral(times, values, area, b) - _linear_integral(times, values, area, a)
-        value[crossing] = over / (b - a)  # (1)
+        integral = _linear_integral(times, values, area, b) - _linear_integral(
+            times, values, area, a
+        )
+        value[crossing] = integral / (b - a)  # (1)
     result: Array = value
     return result
 

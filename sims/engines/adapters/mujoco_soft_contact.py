@@ -57,19 +57,18 @@ class MujocoSoftBall(MujocoMover):
 
 
 @functools.cache
-def compute_damping_ratio(restitution: float, largest: float = _MAX_DAMPING_RATIO) -> float:
+def compute_damping_ratio(restitution: float) -> float:
     """Return the damping ratio of a spring and damper that only push, for a given restitution.
 
     T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
     20.
 
     Args:
-        restitution: restitution of an impact.
-        largest: largest damping ratio; 2 gives a restitution of 0.06.
+        restitution: restitution of an impact; below 0.06, the largest damping ratio is returned.
     """
     # Restitution decreases with damping. After 60 bisections, only rounding error remains.
     low = 0.0
-    high = largest
+    high = _MAX_DAMPING_RATIO
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _compute_restitution(middle) > restitution else (low, middle)

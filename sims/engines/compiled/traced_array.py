@@ -130,10 +130,10 @@ class TracedArray(NDArrayOperatorsMixin):
     def __getitem__(self, index: Any) -> TracedArray:
         """Return selected elements as a traced array, also if it is a single element."""
         _check_index(index)
-        found = self.nodes[index]
-        if isinstance(found, ExpressionNode):
-            found = to_scalar_array(found)
-        return self._make_like(found)
+        selected = self.nodes[index]
+        if isinstance(selected, ExpressionNode):
+            selected = to_scalar_array(selected)
+        return self._make_like(selected)
 
     def __setitem__(self, index: Any, value: Any) -> None:
         _check_index(index)
