@@ -22,8 +22,7 @@ _SMALLEST = 1e-12
 def compute_lag_response(steps: Array, lag: Array) -> tuple[Array, Array]:
     """Return the remaining weight of an old value at the end of each step and in its mean.
 
-    For a step of length h and the time constant T, the weights are exp(-h / T), and its mean over
-    the step, m = (1 - exp(-h / T)) T / h of (3).
+    They are exp(-h / T) at the end, and its mean m over the step (3).
 
     Args:
         steps: (L, S) lengths h in seconds.

@@ -32,29 +32,29 @@ MAX_BATCH_SIZE = 128
 """Maximum number of batch elements whose inputs are evaluated together."""
 
 
-class _LruCache:
+class _BoundedCache:
     """Cache of arrays that is emptied when it exceeds `CACHE_BYTES` bytes."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[object, ...], Array] = {}
+        self._arrays: dict[tuple[object, ...], Array] = {}
         self._bytes = 0
 
     def get(self, key: tuple[object, ...], make: Callable[[], Array]) -> Array:
         """Return the array cached under a key; otherwise compute it with `make` and cache it.
 
-        If the cache exceeds `CACHE_BYTES`, all older arrays are dropped.
+        If the cache exceeds `CACHE_BYTES`, all older arrays are removed.
         """
-        if key not in self._kept:
-            made = make()
-            self._bytes += made.nbytes
+        if key not in self._arrays:
+            array = make()
+            self._bytes += array.nbytes
             if self._bytes > CACHE_BYTES:
-                self._kept.clear()
-                self._bytes = made.nbytes
-            self._kept[key] = made
-        return self._kept[key]
+                self._arrays.clear()
+                self._bytes = array.nbytes
+            self._arrays[key] = array
+        return self._arrays[key]
 
 
-_applied_input_cache = _LruCache()
+_applied_input_cache = _BoundedCache()
 """Cache of applied inputs without input effects.
 
 Thousands of simulations share the same commands.

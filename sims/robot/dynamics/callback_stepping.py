@@ -189,7 +189,7 @@ def find_data_offsets() -> dict[str, int] | None:
     """Find the offsets of fields in MuJoCo's data, in words of eight bytes.
 
     They depend on MuJoCo's version. In the data of a model that has numbers in each of the fields,
-    the address of a field stands at the field, and at empty fields before it.
+    the address of a field's array is stored at the field, and at empty fields before it.
 
     Returns:
         The offsets by the name of the field; None if a field is not found.

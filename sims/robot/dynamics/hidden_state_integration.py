@@ -28,8 +28,7 @@ def advance_state(
 ) -> HiddenState:
     """Advance a hidden state by one exponential Rosenbrock-Euler step (1).
 
-    With w the hidden state and r its rate, w(t + h) = w + h phi(z) r(w), phi(z) = (e^z - 1) /
-    z, z = h dr/dw. The derivative dr/dw is a difference quotient.
+    The derivative dr/dw is a difference quotient.
 
     Args:
         effect: effect with the hidden state.

@@ -525,8 +525,7 @@ def friction_damping(robot: RobotModel, dof: int) -> tuple[float, float]:
 def _looked_at(motion: RobotMotion, every: int) -> tuple[Places, Places]:
     """Choose the steps at which the model is linearised, one after every `every` steps.
 
-    A new sequence of points begins where a piecewise constant command jumps, or where an
-    actuator is switched, since the state changes quickly there.
+    The count begins again where a piecewise constant command jumps or an actuator is switched.
 
     Args:
         motion: the motion.
