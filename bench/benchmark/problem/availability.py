@@ -80,8 +80,13 @@ def _together(experiment: Experiment) -> Availability:
     """Combine what is missing for the experiments that this one names.
 
     Only the first missing data set is reported; the others follow when it has been downloaded.
+    A suite leaves out the problems that cannot run, see `leave_out_missing_problems`: something is
+    missing for it only if no problem can run.
     """
     parts = {each.name: availability(each) for each in expand_sweep(experiment)}
+    runnable = {n: part for n, part in parts.items() if not (part.data_set or part.skipped)}
+    if experiment.suite and runnable:
+        parts = runnable
     data_sets = [part.data_set for part in parts.values() if part.data_set]
     skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]
     absent = {label: why for part in parts.values() for label, why in part.tuners.items()}

@@ -57,18 +57,21 @@ class MujocoSoftBall(MujocoMover):
 
 
 @functools.cache
-def compute_damping_ratio(restitution: float) -> float:
+def compute_damping_ratio(
+    restitution: float, max_damping_ratio: float = _MAX_DAMPING_RATIO
+) -> float:
     """Return the damping ratio of a spring and damper that only push, for a given restitution.
 
     T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
     20.
 
     Args:
-        restitution: restitution of an impact; below 0.06, the largest damping ratio is returned.
+        restitution: restitution of an impact.
+        max_damping_ratio: largest damping ratio returned; 2 corresponds to a restitution of 0.06.
     """
     # Restitution decreases with damping. After 60 bisections, only rounding error remains.
     low = 0.0
-    high = _MAX_DAMPING_RATIO
+    high = max_damping_ratio
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _compute_restitution(middle) > restitution else (low, middle)
