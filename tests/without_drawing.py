@@ -22,9 +22,9 @@ def undrawn():
     """Make comparisons in this process draw nothing within the block."""
     from bench.benchmark import results_report
 
-    before = results_report._drawn, results_report.render_page
-    results_report._drawn, results_report.render_page = lambda *_: {}, lambda _: ""
+    before = results_report._render_figures, results_report.render_page
+    results_report._render_figures, results_report.render_page = lambda *_: {}, lambda _: ""
     try:
         yield
     finally:
-        results_report._drawn, results_report.render_page = before
+        results_report._render_figures, results_report.render_page = before

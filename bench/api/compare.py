@@ -106,10 +106,10 @@ def compare(
         raise InputError(f"experiment {chosen.name} sweeps over values: use simgap.sweep")
     if chosen.experiments:
         raise InputError(f"experiment {chosen.name} names several: use simgap.sweep")
-    pool = _cluster(options.cluster)
+    pool = _connect_to_cluster(options.cluster)
     (begun,) = begin_studies(chosen, options)
     with pdf_figures(options.pdf):
-        return _report(begun, begun.run(options.jobs, options.progress, pool))
+        return _report_study(begun, begun.run(options.jobs, options.progress, pool))
 
 
 @with_options(StudyOptions)
@@ -131,7 +131,9 @@ def sweep(experiment: ExperimentSource, options: StudyOptions) -> list[Compariso
     shared = ComparisonOptions(**vars(options))
     studies = begin_studies(build_experiment(experiment, shared), shared)
     with pdf_figures(options.pdf):
-        results = [_report(begun, begun.run(options.jobs, options.progress)) for begun in studies]
+        results = [
+            _report_study(begun, begun.run(options.jobs, options.progress)) for begun in studies
+        ]
         if len(studies) > 1:
             study.report_jointly(studies[0].folder.parent, _discard_line)
     return results
@@ -154,7 +156,9 @@ def build_experiment(
     trust = options.trust or not options.jobs or options.model_command is not None
     source = resolve_experiment(experiment, options)
     loaded = load_experiment_plugins(source, _list_plugin_files(options), trust, options.isolation)
-    labels = None if options.tuners is None else [_label(tuner) for tuner in options.tuners]
+    labels = (
+        None if options.tuners is None else [_get_tuner_label(tuner) for tuner in options.tuners]
+    )
     if options.model_command is not None:
         # Workers inherit the environment.
         os.environ[language_model.COMMAND_VARIABLE] = options.model_command
@@ -252,7 +256,7 @@ def load_experiment_plugins(
     return complete_robot_experiment(loaded)
 
 
-def _cluster(address: str | None) -> Pool | None:
+def _connect_to_cluster(address: str | None) -> Pool | None:
     """Connect to the Dask cluster at an address; None without one, for worker processes here."""
     if address is None:
         return None
@@ -261,7 +265,7 @@ def _cluster(address: str | None) -> Pool | None:
     return ClusterPool(address)
 
 
-def _report(begun: study.Study, outcome: StudyOutcome) -> ComparisonResult:
+def _report_study(begun: study.Study, outcome: StudyOutcome) -> ComparisonResult:
     """Write the tables and figures of a study that has been run, and return its results.
 
     Raises:
@@ -323,7 +327,7 @@ def _choose_diagnosers(
     return experiment.chosen(diagnosis=table, **rest)
 
 
-def _label(tuner: str | type[Tuner]) -> str:
+def _get_tuner_label(tuner: str | type[Tuner]) -> str:
     """Return the name under which a tuner runs; a class is registered under its name first.
 
     Raises:
@@ -357,11 +361,11 @@ class ComparisonResult:
         self.experiment: Experiment = study.open_study(self.folder).configuration.experiment
 
     @cached_property
-    def _stored(self) -> StoredComparison:
+    def _stored_comparison(self) -> StoredComparison:
         return read_comparison(self.folder)
 
     @cached_property
-    def _labels(self) -> comparison_view.AxisLabels:
+    def _axis_labels(self) -> comparison_view.AxisLabels:
         """Labels of axes in figures: names and units of the parameters and channels.
 
         The problem is built to read them, which takes time, so the labels are cached.
@@ -372,7 +376,7 @@ class ComparisonResult:
         finally:
             problem.close()
 
-    def _csv(self, name: str) -> pd.DataFrame:
+    def _read_csv_table(self, name: str) -> pd.DataFrame:
         """Read a table file of a bounce shot or of a study of two comparisons."""
         remedy = f"simgap plot {self.folder} writes it again"
         path = self.folder / f"{name}.csv"
@@ -389,13 +393,15 @@ class ComparisonResult:
         return bool(experiment.shot or experiment.calibration or experiment.diagnosis)
 
     @property
-    def _what(self) -> str:
+    def _study_kind(self) -> str:
         """Name of this kind of study, for messages."""
         if self.experiment.diagnosis:
             return "a comparison of diagnosers"
         return "a bounce shot" if self.experiment.shot else "a study of two comparisons"
 
-    def _both(self, rows: Callable[[StoredComparison], pd.DataFrame]) -> pd.DataFrame:
+    def _concatenate_comparisons(
+        self, rows: Callable[[StoredComparison], pd.DataFrame]
+    ) -> pd.DataFrame:
         """Concatenate the tables of a study of a missing effect, which consists of two comparisons.
 
         They use the simulator before and after its extension; the new first column ``model`` says
@@ -424,10 +430,10 @@ class ComparisonResult:
                 name: diagnosis.read_table(self.folder, name) for name in diagnosis.TABLE_COLUMNS
             }
         if self.experiment.shot:
-            return {name: self._csv(name) for name in ("table", "shots")}
+            return {name: self._read_csv_table(name) for name in ("table", "shots")}
         if self.experiment.calibration:
-            return {name: self._csv(name) for name in _MISSPECIFICATION_TABLE_COLUMNS}
-        return build_tables(self._stored)
+            return {name: self._read_csv_table(name) for name in _MISSPECIFICATION_TABLE_COLUMNS}
+        return build_tables(self._stored_comparison)
 
     @property
     def table(self) -> pd.DataFrame:
@@ -446,8 +452,8 @@ class ComparisonResult:
         if self.experiment.diagnosis:
             return self.tables["items"]
         if self.experiment.calibration:
-            return self._both(lambda stored: stored.runs)
-        return self.tables["shots"] if self.experiment.shot else self._stored.runs
+            return self._concatenate_comparisons(lambda stored: stored.runs)
+        return self.tables["shots"] if self.experiment.shot else self._stored_comparison.runs
 
     @property
     def statuses(self) -> pd.DataFrame:
@@ -455,8 +461,12 @@ class ComparisonResult:
         if self.experiment.diagnosis:
             return self.tables["items"][list(diagnosis.STATUS_COLUMNS)]
         if self.experiment.calibration:
-            return self._both(lambda stored: stored.statuses)
-        return self._csv("status") if self.experiment.shot else self._stored.statuses
+            return self._concatenate_comparisons(lambda stored: stored.statuses)
+        return (
+            self._read_csv_table("status")
+            if self.experiment.shot
+            else self._stored_comparison.statuses
+        )
 
     @property
     def figures(self) -> list[str]:
@@ -465,7 +475,9 @@ class ComparisonResult:
         The figures of a bounce shot, of a study of a missing effect and of diagnosers are files in
         the folder instead.
         """
-        return [] if self._in_files else comparison_figures.list_figure_names(self._stored)
+        return (
+            [] if self._in_files else comparison_figures.list_figure_names(self._stored_comparison)
+        )
 
     def figure(self, name: str = "error", behind: str | Sequence[str] = ()) -> Figure:
         """Draw one of the figures; a notebook shows it inline.
@@ -479,10 +491,12 @@ class ComparisonResult:
             InputError: There is no such figure, or a reference cannot be drawn in it.
         """
         if self._in_files:
-            raise InputError(f"figures of {self._what} are files: {self.folder / 'figures'}")
+            raise InputError(f"figures of {self._study_kind} are files: {self.folder / 'figures'}")
         names = [behind] if isinstance(behind, str) else behind
         references = [find_reference(reference) for reference in names]
-        return comparison_figures.draw_figure(self._stored, self._labels, name, behind=references)
+        return comparison_figures.draw_figure(
+            self._stored_comparison, self._axis_labels, name, behind=references
+        )
 
     def summary(self) -> pd.DataFrame:
         """Return each tuner's last error in ranking order, with verdict and failures.

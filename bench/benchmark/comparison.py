@@ -131,7 +131,7 @@ class Comparison:
         )
         ids = [job.request.run for job in results.plan]
         if not (self.folder / SEGMENTS_FOLDER).exists():
-            results.run_sink.statuses = self._complete(ids)
+            results.run_sink.statuses = self._finished_statuses(ids)
             return
         planned = read_plan(self.folder)
         journal = RunJournal(self.folder)
@@ -166,13 +166,13 @@ class Comparison:
             check_runs(runs, file, experiment)
             check_rows_match_statuses(runs, file, statuses, partial(_at_file, file), "its statuses")
 
-    def _complete(self, ids: list[str]) -> dict[int, RunStatus]:
+    def _finished_statuses(self, ids: list[str]) -> dict[int, RunStatus]:
         """Return the statuses of a finished comparison by their index in the plan.
 
         Raises:
             InputError: the folder has other runs than the plan, or is damaged.
         """
-        statuses = self._stored()
+        statuses = self._list_finished_statuses()
         if [status.run for status in statuses] != ids:
             raise InputError(
                 f"{self.folder / 'status.csv'}: expected the {len(ids)} runs of the plan, found "
@@ -180,7 +180,7 @@ class Comparison:
             )
         return dict(enumerate(statuses))
 
-    def _stored(self) -> list[RunStatus]:
+    def _list_finished_statuses(self) -> list[RunStatus]:
         """Return the statuses of a finished comparison in the order of its plan.
 
         Tuners that were skipped have no run in the plan, so their rows are left out.
@@ -210,7 +210,7 @@ class Comparison:
 
         from bench.benchmark.runner.experiment_runner import no_progress, run_experiment
 
-        results = self._begun()
+        results = self._require_experiment_run()
         journal = results.run_sink
         if not isinstance(journal, RunJournal):  # the comparison was complete before
             return StudyOutcome(len(results.plan), len(results.plan))
@@ -242,7 +242,7 @@ class Comparison:
         if self.results is not None and isinstance(self.results.run_sink, RunJournal):
             self.results.run_sink.close()
 
-    def _begun(self) -> ExperimentRun:
+    def _require_experiment_run(self) -> ExperimentRun:
         """Return the problem, plan and stored runs, which only a comparison that can be run has.
 
         Raises:
@@ -276,7 +276,7 @@ class Comparison:
             InputError: the folder is damaged.
         """
         configuration = self.configuration
-        ends = tuple(self._ends())
+        ends = tuple(self._list_run_ends())
         return StudyProgress(
             configuration.experiment.name,
             "runs finished",
@@ -285,7 +285,7 @@ class Comparison:
             self._under_way,
         )
 
-    def _ends(self) -> list[RunEnd]:
+    def _list_run_ends(self) -> list[RunEnd]:
         """List how every run ended, for `simgap status`.
 
         A finished comparison has one table of statuses. In an unfinished one they are in its
@@ -293,7 +293,7 @@ class Comparison:
         has not ended has no status.
         """
         if not self._under_way:
-            return [_end(status.run, status) for status in self._stored()]
+            return [_find_run_end(status.run, status) for status in self._list_finished_statuses()]
         planned, experiment = read_plan(self.folder), self.configuration.experiment
         if planned is not None:
             path = self.folder / SEGMENTS_FOLDER / PLAN_FILE
@@ -303,7 +303,7 @@ class Comparison:
             check_segment_statuses(path, statuses_by_index, experiment, planned, SEGMENT_REMEDY)
             statuses_by_run |= {status.run: status for status in statuses_by_index.values()}
         return [
-            _end(name, statuses_by_run.get(name))
+            _find_run_end(name, statuses_by_run.get(name))
             for name in (statuses_by_run if planned is None else planned)
         ]
 
@@ -340,7 +340,7 @@ def _at_file(file: RunsTable, _row: int, problem: str) -> InputError:
     return file.make_error(None, problem)
 
 
-def _end(name: str, status: RunStatus | None) -> RunEnd:
+def _find_run_end(name: str, status: RunStatus | None) -> RunEnd:
     """Return how a planned run ended, or that it is missing; its id begins with the tuner label."""
     tuner = name.partition("/")[0]
     if status is None:

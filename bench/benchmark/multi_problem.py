@@ -205,10 +205,12 @@ class ComparisonCollection:
         frames = {
             "ert": pd.concat(ert),
             "pairs": pd.concat(paired),
-            "ranks": self._squared(self.mean_ranks).reset_index(names="problem"),
+            "ranks": self._add_trusted_column(self.mean_ranks).reset_index(names="problem"),
         }
         if self.has_enough_problems:
-            frames["nemenyi"] = self._squared(self.rank_tests[1]).reset_index(names="tuner")
+            frames["nemenyi"] = self._add_trusted_column(self.rank_tests[1]).reset_index(
+                names="tuner"
+            )
         return frames
 
     def build_page_data(
@@ -234,7 +236,7 @@ class ComparisonCollection:
             self.mean_ranks,
             p_values,
             friedman,
-            self._shares(),
+            self._compute_runtime_distributions(),
             frames,
             pictures,
             [str(folder) for folder in folders],
@@ -246,7 +248,7 @@ class ComparisonCollection:
         """Whether tuners ran without isolation in any of the comparisons."""
         return any(part.experiment.trusted for part in self.parts)
 
-    def _squared(self, frame: pd.DataFrame) -> pd.DataFrame:
+    def _add_trusted_column(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Add the column `has_trusted_runs` to a table if any tuner ran without isolation."""
         return frame.assign(trusted=True) if self.has_trusted_runs else frame
 
@@ -276,13 +278,13 @@ class ComparisonCollection:
         )
         style = TunerStyles(experiment, order)
         looks = [(name, style.get_mark_style(name)) for name in style.order]
-        panel, table = make_runtime_panel(looks, self._shares())
+        panel, table = make_runtime_panel(looks, self._compute_runtime_distributions())
         figure, axes = draw_chart([panel], {panel.table: table})
         caption = "Mean over problems, each with equal weight."
         finish_figure(figure, axes, style, experiment, caption)
         return figure
 
-    def _shares(self) -> dict[str, Array]:
+    def _compute_runtime_distributions(self) -> dict[str, Array]:
         """Compute the runtime distribution of each tuner (101,), the mean over problems.
 
         It is the share of error thresholds reached after 0..100 % of the budget.

@@ -98,7 +98,7 @@ def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None
     made = build_tables(stored, statistics)
     for name, frame in made.items():
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False))
-    pictures = _drawn(stored, labels, statistics)
+    pictures = _render_figures(stored, labels, statistics)
     figures = _write_figures(folder, pictures)
     results = ComparisonReportData(
         ComparisonView(stored, labels, statistics),
@@ -107,23 +107,23 @@ def write_report(folder: Path, problem: TuningProblem, say: Callable[[str], None
         read_environment(folder),
         str(folder),
         (folder / CONFIGURATION_FILE).read_text(encoding="utf-8"),
-        _missing(folder, stored),
+        _count_missing_runs(folder, stored),
     )
     write_atomically(folder / REPORT_FILE, render_page(results))
 
     lines = made["table"]
-    for text in _headlines(results.view):
+    for text in _describe_best_tuners(results.view):
         say(text)
-    for text in _results(lines, labels, statistics):
+    for text in _format_median_errors(lines, labels, statistics):
         say(text)
-    for text in _marks(stored.experiment):
+    for text in _list_limitations(stored.experiment):
         say(text)
     if redrawn := redraws_text(results):
         say(f"\n{redrawn}")
     failed = stored.statuses[stored.statuses["status"].isin(FAILED_OR_SKIPPED_STATUSES)]
     for text in format_failures(failed):
         say(text)
-    say("\n" + _seconds(lines, statistics))
+    say("\n" + _format_run_seconds(lines, statistics))
     say(f"\ntable   {folder / 'table.csv'}")
     say(f"more    {folder}/{', '.join(f'{name}.csv' for name in made if name != 'table')}")
     for figure in figures:
@@ -193,7 +193,7 @@ def _who_wins(experiment: str, statistics: ComparisonStatistics) -> pd.DataFrame
     return pd.DataFrame(lines, columns=WINNER_COLUMNS)
 
 
-def _drawn(
+def _render_figures(
     stored: StoredComparison, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> dict[str, FigureFiles]:
     """Render all figures that exist for the comparison, by name."""
@@ -213,13 +213,13 @@ def _write_figures(folder: Path, pictures: Mapping[str, FigureFiles]) -> list[Pa
     ]
 
 
-def _missing(folder: Path, stored: StoredComparison) -> int:
+def _count_missing_runs(folder: Path, stored: StoredComparison) -> int:
     """Return the number of planned runs that are missing."""
     plan = read_plan(folder) if (folder / SEGMENTS_FOLDER).exists() else None
     return max(len(plan) - int(stored.runs["run"].nunique()), 0) if plan else 0
 
 
-def _marks(experiment: Experiment) -> list[str]:
+def _list_limitations(experiment: Experiment) -> list[str]:
     """Return notes on how the runs were made that limit the value of the results."""
     texts = []
     if experiment.trusted:
@@ -229,7 +229,7 @@ def _marks(experiment: Experiment) -> list[str]:
     return texts
 
 
-def _headlines(view: ComparisonView) -> list[str]:
+def _describe_best_tuners(view: ComparisonView) -> list[str]:
     """Describe the best tuners after 1, 3, 10 and all simulations, one paragraph per range."""
     statistics, texts = view.statistics, []
     label = view.format_metric_label(view.shown_metric)
@@ -237,14 +237,14 @@ def _headlines(view: ComparisonView) -> list[str]:
         where = f"{headline.WHERE[kind]}, {headline.targets_text(statistics, kind)}"
         lines = [f"\nbest tuners, {where} ({label}; {headline.floor_text(statistics)})"]
         for one in headline.standings(statistics, kind):
-            lines += _standing(one)
+            lines += _format_standing(one)
         lines += [headline.failed_runs(statistics, kind)]
         lines += [headline.too_few(statistics, kind) or headline.how_decided(statistics, kind)]
         texts.append("\n".join(line for line in lines if line))
     return texts
 
 
-def _standing(one: headline.Standing) -> list[str]:
+def _format_standing(one: headline.Standing) -> list[str]:
     """Format the lines of one number of simulations; verdicts without tuners are left out."""
     best = f"{', '.join(one.best)} ({one.error})" if one.best else "none: every run failed"
     parts = {
@@ -264,19 +264,19 @@ def _standing(one: headline.Standing) -> list[str]:
     return lines
 
 
-def _results(
+def _format_median_errors(
     lines: pd.DataFrame, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> list[str]:
     """Format the median errors of each range, then the errors along directions where known."""
     texts = []
     for kind in lines["range"][lines["range"] != ""].unique():
-        texts.append("\n" + _text(lines, kind, labels, statistics))
-        if more := _directions(lines, kind, labels.channel, statistics):
+        texts.append("\n" + _format_error_table(lines, kind, labels, statistics))
+        if more := _format_direction_errors(lines, kind, labels.channel, statistics):
             texts.append("\n" + more)
     return texts
 
 
-def _text(
+def _format_error_table(
     lines: pd.DataFrame, kind: str, labels: AxisLabels, statistics: ComparisonStatistics
 ) -> str:
     """Format the median errors of one range as a table for the terminal."""
@@ -302,7 +302,7 @@ def _laid_out(frame: pd.DataFrame) -> str:
     return bare.to_string(float_format=lambda value: f"{value:.2g}")
 
 
-def _directions(
+def _format_direction_errors(
     lines: pd.DataFrame, kind: str, channel: str, statistics: ComparisonStatistics
 ) -> str:
     """Format errors along stiff and sloppy directions, and held-out errors, of one range.
@@ -327,7 +327,7 @@ def _directions(
     return f"{title}, after N simulations\n{_laid_out(medians.rename(index=statistics.labelled))}"
 
 
-def _seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:
+def _format_run_seconds(lines: pd.DataFrame, statistics: ComparisonStatistics) -> str:
     """Format the mean seconds per run of each tuner, of its simulations, and of its training.
 
     `lines` are rows of table.csv; the values after all simulations are used.

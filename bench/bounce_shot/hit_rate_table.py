@@ -62,12 +62,13 @@ def build_result_table(rows: pd.DataFrame) -> pd.DataFrame:
     for method, part in rows.groupby("method", sort=False):
         balls = [(ball, group) for ball, group in part.groupby("ball", sort=False)]
         lines += [
-            _line(str(method), str(ball), group) for ball, group in [*balls, (ALL_BALLS, part)]
+            _compute_table_row(str(method), str(ball), group)
+            for ball, group in [*balls, (ALL_BALLS, part)]
         ]
     return pd.DataFrame(lines, columns=RESULT_COLUMNS)
 
 
-def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
+def _compute_table_row(method: str, ball: str, part: pd.DataFrame) -> list[object]:
     """Compute one line of the results table, in the order of `RESULT_COLUMNS`.
 
     A shot that never meets the plane of the hoop counts as infinitely far off. Quantiles are

@@ -107,7 +107,7 @@ def write_animation(
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     setup, methods = example
-    film = _film(folder / RECORDINGS_FOLDER / f"{setup.name}.mp4")
+    film = _read_film(folder / RECORDINGS_FOLDER / f"{setup.name}.mp4")
     film_columns = int(bool(film.pictures))
     # Margins are set once, below: a layout engine would move the panels from frame to frame.
     figure, axes = make_panel_grid(
@@ -187,7 +187,7 @@ def _film_panel(axis: Any, film: FilmFrames) -> _Filmed:
     return _Filmed(picture, track, ring)
 
 
-def _film(path: Path) -> FilmFrames:
+def _read_film(path: Path) -> FilmFrames:
     """Read the film of a drop and its track, resampled to the frame rate of the animation.
 
     Args:

@@ -67,7 +67,7 @@ def read_shot_config(experiment: Experiment) -> ShotConfig:
     source, hints = f"experiment {experiment.name}", get_type_hints_of(ShotConfig)
     check_known_names(f"entry of [shot] in {source}", experiment.shot, hints)
     values = {
-        key: _value(source, f"shot.{key}", value, hints[key])
+        key: _convert_value(source, f"shot.{key}", value, hints[key])
         for key, value in experiment.shot.items()
     }
     settings = ShotConfig(**values)
@@ -83,7 +83,7 @@ def read_shot_config(experiment: Experiment) -> ShotConfig:
     return settings
 
 
-def _value(source: str, where: str, value: Any, declared: Any) -> Any:
+def _convert_value(source: str, where: str, value: Any, declared: Any) -> Any:
     """Convert a value to the type of its field; numbers must not be negative.
 
     Raises:

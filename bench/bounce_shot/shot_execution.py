@@ -86,12 +86,15 @@ def execute_shot(setup: ShotSetup, settings: ShotConfig, model: TunedModel) -> S
     miss_distance = x - setup.scene.hoop_x
     is_hit = math.hypot(miss_distance, y) < setup.scene.hoop_radius
     # Beyond the hoop's plane, nothing was planned.
-    last = min(_through(planned, setup.scene.hoop_z), _through(flown, setup.scene.hoop_z))
+    last = min(
+        _find_descent_index(planned, setup.scene.hoop_z),
+        _find_descent_index(flown, setup.scene.hoop_z),
+    )
     error = float(np.linalg.norm(planned - flown, axis=1)[: last + 1].mean())
     return ShotResult(is_hit, miss_distance, error, times, planned, flown)
 
 
-def _through(path: Array, height: float) -> int:
+def _find_descent_index(path: Array, height: float) -> int:
     """Return the index of the sample after which a path descends through a height after its bounce.
 
     The height is that of the hoop. The path before the bounce is ignored, because the ball falls
@@ -122,12 +125,12 @@ def build_shot_rows(
         models: fields of the tuned model of each method.
     """
     return [
-        _row(setup, model, execute_shot(setup, settings, model))
+        _build_shot_row(setup, model, execute_shot(setup, settings, model))
         for model in (TunedModel(**row) for row in models)
     ]
 
 
-def _row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> dict[str, Any]:
+def _build_shot_row(setup: ShotSetup, model: TunedModel, result: ShotResult) -> dict[str, Any]:
     """Build the row of shots.csv for one method and shot.
 
     Lengths are in m. ``off`` is the miss distance, ``margin`` the distance inside the rim of the

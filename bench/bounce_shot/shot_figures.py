@@ -129,7 +129,7 @@ def _methods_down(axis: Axes, methods: Sequence[str]) -> None:
     axis.invert_yaxis()
 
 
-def _legend(figure: Figure, methods: Sequence[str]) -> None:
+def _draw_legend(figure: Figure, methods: Sequence[str]) -> None:
     """Draw the legend of the groups that occur, below the figure."""
     from matplotlib.lines import Line2D
 
@@ -157,8 +157,8 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     for place, method in enumerate(methods):
         part = rows[rows["method"] == method]
         colour, _ = _GROUPS[get_method_group(method)]
-        _box(left, 100 * part["off"].dropna().to_numpy(), place, colour)
-        _box(right, 100 * part["prediction_error"].dropna().to_numpy(), place, colour)
+        _draw_box_plot(left, 100 * part["off"].dropna().to_numpy(), place, colour)
+        _draw_box_plot(right, 100 * part["prediction_error"].dropna().to_numpy(), place, colour)
     radius = 100 * settings.hoop_radius
     left.axvspan(-radius, radius, color=BLACK, alpha=0.08, linewidth=0)
     left.axvline(0, color=CAPTION_GREY, linewidth=0.8)
@@ -175,7 +175,7 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     for axis in (left, right):
         axis.grid(visible=True, axis="x", which="both", linewidth=0.3, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
-    _legend(figure, methods)
+    _draw_legend(figure, methods)
     shots, balls = rows["shot"].nunique(), rows["ball"].nunique()
     title = f"How far off: {shots} shots of {balls} kinds of ball by every method"
     note = "box: quartiles and median, whiskers: 5 % and 95 %, dots: shots outside"
@@ -183,7 +183,7 @@ def draw_miss_figure(settings: ShotConfig, rows: pd.DataFrame) -> Figure:
     return figure
 
 
-def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
+def _draw_box_plot(axis: Axes, values: Array, place: int, colour: str) -> None:
     """Draw a horizontal box plot of one method: quartiles, median, and whiskers at 5 % and 95 %.
 
     Args:

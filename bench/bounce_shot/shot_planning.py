@@ -114,32 +114,33 @@ def tune_and_plan(
         Fields of a `TunedModel` for each method.
     """
     recording = read_recording(inputs.recording, BallSimulator, whole=True)
-    models = [TunedModel(UNTUNED_METHOD, _nominal(), {}, 0, 0.0, "done")]
+    models = [TunedModel(UNTUNED_METHOD, _get_nominal_restitution(), {}, 0, 0.0, "done")]
     models += [
-        _tuned(experiment, settings, entry, inputs, recording, {}) for entry in experiment.tuners
+        _tune_model(experiment, settings, entry, inputs, recording, {})
+        for entry in experiment.tuners
     ]
-    explained, acting = _explained(inputs.recording)
+    explained, acting = _explain_drop(inputs.recording)
     models.append(explained)
     # If explain failed, there is no extended simulator to tune.
     if explained.status == "done":
         extended_models = [
-            _tuned(experiment, settings, entry, inputs, recording, acting)
+            _tune_model(experiment, settings, entry, inputs, recording, acting)
             for entry in experiment.tuners
         ]
         models += [
             replace(model, method=model.method + EXPLAIN_SUFFIX, effects=explained.effects)
             for model in extended_models
         ]
-    radius = _constants(recording)["radius"]
-    return [asdict(_planned(model, settings, inputs.scene, radius)) for model in models]
+    radius = _get_run_constants(recording)["radius"]
+    return [asdict(_plan_shot(model, settings, inputs.scene, radius)) for model in models]
 
 
-def _nominal() -> float:
+def _get_nominal_restitution() -> float:
     """Return the nominal restitution of the ball simulator, which an untuned model has."""
     return BallSimulator.system.parameters[0].nominal
 
 
-def _tuned(
+def _tune_model(
     experiment: Experiment,
     settings: ShotConfig,
     entry: TunerEntry,
@@ -161,7 +162,7 @@ def _tuned(
         The tuned model without a plan; with the status "crashed" if the experiment or recording
         cannot be used.
     """
-    label, radius = entry.label, _constants(recording)["radius"]
+    label, radius = entry.label, _get_run_constants(recording)["radius"]
     experiment = make_tuning_experiment(experiment, settings, entry)
     if effects:
         fixed = {name: list(values) for name, values in effects.items()}
@@ -172,7 +173,7 @@ def _tuned(
         observed_runs = (
             build_pixel_runs(recording, experiment, radius)
             if label in settings.rows
-            else _side(recording, experiment)
+            else _make_observed_runs(recording, experiment)
         )
         nothing = ObservedRuns((), np.empty((0, observed_runs.observed.shape[1])))
         target = BlindedTarget(inputs.name, "real", start, observed_runs, nothing)
@@ -188,7 +189,7 @@ def _tuned(
         )
         outcome = execute_run(experiment, request)
     except InputError as error:
-        return TunedModel(label, _nominal(), {}, 0, 0.0, "crashed", str(error))
+        return TunedModel(label, _get_nominal_restitution(), {}, 0, 0.0, "crashed", str(error))
     trace = outcome.trace
     tuned_value = float(problem.cube.to_physical(trace.recommendations[-1])[0])
     return TunedModel(
@@ -211,7 +212,7 @@ def make_tuning_experiment(
     )
 
 
-def _side(recording: Recording, experiment: Experiment) -> ObservedRuns:
+def _make_observed_runs(recording: Recording, experiment: Experiment) -> ObservedRuns:
     """Convert the recorded run to fitting data of the experiment's simulator.
 
     The ball is released at rest at time 0, even if it is first seen later. Heights are shifted to
@@ -225,11 +226,11 @@ def _side(recording: Recording, experiment: Experiment) -> ObservedRuns:
     scenario = make_scenario(run, BallSimulator(observe=["z"]), recording.constants)
     # The radius of the experiment replaces that of the ball: one network serves balls of all sizes.
     radius = experiment.fixed["radius"]
-    shift = radius - _constants(recording)["radius"]
+    shift = radius - _get_run_constants(recording)["radius"]
     z = run.channels["z"] + shift
     visible_heights = run.channels["z"][np.isfinite(run.channels["z"])]
     # Released at rest at t = 0, the ball has the speed g t when it is first seen.
-    speed = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(
+    speed = scenario.constants.get("gravity", _get_run_constants(recording)["gravity"]) * float(
         run.times[0]
     )
     first = {"z": float(visible_heights[0]), "vz": -speed, **scenario.initial}
@@ -238,12 +239,12 @@ def _side(recording: Recording, experiment: Experiment) -> ObservedRuns:
     return ObservedRuns((moved,), z[:, None])
 
 
-def _constants(recording: Recording) -> dict[str, float]:
+def _get_run_constants(recording: Recording) -> dict[str, float]:
     """Return the constants of the recorded run, with defaults of the system."""
     return {**BallSimulator().constant_values, **recording.constants, **recording.runs[0].constants}
 
 
-def _explained(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
+def _explain_drop(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
     """Run explain on the recording of the drop; its fit is a model of its own.
 
     An error of explain does not stop the other methods: the model then has the status "crashed".
@@ -262,7 +263,13 @@ def _explained(recording: Path) -> tuple[TunedModel, EffectCoefficients]:
     except Exception:  # the failure of one method is a row of the table
         last = traceback.format_exc()
         return TunedModel(
-            EXPLAIN_METHOD, _nominal(), {}, 0, perf_counter() - started, "crashed", last
+            EXPLAIN_METHOD,
+            _get_nominal_restitution(),
+            {},
+            0,
+            perf_counter() - started,
+            "crashed",
+            last,
         ), {}
     all_effects = {
         name: tuple(number.value for number in numbers.values())
@@ -355,7 +362,7 @@ def plan_shot_in_model(
     )
 
 
-def _planned(
+def _plan_shot(
     model: TunedModel, settings: ShotConfig, scene: ShotGeometry, radius: float
 ) -> TunedModel:
     """Plan a shot in a tuned model, and store the planned drop height and distance to the rim.

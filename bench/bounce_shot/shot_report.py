@@ -93,7 +93,7 @@ def write_report(study: ReportableShotStudy, say: Callable[[str], None]) -> int:
         rows[name] = pd.to_numeric(rows[name])
     lines = add_trust_column(build_result_table(rows), study.experiment)
     rows = add_trust_column(rows, study.experiment)
-    statuses = add_trust_column(_statuses(rows, study.skipped_tuners), study.experiment)
+    statuses = add_trust_column(_build_status_rows(rows, study.skipped_tuners), study.experiment)
     for name, frame in (("table", lines), ("shots", rows), ("status", statuses)):
         write_atomically(folder / f"{name}.csv", frame.to_csv(index=False, float_format="%.6g"))
     pictures = draw_figures(study.experiment, study.config, study.shots, stored, rows, lines)
@@ -138,7 +138,7 @@ def _say_faults(
         say(f"{status}: {method} in {len(part)} shots; {part['reason'].iloc[0]}")
 
 
-def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
+def _build_status_rows(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
     """Build the rows of status.csv: one per method and shot, and one per tuner that was skipped.
 
     The columns are those of all comparisons; the seed is always 0, because a shot is planned once.

@@ -59,7 +59,7 @@ def draw_shot(
         index: index of the shot with this kind of ball.
         salt: salt from which the shot is drawn.
     """
-    rng = make_rng(*_of(salt), experiment.name, "shot", kind, index)
+    rng = make_rng(*_get_stream_prefix(salt), experiment.name, "shot", kind, index)
     # The order of the draws is part of the experiment: another order gives other shots.
     ball = get_ball_kind(kind).draw_ball(rng)
     angle, x, drop = (
@@ -72,7 +72,7 @@ def draw_shot(
     return ShotSetup(f"{kind}-{index:03d}", ball, scene, (dx, dz), salt)
 
 
-def _of(salt: str) -> tuple[str, ...]:
+def _get_stream_prefix(salt: str) -> tuple[str, ...]:
     """Return the first words of the names of random streams; none for a public salt."""
     return () if salt in ("", PUBLIC_SALT) else ("salt", salt)
 
@@ -119,7 +119,7 @@ def record_drop(experiment: Experiment, setup: ShotSetup, settings: ShotConfig, 
     # If only one of the two files exists, the process was killed while writing.
     for leftover in (path, path.with_suffix(".toml")):
         leftover.unlink(missing_ok=True)
-    rng = make_rng(*_of(setup.salt), experiment.name, "drop", setup.name)
+    rng = make_rng(*_get_stream_prefix(setup.salt), experiment.name, "drop", setup.name)
     height = experiment.initial.get("z", 1.5)
     drop_height = float(rng.uniform(*height)) if isinstance(height, tuple) else height
     radius, sampling = setup.ball.radius, experiment.sampling

@@ -70,7 +70,7 @@ def store_shot(
         visible_share: fraction of the drop's sample times at which its recording has a height.
     """
     rows = [{**row, "seen": visible_share} for row in build_shot_rows(setup, settings, models)]
-    document = _plain({"models": models, "rows": rows})
+    document = _convert_for_json({"models": models, "rows": rows})
     write_atomically(
         get_shot_path(folder, setup), json.dumps(document, indent=1, allow_nan=False) + "\n"
     )
@@ -91,8 +91,8 @@ def read_shot(folder: Path, setup: ShotSetup) -> dict[str, Any] | None:
         return None
     try:
         document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        _check(document, "models", SHOT_MODEL_COLUMNS)
-        _check(document, "rows", tuple(c for c in SHOT_COLUMNS if c.required))
+        _validate_document(document, "models", SHOT_MODEL_COLUMNS)
+        _validate_document(document, "rows", tuple(c for c in SHOT_COLUMNS if c.required))
     except CellError as error:
         raise InputError(f"{path}, {error.says}; {_REMEDY}") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -122,7 +122,7 @@ def check_shots(folder: Path, setups: Sequence[ShotSetup]) -> None:
         read_shot(folder, setup)
 
 
-def _check(document: dict[str, Any], name: str, columns: Columns) -> None:
+def _validate_document(document: dict[str, Any], name: str, columns: Columns) -> None:
     """Validate the models or the rows of a shot.
 
     Raises:
@@ -162,12 +162,12 @@ def _check_effects(row: int, effects: Any) -> None:
             raise
 
 
-def _plain(value: Any) -> Any:
+def _convert_for_json(value: Any) -> Any:
     """Convert a value for JSON: numbers that are not finite become null, tuples become lists."""
     if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
+        return {key: _convert_for_json(v) for key, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [_convert_for_json(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -151,7 +151,7 @@ class BounceShotStudy:
             pool: worker pool; None to create one.
         """
         if reason := true_world.find_missing_requirement():
-            return self._made(skipped=reason)
+            return self._finish_study(skipped=reason)
         if pool is not None or jobs:
             check_classes_importable(self.experiment)
         try:
@@ -159,12 +159,12 @@ class BounceShotStudy:
             if left:
                 _ShotStages(self, left, progress or no_progress).run(jobs, pool)
         except KeyboardInterrupt:  # the kinds of balls alternate, so a partial result covers all
-            return self._made(interrupted=True)
+            return self._finish_study(interrupted=True)
         except PoolLostError as error:
-            return self._made(stopped=str(error))
-        return self._made()
+            return self._finish_study(stopped=str(error))
+        return self._finish_study()
 
-    def _made(self, **why: Any) -> StudyOutcome:
+    def _finish_study(self, **why: Any) -> StudyOutcome:
         """Return the outcome of a run of the study; reveal its salt if no shot is missing.
 
         A secret salt stays hidden as long as shots are missing, because it determines the balls.
@@ -258,16 +258,16 @@ class _ShotStages:
             (self._study.folder / name).mkdir(exist_ok=True)
         # These workers know the true balls and run no tuner; other workers run the tuners.
         with make_pool(jobs) as workers:
-            faults = self._record(workers)
+            faults = self._record_drops(workers)
         # The true balls are in the memory of this process, and a tuner's process may run as the
         # same user.
         hidden = nullcontext() if self._experiment.trusted else not_dumpable()
         with hidden, pool or make_pool(jobs) as workers:
             workers.load_plugins(describe_plugins(self._study.plugins, self._experiment))
-            weights = self._train(workers)
-            self._shoot(workers, faults, weights)
+            weights = self._train_tuners(workers)
+            self._run_shots(workers, faults, weights)
 
-    def _record(self, workers: Pool) -> dict[int, BaseException]:
+    def _record_drops(self, workers: Pool) -> dict[int, BaseException]:
         """Record every drop.
 
         Returns:
@@ -285,7 +285,7 @@ class _ShotStages:
             step()
         return faults
 
-    def _train(self, workers: Pool) -> dict[str, Path]:
+    def _train_tuners(self, workers: Pool) -> dict[str, Path]:
         """Train the tuners that need training.
 
         Returns:
@@ -315,7 +315,7 @@ class _ShotStages:
             step()
         return weights
 
-    def _shoot(
+    def _run_shots(
         self, workers: Pool, faults: dict[int, BaseException], weights: dict[str, Path]
     ) -> None:
         """Tune and plan with every method, and execute and store the shots.
@@ -336,21 +336,27 @@ class _ShotStages:
         step = self._progress("shooting", len(self._left))
         for index, error in faults.items():
             status = "no recording" if isinstance(error, InputError) else "crashed"
-            self._keep(index, _failed(self._experiment, error, status), 0.0)
+            self._execute_and_store(
+                index, _make_failed_models(self._experiment, error, status), 0.0
+            )
             step()
         for position, models in workers.iterate_results(calls, self._experiment.timeout):
             index = recorded[position]
             if isinstance(models, BaseException):
-                models = _failed(self._experiment, models)
-            self._keep(index, models, compute_visible_share(self._paths[index], self._experiment))
+                models = _make_failed_models(self._experiment, models)
+            self._execute_and_store(
+                index, models, compute_visible_share(self._paths[index], self._experiment)
+            )
             step()
 
-    def _keep(self, index: int, models: list[dict[str, Any]], visible_share: float) -> None:
+    def _execute_and_store(
+        self, index: int, models: list[dict[str, Any]], visible_share: float
+    ) -> None:
         """Execute a shot in the true world with every model, and store the result."""
         store_shot(self._study.folder, self._left[index], self._settings, models, visible_share)
 
 
-def _failed(
+def _make_failed_models(
     experiment: Experiment, error: BaseException, status: str = "crashed"
 ) -> list[dict[str, Any]]:
     """Make failed models for a shot without a recording, or whose worker died or was too slow.

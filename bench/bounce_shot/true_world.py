@@ -120,7 +120,7 @@ class _Flight:
         self._drag = 0.5 * air * ball.drag * area
         self._lift = 0.5 * air * area * ball.radius
         self._step = mujoco.mj_step
-        self._model = mujoco.MjModel.from_xml_string(_mjcf(ball, ground))
+        self._model = mujoco.MjModel.from_xml_string(_render_mjcf(ball, ground))
         self._data = mujoco.MjData(self._model)
         self._touches = False
 
@@ -140,11 +140,11 @@ class _Flight:
         data.qpos[:3] = start
         rows = [(0.0, *start, 0.0, 0.0, 0.0)]
         while data.time < last:
-            self._advance()
+            self._make_step()
             rows.append((data.time, *data.qpos[:3].tolist(), *data.qvel[:3].tolist()))
-        return _sampled(np.array(rows), times)
+        return _interpolate_positions(np.array(rows), times)
 
-    def _advance(self) -> None:
+    def _make_step(self) -> None:
         """Make one step, a short one if the ball touches the ground or soon will.
 
         At the begin of an impact the contact damping is set; it stays until the ball has left the
@@ -163,11 +163,11 @@ class _Flight:
         # Set the damping once per impact, at its initial speed: restitution refers to the whole
         # impact.
         if not self._touches and rate < 0.0 and gap + rate * _IMPACT <= 0.0:
-            self._prepare(-rate)
-        self._push(velocity)
+            self._set_contact_damping(-rate)
+        self._apply_forces(velocity)
         self._step(self._model, data)
 
-    def _prepare(self, speed: float) -> None:
+    def _set_contact_damping(self, speed: float) -> None:
         """Set the contact damping that gives the ball's restitution, for an impact at this speed.
 
         Args:
@@ -181,7 +181,7 @@ class _Flight:
         frequency = math.pi / CONTACT_SECONDS
         self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency
 
-    def _push(self, velocity: list[float]) -> None:
+    def _apply_forces(self, velocity: list[float]) -> None:
         """Apply drag (1), lift (2) and friction (5) as force and torque of the next step.
 
         Args:
@@ -199,13 +199,13 @@ class _Flight:
         ]
         torque = 0.0
         if self._data.ncon and self._friction > 0.0:
-            rub = self._rub(vx, vz, wy)
+            rub = self._compute_friction(vx, vz, wy)
             force[0] += rub * self._normal[1]
             force[2] -= rub * self._normal[0]
             torque = -rub * self._ball.radius
         self._data.xfrc_applied[1] = (*force, 0.0, torque, 0.0)
 
-    def _rub(self, vx: float, vz: float, spin: float) -> float:
+    def _compute_friction(self, vx: float, vz: float, spin: float) -> float:
         """Return the Coulomb friction (5) on the ball, N, positive down the slope.
 
         It is limited to the force that stops the slip within the step, so that it does not reverse
@@ -223,7 +223,7 @@ class _Flight:
         return -math.copysign(min(stops, held), slip)  # (5)
 
 
-def _mjcf(ball: BallKind, ground: InclinedGround) -> str:
+def _render_mjcf(ball: BallKind, ground: InclinedGround) -> str:
     """Render the MuJoCo model: an inclined plane, and a free sphere above it.
 
     Contacts are frictionless (``condim`` 1), because `_Flight` applies the friction. The moments of
@@ -251,7 +251,7 @@ def _mjcf(ball: BallKind, ground: InclinedGround) -> str:
     </mujoco>"""
 
 
-def _sampled(rows: Array, times: Array) -> Array:
+def _interpolate_positions(rows: Array, times: Array) -> Array:
     """Interpolate positions (T, 3) at the sample times by cubic Hermite splines between steps.
 
     Args:

@@ -46,7 +46,7 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
             "schema": name,
             "exit_codes": list(EXIT_CODES),
             "options": [
-                _option(action)
+                _describe_option(action)
                 for action in command._actions
                 if not isinstance(action, argparse._HelpAction)
             ],
@@ -55,7 +55,7 @@ def list_commands(parser: argparse.ArgumentParser) -> list[JsonDocument]:
     ]
 
 
-def _option(action: argparse.Action) -> JsonDocument:
+def _describe_option(action: argparse.Action) -> JsonDocument:
     """Describe an argument or option of a command by plain values, for `simgap list commands`."""
     default = None if action.default in ([], "") else action.default
     read = getattr(action.type, "__name__", "")
@@ -91,24 +91,24 @@ def list_tuners() -> list[JsonDocument]:
             "requires": list(getattr(kind, "requires", ())),
         }
 
-    return [_part(registry, name, describe_kind) for name in registry.names()]
+    return [_describe_part(registry, name, describe_kind) for name in registry.names()]
 
 
 def list_simulators() -> list[JsonDocument]:
     """List every simulator with its description."""
     from bench.core.plugin_registries import simulators as registry
 
-    return [_part(registry, name, lambda _: {}) for name in registry.names()]
+    return [_describe_part(registry, name, lambda _: {}) for name in registry.names()]
 
 
 def list_systems() -> list[JsonDocument]:
     """List every simulator's declared numbers, states and signals, with units and ranges."""
     from bench.core.plugin_registries import simulators as registry
 
-    return [_part(registry, name, _declared) for name in registry.names()]
+    return [_describe_part(registry, name, _describe_system) for name in registry.names()]
 
 
-def _declared(kind: Any) -> JsonDocument:
+def _describe_system(kind: Any) -> JsonDocument:
     """Return what a system declares: parameters, constants, inputs, states and observed channels.
 
     `kind` is the class of the system; a parameter has its bounds, its training range and its unit.
@@ -131,13 +131,13 @@ def _declared(kind: Any) -> JsonDocument:
     return {
         "parameters": parameters,
         "constants": constants,
-        "inputs": _channels(kind.inputs),
+        "inputs": _describe_channels(kind.inputs),
         "states": [{"name": name, "value": value} for name, value in kind.states.items()],
-        "channels": _channels(kind.channels),
+        "channels": _describe_channels(kind.channels),
     }
 
 
-def _channels(channels: Iterable[Any]) -> list[JsonDocument]:
+def _describe_channels(channels: Iterable[Any]) -> list[JsonDocument]:
     return [{"name": c.name, "unit": c.unit, "says": c.says} for c in channels]
 
 
@@ -145,10 +145,12 @@ def list_effects() -> list[JsonDocument]:
     """List every effect, with unit and plausible range of each coefficient on each system kind."""
     from sims.effects import registry
 
-    return [_part(registry, name, _acting) for name in registry.names()]
+    return [
+        _describe_part(registry, name, _describe_effect_properties) for name in registry.names()
+    ]
 
 
-def _acting(effect: Any) -> JsonDocument:
+def _describe_effect_properties(effect: Any) -> JsonDocument:
     """Return the properties of one effect: how it acts, and the range of each of its coefficients.
 
     A coefficient has an entry in ``on`` for each kind of system to which it can be applied, because
@@ -185,7 +187,7 @@ def list_diagnosers() -> list[JsonDocument]:
     def describe_kind(kind: Any) -> JsonDocument:
         return {"learned": bool(kind.learned), "requires": list(kind.requires)}
 
-    return [_part(registry, name, describe_kind) for name in registry.names()]
+    return [_describe_part(registry, name, describe_kind) for name in registry.names()]
 
 
 def list_experiments() -> list[JsonDocument]:
@@ -243,7 +245,9 @@ def list_schemas() -> list[JsonDocument]:
     return [{"name": name, "says": load_schema(name)["title"]} for name in list_schema_names()]
 
 
-def _part(registry: Any, name: str, describe_kind: Callable[[Any], JsonDocument]) -> JsonDocument:
+def _describe_part(
+    registry: Any, name: str, describe_kind: Callable[[Any], JsonDocument]
+) -> JsonDocument:
     """Describe a registered part, or why it cannot be used here.
 
     `describe_kind` returns the properties that only parts of this kind have, from the class.

@@ -24,11 +24,11 @@ def format_documents(what: str, documents: list[JsonDocument]) -> list[str]:
         what: Name of the section.
         documents: Documents of its entries.
     """
-    lay = _LAID_OUT.get(what, _plain)
+    lay = _LAID_OUT.get(what, _format_plain_entry)
     return [line for document in documents for line in lay(document)]
 
 
-def _plain(each: JsonDocument) -> list[str]:
+def _format_plain_entry(each: JsonDocument) -> list[str]:
     return [f"{each['name']:18} {_format_sentence(each)}"]
 
 
@@ -38,7 +38,7 @@ def _format_sentence(each: JsonDocument) -> str:
     return f"skipped: {skipped}" if skipped else each["says"]
 
 
-def _experiment(each: JsonDocument) -> list[str]:
+def _format_experiment(each: JsonDocument) -> list[str]:
     """Format an experiment: what is missing on this machine, its description, its tags."""
     lacks = []
     if each["skipped"]:
@@ -52,7 +52,7 @@ def _experiment(each: JsonDocument) -> list[str]:
     return [f"{each['name']:22} {words} [{', '.join(each['tags'])}]"]
 
 
-def _system(each: JsonDocument) -> list[str]:
+def _format_system(each: JsonDocument) -> list[str]:
     """Format a system: its description, then a line for each of its declared quantities."""
     result = [f"{each['name']}: {_format_sentence(each)}"]
     if each["skipped"]:
@@ -69,16 +69,16 @@ def _system(each: JsonDocument) -> list[str]:
         f"  constant  {c['name']:18} {c['unit']:12} {c['value']:g}  {c['says']}"
         for c in each["constants"]
     ]
-    result += _channels("input", each["inputs"])
+    result += _format_channels("input", each["inputs"])
     result += [f"  state     {s['name']:18} {s['value']:>12g}" for s in each["states"]]
-    return result + _channels("channel", each["channels"])
+    return result + _format_channels("channel", each["channels"])
 
 
-def _channels(what: str, channels: list[JsonDocument]) -> list[str]:
+def _format_channels(what: str, channels: list[JsonDocument]) -> list[str]:
     return [f"  {what:9} {c['name']:18} {c['unit']:12} {c['says']}".rstrip() for c in channels]
 
 
-def _effect(each: JsonDocument) -> list[str]:
+def _format_effect(each: JsonDocument) -> list[str]:
     """Format an effect, with its coefficients' units and plausible ranges by kind of system."""
     if each["skipped"]:
         return [f"{each['name']}: {_format_sentence(each)}"]
@@ -90,14 +90,14 @@ def _effect(each: JsonDocument) -> list[str]:
     return result
 
 
-def _reference(each: JsonDocument) -> list[str]:
+def _format_reference(each: JsonDocument) -> list[str]:
     what = f"{each['says']} [simgap {each['simgap']}, {each['started'][:10]}, "
     return [f"{each['name']:26} {what}{each['targets']} targets, budget {each['budget']}]"]
 
 
 _LAID_OUT: dict[str, Callable[[JsonDocument], list[str]]] = {
-    "systems": _system,
-    "effects": _effect,
-    "experiments": _experiment,
-    "references": _reference,
+    "systems": _format_system,
+    "effects": _format_effect,
+    "experiments": _format_experiment,
+    "references": _format_reference,
 }

@@ -29,14 +29,14 @@ class InterruptHandler:
         self._answers = threading.current_thread() is threading.main_thread()
         # Keep ignoring SIGINT if it is ignored, as for background jobs of a shell.
         if self._answers and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, self._first)
+            signal.signal(signal.SIGINT, self._announce_early_end)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._answers and signal.getsignal(signal.SIGINT) == self._first:
+        if self._answers and signal.getsignal(signal.SIGINT) == self._announce_early_end:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def _first(self, *_: object) -> None:
+    def _announce_early_end(self, *_: object) -> None:
         self._asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self._say("ending with what there is; Ctrl-C again ends at once")

@@ -227,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     printer: OutputWriter = JsonWriter() if "--json" in words else TextWriter()
     try:
-        options = _parse(words)
+        options = _parse_command_line(words)
     except _UsageError as error:
         printer.print_error("usage", str(error), EXIT_ERROR)
         sys.exit(EXIT_ERROR)
@@ -283,7 +283,7 @@ def _name_glfw_library() -> None:
         os.environ["PYGLFW_LIBRARY"] = str(library)
 
 
-def _parse(words: Sequence[str]) -> argparse.Namespace:
+def _parse_command_line(words: Sequence[str]) -> argparse.Namespace:
     """Parse the command line.
 
     Raises:

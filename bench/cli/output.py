@@ -94,7 +94,7 @@ class TextWriter:
 
     def print_error(self, kind: ErrorKind, message: str, code: int) -> None:  # noqa: ARG002
         """Print one line on stderr, except for internal errors, which have a traceback."""
-        _warn(kind, message)
+        _print_warning(kind, message)
 
 
 class JsonWriter:
@@ -113,11 +113,11 @@ class JsonWriter:
 
     def print_error(self, kind: ErrorKind, message: str, code: int) -> None:
         """Print the error as JSON, and as a line on stderr for logs."""
-        _warn(kind, message)
+        _print_warning(kind, message)
         print(format_json({"error": {"kind": kind, "message": message, "code": code}}))
 
 
-def _warn(kind: ErrorKind, message: str) -> None:
+def _print_warning(kind: ErrorKind, message: str) -> None:
     if kind != "internal":
         print(f"simgap: {message}", file=sys.stderr)
 

@@ -19,8 +19,8 @@ def format_places(model: Path) -> Iterator[str]:
     """Yield lines about a model file's places and signals, and the effects that can act there."""
     kind = cast(type[RobotSimulator], make_robot_simulator(model))
     yield from format_robot_summary(kind)
-    yield from _joints(kind.robot)
-    yield from _actuators(kind)
+    yield from _format_joints(kind.robot)
+    yield from _format_actuators(kind)
     for body in kind.robot.bodies:
         links = f", with {', '.join(body.aliases)}" if body.aliases else ""
         yield f"  {'body':9} {body.name:24} {body.mass:.4g} kg{links}"
@@ -28,7 +28,7 @@ def format_places(model: Path) -> Iterator[str]:
         yield f"  {'input':9} {signal.name:24} {signal.unit}"
     for channel in kind.channels:
         yield f"  {'channel':9} {channel.name:24} {channel.unit:9} {channel.says}"
-    yield from _effects(kind.system)
+    yield from _format_effects_by_place(kind.system)
     yield f"  --free also takes MuJoCo's words: {', '.join(kind.system.list_mujoco_words())}"
 
 
@@ -65,27 +65,27 @@ def list_places(model: Path) -> JsonDocument:
     }
 
 
-def _joints(robot: RobotModel) -> Iterator[str]:
+def _format_joints(robot: RobotModel) -> Iterator[str]:
     """Yield a line for each joint of a robot: kind, and range of motion and effort if limited."""
     for joint in robot.joints:
-        limits = "" if joint.range is None else _range(joint.range, joint.unit)
+        limits = "" if joint.range is None else _format_range(joint.range, joint.unit)
         effort = "" if joint.effort is None else f", effort {joint.effort:g} {joint.force_unit}"
         yield f"  {'joint':9} {joint.name:24} {joint.kind}{limits}{effort}"
 
 
-def _actuators(kind: type[RobotSimulator]) -> Iterator[str]:
+def _format_actuators(kind: type[RobotSimulator]) -> Iterator[str]:
     """Yield a line for each actuator of a robot: kind, the driven joint and the control range."""
     units = {channel.name: channel.unit for channel in kind.inputs}
     for a in kind.robot.actuators:
-        limits = "" if a.range is None else _range(a.range, units.get(f"u.{a.name}", ""))
+        limits = "" if a.range is None else _format_range(a.range, units.get(f"u.{a.name}", ""))
         yield f"  {'actuator':9} {a.name:24} {a.kind} on {a.joint or 'no joint'}{limits}"
 
 
-def _range(ends: tuple[float, float], unit: str) -> str:
+def _format_range(ends: tuple[float, float], unit: str) -> str:
     return f", {ends[0]:.4g} to {ends[1]:.4g} {unit}"
 
 
-def _effects(system: type[RobotSystem]) -> Iterator[str]:
+def _format_effects_by_place(system: type[RobotSystem]) -> Iterator[str]:
     """Yield a line for each kind of place with the effects that can act there."""
     for kind, named in list_effects_by_place_kind(system).items():
         at = "of the world" if kind == "world" else f"at a {kind}, as {named[0]}@NAME or @*"

@@ -120,30 +120,32 @@ class SearchProgress:
             percent = ""
         elif empty:
             bar = f"|{full * done}{empty * (BAR_WIDTH - done)}| "
-        long = self._joined(self._times(), self._stage(), self._best_so_far())
-        short = self._joined(self._times(), self._stage(), self._best_so_far("best {1} % {0}"))
+        long = self._join_parts(self._format_times(), self._format_stage(), self._best_so_far())
+        short = self._join_parts(
+            self._format_times(), self._format_stage(), self._best_so_far("best {1} % {0}")
+        )
         yield f"simgap {percent}{bar}{long}"
         yield f"{percent}{bar}{short}"
         yield f"{percent}{short}"
 
     def report(self) -> str:
         """Return the state as a line of a log."""
-        times = self._times() if self.elapsed() >= 1.0 else ""
-        return self._joined(self._stage(), self._best_so_far(), times)
+        times = self._format_times() if self.elapsed() >= 1.0 else ""
+        return self._join_parts(self._format_stage(), self._best_so_far(), times)
 
     @staticmethod
-    def _joined(*parts: str) -> str:
+    def _join_parts(*parts: str) -> str:
         return "; ".join(part for part in parts if part)
 
     def _best_so_far(self, form: str = "best so far {0} closes {1} % of the gap") -> str:
         return form.format(*self._best) if self._best is not None else ""
 
-    def _stage(self) -> str:
+    def _format_stage(self) -> str:
         if self._total is None or self._total < 2:
             return self._name
         return f"{self._name}, {min(self._done, self._total)} of {self._total}"
 
-    def _times(self) -> str:
+    def _format_times(self) -> str:
         """Format the elapsed time, and the remaining time while the search is running.
 
         With a time budget the remaining time is an upper limit; otherwise it is an estimate, or
@@ -217,7 +219,7 @@ class ProgressDisplay(SearchProgress):
     def __enter__(self) -> ProgressDisplay:
         """Start the timer that redraws the live line, where signals can be used."""
         if not self._silent and _can_use_timer():
-            signal.signal(signal.SIGALRM, lambda *_: self._update())
+            signal.signal(signal.SIGALRM, lambda *_: self._redraw_if_due())
             # System calls of libraries continue after the signal.
             signal.siginterrupt(signal.SIGALRM, False)
             signal.setitimer(signal.ITIMER_REAL, TICK, TICK)
@@ -231,8 +233,8 @@ class ProgressDisplay(SearchProgress):
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
         # An exception may have occurred while a line was written.
         self._busy = False
-        with self._writing():
-            self._erase()
+        with self._block_timer_writes():
+            self._erase_live_line()
             self._print_waiting()
         self._silent = True
 
@@ -244,12 +246,12 @@ class ProgressDisplay(SearchProgress):
             total: Number of its steps; None if unknown.
         """
         super().stage(name, total)
-        self._update()
+        self._redraw_if_due()
 
     def advance(self, count: int = 1) -> None:
         """Finish steps of the stage and show it."""
         super().advance(count)
-        self._update()
+        self._redraw_if_due()
 
     def found(self, effects: Sequence[str], share: float) -> None:
         """Store the best model so far and show it.
@@ -259,12 +261,12 @@ class ProgressDisplay(SearchProgress):
             share: Share of the gap that it closes.
         """
         super().found(effects, share)
-        self._update()
+        self._redraw_if_due()
 
     def completed(self, share: float) -> None:
         """Store the share done and show it."""
         super().completed(share)
-        self._update()
+        self._redraw_if_due()
 
     def note(self, text: str) -> None:
         """Print a permanent line: above the live line on a terminal."""
@@ -272,41 +274,41 @@ class ProgressDisplay(SearchProgress):
             return
         self._waiting.append(text)
         if not self._busy:
-            with self._writing():
-                self._draw()
+            with self._block_timer_writes():
+                self._draw_lines()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Erase the live line while something else is printed on the terminal."""
-        with self._writing():
-            self._erase()
+        with self._block_timer_writes():
+            self._erase_live_line()
         self._busy = True
         try:
             yield
         finally:
             self._busy = False
 
-    def _update(self) -> None:
+    def _redraw_if_due(self) -> None:
         """Show the state, unless that was done less than an interval ago."""
         if self._silent or self._busy or not self._name:
             return
         now = self._clock()
         if self._shown_at is not None and now - self._shown_at < self._interval:
             return
-        with self._writing():
+        with self._block_timer_writes():
             if self._hints and self.elapsed() >= HINT_AFTER and self._is_searching:
                 self._hints = False
                 self._waiting.append(HINT)
             self._shown_at = now
             if self._live:
-                self._draw()
+                self._draw_lines()
             else:
                 self._print_waiting()
                 self._stream.write(f"simgap: {self.report()} ...\n")
                 self._stream.flush()
 
     @contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _block_timer_writes(self) -> Iterator[None]:
         """Mark the time in which stderr is written, so that the timer signal does not write too."""
         self._busy = True
         try:
@@ -317,16 +319,16 @@ class ProgressDisplay(SearchProgress):
         finally:
             self._busy = False
 
-    def _draw(self) -> None:
+    def _draw_lines(self) -> None:
         """Write the waiting lines, then the live line on a terminal."""
         if self._waiting:
-            self._erase()
+            self._erase_live_line()
             self._print_waiting()
         if not self._live or not self._name:
             return
         from tqdm.utils import disp_len, disp_trim
 
-        columns = _columns(self._stream) - 1
+        columns = _get_terminal_width(self._stream) - 1
         lines = list(self.lines(*_bar_characters(self._stream)))
         line = next((one for one in lines if disp_len(one) <= columns), lines[-1])
         line = disp_trim(line, columns)
@@ -341,7 +343,7 @@ class ProgressDisplay(SearchProgress):
             self._stream.write(f"simgap: {self._waiting.pop(0)}\n")
             self._stream.flush()
 
-    def _erase(self) -> None:
+    def _erase_live_line(self) -> None:
         """Overwrite the live line with spaces; nothing to do without a terminal or a line.
 
         Two more characters are overwritten, because a terminal echoes ^C at the end of the line.
@@ -349,7 +351,7 @@ class ProgressDisplay(SearchProgress):
         if self._live and self._shown:
             from tqdm.utils import disp_len
 
-            width = min(disp_len(self._shown) + 2, _columns(self._stream) - 1)
+            width = min(disp_len(self._shown) + 2, _get_terminal_width(self._stream) - 1)
             self._stream.write("\r" + " " * width + "\r")
             self._stream.flush()
             self._shown = ""
@@ -362,7 +364,7 @@ def _can_use_timer() -> bool:
     return is_main and has_timer and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
 
 
-def _columns(stream: Any) -> int:
+def _get_terminal_width(stream: Any) -> int:
     """Return the width of a terminal in columns."""
     try:
         columns = os.get_terminal_size(stream.fileno()).columns

@@ -142,15 +142,15 @@ def add_trust_option(parser: argparse.ArgumentParser) -> None:
 
 def parse_positive_int(text: str) -> int:
     """Parse a whole number of at least 1."""
-    return _whole(text, 1)
+    return _parse_whole_number(text, 1)
 
 
 def parse_non_negative_int(text: str) -> int:
     """Parse a whole number of at least 0."""
-    return _whole(text, 0)
+    return _parse_whole_number(text, 0)
 
 
-def _whole(text: str, least: int) -> int:
+def _parse_whole_number(text: str, least: int) -> int:
     """Parse a whole number from `least` to MAX_INTEGER, for argparse.
 
     Raises:

@@ -107,7 +107,7 @@ def _open_case(
                 np.random.default_rng(3),
                 budget,
                 TIME_LIMIT_SECONDS,
-                _learned(kind),
+                _get_trained_state(kind),
             )
         finally:
             SIMULATION_COUNTER.reset()
@@ -124,17 +124,17 @@ def _with_gaps(recording: Recording) -> Recording:
     return replace(recording, runs=tuple(runs))
 
 
-def _learned(kind: type[Diagnoser]) -> dict[str, Array]:
+def _get_trained_state(kind: type[Diagnoser]) -> dict[str, Array]:
     """Train a diagnoser with a small budget, once per process."""
     if not kind.learned:
         return {}
     if kind not in TRAINED_DIAGNOSERS:
-        arrays, _ = _train(kind)
+        arrays, _ = _train_diagnoser(kind)
         TRAINED_DIAGNOSERS[kind] = arrays
     return TRAINED_DIAGNOSERS[kind]
 
 
-def _train(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
+def _train_diagnoser(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
     """Train a diagnoser with a small budget on the slider, the system of the checks.
 
     Returns:
@@ -177,7 +177,7 @@ def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) 
         answers: list[Answer] = []
         try:
             with check_global_random_state(f"case.rng in {kind.__name__}.diagnose"):
-                answers.append(_answer(kind, case))
+                answers.append(_run_diagnoser(kind, case))
         except CheckError as error:
             # Without an answer, there is nothing else to check.
             if not answers:
@@ -189,7 +189,7 @@ def _diagnose_cached(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) 
         return _Run(answer, foreign, _copy_case_bytes(case) != before, touched)
 
 
-def _answer(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
+def _run_diagnoser(kind: type[Diagnoser], case: DiagnosisCase) -> Answer:
     """Run a diagnoser and validate its answer.
 
     Raises:
@@ -252,7 +252,7 @@ def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
     """Check that the diagnoser answers with a tiny budget, or stops with the budget error."""
     with _open_case(kind, budget=TINY_SIMULATION_BUDGET) as case:
         try:
-            _answer(kind, case)
+            _run_diagnoser(kind, case)
         except SimulationBudgetExceededError:
             return
         used = case.used
@@ -267,14 +267,14 @@ def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
 def check_takes_missing_samples(kind: type[Diagnoser]) -> None:
     """Check that the diagnoser answers about a recording with missing samples."""
     with _open_case(kind, missing=True) as case:
-        _answer(kind, case)
+        _run_diagnoser(kind, case)
 
 
 def check_learns_within_its_budget(kind: type[Diagnoser]) -> NotApplicable | None:
     """Check that the training stays within its budget and results in numeric arrays."""
     if not kind.learned:
         return NotApplicable("it does not learn")
-    arrays, used = _train(kind)
+    arrays, used = _train_diagnoser(kind)
     check(
         used <= TRAINING_BUDGET,
         f"at most {TRAINING_BUDGET} simulations",

@@ -44,7 +44,7 @@ _RATE = 30.0
 """Sampling rate of a run, Hz."""
 
 
-def _declared() -> Iterator[type[SystemSimulator]]:
+def _iterate_systems() -> Iterator[type[SystemSimulator]]:
     """Yield the registered simulators of declared systems (`SystemSimulator`).
 
     Simulators whose packages are not installed are left out.
@@ -58,7 +58,7 @@ def _declared() -> Iterator[type[SystemSimulator]]:
 
 def _find_supporting_systems(effect: type[Effect]) -> Iterator[type[SystemSimulator]]:
     """Return the simulators whose systems can have the effect."""
-    kinds: tuple[type[SystemSimulator], ...] = (*_declared(), FirstOrderTank)
+    kinds: tuple[type[SystemSimulator], ...] = (*_iterate_systems(), FirstOrderTank)
     return (kind for kind in kinds if not effect.misses(kind.system))
 
 
@@ -79,14 +79,14 @@ def _make_simulator_with_effect(
                 f"expected a name of its own; found {effect.name}; see {effect.__name__}.name"
             )
         effects.register_effect(effect)
-    return host(engine=_engine(host), effects=[effect.name])
+    return host(engine=_choose_engine(host), effects=[effect.name])
 
 
-def _engine(host: type[SystemSimulator]) -> str | None:
+def _choose_engine(host: type[SystemSimulator]) -> str | None:
     return None if issubclass(host, OwnSimulator) else "batch"
 
 
-def _scenario(system: type[System]) -> Scenario:
+def _make_scenario(system: type[System]) -> Scenario:
     """Make a run with nonzero velocities in all directions and inputs that change."""
     times = np.arange(_SAMPLES) / _RATE
     # Initial values of states that are neither coordinates nor rates, such as levels, are among the
@@ -99,7 +99,7 @@ def _scenario(system: type[System]) -> Scenario:
     return Scenario(times, initial, inputs)
 
 
-def _theta(simulator: SystemSimulator, share: float) -> Array:
+def _make_parameters(simulator: SystemSimulator, share: float) -> Array:
     """Return parameters (1, P) for one simulation with the effect.
 
     The system's own parameters are nominal; each coefficient of the effect is at the fraction
@@ -148,13 +148,13 @@ def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable
         c = np.zeros((len(effect.coefficients), 2, 1))
         same = all(
             is_bitwise_equal(given, nothing)
-            for given, nothing in _contributions(acting, c, host, system)
+            for given, nothing in _compute_contributions(acting, c, host, system)
         )
         check(same, f"no contribution on {host.name} at zero", "one", effect.__name__)
     return None if hosts else NO_SUPPORTING_SYSTEM
 
 
-def _contributions(
+def _compute_contributions(
     acting: Effect, c: Array, host: type[SystemSimulator], system: System
 ) -> list[tuple[Array, Array]]:
     """Return pairs of the hook's result and the expected result of an inactive effect.
@@ -223,10 +223,10 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | Non
     for host in hosts:
         simulator, plain, scenario = (
             _make_simulator_with_effect(host, effect),
-            host(engine=_engine(host)),
-            _scenario(host.system),
+            host(engine=_choose_engine(host)),
+            _make_scenario(host.system),
         )
-        thetas = np.concatenate([_theta(simulator, share) for share in (0.05, 0.3, 0.7)])
+        thetas = np.concatenate([_make_parameters(simulator, share) for share in (0.05, 0.3, 0.7)])
         observations = simulator.simulate(thetas, scenario)
         look = f"{effect.__name__} on {host.name}"
         check(bool(np.isfinite(observations[-1]).all()), "finite observations", "others", look)
@@ -244,8 +244,8 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
     """Check that observations do not depend on other elements of the batch, bit for bit."""
     hosts = list(_find_supporting_systems(effect))
     for host in hosts:
-        simulator, scenario = _make_simulator_with_effect(host, effect), _scenario(host.system)
-        lanes = np.concatenate([_theta(simulator, share) for share in (0.2, 0.5, 0.9)])
+        simulator, scenario = _make_simulator_with_effect(host, effect), _make_scenario(host.system)
+        lanes = np.concatenate([_make_parameters(simulator, share) for share in (0.2, 0.5, 0.9)])
         together = simulator.simulate(lanes, scenario)
         alone = np.concatenate([simulator.simulate(lane[None], scenario) for lane in lanes])
         check(
@@ -259,7 +259,7 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
 
 def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | None:
     """Check that a system that cannot have the effect is rejected by name."""
-    impossible = [host for host in _declared() if effect.misses(host.system)]
+    impossible = [host for host in _iterate_systems() if effect.misses(host.system)]
     for host in impossible:
         try:
             _make_simulator_with_effect(host, effect)

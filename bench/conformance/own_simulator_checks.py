@@ -19,21 +19,21 @@ _GROWN = 2.5
 """Ratio of velocity changes above which the effect of a force has grown."""
 
 
-def _own(kind: type[Simulator]) -> type[OwnSimulator] | None:
+def _as_own_simulator(kind: type[Simulator]) -> type[OwnSimulator] | None:
     return kind if issubclass(kind, OwnSimulator) else None
 
 
 _NOT_OWN = NotApplicable("it is not a subclass of OwnSimulator")
 
 
-def _started(simulator: OwnSimulator) -> None:
+def _start_run(simulator: OwnSimulator) -> None:
     """Start a run with nominal parameters, default constants and default states."""
     theta = {p.name: p.nominal for p in simulator.parameters}
     constants = {c.name: c.value for c in simulator.constants}
     simulator.reset(theta, constants, dict(simulator.states))
 
 
-def _step(simulator: OwnSimulator) -> None:
+def _make_step(simulator: OwnSimulator) -> None:
     simulator.step({c.name: 0.0 for c in simulator.inputs}, simulator.time_step)
 
 
@@ -43,7 +43,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
     `observe` must return a number for every channel, coordinate, rate and level. `inertia` must
     return a number or a positive definite matrix (D, D). `apply_force` must accept (D,).
     """
-    own = _own(kind)
+    own = _as_own_simulator(kind)
     if own is None:
         return _NOT_OWN
     forced = own.apply_force is not OwnSimulator.apply_force
@@ -54,7 +54,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
         check(bool(own.coordinates), what, "none", own.__name__)
     simulator = own()
     names = [c.name for c in simulator.channels]
-    _started(simulator)
+    _start_run(simulator)
     try:
         for _ in range(2):
             observation = simulator.observe()
@@ -64,7 +64,7 @@ def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable
                 _check_inertia(own, inertia_of(simulator))
             if forced:
                 simulator.apply_force(np.zeros(len(own.coordinates)))
-            _step(simulator)
+            _make_step(simulator)
     except InputError as error:
         message = str(error).removeprefix(f"simulator {own.name}: ")
         wanted, _, found = message.partition(", found ")
@@ -92,11 +92,11 @@ def _check_inertia(kind: type[OwnSimulator], given: float | Array) -> None:
 
 def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | None:
     """Check that twice as many steps of half the length lead to about the same state."""
-    own = _own(kind)
+    own = _as_own_simulator(kind)
     if own is None:
         return _NOT_OWN
     simulator = own()
-    whole, half = (_way(simulator, own.time_step / n, _FEW * n) for n in (1, 2))
+    whole, half = (_compute_scaled_change(simulator, own.time_step / n, _FEW * n) for n in (1, 2))
     simulator.close()
     moved = np.abs(whole) > _ROUNDING
     if not moved.any():
@@ -119,7 +119,7 @@ _ROUNDING = 1e-9
 """Minimum change of a channel, in units of its scale, that counts as motion."""
 
 
-def _way(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
+def _compute_scaled_change(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
     """Compute the change (C,) of each of C channels over a run, in units of its scale.
 
     The run has `steps` steps of `seconds` each, with constant inputs.
@@ -130,7 +130,7 @@ def _way(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
         now = simulator.observe()
         return np.array([observed(simulator, now, c.name) / c.scale for c in simulator.channels])
 
-    _started(simulator)
+    _start_run(simulator)
     before = observation()
     for _ in range(steps):
         simulator.step(inputs, seconds)
@@ -142,20 +142,20 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
 
     It must not act in the next run.
     """
-    own = _own(kind)
+    own = _as_own_simulator(kind)
     if own is None:
         return _NOT_OWN
     if own.apply_force is OwnSimulator.apply_force:
         return NotApplicable("it takes no forces (it has no method apply_force)")
     simulator, look = own(), f"{own.__name__}.apply_force"
-    still = _motion(simulator, None)
+    still = _simulate_motion(simulator, None)
     for place, name in enumerate(own.coordinates):
         moved = still
         size = 1.0
         while is_bitwise_equal(still, moved) and size <= _LARGEST:
             force = np.zeros(len(own.coordinates))
             force[place] = size
-            moved = _motion(simulator, force)
+            moved = _simulate_motion(simulator, force)
             size *= 10.0
         found = f"the same motion with forces up to {_LARGEST:g}"
         check(
@@ -164,7 +164,7 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
             found,
             look,
         )
-        again = is_bitwise_equal(still, _motion(simulator, None))
+        again = is_bitwise_equal(still, _simulate_motion(simulator, None))
         reset = f"{own.__name__}.reset: it must take away a force that was applied"
         check(again, "the same run after one with forces", "another", reset)
         velocity = np.abs(moved - still)[:, len(own.coordinates) + place]
@@ -175,31 +175,31 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
     return None
 
 
-def _motion(simulator: OwnSimulator, force: Array | None) -> Array:
+def _simulate_motion(simulator: OwnSimulator, force: Array | None) -> Array:
     """Simulate coordinates and rates (K + 1, 2 D) of a run; the force acts in its first step."""
     names = (*simulator.coordinates, *simulator.rates)
-    _started(simulator)
+    _start_run(simulator)
     rows = []
     for i in range(_STEPS + 1):
         observation = simulator.observe()
         rows.append([observed(simulator, observation, name) for name in names])
         if force is not None:
             simulator.apply_force(force if i == 0 else np.zeros_like(force))
-        _step(simulator)
+        _make_step(simulator)
     return np.array(rows)
 
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
     """Check that `put` sets a level, which `observe` returns, and leaves other levels unchanged."""
-    own = _own(kind)
+    own = _as_own_simulator(kind)
     if own is None:
         return _NOT_OWN
     if own.put is OwnSimulator.put or not own.levels:
         return NotApplicable("its levels cannot be set (it has no method put)")
     simulator, look = own(), f"{own.__name__}.put"
     for name in own.levels:
-        _started(simulator)
-        _step(simulator)
+        _start_run(simulator)
+        _make_step(simulator)
         before = {level: float(simulator.observe()[level]) for level in own.levels}
         wanted = {**before, name: 0.9 * before[name] + 0.01}
         simulator.put({name: wanted[name]})

@@ -48,11 +48,11 @@ def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
         return NO_PLACE
     places = [effect_class.place for effect_class in classes if effect_class.place]
     if places:
-        _refuses(effect, places)
+        _check_place_refusal(effect, places)
     return None
 
 
-def _refuses(effect: type[Effect], places: Sequence[str]) -> None:
+def _check_place_refusal(effect: type[Effect], places: Sequence[str]) -> None:
     """Check that the effect refuses a place that does not exist, and lists those that do.
 
     Raises:
@@ -81,7 +81,9 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
         for part, own in effect_class().parts(c):
             none = _acts_on(part, own, kind) == ()
             check(none, "no contribution at zero", "one", look)
-        lanes = np.concatenate([_theta(effect_class, 0.0), _theta(effect_class, 0.7)])
+        lanes = np.concatenate(
+            [_make_coefficients(effect_class, 0.0), _make_coefficients(effect_class, 0.7)]
+        )
         observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
             lanes, make_scenario()
         )
@@ -105,7 +107,9 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
     touched = {}
     for effect_class in classes:
         look = f"{effect.__name__} at {effect_class.place or 'the world'}"
-        thetas = np.concatenate([_theta(effect_class, share) for share in (0.05, *_SHARES)])
+        thetas = np.concatenate(
+            [_make_coefficients(effect_class, share) for share in (0.05, *_SHARES)]
+        )
         observations = kind(observe=OBSERVED_CHANNELS, effects=[effect_class]).simulate(
             thetas, make_scenario()
         )
@@ -149,7 +153,7 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
         several = kind(observe=OBSERVED_CHANNELS, effects=members)
         # A family with one coefficient applies it at every place.
         shared = len(effect_class.parameters) < len(several.parameters)
-        theta = _theta(whole, 0.3)
+        theta = _make_coefficients(whole, 0.3)
         each = np.tile(theta, len(members)) if shared else theta
         check(
             is_bitwise_equal(
@@ -177,7 +181,7 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
         end = begin + len(effect_class.coefficients)
         for share in _SHARES:
             row = rows[0].copy()
-            row[:, begin:end] = _theta(effect_class, share)
+            row[:, begin:end] = _make_coefficients(effect_class, share)
             rows.append(row)
         begin = end
     lanes = np.concatenate(rows)
@@ -191,7 +195,7 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
     return None if classes else NO_PLACE
 
 
-def _theta(effect: type[Effect], share: float) -> Array:
+def _make_coefficients(effect: type[Effect], share: float) -> Array:
     """Return coefficients (1, K) at a fraction of their plausible ranges; all zero for 0."""
     ends = np.array([c.plausible[0] for c in effect.coefficients])
     theta: Array = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])

@@ -55,12 +55,12 @@ class SuiteResult(NamedTuple):
     @property
     def has_passed(self) -> bool:
         """Whether no check failed."""
-        return all(_outcome(line) != "failed" for line in self.lines.values())
+        return all(_get_outcome(line) != "failed" for line in self.lines.values())
 
     def to_document(self) -> dict[str, Any]:
         """Convert to a JSON document."""
         checks = [
-            {"check": title, "outcome": _outcome(line), "says": line.strip()}
+            {"check": title, "outcome": _get_outcome(line), "says": line.strip()}
             for title, line in self.lines.items()
         ]
         return {
@@ -85,7 +85,7 @@ def find_part_kind(name: str) -> str:
     raise make_unknown_name_error("tuner, simulator, effect or diagnoser", name, names)
 
 
-def _subject(kind: str, name: str) -> Any:
+def _get_subject(kind: str, name: str) -> Any:
     return {registry.kind: registry for registry in REGISTRIES}[kind].get(name)
 
 
@@ -100,7 +100,7 @@ def run_check(kind: str, name: str, place: int) -> str:
     Returns:
         Description of the failure, or an empty text.
     """
-    check, subject = SUITES[kind][place], _subject(kind, name)
+    check, subject = SUITES[kind][place], _get_subject(kind, name)
     known = getattr(subject, "known_failures", {}).get(check.__name__)
     try:
         outcome = check(subject)
@@ -137,20 +137,20 @@ def run_suite(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> 
         InputError: the name does not exist, or the subject cannot be used here.
     """
     kind = find_part_kind(name)
-    subject = _subject(kind, name)
+    subject = _get_subject(kind, name)
     lines = {}
-    for check, line in _lines(kind, name, plugins):
+    for check, line in _run_all_checks(kind, name, plugins):
         lines[title_of(check)] = line
         below = f"\n        {line.removeprefix(_EXPECTED_FAILURE_PREFIX)}" if line else ""
-        say(f"{_mark(line)}  {title_of(check)}{below}")
+        say(f"{_get_outcome_label(line)}  {title_of(check)}{below}")
     checked = SuiteResult(name, kind, f"{subject.__module__}.{subject.__qualname__}", lines)
-    say(f"{kind} {name} ({checked.qualified}): {_summary(checked)}")
+    say(f"{kind} {name} ({checked.qualified}): {_summarise_checks(checked)}")
     return checked
 
 
-def _summary(checked: SuiteResult) -> str:
+def _summarise_checks(checked: SuiteResult) -> str:
     """Summarise how many checks failed and how many were not run."""
-    outcomes = [_outcome(line) for line in checked.lines.values()]
+    outcomes = [_get_outcome(line) for line in checked.lines.values()]
     idle = {what: outcomes.count(what) for what in ("not tested", "not applicable")}
     checked_count, failed = len(outcomes) - sum(idle.values()), outcomes.count("failed")
     other_counts = "".join(f", {count} {what}" for what, count in idle.items() if count)
@@ -159,7 +159,7 @@ def _summary(checked: SuiteResult) -> str:
     return f"all {checked_count} checks passed{other_counts}"
 
 
-def _outcome(line: str) -> str:
+def _get_outcome(line: str) -> str:
     """Return the outcome that a check's line stands for; an empty line is a passed check."""
     for begin, outcome in _OUTCOMES.items():
         if line.startswith(begin):
@@ -167,7 +167,7 @@ def _outcome(line: str) -> str:
     return "failed" if line else "passed"
 
 
-def _mark(line: str) -> str:
+def _get_outcome_label(line: str) -> str:
     """Return the label printed before a check's title; an empty line is a passed check."""
     for begin, mark in _MARKS.items():
         if line.startswith(begin):
@@ -175,7 +175,7 @@ def _mark(line: str) -> str:
     return "FAILED" if line else "ok    "
 
 
-def _lines(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check, str]]:
+def _run_all_checks(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check, str]]:
     """Run the checks one after another, and yield each with its line (empty if it passed).
 
     After two checks that were killed or whose process died, no more checks are run.
@@ -199,13 +199,13 @@ def _lines(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check
                     [(run_check, (kind, name, place))], CALL_TIMEOUT_SECONDS
                 )
                 lost += isinstance(end, Exception) and not isinstance(end, InputError)
-                line = _line(end)
-            if _outcome(line) == "failed":
+                line = _format_check_end(end)
+            if _get_outcome(line) == "failed":
                 failed.append(check)
             yield check, line.strip().replace("\n", "\n        ")
 
 
-def _line(end: Any) -> str:
+def _format_check_end(end: Any) -> str:
     """Return the line of a check that ran in a worker process."""
     if isinstance(end, TimeoutError):
         return (

@@ -29,7 +29,7 @@ from sims.recording.unit_conversion import is_unit
 _NAME = re.compile(r"[a-z][a-z0-9_.]*$")
 
 
-def _scenario(
+def _make_scenario(
     kind: type[Simulator], samples: int = 40, rate: float = 60.0, size: float = 0.0
 ) -> Scenario:
     """Make a run from the default initial state.
@@ -45,12 +45,12 @@ def _scenario(
     return Scenario(times, inputs=waves)
 
 
-def _points(simulator: Simulator, n: int, seed: int = 0) -> Array:
+def _draw_points(simulator: Simulator, n: int, seed: int = 0) -> Array:
     cube = UnitCube(simulator.parameters)
     return cube.to_physical(np.random.default_rng(seed).uniform(size=(n, cube.dim)))
 
 
-def _named(kind: type[Simulator]) -> list[Parameter | Channel | Constant]:
+def _list_named_parts(kind: type[Simulator]) -> list[Parameter | Channel | Constant]:
     return [*kind.parameters, *kind.channels, *kind.constants, *kind.inputs]
 
 
@@ -68,7 +68,7 @@ def check_declaration_is_complete(kind: type[Simulator]) -> None:
     for group in groups:
         names = [thing.name for thing in group]
         check(len(set(names)) == len(names), "different names", names, look)
-    for thing in _named(kind):
+    for thing in _list_named_parts(kind):
         # The names of a robot are those of its model file and may contain any character.
         plain = kind.has_model or bool(_NAME.match(thing.name))
         check(plain, "a name in lower case", thing.name, look)
@@ -76,7 +76,7 @@ def check_declaration_is_complete(kind: type[Simulator]) -> None:
 
 def check_units_are_known(kind: type[Simulator]) -> None:
     """Check that every parameter, channel, constant and input has a unit that can be converted."""
-    for thing in _named(kind):
+    for thing in _list_named_parts(kind):
         check(
             is_unit(thing.unit),
             f"a unit for {thing.name} (such as m/s, rad, N*m; '1' for a number)",
@@ -89,7 +89,7 @@ def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
     """Check that observations are (n, T, C) and finite, for several n and T."""
     simulator, look = kind(), f"{kind.__name__}.simulate"
     for n, samples in ((1, 2), (3, 40), (1, 1)):
-        observations = simulator.simulate(_points(simulator, n), _scenario(kind, samples))
+        observations = simulator.simulate(_draw_points(simulator, n), _make_scenario(kind, samples))
         shape = (n, samples, len(simulator.channels))
         check(
             observations.shape == shape, f"observations of shape {shape}", observations.shape, look
@@ -108,9 +108,9 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
     vectors of the same call.
     """
     simulator, other = kind(), kind()
-    points = _points(simulator, 6)
+    points = _draw_points(simulator, 6)
     # Nonzero inputs, because their lasting effects, such as heat, would not be visible otherwise.
-    run, longer = _scenario(kind, size=1.0), _scenario(kind, 300, 50.0, size=3.0)
+    run, longer = _make_scenario(kind, size=1.0), _make_scenario(kind, 300, 50.0, size=3.0)
     together = simulator.simulate(points.copy(), run)
 
     def compare(observations: Array, after: str) -> None:
@@ -128,7 +128,7 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
                 "everything that a run has changed"
             )
 
-    simulator.simulate(_points(simulator, 2, seed=9), longer)
+    simulator.simulate(_draw_points(simulator, 2, seed=9), longer)
     compare(simulator.simulate(points.copy(), run), "after a run with other inputs")
     alone = [simulator.simulate(point[None].copy(), run) for point in points[::-1]]
     compare(np.concatenate(alone[::-1]), "one by one as all together")
@@ -156,8 +156,8 @@ def _first_difference(kind: type[Simulator], expected: Array, observations: Arra
 
 def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
     """Check that the simulator does not change `theta` and the scenario."""
-    simulator, scenario = kind(), _scenario(kind)
-    points = _points(simulator, 3)
+    simulator, scenario = kind(), _make_scenario(kind)
+    points = _draw_points(simulator, 3)
     before, times = points.copy(), scenario.times.copy()
     simulator.simulate(points, scenario)
     check(
@@ -172,11 +172,11 @@ def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
 def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simulator]) -> None:
     """Check that a NaN parameter makes its own batch element NaN, and no other."""
     simulator, look = kind(), f"{kind.__name__}.simulate"
-    points = _points(simulator, 3)
-    clean = simulator.simulate(points, _scenario(kind))
+    points = _draw_points(simulator, 3)
+    clean = simulator.simulate(points, _make_scenario(kind))
     # The middle element has neighbours on both sides.
     points[1] = np.nan
-    observations = simulator.simulate(points, _scenario(kind))
+    observations = simulator.simulate(points, _make_scenario(kind))
     check(bool(np.isnan(observations[1]).all()), "a lane of NaN", observations[1][:2], look)
     check(
         is_bitwise_equal(clean[[0, 2]], observations[[0, 2]]),
@@ -217,7 +217,7 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
     simulator = kind(observe=[c.name for c in kind.channels])
     scales = {c.name: c.scale for c in kind.channels}
     theta = np.array([[p.nominal for p in simulator.parameters]])
-    run = _scenario(kind, 600, size=1.0)
+    run = _make_scenario(kind, 600, size=1.0)
     observations = simulator.simulate(theta, run)
     for name, value in kind.states.items():
         other = value + _MOVED * max(abs(value), scales.get(name, 1.0))
@@ -248,7 +248,7 @@ def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
     )
 
     def simulating(scenario: Scenario) -> Callable[[], object]:
-        return lambda: kind().simulate(_points(kind(), 1), scenario)
+        return lambda: kind().simulate(_draw_points(kind(), 1), scenario)
 
     attempts: list[Callable[[], object]] = [simulating(s) for s in scenarios]
     attempts += [lambda: kind(constants={"no_such": 1.0}), lambda: kind(observe=["no_such"])]
@@ -271,10 +271,10 @@ def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotAppl
         everything.close()
         return NotApplicable("it has one channel")
     chosen = kind(observe=names)
-    points = _points(everything, 2)
+    points = _draw_points(everything, 2)
     same = is_bitwise_equal(
-        np.ascontiguousarray(everything.simulate(points, _scenario(kind))[:, :, ::-1]),
-        np.ascontiguousarray(chosen.simulate(points, _scenario(kind))),
+        np.ascontiguousarray(everything.simulate(points, _make_scenario(kind))[:, :, ::-1]),
+        np.ascontiguousarray(chosen.simulate(points, _make_scenario(kind))),
     )
     check(
         same, "the same columns in the order asked for", "others", f"{kind.__name__}: self.columns"

@@ -16,7 +16,7 @@ CALL_TIMEOUT_SECONDS = 120.0
 
 
 @cache
-def _pool(workers: int, plugins: tuple[str, ...]) -> LocalPool:
+def _get_pool(workers: int, plugins: tuple[str, ...]) -> LocalPool:
     """Return the pool with this number of workers and these plugins, which all checks share.
 
     It is closed when Python exits; starting workers for every check would take too long.
@@ -43,7 +43,7 @@ def call_in_processes(
     """
     plugins = (inspect.getfile(subject),) if subject.__module__.startswith("simgap_plugin_") else ()
     results = dict(
-        _pool(workers, plugins).iterate_results(
+        _get_pool(workers, plugins).iterate_results(
             [(function, argument) for argument in arguments], CALL_TIMEOUT_SECONDS
         )
     )

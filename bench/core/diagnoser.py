@@ -65,7 +65,7 @@ class NamedCause:
         return {
             "effect": self.effect,
             "alternatives": list(self.alternatives),
-            "coefficients": _intervals(self.coefficients),
+            "coefficients": _convert_intervals(self.coefficients),
             "p_value": self.p_value,
         }
 
@@ -104,17 +104,17 @@ class Answer:
         verdict = given.get("verdict")
         if verdict not in VERDICTS:
             raise InputError(f"verdict: expected one of {', '.join(VERDICTS)}, found {verdict!r}")
-        causes = _list("causes", given.get("causes") or [], _MAX_CAUSES)
+        causes = _check_list("causes", given.get("causes") or [], _MAX_CAUSES)
         parameters = _read_intervals("parameters", given.get("parameters") or {})
-        p = _probability(given.get("p_value"))
-        return cls(str(verdict), tuple(_named(cause) for cause in causes), parameters, p)
+        p = _convert_p_value(given.get("p_value"))
+        return cls(str(verdict), tuple(_convert_cause(cause) for cause in causes), parameters, p)
 
     def document(self) -> dict[str, Any]:
         """Convert to a JSON document with the keys of verdict.json that a diagnoser provides."""
         return {
             "verdict": self.verdict,
             "causes": [cause.document() for cause in self.causes],
-            "parameters": _intervals(self.parameters),
+            "parameters": _convert_intervals(self.parameters),
             "p_value": self.p_value,
         }
 
@@ -264,7 +264,7 @@ def list_named_sets(answer: Answer) -> list[tuple[str, ...]]:
     return [(cause.effect, *cause.alternatives) for cause in answer.causes]
 
 
-def _named(given: object) -> NamedCause:
+def _convert_cause(given: object) -> NamedCause:
     """Convert one cause of a diagnoser's answer to a `NamedCause`.
 
     `given` is the name of an effect, or a mapping with the key ``effect`` and optionally
@@ -278,24 +278,24 @@ def _named(given: object) -> NamedCause:
         given = {"effect": given}
     if not isinstance(given, Mapping) or not isinstance(given.get("effect"), str):
         raise InputError(f"causes: expected effects' names, found {given!r:.80}")
-    others = _list("alternatives", given.get("alternatives") or [], _MAX_ALTERNATIVES)
+    others = _check_list("alternatives", given.get("alternatives") or [], _MAX_ALTERNATIVES)
     if not all(isinstance(name, str) for name in others):
         raise InputError(f"alternatives: expected effects' names, found {others!r:.80}")
     return NamedCause(
         given["effect"],
         tuple(others),
         _read_intervals("coefficients", given.get("coefficients") or {}),
-        _probability(given.get("p_value")),
+        _convert_p_value(given.get("p_value")),
     )
 
 
-def _list(what: str, given: object, most: int) -> list[Any]:
+def _check_list(what: str, given: object, most: int) -> list[Any]:
     if not isinstance(given, list | tuple) or len(given) > most:
         raise InputError(f"{what}: expected a list of up to {most}, found {given!r:.80}")
     return list(given)
 
 
-def _probability(given: object) -> float | None:
+def _convert_p_value(given: object) -> float | None:
     """Convert a p-value of a diagnoser's answer; None stays None (no p-value given).
 
     Raises:
@@ -312,10 +312,10 @@ def _probability(given: object) -> float | None:
 def _read_intervals(what: str, given: object) -> dict[str, tuple[float | None, float | None]]:
     if not isinstance(given, Mapping):
         raise InputError(f"{what}: expected intervals by name, found {given!r:.80}")
-    return {str(name): _interval(what, value) for name, value in given.items()}
+    return {str(name): _convert_interval(what, value) for name, value in given.items()}
 
 
-def _interval(what: str, given: object) -> tuple[float | None, float | None]:
+def _convert_interval(what: str, given: object) -> tuple[float | None, float | None]:
     """Convert a confidence interval of a diagnoser's answer to (low, high).
 
     `given` is a pair, or a mapping with the keys ``low`` and ``high``. An end that is missing or
@@ -323,7 +323,7 @@ def _interval(what: str, given: object) -> tuple[float | None, float | None]:
     """
     if isinstance(given, Mapping):
         given = (given.get("low"), given.get("high"))
-    ends = _list(what, given, 2)
+    ends = _check_list(what, given, 2)
     if len(ends) != 2:
         raise InputError(f"{what}: expected (low, high), found {given!r:.80}")
     low, high = (
@@ -333,7 +333,7 @@ def _interval(what: str, given: object) -> tuple[float | None, float | None]:
     return low, high
 
 
-def _intervals(
+def _convert_intervals(
     given: Mapping[str, tuple[float | None, float | None]],
 ) -> dict[str, dict[str, float | None]]:
     return {name: {"low": low, "high": high} for name, (low, high) in given.items()}

@@ -32,11 +32,11 @@ A sample that is earlier than the step by less than this share belongs to the ne
 # All functions take the generator, so that they can be called in the same way.
 
 
-def _constant(t: Array, rng: np.random.Generator, value: float) -> Array:  # noqa: ARG001
+def _compute_constant(t: Array, rng: np.random.Generator, value: float) -> Array:  # noqa: ARG001
     return np.full(t.size, value)
 
 
-def _sine(
+def _compute_sine(
     t: Array,
     rng: np.random.Generator,  # noqa: ARG001
     amplitude: float,
@@ -47,7 +47,7 @@ def _sine(
     return signal
 
 
-def _square(
+def _compute_square_wave(
     t: Array,
     rng: np.random.Generator,  # noqa: ARG001
     amplitude: float,
@@ -61,7 +61,9 @@ def _square(
     return np.where(half_periods % 2 == 0, amplitude, -amplitude)
 
 
-def _steps(t: Array, rng: np.random.Generator, amplitude: float, seconds: float) -> Array:
+def _compute_random_steps(
+    t: Array, rng: np.random.Generator, amplitude: float, seconds: float
+) -> Array:
     """Compute random levels, uniform within +-amplitude, each held for the given number of seconds.
 
     `t` (T,) are times in s. `place` is the index of the level at each time.
@@ -72,7 +74,7 @@ def _steps(t: Array, rng: np.random.Generator, amplitude: float, seconds: float)
     return held
 
 
-def _chirp(
+def _compute_chirp(
     t: Array,
     rng: np.random.Generator,  # noqa: ARG001
     amplitude: float,
@@ -89,7 +91,7 @@ def _chirp(
     return signal
 
 
-def _multisine(
+def _compute_multisine(
     t: Array, rng: np.random.Generator, amplitude: float, low: float, high: float
 ) -> Array:
     """Compute a sum of `_MULTISINE_COUNT` sines from `low` to `high` (Hz), with random phases.
@@ -108,12 +110,12 @@ def _multisine(
 
 
 _FORMS: dict[str, tuple[Callable[..., Array], str]] = {
-    "constant": (_constant, "VALUE"),
-    "sine": (_sine, "AMPLITUDE:HERTZ"),
-    "square": (_square, "AMPLITUDE:HERTZ"),
-    "steps": (_steps, "AMPLITUDE:SECONDS"),
-    "chirp": (_chirp, "AMPLITUDE:HERTZ:HERTZ"),
-    "multisine": (_multisine, "AMPLITUDE:HERTZ:HERTZ"),
+    "constant": (_compute_constant, "VALUE"),
+    "sine": (_compute_sine, "AMPLITUDE:HERTZ"),
+    "square": (_compute_square_wave, "AMPLITUDE:HERTZ"),
+    "steps": (_compute_random_steps, "AMPLITUDE:SECONDS"),
+    "chirp": (_compute_chirp, "AMPLITUDE:HERTZ:HERTZ"),
+    "multisine": (_compute_multisine, "AMPLITUDE:HERTZ:HERTZ"),
 }
 """Function and argument names of each form of signal, by name."""
 
@@ -141,13 +143,13 @@ def evaluate_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
         InputError: there is no such form, or its numbers are not valid.
     """
     first, *others = text.split(" + ")
-    result = _one(first.strip(), times, rng)
+    result = _compute_signal(first.strip(), times, rng)
     for other in others:
-        result = result + _one(other.strip(), times, rng)
+        result = result + _compute_signal(other.strip(), times, rng)
     return result
 
 
-def _one(text: str, times: Array, rng: np.random.Generator) -> Array:
+def _compute_signal(text: str, times: Array, rng: np.random.Generator) -> Array:
     """Compute the values (T,) of one signal, such as ``sine:2:0.5``, without sums.
 
     The limits on the numbers prevent values that overflow, and signals that change too often.
@@ -171,7 +173,7 @@ def _one(text: str, times: Array, rng: np.random.Generator) -> Array:
         wanted = f"{name}:{form} with numbers, all but the first > 0"
         raise InputError(f"signal '{truncate_text(text)}': expected {wanted}")
     span = float(times[-1])
-    changes = [span / n if make is _steps else span * n for n in numbers[1:]]
+    changes = [span / n if make is _compute_random_steps else span * n for n in numbers[1:]]
     if max(map(abs, numbers)) > MAX_NUMBER or max([0.0, *changes]) > _MOST_CHANGES:
         wanted = f"numbers within {MAX_NUMBER:g}, and at most {_MOST_CHANGES:g} periods or levels"
         raise InputError(f"signal '{truncate_text(text)}': expected {wanted} in its {span:g} s")

@@ -79,7 +79,7 @@ def takes_options(
             return function(make(**given.arguments))
 
         call.__name__ = called
-        _describe(call, options, signature)
+        _set_signature(call, options, signature)
         return call
 
     return decorate
@@ -116,13 +116,13 @@ def with_options(
             make: Callable[..., Options] = options
             return function(given.pop(source.name, source.default), make(**given))
 
-        _describe(call, options, signature)
+        _set_signature(call, options, signature)
         return call
 
     return decorate
 
 
-def _describe(call: Any, options: Any, signature: inspect.Signature) -> None:
+def _set_signature(call: Any, options: Any, signature: inspect.Signature) -> None:
     """Give a function the signature of its callers, and the descriptions of its options.
 
     Without this, help() and editors would show ``*args, **kwargs``.

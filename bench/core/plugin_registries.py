@@ -95,7 +95,7 @@ def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
             continue
         before = [registry.snapshot() for registry in REGISTRIES]
         try:
-            _load(path)
+            _load_plugin_file(path)
         except InputError:
             # A partly registered plugin would count as loaded, and its error would not be reported
             # again.
@@ -104,7 +104,7 @@ def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
             raise
 
 
-def _load(path: Path) -> None:
+def _load_plugin_file(path: Path) -> None:
     """Load one plugin file, and register every part that it defines under its name.
 
     A TOML file is an extended simulator (the result of `simgap explain`); any other file is Python.
@@ -115,7 +115,7 @@ def _load(path: Path) -> None:
     if path.suffix == ".toml":
         simulators.register(load_extended(path, simulators.get), path)
         return
-    parts = _parts(_run(path))
+    parts = _find_plugin_classes(_execute_module(path))
     if not parts:
         raise InputError(
             f"plugin {path}: defines neither a Tuner nor a Simulator nor an Effect nor a Diagnoser"
@@ -124,7 +124,7 @@ def _load(path: Path) -> None:
         registry.register(part, path)
 
 
-def _parts(module: ModuleType) -> list[tuple[Registry[Any], type]]:
+def _find_plugin_classes(module: ModuleType) -> list[tuple[Registry[Any], type]]:
     """Return the non-abstract classes that the module defines, each with its registry."""
     own = [
         value
@@ -153,7 +153,7 @@ def _module_name(path: Path) -> str:
     return name
 
 
-def _run(path: Path) -> ModuleType:
+def _execute_module(path: Path) -> ModuleType:
     """Execute a plugin file as a module, and return the module.
 
     Raises:
@@ -175,11 +175,13 @@ def _run(path: Path) -> ModuleType:
         raise
     # This includes SystemExit and other exceptions that are not an `Exception`.
     except BaseException as error:
-        raise InputError(f"plugin {path}: {type(error).__name__}: {_said(error)}") from error
+        raise InputError(
+            f"plugin {path}: {type(error).__name__}: {_format_plugin_error(error)}"
+        ) from error
     return module
 
 
-def _said(error: BaseException) -> str:
+def _format_plugin_error(error: BaseException) -> str:
     """Return the message of an error; it is made by a plugin's code, which may fail again."""
     try:
         return str(error)

@@ -90,7 +90,8 @@ class ResourceNeed:
                 f"where {MAX_STEPS_PER_SIMULATION:g} take hours"
             )
         if self.seconds > MAX_TOTAL_SECONDS:
-            return f"{_long(self.seconds)}, where {_long(MAX_TOTAL_SECONDS)} are the most"
+            most = _format_long_duration(MAX_TOTAL_SECONDS)
+            return f"{_format_long_duration(self.seconds)}, where {most} are the most"
         return ""
 
 
@@ -125,7 +126,7 @@ def get_machine_resources(folder: Path | None = None) -> MachineResources:
         disk = float(shutil.disk_usage(place).free)
     except OSError:
         disk = math.inf
-    return MachineResources(_memory(), disk, _files(place))
+    return MachineResources(_read_available_memory(), disk, _count_free_inodes(place))
 
 
 def get_max_step(simulator: Simulator) -> float:
@@ -133,7 +134,7 @@ def get_max_step(simulator: Simulator) -> float:
     return simulator.engine.largest_step if isinstance(simulator, SystemSimulator) else math.inf
 
 
-def _memory() -> float:
+def _read_available_memory() -> float:
     """Return the memory in bytes: the machine's, or the limit of a container."""
     limits = [math.inf]
     with suppress(AttributeError, OSError, ValueError):  # a system that does not state it
@@ -143,7 +144,7 @@ def _memory() -> float:
     return min(limit for limit in limits if limit > 0)
 
 
-def _files(place: Path) -> float:
+def _count_free_inodes(place: Path) -> float:
     """Return the number of files that can still be created (free inodes); infinite if unknown."""
     try:
         free = os.statvfs(place).f_favail
@@ -162,6 +163,6 @@ def format_bytes(count: float) -> str:
     return f"{count:.3g} EB"
 
 
-def _long(seconds: float) -> str:
+def _format_long_duration(seconds: float) -> str:
     days = seconds / 86400
     return f"{days:.3g} days" if days < 1000 else f"{days / 365.25:.3g} years"

@@ -146,7 +146,7 @@ def find(kind: str, path: str) -> Path | None:
 
 def names() -> list[str]:
     """List the names of all data sets."""
-    return list(_catalogue())
+    return list(_read_catalogue())
 
 
 def get(name: str) -> DataSet:
@@ -155,9 +155,9 @@ def get(name: str) -> DataSet:
     Raises:
         InputError: no data set has this name; the message lists the known names.
     """
-    if name not in _catalogue():
+    if name not in _read_catalogue():
         raise make_unknown_name_error("data set", name, names())
-    return _catalogue()[name]
+    return _read_catalogue()[name]
 
 
 def providing(kind: str, path: str) -> DataSet | None:
@@ -168,12 +168,12 @@ def providing(kind: str, path: str) -> DataSet | None:
         path: path of the file, with the name of the data set as its folder.
     """
     folder, _, file = path.replace("\\", "/").rpartition("/")
-    found = _catalogue().get(folder)
+    found = _read_catalogue().get(folder)
     return found if found and found.kind == kind and file in found.provides else None
 
 
 @cache
-def _catalogue() -> dict[str, DataSet]:
+def _read_catalogue() -> dict[str, DataSet]:
     """Read datasets.toml, and return its data sets by name."""
     text = resources.files(__package__).joinpath("datasets.toml").read_text(encoding="utf-8")
     return {name: _data_set(name, table) for name, table in tomllib.loads(text).items()}

@@ -54,19 +54,19 @@ def download(
             "delete it, or choose another folder with --out"
         )
     contents = {
-        file.name: _checked(file, *_fetched(data_set, file, source, advance))
+        file.name: _check_content(file, *_fetch_file(data_set, file, source, advance))
         for file in data_set.files
     }
     written: dict[str, Content] = dict(contents)
     if data_set.conversion:
         kept = {"LICENSE": contents["LICENSE"]}
         written = {**CONVERSIONS[data_set.conversion](contents), **kept}
-    written["SOURCE.txt"] = _provenance(data_set)
-    _write(target, written)
+    written["SOURCE.txt"] = _format_provenance(data_set)
+    _write_folder(target, written)
     return target
 
 
-def _fetched(
+def _fetch_file(
     data_set: DataSet, file: SourceFile, source: str, advance: Advance
 ) -> tuple[str, bytes]:
     """Fetch a file from the folder or address that the user gave, or from the public repository.
@@ -84,14 +84,16 @@ def _fetched(
         InputError: The source is of another form, or the file cannot be read.
     """
     if source and "://" not in source:
-        return _read(data_set, file, Path(source), advance)
+        return _read_file(data_set, file, Path(source), advance)
     if source and not source.startswith(("http://", "https://")):
         raise InputError(f"--from {source}: expected a folder, or an http or https address")
     url = f"{(source or data_set.base_url).rstrip('/')}/{file.path}"
-    return url, _received(url, data_set, file, advance)
+    return url, _download_content(url, data_set, file, advance)
 
 
-def _read(data_set: DataSet, file: SourceFile, folder: Path, advance: Advance) -> tuple[str, bytes]:
+def _read_file(
+    data_set: DataSet, file: SourceFile, folder: Path, advance: Advance
+) -> tuple[str, bytes]:
     """Read a file from a folder that contains a clone, or the files without subfolders.
 
     At most one byte more than expected is read: enough to see that the file is too long.
@@ -123,7 +125,7 @@ def _read(data_set: DataSet, file: SourceFile, folder: Path, advance: Advance) -
     raise InputError(f"{folder}: expected {file.path} of {where}, or the file alone; found neither")
 
 
-def _received(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -> bytes:
+def _download_content(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -> bytes:
     """Download the content of an address, in blocks.
 
     At most one byte more than expected is received: enough to see that the file is too long.
@@ -157,7 +159,7 @@ def _received(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -
     return content
 
 
-def _checked(file: SourceFile, where: str, content: bytes) -> bytes:
+def _check_content(file: SourceFile, where: str, content: bytes) -> bytes:
     """Return the content of a file if it is the published one.
 
     Args:
@@ -181,7 +183,7 @@ def _checked(file: SourceFile, where: str, content: bytes) -> bytes:
     return content
 
 
-def _provenance(data_set: DataSet) -> str:
+def _format_provenance(data_set: DataSet) -> str:
     """Format SOURCE.txt: source, citation, licence and hashes of the files."""
     lines = [
         data_set.title,
@@ -198,7 +200,7 @@ def _provenance(data_set: DataSet) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write(target: Path, contents: dict[str, Content]) -> None:
+def _write_folder(target: Path, contents: dict[str, Content]) -> None:
     """Write the folder of a data set as a whole, or not at all.
 
     Args:

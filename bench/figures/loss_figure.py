@@ -52,7 +52,7 @@ def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
         for seed in seeds:
             values = np.array([row[2:] for row in rows if row[:2] == (seed, stage)])
             # The legend lists the lines of the first seed only.
-            _lines(axis, values.T, named=seed == seeds[0])
+            _draw_losses(axis, values.T, named=seed == seeds[0])
         axis.set(
             title=_STAGES.get(stage, stage),
             xlabel="epoch (pass over the training data)",
@@ -66,7 +66,7 @@ def draw_loss_figure(title: str, rows: Sequence[LossRow]) -> Figure:
     return figure
 
 
-def _lines(axis: Axes, values: Array, named: bool) -> None:
+def _draw_losses(axis: Axes, values: Array, named: bool) -> None:
     """Draw one training; `values` are (3, epochs): epoch, training loss, held-out loss."""
     epochs, training, held_out = values
     for losses, line, colour, name in (

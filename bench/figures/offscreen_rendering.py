@@ -59,14 +59,14 @@ def render_robot(model: Any, positions: Array, view: Projection) -> Image | None
     for backend in list_gl_backends():
         if backend in _failed:
             continue
-        image = _asked(backend, model, positions, view)
+        image = _render_in_child(backend, model, positions, view)
         if image is not None:
             return image
         _failed.add(backend)
     return None
 
 
-def _asked(backend: str, model: Any, positions: Array, view: Projection) -> Image | None:
+def _render_in_child(backend: str, model: Any, positions: Array, view: Projection) -> Image | None:
     """Render a robot in a child process with one OpenGL backend; return None if that fails.
 
     A missing graphics driver may crash a process, so it must not be this one. `positions` is
@@ -100,7 +100,7 @@ def _asked(backend: str, model: Any, positions: Array, view: Projection) -> Imag
 
 
 def render_requested(folder: str) -> None:
-    """Render the request that `_asked` has stored in a folder; any error ends the process."""
+    """Render the request that `_render_in_child` stored in a folder; any error ends the process."""
     import mujoco
 
     folder_path = Path(folder)
@@ -111,10 +111,10 @@ def render_requested(folder: str) -> None:
     data = mujoco.MjData(model)
     data.qpos[:] = request["qpos"]
     mujoco.mj_forward(model, data)
-    np.save(folder_path / "image.npy", _drawn(mujoco, model, data, view))
+    np.save(folder_path / "image.npy", _render_image(mujoco, model, data, view))
 
 
-def _drawn(mujoco: Any, model: Any, data: Any, view: Projection) -> Image:
+def _render_image(mujoco: Any, model: Any, data: Any, view: Projection) -> Image:
     """Render the robot by MuJoCo in grey on a white background, in parallel projection."""
     scale = MAX_IMAGE_PIXELS / max(view.width, view.height)
     rows, columns = (max(2, round(scale * size)) for size in (view.height, view.width))

@@ -40,14 +40,14 @@ def encoded_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) -
     return b"".join(
         (
             _SIGNATURE,
-            _chunk(b"IHDR", struct.pack(">II5B", width, height, *_EIGHT_BITS_RGB)),
-            _chunk(b"pHYs", struct.pack(">IIB", density, density, 1)),
-            _chunk(b"IDAT", zlib.compress(rows.tobytes(), _LEVEL)),
-            _chunk(b"IEND", b""),
+            _make_chunk(b"IHDR", struct.pack(">II5B", width, height, *_EIGHT_BITS_RGB)),
+            _make_chunk(b"pHYs", struct.pack(">IIB", density, density, 1)),
+            _make_chunk(b"IDAT", zlib.compress(rows.tobytes(), _LEVEL)),
+            _make_chunk(b"IEND", b""),
         )
     )
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
+def _make_chunk(kind: bytes, data: bytes) -> bytes:
     """Return a chunk of a PNG file with its length and checksum."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -75,21 +75,21 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
         kind: Simulator class of its system, which declares names and units.
     """
     signals = list_recorded_signals(recording, kind)
-    placed = _placed(recording.runs)
+    placed = _place_runs(recording.runs)
     width = float(np.clip(3 + 0.8 * len(placed), 9, 16))
     figure, axes = make_panel_grid(len(signals), 1, (width, 1.2 + 2.0 * len(signals)), sharex=True)
     for axis, (channel, what) in zip(axes[:, 0], signals, strict=True):
-        unit = "" if channel.unit == "1" else f" [{_pretty(channel.unit)}]"
+        unit = "" if channel.unit == "1" else f" [{_format_unit(channel.unit)}]"
         axis.set_ylabel(f"{channel.name}{unit}\n({what})")
         for part in placed:
             values = part.run.channels.get(channel.name)
-            _panel(axis, part, part.run.inputs[channel.name] if values is None else values)
+            _draw_signal(axis, part, part.run.inputs[channel.name] if values is None else values)
     panels = list(axes[:, 0])
-    _finish(panels, placed)
-    _named(panels[0], placed)
-    _titled(panels[0], recording, placed)
+    _style_panels(panels, placed)
+    _draw_run_names(panels[0], placed)
+    _draw_title(panels[0], recording, placed)
     figure.legend(
-        handles=_marks(recording, placed),
+        handles=_make_mark_legend(recording, placed),
         loc="outside lower center",
         ncols=3,
         fontsize=8,
@@ -98,11 +98,11 @@ def draw_recording_figure(recording: Recording, kind: type[Simulator]) -> Figure
     return figure
 
 
-def _pretty(unit: str) -> str:
+def _format_unit(unit: str) -> str:
     return unit.replace("^2", "²").replace("^3", "³").replace("*", "·")
 
 
-def _placed(runs: Sequence[Run]) -> list[_PlacedRun]:
+def _place_runs(runs: Sequence[Run]) -> list[_PlacedRun]:
     """Place runs end to end with small gaps; of too many runs, use evenly spaced ones."""
     if len(runs) > _MOST_RUNS:
         chosen = np.linspace(0, len(runs) - 1, _MOST_RUNS).round().astype(int)
@@ -114,7 +114,7 @@ def _placed(runs: Sequence[Run]) -> list[_PlacedRun]:
     return [_PlacedRun(run, float(begin)) for run, begin in zip(runs, begins, strict=True)]
 
 
-def _panel(axis: Axes, part: _PlacedRun, values: Array) -> None:
+def _draw_signal(axis: Axes, part: _PlacedRun, values: Array) -> None:
     """Draw one signal of one run at its position on the common time axis.
 
     Missing samples are marked at the foot; a held-out run is shaded.
@@ -123,7 +123,7 @@ def _panel(axis: Axes, part: _PlacedRun, values: Array) -> None:
     if part.run.held_out:
         axis.axvspan(float(times[0]), float(times[-1]), color=HELD_OUT_GREY, linewidth=0)
     missing = np.isnan(values)
-    t, y = _decimate(times, values)
+    t, y = _reduce_points(times, values)
     # A sample between two missing ones forms no line and needs a marker to be visible.
     marked = values.size <= _FEW_SAMPLES or missing.mean() > 0.2
     colour = _HELD_OUT if part.run.held_out else _FITTING
@@ -135,7 +135,7 @@ def _panel(axis: Axes, part: _PlacedRun, values: Array) -> None:
         axis.plot(times[missing], foot, "|", color="black", markersize=5, transform=across)
 
 
-def _decimate(times: Array, values: Array) -> tuple[Array, Array]:
+def _reduce_points(times: Array, values: Array) -> tuple[Array, Array]:
     """Reduce a signal (T,) to about `_MOST_POINTS` points: minimum and maximum of each part.
 
     The curve then looks the same, and the file stays small.
@@ -155,7 +155,7 @@ def _decimate(times: Array, values: Array) -> tuple[Array, Array]:
     return times[rows], values[rows]
 
 
-def _finish(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
+def _style_panels(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
     """Style the panels, and mark with dotted lines where each run after the first begins.
 
     `axes` has the panels from top to bottom; the last one gets the label of the time axis.
@@ -169,7 +169,7 @@ def _finish(axes: Sequence[Axes], placed: Sequence[_PlacedRun]) -> None:
     axes[-1].set_xlabel("time, runs end to end [s]; above: their names")
 
 
-def _named(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
+def _draw_run_names(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
     """Write the name of each run above the first panel, in the middle of the run."""
     for part in placed:
         middle = float(part.times[[0, -1]].mean())
@@ -186,13 +186,13 @@ def _named(axis: Axes, placed: Sequence[_PlacedRun]) -> None:
         )
 
 
-def _titled(axis: Axes, recording: Recording, placed: Sequence[_PlacedRun]) -> None:
+def _draw_title(axis: Axes, recording: Recording, placed: Sequence[_PlacedRun]) -> None:
     total = len(recording.runs)
     selection = f", {len(placed)} of {total} runs" if len(placed) < total else ""
     axis.set_title(f"{recording.title}{selection}", fontsize=11, pad=16)
 
 
-def _marks(recording: Recording, placed: Sequence[_PlacedRun]) -> list[Line2D]:
+def _make_mark_legend(recording: Recording, placed: Sequence[_PlacedRun]) -> list[Line2D]:
     """Make the legend entries for the marks that are present."""
     from matplotlib.lines import Line2D
 

@@ -102,11 +102,11 @@ def draw_robot_figure(
     """
     data = make_posed_data(robot, dict(positions))
     projection = choose_projection(robot, data)
-    labels = _labels(robot, data, projection, marks)
-    sides = _sides(labels)
-    columns = [_breadth(side) for side in sides]
+    labels = _make_labels(robot, data, projection, marks)
+    sides = _divide_labels(labels)
+    columns = [_compute_column_width(side) for side in sides]
     scale = MAX_SIDE_INCHES / max(projection.width, projection.height)
-    needed = max(_height(side) for side in sides)
+    needed = max(_compute_column_height(side) for side in sides)
     width, height = scale * projection.width, scale * projection.height
     tall = max(height, needed)
     spare = max(0.0, least - sum(columns) - width) / 2
@@ -139,7 +139,9 @@ def draw_robot_figure(
     for side, ((left, right), begin) in enumerate(
         zip(((1, 0), (0, 1)), (-0.12, 0.12), strict=True)
     ):
-        _write(axis, sides[side], left * -across + right * across + begin / scale, scale, tall)
+        _draw_label_column(
+            axis, sides[side], left * -across + right * across + begin / scale, scale, tall
+        )
     _draw_scale_bar(axis, projection, scale, tall)
     return figure
 
@@ -175,7 +177,7 @@ def _has_shapes(robot: RobotModel) -> bool:
     return any(int(model.body_weldid[body]) for body in model.geom_bodyid.tolist())
 
 
-def _labels(
+def _make_labels(
     robot: RobotModel, data: Any, projection: Projection, marks: Sequence[PlaceMark]
 ) -> list[_Label]:
     """Make a label for each marked place, and for the other joints if the robot has few.
@@ -206,7 +208,7 @@ def _labels(
     return labels
 
 
-def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
+def _divide_labels(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
     """Divide labels between the left and the right column, each from top to bottom.
 
     Each label is on the side of its place, as long as there is space.
@@ -214,20 +216,22 @@ def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
     across = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
     count = sum(label.point[0] < 0 for label in across)
     # A column is not longer than the drawing, unless both columns are.
-    while count and _height(across[:count]) > max(MAX_SIDE_INCHES, _height(across[count:])):
+    while count and _compute_column_height(across[:count]) > max(
+        MAX_SIDE_INCHES, _compute_column_height(across[count:])
+    ):
         count -= 1
-    while count < len(across) and _height(across[count:]) > max(
-        MAX_SIDE_INCHES, _height(across[:count])
+    while count < len(across) and _compute_column_height(across[count:]) > max(
+        MAX_SIDE_INCHES, _compute_column_height(across[:count])
     ):
         count += 1
-    return _downwards(across[:count]), _downwards(across[count:])
+    return _sort_downwards(across[:count]), _sort_downwards(across[count:])
 
 
-def _height(labels: Sequence[_Label]) -> float:
+def _compute_column_height(labels: Sequence[_Label]) -> float:
     return sum(label.height for label in labels)
 
 
-def _breadth(labels: Sequence[_Label]) -> float:
+def _compute_column_width(labels: Sequence[_Label]) -> float:
     """Return the width of a column in inches: its longest line and the connecting line."""
     if not labels:
         return 0.3
@@ -235,7 +239,7 @@ def _breadth(labels: Sequence[_Label]) -> float:
     return max(MIN_LABEL_COLUMN_INCHES, 0.3 + LETTER_WIDTH_INCHES * longest)
 
 
-def _downwards(labels: Sequence[_Label]) -> list[_Label]:
+def _sort_downwards(labels: Sequence[_Label]) -> list[_Label]:
     return sorted(labels, key=lambda label: -label.point[1])
 
 
@@ -264,7 +268,9 @@ def arrange_labels(
     return middles
 
 
-def _write(axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float) -> None:
+def _draw_label_column(
+    axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float
+) -> None:
     """Write a column of labels at `x` metres.
 
     `scale` is in inches per metre, `tall` is the height of the column in inches.

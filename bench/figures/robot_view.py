@@ -56,7 +56,7 @@ class Projection:
     @property
     def axes(self) -> Array:
         """(3, 3) unit vectors in rows: right, up, forward."""
-        return _axes(self.azimuth, self.elevation)
+        return _compute_camera_axes(self.azimuth, self.elevation)
 
     def project(self, points: Array) -> Array:
         """Project points (N, 3) to (N, 2) metres to the right and up from the middle."""
@@ -64,7 +64,7 @@ class Projection:
         return projected
 
 
-def _axes(azimuth: float, elevation: float) -> Array:
+def _compute_camera_axes(azimuth: float, elevation: float) -> Array:
     """Return the unit vectors right, up and forward of a camera, in the rows of a (3, 3) array.
 
     The angles are in degrees, by the convention of MuJoCo's free camera.
@@ -102,10 +102,10 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
         robot: The robot.
         data: MuJoCo data at the pose.
     """
-    azimuth, elevation = _direction(robot, data)
-    axes = _axes(azimuth, elevation)
+    azimuth, elevation = _choose_view_angles(robot, data)
+    axes = _compute_camera_axes(azimuth, elevation)
     moving, still = compute_bounding_points(robot.compiled, data)
-    points = np.concatenate([data.xanchor, moving, _tips(robot.compiled, data)]) @ axes.T
+    points = np.concatenate([data.xanchor, moving, _find_end_points(robot.compiled, data)]) @ axes.T
     low, high = points.min(axis=0), points.max(axis=0)
     if len(still):
         # A floor or a long rail would make the robot too small.
@@ -118,7 +118,7 @@ def choose_projection(robot: RobotModel, data: Any) -> Projection:
     return Projection(azimuth, elevation, (low + high) / 2 @ axes, float(width), float(height))
 
 
-def _tips(model: Any, data: Any) -> Array:
+def _find_end_points(model: Any, data: Any) -> Array:
     """Return the (N, 3) drawn ends of bodies that have neither shapes nor child bodies.
 
     The end is the body's joint mirrored at its centre of mass.
@@ -129,19 +129,19 @@ def _tips(model: Any, data: Any) -> Array:
     return tips
 
 
-def _direction(robot: RobotModel, data: Any) -> tuple[float, float]:
+def _choose_view_angles(robot: RobotModel, data: Any) -> tuple[float, float]:
     """Choose azimuth and elevation of the camera, in degrees.
 
     A planar robot is viewed along its common axis; another one from where its joints look widest.
     """
-    normal = _normal(robot, data)
+    normal = _find_motion_plane_normal(robot, data)
     if normal is not None and abs(normal[2]) > 1 - PARALLEL_SINE_TOLERANCE:
         return 90.0, -90.0
     if normal is not None:
         azimuth = float(np.rad2deg(np.arctan2(normal[1], normal[0]))) % 360
         elevation = float(np.rad2deg(np.arcsin(np.clip(normal[2], -1, 1))))
         # Of the two sides, use the one where x points to the right, as in a drawing.
-        right = _axes(azimuth, elevation)[0]
+        right = _compute_camera_axes(azimuth, elevation)[0]
         flipped = right @ (1.0, 1e-3, 0.0) < 0
         return ((azimuth + 180) % 360, -elevation) if flipped else (azimuth, elevation)
     moving, _ = compute_bounding_points(robot.compiled, data)
@@ -149,7 +149,7 @@ def _direction(robot: RobotModel, data: Any) -> tuple[float, float]:
 
     def spread(azimuth: float) -> float:
         """Return how widely the joints are spread in the picture from an azimuth, in m²."""
-        projected = points @ _axes(azimuth, ELEVATION_DEG)[:2].T
+        projected = points @ _compute_camera_axes(azimuth, ELEVATION_DEG)[:2].T
         sizes = np.linalg.svd(projected - projected.mean(axis=0), compute_uv=False)
         return float(np.prod(sizes))
 
@@ -158,7 +158,7 @@ def _direction(robot: RobotModel, data: Any) -> tuple[float, float]:
     return max(CANDIDATE_AZIMUTHS_DEG, key=lambda azimuth: round(spread(azimuth), 9)), ELEVATION_DEG
 
 
-def _normal(robot: RobotModel, data: Any) -> Array | None:
+def _find_motion_plane_normal(robot: RobotModel, data: Any) -> Array | None:
     """Return (3,) the normal of the plane in which a planar robot moves; None for others."""
     if not all(joint.has_one_coordinate for joint in robot.joints):
         return None
@@ -197,15 +197,15 @@ def compute_bounding_points(model: Any, data: Any) -> tuple[Array, Array]:
         shaped.add(body)
         box = model.geom_aabb[g, :3] + corners * model.geom_aabb[g, 3:]
         turn = data.geom_xmat[g].reshape(3, 3)
-        parts[_still(model, body)].append(data.geom_xpos[g] + box @ turn.T)
+        parts[_is_static_body(model, body)].append(data.geom_xpos[g] + box @ turn.T)
     for body in range(1, model.nbody):
         if body not in shaped:
-            parts[_still(model, body)].append(data.xipos[body][None])
+            parts[_is_static_body(model, body)].append(data.xipos[body][None])
     moving, still = (np.concatenate(part) for part in parts)
     return moving, still
 
 
-def _still(model: Any, body: int) -> bool:
+def _is_static_body(model: Any, body: int) -> bool:
     return int(model.body_weldid[body]) == 0
 
 

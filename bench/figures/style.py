@@ -119,7 +119,7 @@ def get_colour(place: int) -> str:
 
 def get_marker(place: int) -> str:
     """Return the marker of the tuner or diagnoser at this index."""
-    return _marker(place)
+    return _get_marker(place)
 
 
 def get_line_style(place: int) -> Any:
@@ -162,7 +162,7 @@ class MarkStyle(NamedTuple):
     marker: str = ""
 
 
-def _marker(place: int) -> str:
+def _get_marker(place: int) -> str:
     """Return the marker at an index; it is combined with another colour in each round."""
     rounds = place // len(_COLOURS)
     return _MARKERS[(place + 3 * rounds) % len(_MARKERS)]
@@ -172,7 +172,7 @@ def get_mark_style(place: int) -> MarkStyle:
     """Return the style at an index of a list; neighbours differ in greyscale, too."""
     colour, line = _COLOURS[place % len(_COLOURS)], _LINES[place % len(_LINES)]
     dashes = _DASHES[line] if isinstance(line, str) else tuple(map(float, line[1]))
-    return MarkStyle(colour, _DARK[colour], dashes, _marker(place))
+    return MarkStyle(colour, _DARK[colour], dashes, _get_marker(place))
 
 
 def make_mark_style(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> MarkStyle:
@@ -216,7 +216,7 @@ class TunerStyles:
         i = self._places[tuner]
         return {
             "color": _COLOURS[i % len(_COLOURS)],
-            "marker": _marker(i),
+            "marker": _get_marker(i),
             "linestyle": _LINES[i % len(_LINES)],
             "linewidth": 1.6,
             "label": tuner,
@@ -242,7 +242,7 @@ class TunerStyles:
         i = self._places[tuner] if tuner in self._places else taken + others.index(tuner)
         return {
             "color": REFERENCE_GREYS[self.behind.index(reference)],
-            "marker": _marker(i),
+            "marker": _get_marker(i),
             "markerfacecolor": "white",
             "markersize": 3.5,
             "linestyle": _LINES[i % len(_LINES)],

@@ -49,7 +49,7 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
     """
     figure, axes = make_panel_grid(1, 3, (13, 4.3), gridspec_kw={"width_ratios": (1, 1.2, 1.2)})
     scene, above, below = axes[0]
-    _scene(scene, track)
+    _draw_scene(scene, track)
     _over_time(above, track, part, heights.z, "height of the centre z [m]")
     _over_time(below, track, part, track.radius, "radius [px]")
     above.axhline(heights.radius, color="black", linewidth=0.6, linestyle=":")
@@ -61,14 +61,14 @@ def draw_track_figure(track: BallTrack, heights: BallHeights, part: slice, title
     return figure
 
 
-def _scene(axis: Axes, track: BallTrack) -> None:
+def _draw_scene(axis: Axes, track: BallTrack) -> None:
     """Draw the track on the background with some outlines, on white for dark scenes."""
     from matplotlib.patches import Circle
 
-    axis.imshow(_overlaid(track), interpolation="nearest")
+    axis.imshow(_overlay_balls(track), interpolation="nearest")
     axis.plot(track.u, track.v, "-", color="white", linewidth=2.4)
     axis.plot(track.u, track.v, ".-", color=_SEEN, linewidth=0.8, markersize=2.5)
-    for k in _some(track):
+    for k in _choose_frames(track):
         middle = (track.u[k], track.v[k])
         for colour, width in (("black", 1.6), ("white", 0.8)):
             outline = Circle(middle, track.radius[k], fill=False, color=colour, linewidth=width)
@@ -92,7 +92,7 @@ def _over_time(axis: Axes, track: BallTrack, part: slice, values: Array, label: 
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _some(track: BallTrack) -> list[int]:
+def _choose_frames(track: BallTrack) -> list[int]:
     """Return the indices of a few frames with the ball, evenly spaced along its path."""
     visible = track.visible_frames.tolist()
     steps = np.hypot(np.diff(track.u[visible]), np.diff(track.v[visible]))
@@ -104,7 +104,7 @@ def _some(track: BallTrack) -> list[int]:
     return [visible[i] for i in np.unique(indices)]
 
 
-def _overlaid(track: BallTrack) -> RgbImage:
+def _overlay_balls(track: BallTrack) -> RgbImage:
     """Return the background with the balls of a few frames copied into it."""
     picture = track.background.copy()
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]

@@ -113,10 +113,10 @@ def compute_heights_by_scale(
     Raises:
         InputError: The film does not show what the method needs.
     """
-    q = _place(track) / _radius(track)
-    arcs = _arcs(track.times, q)
-    ground = _ground(track, q, arcs)
-    fallen = _factor(arcs)
+    q = _compute_fall_position(track) / _smooth_radius(track)
+    arcs = _fit_free_flights(track.times, q)
+    ground = _estimate_ground_position(track, q, arcs)
+    fallen = _compute_gravity_scale(arcs)
     notes = []
     if diameter is None or scale == "fall":
         if fallen is None:
@@ -142,10 +142,10 @@ def compute_heights_by_scale(
     return BallHeights(ball + factor * (ground - q), ball, how, tuple(notes))  # Equation (2).
 
 
-def _place(track: BallTrack) -> Array:
+def _compute_fall_position(track: BallTrack) -> Array:
     """Return the position along the line of the fall, downwards positive, in pixels.
 
-    The perspective along that line is described by `_radius`.
+    The perspective along that line is described by `_smooth_radius`.
     """
     seen = track.visible_frames
     points = np.stack([track.u[seen], track.v[seen]], axis=1)
@@ -161,12 +161,12 @@ def _place(track: BallTrack) -> Array:
     return result
 
 
-def _radius(track: BallTrack) -> Array:
+def _smooth_radius(track: BallTrack) -> Array:
     """Smooth the radius (T,) of the ball in pixels, as a linear function of its position.
 
     The outline in a single frame is too noisy. Frames far from the line get a small weight.
     """
-    s, seen = _place(track), track.visible_frames
+    s, seen = _compute_fall_position(track), track.visible_frames
     places, radii = s[seen], track.radius[seen]
     line = np.polyfit(places, radii, 1)
     for _ in range(_FITS):
@@ -179,7 +179,7 @@ def _radius(track: BallTrack) -> Array:
     return result
 
 
-def _arcs(times: Array, q: Array) -> list[_Flight]:
+def _fit_free_flights(times: Array, q: Array) -> list[_Flight]:
     """Divide the motion of the ball at its bounces, and fit a parabola to each free flight.
 
     `q` (T,) is the position downwards, in ball radii; NaN where the ball was not detected.
@@ -204,7 +204,7 @@ def _arcs(times: Array, q: Array) -> list[_Flight]:
     return arcs
 
 
-def _factor(arcs: list[_Flight]) -> float | None:
+def _compute_gravity_scale(arcs: list[_Flight]) -> float | None:
     """Return the S for which the flights fall with gravity; None without a falling flight."""
     falling = [arc for arc in arcs if arc.curve[0] > 0]
     if not falling:
@@ -214,7 +214,7 @@ def _factor(arcs: list[_Flight]) -> float | None:
     return float(DEFAULT_GRAVITY / mean)  # Equation (3).
 
 
-def _ground(track: BallTrack, q: Array, arcs: list[_Flight]) -> float:
+def _estimate_ground_position(track: BallTrack, q: Array, arcs: list[_Flight]) -> float:
     """Return the position q, in ball radii, at which the ball touches the ground.
 
     It is where two successive flights meet, or the lowest position if there is only one flight.
@@ -246,7 +246,7 @@ def estimate_height_noise(times: Array, z: Array) -> float:
         Standard deviation (1 sigma) in m; NaN without a flight.
     """
     squares, freedom = 0.0, 0
-    for arc in _arcs(times, -z):
+    for arc in _fit_free_flights(times, -z):
         inside = (times >= arc.begin) & (times <= arc.end) & np.isfinite(z)
         t = times[inside] - arc.begin
         if len(t) > _MIN_FLIGHT_FRAMES:
@@ -259,7 +259,7 @@ def estimate_height_noise(times: Array, z: Array) -> float:
 
 def find_release_frame(track: BallTrack) -> int:
     """Find the frame at which the ball begins to move; the first one unless it is held before."""
-    s, seen = _place(track), track.visible_frames
+    s, seen = _compute_fall_position(track), track.visible_frames
     start = float(np.median(s[seen[:5]]))
     # Up to a pixel, or four sigmas, is a trembling hand or an error of the outline, not a fall.
     moved = np.flatnonzero(np.abs(s[seen] - start) > max(1.0, 4 * track.noise))

@@ -74,12 +74,12 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
     if about.constants:
         stated = check_table(name, "constants", meta.get("constants", {}))
         meta["constants"] = {**stated, **about.constants}
-    kind = _kind(name, meta)
+    kind = _get_simulator_class(name, meta)
     meta.setdefault("title", f"{kind.name}, {name}")
     return recording_of_frame(frame, kind, meta, about.units or {}, name)
 
 
-def _kind(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
+def _get_simulator_class(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
     """Return the simulator class of the system or robot model that a description names.
 
     Raises:

@@ -59,7 +59,7 @@ def write_film(
         missing = "has missing samples; a film shows the ball in every frame"
         raise InputError(f"{recording}: run {chosen.name}: {missing}")
     check_film_size(recording, len(positions), pixels, force)
-    radius = {**data.constants, **chosen.constants}.get("radius", _default("radius"))
+    radius = {**data.constants, **chosen.constants}.get("radius", _get_default_constant("radius"))
     rng = make_rng("film", seed)
     camera, look = PinholeCamera.draw_published(rng, pixels), SceneAppearance.draw(rng)
     stage = BallScene(camera, look, radius, rng)
@@ -70,5 +70,5 @@ def write_film(
     return len(positions), float(chosen.times[-1] - chosen.times[0])
 
 
-def _default(name: str) -> float:
+def _get_default_constant(name: str) -> float:
     return next(c.value for c in BallSystem.constants if c.name == name)

@@ -96,7 +96,7 @@ def track_film(
     film = VideoFile(video, fps)
     try:
         seen = track_ball(film)
-        heights = _heights(seen, video, diameter, scale)
+        heights = _convert_to_heights(seen, video, diameter, scale)
     except InputError as error:
         # Some error messages already name the film, others do not.
         text = str(error)
@@ -108,14 +108,14 @@ def track_film(
     if first > seen.visible_frames[0]:
         until = f"the ball is held until {seen.times[first]:.2f} s"
         notes.append(f"{until}; what is before that is left out")
-    noise = _noise(seen, heights, part)
+    noise = _estimate_height_noise(seen, heights, part)
 
     # The recording and its figures are published together, so that none exists without the others.
     drawn = draw(seen, heights, part, f"{video.name}: {heights.method}")
     shown = {
         path: content for path, content in zip(pictures, drawn, strict=True) if content is not None
     }
-    recording = _recording(seen, heights, noise, part, video)
+    recording = _build_recording(seen, heights, noise, part, video)
     write_recording(out, recording, BallSystem, digits=_DIGITS, beside=shown)
 
     count, frames = int(np.isfinite(heights.z[part]).sum()), part.stop - part.start
@@ -129,7 +129,9 @@ def track_film(
     )
 
 
-def _noise(seen: BallTrack, heights: ball_heights.BallHeights, part: slice) -> float:
+def _estimate_height_noise(
+    seen: BallTrack, heights: ball_heights.BallHeights, part: slice
+) -> float:
     """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights."""
     z = heights.z[part]
     noise = float(
@@ -143,7 +145,7 @@ def _noise(seen: BallTrack, heights: ball_heights.BallHeights, part: slice) -> f
     return seen.noise * heights.radius / float(np.nanmedian(seen.radius))
 
 
-def _heights(
+def _convert_to_heights(
     seen: BallTrack, video: Path, diameter: float | None, scale: str | None
 ) -> ball_heights.BallHeights:
     """Convert the track of the ball from pixels to heights in metres.
@@ -159,7 +161,7 @@ def _heights(
     return ball_heights.compute_heights_by_scale(seen, diameter, scale)
 
 
-def _recording(
+def _build_recording(
     seen: BallTrack, heights: ball_heights.BallHeights, noise: float, part: slice, video: Path
 ) -> Recording:
     """Build the recording: the height z of the ball (m), and its track in pixels as extra columns.

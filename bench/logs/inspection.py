@@ -153,21 +153,21 @@ def format_summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]
     held = "its last third held out" if whole < len(runs) else f"{held_out} held out"
     if recording.folds():
         held = "each left out in turn"
-    size = f"{_count(whole, 'run')} ({held}), {samples} samples, {seconds:.4g} s"
+    size = f"{_format_count(whole, 'run')} ({held}), {samples} samples, {seconds:.4g} s"
     yield f"{recording.path}: system {recording.system}, {size}"
     yield from recording.notes
     yield ""
-    yield from _aligned([_RUN_HEAD, *map(_run_row, runs[:_MOST_RUNS])], left=2)
+    yield from _align_columns([_RUN_HEAD, *map(_run_row, runs[:_MOST_RUNS])], left=2)
     if len(runs) > _MOST_RUNS:
         yield f"... and {len(runs) - _MOST_RUNS} more runs"
     yield ""
-    yield from _aligned([_SIGNAL_HEAD, *_signal_rows(recording, kind)], left=3)
+    yield from _align_columns([_SIGNAL_HEAD, *_signal_rows(recording, kind)], left=3)
     yield _CAVEAT
     yield ""
-    yield from _constants(recording, kind)
+    yield from _format_constants(recording, kind)
 
 
-def _use(run: Run) -> str:
+def _format_use(run: Run) -> str:
     if run.fold is not None:
         return "left out in turn"
     return "held out" if run.held_out else "fitting"
@@ -178,7 +178,7 @@ def _run_row(run: Run) -> tuple[str, ...]:
     facts = compute_run_statistics(run)
     return (
         facts.name,
-        _use(run),
+        _format_use(run),
         str(facts.samples),
         f"{facts.seconds:.4g}",
         f"{facts.rate:.4g}",
@@ -210,10 +210,10 @@ def _signal_rows(recording: Recording, kind: type[Simulator]) -> Iterator[tuple[
         )
 
 
-def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
+def _format_constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
     """Yield a line for each constant of the system, and one for the stated initial states."""
     for constant in kind.constants:
-        yield _constant(recording, constant.name, constant.value, constant.unit)
+        yield _format_constant(recording, constant.name, constant.value, constant.unit)
     known = []
     for run in recording.runs:
         if run.initial:
@@ -223,7 +223,7 @@ def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
         yield f"initial states stated: {', '.join(known[:_MOST_RUNS])}"
 
 
-def _constant(recording: Recording, name: str, default: float, unit: str) -> str:
+def _format_constant(recording: Recording, name: str, default: float, unit: str) -> str:
     """Describe a constant's value, and list the runs with each value if it differs."""
     usual = recording.constants.get(name, default)
     runs_by_value: dict[float, list[str]] = {}
@@ -231,7 +231,9 @@ def _constant(recording: Recording, name: str, default: float, unit: str) -> str
         runs_by_value.setdefault(run.constants.get(name, usual), []).append(run.name)
     unit = "" if unit == "1" else f" {unit}"
     if len(runs_by_value) > 1:
-        parts = [f"{value:g}{unit} in {_named(runs)}" for value, runs in runs_by_value.items()]
+        parts = [
+            f"{value:g}{unit} in {_format_run_names(runs)}" for value, runs in runs_by_value.items()
+        ]
         return f"{name} differs by run: {'; '.join(parts)}"
     value = next(iter(runs_by_value))
     stated = name in recording.constants or any(name in run.constants for run in recording.runs)
@@ -239,17 +241,17 @@ def _constant(recording: Recording, name: str, default: float, unit: str) -> str
     return f"{name} = {value:g}{unit}{note}"
 
 
-def _named(names: Sequence[str]) -> str:
+def _format_run_names(names: Sequence[str]) -> str:
     runs = f"run{'s' * (len(names) > 1)} {', '.join(names[:_MOST_NAMES])}"
     more = len(names) - _MOST_NAMES
     return f"{runs} and {more} more" if more > 0 else runs
 
 
-def _count(number: int, what: str) -> str:
+def _format_count(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
-def _aligned(rows: Sequence[Sequence[str]], left: int) -> Iterator[str]:
+def _align_columns(rows: Sequence[Sequence[str]], left: int) -> Iterator[str]:
     """Align a table as text, with the first `left` columns left-justified."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

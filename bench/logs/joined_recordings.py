@@ -71,7 +71,7 @@ def load_joined(
             run,
             name=f"{name}: {run.name}",
             log=name,
-            constants={key: _constant(key, recording, run, usual) for key in differing}
+            constants={key: _get_constant(key, recording, run, usual) for key in differing}
             | dict(run.constants),
         )
         for name, recording in zip(names, recordings, strict=True)
@@ -82,14 +82,14 @@ def load_joined(
         first,
         title=f"{first.title or first.path.stem} and {more} more log{'s' * (more > 1)}",
         constants=constants,
-        noise=_noise(recordings),
+        noise=_compute_rms_noise(recordings),
         runs=tuple(runs),
         notes=tuple(note for recording in recordings for note in recording.notes),
     )
     return (split_held_out(joined, folds=True) if folds else joined), kind
 
 
-def _constant(key: str, recording: Recording, run: Run, usual: dict[str, float]) -> float:
+def _get_constant(key: str, recording: Recording, run: Run, usual: dict[str, float]) -> float:
     return run.constants.get(key, recording.constants.get(key, usual.get(key, np.nan)))
 
 
@@ -135,7 +135,7 @@ def make_log_names(paths: Sequence[Path]) -> list[str]:
     return [f"{number}/{name}" for number, name in enumerate(longer, start=1)]
 
 
-def _noise(recordings: Sequence[Recording]) -> dict[str, float]:
+def _compute_rms_noise(recordings: Sequence[Recording]) -> dict[str, float]:
     """Return the root mean square noise of each channel, if all recordings state it."""
     shared = set(recordings[0].noise).intersection(*(r.noise for r in recordings))
     return {

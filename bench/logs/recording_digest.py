@@ -59,7 +59,7 @@ def read_content(path: Path) -> bytes:
     for file in files if whole.suffix.lower() != ".xml" else _with_included(whole):
         if file.is_file():
             about = file.stat()
-            content.update(_hashed(file, about.st_mtime_ns, about.st_size))
+            content.update(_hash_file(file, about.st_mtime_ns, about.st_size))
     return content.digest()
 
 
@@ -76,7 +76,7 @@ def _with_included(model: Path) -> list[Path]:
 
 
 @lru_cache(maxsize=256)
-def _hashed(path: Path, _changed: int, _size: int) -> bytes:
+def _hash_file(path: Path, _changed: int, _size: int) -> bytes:
     """Return the hash of a file; cached, as many logs may use the same file.
 
     The unused arguments are part of the cache key, so a changed file is hashed again.

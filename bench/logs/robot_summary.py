@@ -33,14 +33,14 @@ def format_robot_summary(kind: type[Simulator]) -> Iterator[str]:
         (len(robot.bodies), "moving body"),
         (len(robot.sensors), "sensor row"),
     )
-    words = ", ".join(f"{n} {_plural(word, n)}" for n, word in counts if n)
+    words = ", ".join(f"{n} {_pluralise(word, n)}" for n, word in counts if n)
     step, integrator = simulator.numerics
     form = robot.format.upper()
     yield f"robot {robot.path} ({form}): {words}; {integrator} at {1e3 * step:g} ms"
     yield from (f"note: {note}" for note in robot.notes)
 
 
-def _plural(word: str, count: int) -> str:
+def _pluralise(word: str, count: int) -> str:
     return word if count == 1 else word.replace("body", "bodie") + "s"
 
 
@@ -55,7 +55,7 @@ def format_log_warnings(recording: Recording, kind: type[Simulator]) -> Iterator
         return
     robot = cast(type[RobotSimulator], kind).robot
     yield from _left_out(recording, robot)
-    yield from _beyond(recording, robot)
+    yield from _list_exceeded_ranges(recording, robot)
 
 
 def _left_out(recording: Recording, robot: RobotModel) -> Iterator[str]:
@@ -71,19 +71,25 @@ def _left_out(recording: Recording, robot: RobotModel) -> Iterator[str]:
         yield f"positions that are not in the log, and begin as the file states them: {where}"
 
 
-def _beyond(recording: Recording, robot: RobotModel) -> Iterator[str]:
+def _list_exceeded_ranges(recording: Recording, robot: RobotModel) -> Iterator[str]:
     """Yield a line for each signal that leaves its range."""
     model = robot.path.name
     for joint in robot.joints:
         if joint.has_one_coordinate:
-            yield from _outside(recording, f"q.{joint.name}", joint.range, joint.unit, model)
+            yield from _format_exceeded_range(
+                recording, f"q.{joint.name}", joint.range, joint.unit, model
+            )
             effort = None if joint.effort is None else (-joint.effort, joint.effort)
-            yield from _outside(recording, f"tau.{joint.name}", effort, joint.force_unit, model)
+            yield from _format_exceeded_range(
+                recording, f"tau.{joint.name}", effort, joint.force_unit, model
+            )
     for actuator in robot.actuators:
-        yield from _outside(recording, f"u.{actuator.name}", actuator.range, "", model)
+        yield from _format_exceeded_range(
+            recording, f"u.{actuator.name}", actuator.range, "", model
+        )
 
 
-def _outside(
+def _format_exceeded_range(
     recording: Recording, name: str, limits: tuple[float, float] | None, unit: str, model: str
 ) -> Iterator[str]:
     """Yield a line if a recorded signal leaves the range that the model file states.

@@ -79,32 +79,34 @@ def segment_recording(
             f"{recording.path}: expected no --pieces: bodies of {recording.system} float, and "
             "nothing says where they are when a piece begins; leave it out"
         )
-    budget = np.inf if whole or not kind.has_model else _budget(kind)
+    budget = np.inf if whole or not kind.has_model else _compute_affordable_seconds(kind)
     kept: list[Run] = []
     notes = []
     for word, runs in (("fitting", recording.training()), ("measuring", recording.held_out())):
-        all_of_it = sum(map(_seconds, runs))
+        all_of_it = sum(map(_compute_duration, runs))
         if all_of_it <= budget and seconds is None:
             kept += runs
             continue
         share = min(budget / all_of_it, 1.0) if all_of_it > 0 else 1.0
-        take = _first if floats else _pieces
+        take = _take_beginning if floats else _cut_run
         pieces = [
-            p for run in runs for p in take(run, share * _seconds(run), seconds or SEGMENT_SECONDS)
+            p
+            for run in runs
+            for p in take(run, share * _compute_duration(run), seconds or SEGMENT_SECONDS)
         ]
         kept += pieces
-        left = sum(map(_seconds, pieces))
+        left = sum(map(_compute_duration, pieces))
         notes.append(f"{left:.3g} s of {all_of_it:.4g} s for {word}, in {len(pieces)} pieces")
     if not notes:
         return SegmentedRecording(recording, "")
     said = " and ".join(notes)
-    left_out = budget < max(sum(map(_seconds, recording.training())), 0.0)
+    left_out = budget < max(sum(map(_compute_duration, recording.training())), 0.0)
     more = " from all over it (--whole takes all)" if left_out and not whole else ""
     note = f"of the recording {said} were looked at{more}"
     return SegmentedRecording(replace(recording, runs=tuple(kept)), note)
 
 
-def _budget(kind: type[Simulator]) -> float:
+def _compute_affordable_seconds(kind: type[Simulator]) -> float:
     """Return the seconds of a robot's motion that cost `MAX_RECORDING_COST`."""
     robot: Any = kind
     step, integrator = robot.numerics
@@ -114,11 +116,11 @@ def _budget(kind: type[Simulator]) -> float:
     )
 
 
-def _seconds(run: Run) -> float:
+def _compute_duration(run: Run) -> float:
     return float(run.times[-1] - run.times[0])
 
 
-def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
+def _cut_run(run: Run, seconds: float, longest: float) -> list[Run]:
     """Cut a run into segments of at most `longest` seconds that last `seconds` in total.
 
     The segments are spread over the run. Each begins at the sample before which the commands have
@@ -128,9 +130,9 @@ def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
     # A segment needs a few samples, even if only little of a run may be kept.
     length = max(length, MIN_SEGMENT_INTERVALS * float(np.median(np.diff(run.times))))
     count = max(int(seconds / length + 0.5), 1)
-    span = _seconds(run) / count
+    span = _compute_duration(run) / count
     length = min(length, span)
-    change = _changes(run)
+    change = _compute_command_changes(run)
     pieces = []
     for number in range(count):
         # A segment may begin anywhere in its part of the run that leaves enough room for it.
@@ -145,7 +147,7 @@ def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
     return pieces
 
 
-def _first(run: Run, seconds: float, _: float) -> list[Run]:
+def _take_beginning(run: Run, seconds: float, _: float) -> list[Run]:
     """Return the beginning of a run, the only part with a known pose of floating bodies."""
     end = int(np.searchsorted(run.times, run.times[0] + seconds - ROUNDING_SECONDS))
     return [
@@ -155,7 +157,7 @@ def _first(run: Run, seconds: float, _: float) -> list[Run]:
     ]
 
 
-def _changes(run: Run) -> Array:
+def _compute_command_changes(run: Run) -> Array:
     """Return (T,) the change of the commands before each sample, relative to their range."""
     back = np.searchsorted(run.times, run.times - QUIET_LEAD_SECONDS)
     total = np.zeros(run.times.size)

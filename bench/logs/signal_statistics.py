@@ -94,7 +94,7 @@ def compute_signal_statistics(
         channel: Declaration of the signal.
         kind: input or channel.
     """
-    signals = [(run.times, _of(run, channel.name)) for run in recording.runs]
+    signals = [(run.times, _get_signal(run, channel.name)) for run in recording.runs]
     values = np.concatenate([v for _, v in signals])
     # An input is what was commanded, so it has no noise.
     noise = estimate_noise(signals) if kind == "channel" else NoiseEstimate(np.nan, 0.0)
@@ -155,5 +155,5 @@ def to_document(recording: Recording, kind: type[Simulator]) -> dict[str, Any]:
     }
 
 
-def _of(run: Run, name: str) -> Array:
+def _get_signal(run: Run, name: str) -> Array:
     return run.channels[name] if name in run.channels else run.inputs[name]

@@ -187,29 +187,31 @@ class _RecordingSimulation:
             InputError: The specification names something unknown or has implausible numbers.
         """
         self.options = options
-        self.kind = kind = _kind(options)
+        self.kind = kind = _get_simulator_class(options)
         self.name = options.system or kind.name
         self.usual = _get_default_recording(kind)
         self.held_out = _held_out(options)
-        self.theta = _theta({} if options.parameters is None else options.parameters, kind)
+        self.theta = _make_parameters(
+            {} if options.parameters is None else options.parameters, kind
+        )
         self.effects = {
-            name: _coefficients(name, c, kind) for name, c in (options.effects or {}).items()
+            name: _make_coefficients(name, c, kind) for name, c in (options.effects or {}).items()
         }
         self.engine = options.engine
         if not self.engine and issubclass(kind, SystemSimulator) and not kind.own_engine:
             self.engine = "batch"
-        self.simulator = self._simulator()
-        self.noise = _noise(options.noise, [c.name for c in self.simulator.channels])
+        self.simulator = self._build_simulator()
+        self.noise = _make_noise_table(options.noise, [c.name for c in self.simulator.channels])
         initial, inputs = options.initial or {}, options.inputs or {}
         check_known_names("initial state", initial, list(kind.states))
-        given = {name: _range(name, value) for name, value in initial.items()}
+        given = {name: _check_interval(name, value) for name, value in initial.items()}
         self.ranges = {**self.usual.initial, **given}
         check_known_names("input", inputs, [c.name for c in kind.inputs])
         inputs = {**self.usual.inputs, **inputs}
         self.inputs = {name: _signal_text(name, value) for name, value in inputs.items()}
-        samples = _samples(options)
+        samples = _count_samples(options)
         check_simulation_size(options.runs, samples, options.seconds, self.simulator, options.force)
-        self.times = _times(samples, options.rate)
+        self.times = _make_sample_times(samples, options.rate)
 
     def make(self) -> SimulatedRecording:
         """Simulate all runs, add noise, and return the recording with its true model.
@@ -218,9 +220,11 @@ class _RecordingSimulation:
         it.
         """
         scenarios = {
-            str(number): self._scenario(number) for number in range(1, self.options.runs + 1)
+            str(number): self._build_scenario(number) for number in range(1, self.options.runs + 1)
         }
-        runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
+        runs = tuple(
+            self._simulate_run(int(name), scenario) for name, scenario in scenarios.items()
+        )
         stated = {name: sigma for name, sigma in self.noise.items() if sigma}
         constants, system = self.simulator.constant_values, self.name
         path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
@@ -244,11 +248,11 @@ class _RecordingSimulation:
         self.simulator.close()
         return SimulatedRecording(recording, truth, self.simulator)
 
-    def _simulator(self) -> Simulator:
+    def _build_simulator(self) -> Simulator:
         """Build the simulator with the specified constants, channels, engine and true effects."""
         constants = self.options.constants or {}
         check_known_names("constant", constants, [c.name for c in self.kind.constants])
-        values = {n: _number("constant", n, value) for n, value in constants.items()}
+        values = {n: _check_number("constant", n, value) for n, value in constants.items()}
         observe = list(self.options.observe) or list(self.usual.observe) or None
         if issubclass(self.kind, SystemSimulator):
             return self.kind(values, observe, engine=self.engine, fixed=self.effects)
@@ -256,22 +260,22 @@ class _RecordingSimulation:
             raise InputError(f"simulator {self.name} takes neither effects nor an engine")
         return self.kind(values, observe)
 
-    def _scenario(self, number: int) -> Scenario:
+    def _build_scenario(self, number: int) -> Scenario:
         """Build the scenario of run `number`.
 
         Each random draw has its own stream, so that no draw depends on any other.
         """
         initial = {
-            name: low if low == high else self._rng("initial", name, number).uniform(low, high)
+            name: low if low == high else self._make_rng("initial", name, number).uniform(low, high)
             for name, (low, high) in self.ranges.items()
         }
         inputs = {
-            name: evaluate_signal(text, self.times, self._rng("input", name, number))
+            name: evaluate_signal(text, self.times, self._make_rng("input", name, number))
             for name, text in self.inputs.items()
         }
         return Scenario(self.times, initial, inputs)
 
-    def _run(self, number: int, scenario: Scenario) -> Run:
+    def _simulate_run(self, number: int, scenario: Scenario) -> Run:
         """Simulate a run, and add white Gaussian noise to each channel.
 
         `number` counts runs from 1; the last ones are held out for validation. The true initial
@@ -288,7 +292,7 @@ class _RecordingSimulation:
             )
         channels = {}
         for (name, sigma), values in zip(self.noise.items(), observed.T, strict=True):
-            rng = self._rng("noise", name, number)
+            rng = self._make_rng("noise", name, number)
             channels[name] = values + sigma * rng.standard_normal(values.size)
         held_out = number > self.options.runs - self.held_out
         # The pose of a floating body is never estimated, so it need not be hidden.
@@ -296,11 +300,11 @@ class _RecordingSimulation:
         begun = {name: states[name] for name in get_floating_state_units(self.kind)}
         return Run(str(number), self.times, channels, scenario.inputs, {}, begun, held_out)
 
-    def _rng(self, what: str, name: str, number: int) -> np.random.Generator:
+    def _make_rng(self, what: str, name: str, number: int) -> np.random.Generator:
         return make_rng("simulate", self.name, what, name, self.options.seed, number)
 
 
-def _kind(options: SimulationSpec) -> type[Simulator]:
+def _get_simulator_class(options: SimulationSpec) -> type[Simulator]:
     """Return the simulator class that a specification names, by its system or its robot model file.
 
     Raises:
@@ -341,7 +345,7 @@ def _held_out(options: SimulationSpec) -> int:
     return options.held_out
 
 
-def _samples(options: SimulationSpec) -> int:
+def _count_samples(options: SimulationSpec) -> int:
     """Return the number of samples of a run: duration (s) times rate (Hz), rounded.
 
     Raises:
@@ -357,13 +361,15 @@ def _samples(options: SimulationSpec) -> int:
     return samples
 
 
-def _times(samples: int, rate: float) -> Array:
+def _make_sample_times(samples: int, rate: float) -> Array:
     """Return the sample times (T,) of a run in seconds, from zero."""
     # Round as in the table, so that the times read back are the times simulated.
     return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
 
 
-def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) -> dict[str, float]:
+def _make_parameters(
+    given: Mapping[str, float] | Sequence[float], kind: type[Simulator]
+) -> dict[str, float]:
     """Return every parameter's value by name, in the simulator's order."""
     names = [p.name for p in kind.parameters]
     if not isinstance(given, Mapping):
@@ -374,7 +380,8 @@ def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) 
         given = dict(zip(names, given, strict=True))
     check_known_names("parameter", given, names)
     theta = {
-        p.name: _number("parameter", p.name, given.get(p.name, p.nominal)) for p in kind.parameters
+        p.name: _check_number("parameter", p.name, given.get(p.name, p.nominal))
+        for p in kind.parameters
     }
     for p in kind.parameters:
         low, high = p.bounds
@@ -385,7 +392,7 @@ def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) 
     return theta
 
 
-def _coefficients(name: str, given: EffectCoefficients, kind: type[Simulator]) -> list[float]:
+def _make_coefficients(name: str, given: EffectCoefficients, kind: type[Simulator]) -> list[float]:
     """Return an effect's coefficients in order; coefficients that are not named are zero."""
     if isinstance(given, Mapping):
         of_system = (
@@ -395,9 +402,9 @@ def _coefficients(name: str, given: EffectCoefficients, kind: type[Simulator]) -
         )
         names = [c.name for c in of_system]
         check_known_names(f"coefficient of effect {name}", given, names)
-        return [_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
+        return [_check_number(f"effect {name}:", c, given.get(c, 0.0)) for c in names]
     values = [given] if isinstance(given, int | float) else list(given)
-    return [_number("effect", name, value) for value in _of_family(name, values, kind)]
+    return [_check_number("effect", name, value) for value in _of_family(name, values, kind)]
 
 
 def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
@@ -411,7 +418,9 @@ def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[fl
     return values * len(members) if alike else values
 
 
-def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:
+def _make_noise_table(
+    given: float | Mapping[str, float], channels: Sequence[str]
+) -> dict[str, float]:
     """Return the standard deviation of the noise of each channel, in the channel's unit.
 
     `given` is one value for all channels, or a value for each. Channels that are not named have
@@ -422,29 +431,29 @@ def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[
         "recorded channel", [name for name in named if name != ALL_CHANNELS], channels
     )
     rest = named.get(ALL_CHANNELS, 0.0)
-    values = {name: _number("noise of", name, named.get(name, rest)) for name in channels}
+    values = {name: _check_number("noise of", name, named.get(name, rest)) for name in channels}
     for name, value in values.items():
         if value < 0:
             raise InputError(f"noise of {name} = {value:g}: expected at least 0")
     return values
 
 
-def _range(name: str, given: float | tuple[float, float]) -> tuple[float, float]:
+def _check_interval(name: str, given: float | tuple[float, float]) -> tuple[float, float]:
     """Return the interval (low, high) from which an initial state is drawn."""
     ends = (given, given) if isinstance(given, int | float) else tuple(given)
     if len(ends) != 2:
         raise InputError(f"initial state {name}: expected a value or (low, high), found {given!r}")
-    low, high = (_number("initial state", name, end) for end in ends)
+    low, high = (_check_number("initial state", name, end) for end in ends)
     if low > high:
         raise InputError(f"initial state {name} = {low:g}:{high:g}: expected low <= high")
     return low, high
 
 
 def _signal_text(name: str, given: float | str) -> str:
-    return given if isinstance(given, str) else f"{_number('input', name, given):.17g}"
+    return given if isinstance(given, str) else f"{_check_number('input', name, given):.17g}"
 
 
-def _number(what: str, name: str, value: object) -> float:
+def _check_number(what: str, name: str, value: object) -> float:
     """Return a value of the specification as a float if it is a plausible number.
 
     `what` and `name` identify the value in the message of the error.

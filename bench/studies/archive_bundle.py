@@ -93,7 +93,7 @@ def write_bundle(
         InputError: the folder is not a result folder or not finished, or the archive exists
             already.
     """
-    kind = _kind(folder)
+    kind = _find_folder_kind(folder)
     name = folder.resolve().name
     files, left_out = _list_result_files(folder)
     if kind == "comparison":
@@ -117,7 +117,7 @@ def write_bundle(
     return BundleResult(archive, kind, len(files), command, tuple(left_out))
 
 
-def _kind(folder: Path) -> str:
+def _find_folder_kind(folder: Path) -> str:
     """Return whether a folder has an "explanation" or a "comparison", which may be a sweep.
 
     Raises:

@@ -21,7 +21,7 @@ def find_changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, A
     Returns:
         For each dotted key that differs, the values in both; None where the key does not exist.
     """
-    flat_a, flat_b = dict(_flat(a)), dict(_flat(b))
+    flat_a, flat_b = dict(_flatten_table(a)), dict(_flatten_table(b))
     return [
         {"what": key, "a": flat_a.get(key), "b": flat_b.get(key)}
         for key in sorted({*flat_a, *flat_b})
@@ -29,7 +29,7 @@ def find_changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, A
     ]
 
 
-def _flat(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten_table(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of nested tables, each with its path such as ``noise.q``.
 
     `before` is the path of the table with its final dot. A tuple becomes a list, so that it equals
@@ -37,7 +37,7 @@ def _flat(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any
     """
     for key, inner in value.items():
         if isinstance(inner, Mapping):
-            yield from _flat(inner, f"{before}{key}.")
+            yield from _flatten_table(inner, f"{before}{key}.")
         elif isinstance(inner, list | tuple):
             yield f"{before}{key}", list(inner)
         else:
@@ -74,7 +74,10 @@ def format_changes(changes: Iterable[Mapping[str, Any]], max_count: int = 12) ->
         changes: the changes.
         max_count: maximum number of changes.
     """
-    lines = [f"  {each['what']}: {_short(each['a'])} -> {_short(each['b'])}" for each in changes]
+    lines = [
+        f"  {each['what']}: {_shorten_text(each['a'])} -> {_shorten_text(each['b'])}"
+        for each in changes
+    ]
     remaining_count = len(lines) - max_count
     return [
         *lines[:max_count],
@@ -82,7 +85,7 @@ def format_changes(changes: Iterable[Mapping[str, Any]], max_count: int = 12) ->
     ]
 
 
-def _short(value: Any) -> str:
+def _shorten_text(value: Any) -> str:
     text = "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 

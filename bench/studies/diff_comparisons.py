@@ -136,7 +136,7 @@ class ComparisonDiff:
     @cached_property
     def errors(self) -> pd.DataFrame:
         """Table of errors, a line per range, tuner and number of simulations (schema ``diff``)."""
-        lines = list(self._lines())
+        lines = list(self._compare_all_errors())
         if not lines:
             return pd.DataFrame()
         frame = pd.DataFrame(lines)
@@ -148,7 +148,7 @@ class ComparisonDiff:
         frame["significant"] = frame["p_holm"] < FAMILYWISE_ERROR_RATE
         return frame
 
-    def _lines(self) -> Iterator[dict[str, Any]]:
+    def _compare_all_errors(self) -> Iterator[dict[str, Any]]:
         """Yield a row for each range, tuner and number of simulations that both comparisons have.
 
         Errors are compared at `COMPARED_SIMULATION_COUNTS` and at the smaller one of the two
@@ -163,9 +163,9 @@ class ComparisonDiff:
             mine, other = (s.curves.select(range=str(kind)).list_tuners() for s in (self.a, self.b))
             for tuner in (t for t in mine if t in other):
                 for k in checkpoints:
-                    yield self._line(str(kind), tuner, k)
+                    yield self._compare_errors(str(kind), tuner, k)
 
-    def _line(self, kind: str, tuner: str, k: int) -> dict[str, Any]:
+    def _compare_errors(self, kind: str, tuner: str, k: int) -> dict[str, Any]:
         """Compare the errors of one tuner in one range after k simulations.
 
         On shared targets the test is Wilcoxon's signed-rank test, otherwise the Mann-Whitney test;
@@ -185,7 +185,7 @@ class ComparisonDiff:
         if paired:
             count, _, _, ratio, p = compare_pair(second, first)
         else:
-            count, ratio, p = min(len(first), len(second)), *_unpaired(first, second)
+            count, ratio, p = min(len(first), len(second)), *_compare_unpaired(first, second)
         medians = [float(each.median()) for each in by_target]
         return {
             "range": kind,
@@ -244,19 +244,21 @@ class ComparisonDiff:
     @property
     def has_changed(self) -> bool:
         """Whether an error differs significantly, or the fraction of failed runs differs."""
-        return bool(len(self._significant())) or any(a != b for a, b in self._failing())
+        return bool(len(self._select_significant_errors())) or any(
+            a != b for a, b in self._compute_failure_shares()
+        )
 
     @property
     def is_worse(self) -> bool:
         """Whether an error has grown significantly, or the fraction of failed runs has grown."""
-        found = self._significant()
+        found = self._select_significant_errors()
         grown = bool(len(found) and (found["ratio"] > 1).any())
-        return grown or any(b > a for a, b in self._failing())
+        return grown or any(b > a for a, b in self._compute_failure_shares())
 
-    def _significant(self) -> pd.DataFrame:
+    def _select_significant_errors(self) -> pd.DataFrame:
         return self.errors[self.errors["significant"]] if len(self.errors) else self.errors
 
-    def _failing(self) -> Iterator[tuple[float, float]]:
+    def _compute_failure_shares(self) -> Iterator[tuple[float, float]]:
         """Yield the fractions of failed runs in both comparisons, for each common tuner.
 
         Skipped runs count as failed, because they have no result either.
@@ -270,7 +272,7 @@ class ComparisonDiff:
                 ]
                 yield float(mine[0]), float(mine[1])
 
-    def _telling(self) -> Iterator[str]:
+    def _format_status_changes(self) -> Iterator[str]:
         """Yield changed status counts as text lines.
 
         Counts other than failures are included only if both comparisons have the same number of
@@ -355,7 +357,7 @@ class ComparisonDiff:
         yield from format_columns(rows)
         if len(lines) > len(shown):
             yield f"({len(lines) - len(shown)} more lines differ by chance at most; --json has all)"
-        yield from self._telling()
+        yield from self._format_status_changes()
         for name, tuners in self.unshared_tuners.items():
             if tuners:
                 yield f"in {name} alone: {', '.join(tuners)}"
@@ -371,7 +373,7 @@ class ComparisonDiff:
         return self.errors
 
 
-def _unpaired(a: Array, b: Array) -> tuple[float, float]:
+def _compare_unpaired(a: Array, b: Array) -> tuple[float, float]:
     """Compute the ratio of the medians of b over a, and the p-value of the Mann-Whitney test."""
     from scipy.stats import mannwhitneyu
 

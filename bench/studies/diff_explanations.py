@@ -137,8 +137,10 @@ class ExplanationDiff:
     @cached_property
     def numbers(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Coefficients and parameters of either explanation, with intervals and significance."""
-        coefficients = _beside(_coefficients(self.a), _coefficients(self.b))
-        parameters = _beside(self.a.verdict.parameters, self.b.verdict.parameters)
+        coefficients = _pair_coefficients(
+            _collect_coefficients(self.a), _collect_coefficients(self.b)
+        )
+        parameters = _pair_coefficients(self.a.verdict.parameters, self.b.verdict.parameters)
         rows = [*coefficients, *parameters]
         p = np.array([_p_value(row) for row in rows])
         there = np.isfinite(p)
@@ -153,10 +155,10 @@ class ExplanationDiff:
         """Whether verdict or causes differ, or a number differs significantly."""
         other = self.a.verdict.verdict != self.b.verdict.verdict
         moved = any(row["significant"] for rows in self.numbers for row in rows)
-        causes = any("cause" in pair and len(set(pair)) > 1 for pair in self._places())
+        causes = any("cause" in pair and len(set(pair)) > 1 for pair in self._list_cause_places())
         return other or moved or causes
 
-    def _places(self) -> list[tuple[str, str]]:
+    def _list_cause_places(self) -> list[tuple[str, str]]:
         return [(each["in_a"], each["in_b"]) for each in self.causes]
 
     @property
@@ -176,7 +178,7 @@ class ExplanationDiff:
             for name in _HELD_OUT
         ]
 
-    def _candidates(self) -> list[dict[str, Any]]:
+    def _compare_candidates(self) -> list[dict[str, Any]]:
         """Return the best candidates of either explanation, with score and rank in both."""
         ranked = [
             {c.effect: (rank, c.score) for rank, c in enumerate(each.verdict.candidates, 1)}
@@ -224,7 +226,7 @@ class ExplanationDiff:
             "coefficients": coefficients,
             "parameters": parameters,
             "heldout": self._held_out(),
-            "candidates": self._candidates(),
+            "candidates": self._compare_candidates(),
             "settings": find_changes(self.a.settings, self.b.settings),
             "notes": self.notes,
         }
@@ -244,9 +246,9 @@ class ExplanationDiff:
             mark = "MOVED" if row["significant"] else ""
             cells = [
                 format_number(row["a"]),
-                _interval(row, "a"),
+                _format_interval(row, "a"),
                 format_number(row["b"]),
-                _interval(row, "b"),
+                _format_interval(row, "b"),
             ]
             rows.append((row["name"], row["unit"], mark, *cells))
         yield from format_columns(rows)
@@ -271,7 +273,7 @@ class ExplanationDiff:
         return pd.DataFrame([*coefficients, *parameters, *held_out])
 
 
-def _coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
+def _collect_coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
     """Return the coefficients of all causes of an explanation, by effect and coefficient name."""
     return {
         f"{cause.effect} {name}": value
@@ -280,7 +282,9 @@ def _coefficients(each: ExplanationSide) -> dict[str, FittedValue]:
     }
 
 
-def _beside(a: Mapping[str, FittedValue], b: Mapping[str, FittedValue]) -> list[dict[str, Any]]:
+def _pair_coefficients(
+    a: Mapping[str, FittedValue], b: Mapping[str, FittedValue]
+) -> list[dict[str, Any]]:
     """Write the numbers of two explanations into one row per name.
 
     A row has name and unit, and for each explanation the value and its 95 % interval (low, high).
@@ -315,6 +319,6 @@ def _p_value(row: Mapping[str, Any]) -> float:
     return math.erfc(difference / spread / math.sqrt(2))
 
 
-def _interval(row: Mapping[str, Any], mark: str) -> str:
+def _format_interval(row: Mapping[str, Any], mark: str) -> str:
     low, high = row[f"low_{mark}"], row[f"high_{mark}"]
     return "" if row[mark] is None else f"{format_number(low)} to {format_number(high)}"

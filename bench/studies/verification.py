@@ -122,13 +122,13 @@ def verify_comparison(
 
     # The salt in experiment.toml was already checked against its hash when the file was read.
     stored = read_checked_comparison(folder)
-    note(_salt(experiment))
+    note(_describe_salt(experiment))
     named = configuration.plugins if own_plugins else []
     files = [*named, *(str(Path(plugin).resolve()) for plugin in plugins)]
     load_plugins_for_experiment(list(dict.fromkeys(files)), experiment)
     problem = TuningProblem(experiment)
     try:
-        doubts = _rows(stored, problem, note, every)
+        doubts = _verify_runs_table(stored, problem, note, every)
     finally:
         problem.close()
     doubts += _verify_tables(folder, stored, note)
@@ -141,7 +141,7 @@ def verify_comparison(
     return VerificationResult(folder, tuple(checks), tuple(doubts))
 
 
-def _salt(experiment: Experiment) -> str:
+def _describe_salt(experiment: Experiment) -> str:
     """Describe the salt of a comparison that has been verified: public, or committed beforehand.
 
     Only a salt whose hash was published before the first run proves that nobody knew the targets.
@@ -154,7 +154,7 @@ def _salt(experiment: Experiment) -> str:
     )
 
 
-def _rows(
+def _verify_runs_table(
     stored: StoredComparison, problem: TuningProblem, say: PrintLine, every: bool
 ) -> list[VerificationFailure]:
     """Verify runs.parquet, and return the failures.
@@ -174,11 +174,11 @@ def _rows(
     if doubts:
         return doubts
     for name, rows in runs.groupby("target", sort=False):
-        doubts += _errors(problem, targets[str(name)], rows)
+        doubts += _verify_errors(problem, targets[str(name)], rows)
     say(f"runs.parquet: {len(targets)} targets drawn again, {len(runs)} rows compared with them")
     shown = _select_rows(runs, MAX_RESIMULATED_ROWS if not every else len(runs))
     for name, rows in shown.groupby("target", sort=False):
-        doubts += _losses(problem, targets[str(name)], rows)
+        doubts += _verify_losses(problem, targets[str(name)], rows)
     say(f"runs.parquet: {len(shown)} of {len(runs)} rows simulated again")
     doubts += [
         VerificationFailure(
@@ -189,7 +189,7 @@ def _rows(
     return doubts
 
 
-def _errors(
+def _verify_errors(
     problem: TuningProblem, target: Target, rows: pd.DataFrame
 ) -> Iterator[VerificationFailure]:
     """Yield rows of a target whose errors do not follow from its truth."""
@@ -209,7 +209,7 @@ def _errors(
         yield from _find_first_difference(rows, column, values, _ARITHMETIC_TOLERANCE, slack)
 
 
-def _losses(
+def _verify_losses(
     problem: TuningProblem, target: Target, rows: pd.DataFrame
 ) -> Iterator[VerificationFailure]:
     """Yield rows of a target whose losses and errors differ from repeated simulations.
@@ -222,12 +222,14 @@ def _losses(
     simulated_rows = rows[rows["k"] > 0]
     fitting = ProposalEvaluator(problem, target.blinded.fitting)
     if len(simulated_rows):
-        proposed = _points(problem, simulated_rows[[f"proposal_{name}" for name in names]])
+        proposed = _convert_to_unit_cube(
+            problem, simulated_rows[[f"proposal_{name}" for name in names]]
+        )
         losses = np.concatenate([fitting(point[None])[1] for point in proposed])
         yield from _find_first_difference(
             simulated_rows, "loss", losses, _SIMULATION_TOLERANCE, _SIMULATION_TOLERANCE
         )
-    recommended = _points(problem, rows[[f"recommendation_{name}" for name in names]])
+    recommended = _convert_to_unit_cube(problem, rows[[f"recommendation_{name}" for name in names]])
     for column, side in (
         ("obs_error", target.blinded.fitting),
         ("heldout_error", target.blinded.held_out),
@@ -244,7 +246,7 @@ def _losses(
             )
 
 
-def _points(problem: TuningProblem, frame: pd.DataFrame) -> Array:
+def _convert_to_unit_cube(problem: TuningProblem, frame: pd.DataFrame) -> Array:
     """Convert parameters to points of the unit cube, clipped because of rounding."""
     points: Array = np.clip(problem.cube.to_unit_cube(frame.to_numpy(dtype=float)), 0.0, 1.0)
     return points

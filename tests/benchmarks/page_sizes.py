@@ -23,7 +23,7 @@ from bench.benchmark.figures.comparison_view import AxisLabels, ComparisonView
 from bench.benchmark.problem.experiment import load_experiment
 from bench.benchmark.report_page.comparison_page import render_page
 from bench.benchmark.report_page.comparison_page_data import ComparisonReportData
-from bench.benchmark.results_report import _drawn, build_tables
+from bench.benchmark.results_report import _render_figures, build_tables
 from bench.benchmark.storage.result_folder import StoredComparison
 from tests.benchmarks import coco_bbob
 from tests.browser import Opened, launched
@@ -97,7 +97,7 @@ def ours(browser, place, targets, budget):
     started = process_time()
     frames = build_tables(stored, statistics)
     tabled = process_time()
-    pictures = _drawn(stored, labels, statistics)
+    pictures = _render_figures(stored, labels, statistics)
     drawn = process_time()
     environment = {"packages": {}, "plugins": []}
     results = ComparisonReportData(

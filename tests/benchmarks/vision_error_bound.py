@@ -60,7 +60,7 @@ def tuned(experiment, folder, shot, entry, weights, effects):
     path = folder / "recordings" / f"{shot}.csv"
     known = shot_planning.ShotInputs(shot, path, None, {VISION: weights})
     recording = read_recording(path, Ball, whole=True)
-    model = shot_planning._tuned(
+    model = shot_planning._tune_model(
         experiment, read_shot_config(experiment), entry, known, recording, effects
     )
     assert model.status in ("done", "converged"), model.reason

@@ -17,7 +17,7 @@ def answer():
     from bench.benchmark.runner import plugin_discovery
 
     said = {"kind": "simulator", "name": "spring", "says": ""}
-    plugin_discovery._told = lambda _kind, _part: said
+    plugin_discovery._describe_class = lambda _kind, _part: said
 
 
 with contextlib.suppress(Exception):

@@ -51,8 +51,8 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     names = [c for c in table.columns if c not in IDENTIFIABILITY_COLUMNS]
     size = (4.8 + 0.8 * len(names), 2.2 + 0.4 * len(names))
     figure, axes = make_panel_grid(1, 2, size, width_ratios=[1, 1.25])
-    _spectra(axes[0, 0], table, len(names))
-    _directions(axes[0, 1], table, names)
+    _draw_spectra(axes[0, 0], table, len(names))
+    _draw_direction_shares(axes[0, 1], table, names)
     figure.suptitle(f"{experiment.title or experiment.name}: what the data identify", fontsize=11)
     real = set(table["range"]) == {"real"}
     where = "the nominal parameters" if real else "each target's truth"
@@ -65,7 +65,7 @@ def draw_spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
     return figure
 
 
-def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
+def _draw_spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     """Draw every target's smallest possible standard error (1 sigma) along each direction.
 
     A direction is a combination of parameters; stiff ones are determined by the data, sloppy ones
@@ -110,7 +110,7 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
     axis.legend(fontsize=7.5, frameon=False, loc="lower right")
 
 
-def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
+def _draw_direction_shares(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
     """Draw the shares of the parameters in each direction, as a grid of numbers."""
     # A direction has length 1: its squared components are shares, independent of their signs.
     squares = table.set_index("direction")[names] ** 2

@@ -42,17 +42,17 @@ class AffinityController:
             self.release_affinity()
             return 255
         if not self._pinned and mean < _FAST_EXCHANGE_SECONDS:
-            return self._pin(now)
+            return self._pin_to_current_processor(now)
         return 0
 
-    def _pin(self, now: float) -> int:
+    def _pin_to_current_processor(self, now: float) -> int:
         """Pin this side to the processor that it uses now, until `now` plus `_REMEASURE_SECONDS`.
 
         Returns processor number + 1, the flag for the other side; 0 (no change) if the processor is
         unknown or its number does not fit into the flag, which is one byte (255 means any
         processor).
         """
-        processor = _processor()
+        processor = _read_current_processor()
         if self._home is None or not 0 <= processor < 254:
             return 0
         os.sched_setaffinity(0, {processor})
@@ -66,7 +66,7 @@ class AffinityController:
             self._pinned = False
 
 
-def _processor() -> int:
+def _read_current_processor() -> int:
     """Return the number of the processor that runs this process; -1 if unknown."""
     try:
         return int(ctypes.CDLL(None).sched_getcpu())

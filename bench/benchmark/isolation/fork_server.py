@@ -79,7 +79,7 @@ def serve_fork_requests(descriptor: int) -> None:
             if descriptors and not os.fork():
                 link.close()
                 try:
-                    _supervise(request, descriptors, layers)
+                    _supervise_service(request, descriptors, layers)
                 finally:
                     # Without the exit, the fork would continue as a second fork server.
                     os._exit(1)
@@ -100,7 +100,7 @@ def _preload_modules(modules: list[str]) -> None:
             importlib.import_module(name)
 
 
-def _supervise(request: dict[str, Any], descriptors: list[int], layers: list[str]) -> None:
+def _supervise_service(request: dict[str, Any], descriptors: list[int], layers: list[str]) -> None:
     """Act as supervisor: fork the process that runs the service, and report how it ended.
 
     The supervisor is needed because a new process namespace begins with the next child. It never

@@ -75,11 +75,11 @@ def list_readable_paths(hidden: tuple[str, ...]) -> tuple[str, ...]:
             packages that contains one of them is left out.
     """
     # A notebook may have added a folder to the path since the last call.
-    return _readable(hidden, tuple(sys.path))
+    return _list_readable_paths(hidden, tuple(sys.path))
 
 
 @cache
-def _readable(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, ...]:
+def _list_readable_paths(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, ...]:
     """List the readable paths for given hidden folders and a given `sys.path` (`packages`).
 
     A folder of packages that contains a hidden one is left out, and of the project only the folders
@@ -112,13 +112,13 @@ def enter_namespaces() -> list[str]:
     """
     user, group = os.geteuid(), os.getegid()
     active: list[str] = []
-    with _layer(active, "memory"):
+    with _try_restriction(active, "memory"):
         linux_syscalls.unshare(linux_syscalls.CLONE_NEWUSER)
         linux_syscalls.map_identity(user, group)
     # A superuser can enter these namespaces without a user namespace.
-    with _layer(active, "network"):
+    with _try_restriction(active, "network"):
         linux_syscalls.unshare(linux_syscalls.CLONE_NEWNET)
-    with _layer(active, "names"):
+    with _try_restriction(active, "names"):
         linux_syscalls.unshare(linux_syscalls.CLONE_NEWIPC)
     return active
 
@@ -130,12 +130,12 @@ def mount_empty_folder(folder: str) -> list[str]:
         Names of the active isolation layers.
     """
     active: list[str] = []
-    with _layer(active, "disk"):
+    with _try_restriction(active, "disk"):
         linux_syscalls.unshare(linux_syscalls.CLONE_NEWNS)
         linux_syscalls.make_mounts_private()
         # This comes before the mount of its own writable folder. File times and permissions could
         # pass information to other runs.
-        with _layer(active):
+        with _try_restriction(active):
             linux_syscalls.make_mounts_read_only()
         linux_syscalls.mount_filesystem(
             "tmpfs", folder, f"size={MAX_FOLDER_BYTES},nr_inodes=4096,mode=700"
@@ -150,7 +150,7 @@ def enter_process_namespace() -> list[str]:
         Names of the active isolation layers.
     """
     active: list[str] = []
-    with _layer(active, "processes"):
+    with _try_restriction(active, "processes"):
         linux_syscalls.unshare(linux_syscalls.CLONE_NEWPID)
     return active
 
@@ -169,25 +169,25 @@ def lock_down(policy: AccessPolicy, has_user_namespace: bool) -> list[str]:
     """
     active: list[str] = []
     # If its own /proc cannot be mounted, Landlock allows only this process's part of the old one.
-    with _layer(active):
+    with _try_restriction(active):
         linux_syscalls.mount_filesystem("proc", "/proc")
     os.chdir(policy.folder)
     _set_resource_limits(has_user_namespace)
     # This comes before Landlock, which may deny this process access to its own /proc entries.
     limit_memory(policy.memory)
     # If memory is exhausted, the kernel kills the tuner first, and no other process.
-    with _layer(active):
+    with _try_restriction(active):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-    with _layer(active, "files"):
+    with _try_restriction(active, "files"):
         writable = [policy.folder, *_DEVICE_PATHS]
         linux_syscalls.restrict_file_access(policy.readable_paths, writable)
-    with _layer(active, "calls", "network"):
+    with _try_restriction(active, "calls", "network"):
         seccomp_filter.install_syscall_filter(has_memory_limit=policy.memory > 0)
     return active
 
 
 @contextmanager
-def _layer(active: list[str], *names: str) -> Iterator[None]:
+def _try_restriction(active: list[str], *names: str) -> Iterator[None]:
     """Apply a restriction in the block; if the kernel permits it, add the names to `active`."""
     with suppress(OSError, KeyError, AttributeError):
         yield

@@ -155,7 +155,7 @@ def mount_filesystem(kind: str, mount_point: str, options: str = "") -> None:
     Raises:
         OSError: the kernel does not permit it.
     """
-    _mount(kind, mount_point, _MS_CAREFUL, options)
+    _call_mount(kind, mount_point, _MS_CAREFUL, options)
 
 
 def make_mounts_private() -> None:
@@ -164,7 +164,7 @@ def make_mounts_private() -> None:
     Raises:
         OSError: the kernel does not permit it.
     """
-    _mount("none", "/", _MS_PRIVATE, "")
+    _call_mount("none", "/", _MS_PRIVATE, "")
 
 
 def make_mounts_read_only() -> None:
@@ -181,7 +181,7 @@ def make_mounts_read_only() -> None:
     )
 
 
-def _mount(kind: str, mount_point: str, flags: int, options: str) -> None:
+def _call_mount(kind: str, mount_point: str, flags: int, options: str) -> None:
     """Call mount(2); `kind` is the type of the file system, which also serves as its source.
 
     Raises an OSError if the kernel refuses.
@@ -263,16 +263,16 @@ def restrict_file_access(readable: Iterable[str], writable: Iterable[str]) -> No
     rules = call_system(_LANDLOCK_CREATE, attributes, size, ctypes.c_uint32(0))
     try:
         for path in readable:
-            _allow(rules, path, _LANDLOCK_READ & everything)
+            _add_landlock_rule(rules, path, _LANDLOCK_READ & everything)
         for path in writable:
-            _allow(rules, path, everything)
+            _add_landlock_rule(rules, path, everything)
         set_no_new_privileges()
         call_system(_LANDLOCK_RESTRICT, ctypes.c_int(rules), ctypes.c_uint32(0))
     finally:
         os.close(rules)
 
 
-def _allow(rules: int, path: str, rights: int) -> None:
+def _add_landlock_rule(rules: int, path: str, rights: int) -> None:
     """Add a Landlock rule that gives a process `rights` on a file, or on a folder and its content.
 
     A path that does not exist or cannot be opened is skipped: it then remains forbidden.

@@ -155,7 +155,7 @@ class MessageChannel:
             TimeoutError: the other side does not read in time.
         """
         body = b"".join([part if isinstance(part, bytes) else bytes(part) for part in parts])
-        self._write(_HEAD.pack(kind, flags, size, len(body)) + body, deadline)
+        self._write_message(_HEAD.pack(kind, flags, size, len(body)) + body, deadline)
 
     def send_document(self, kind: bytes, document: Any, flags: int = 0) -> None:
         """Send a message whose body is JSON.
@@ -167,7 +167,7 @@ class MessageChannel:
         """
         self.send(kind, json.dumps(document).encode(), flags=flags)
 
-    def _write(self, message: bytes, deadline: float) -> None:
+    def _write_message(self, message: bytes, deadline: float) -> None:
         """Write the whole message, in several parts if the pipe is full.
 
         Raises TimeoutError at the deadline (a time of `perf_counter`), PeerClosedError if the other
@@ -178,7 +178,7 @@ class MessageChannel:
             try:
                 unsent = unsent[os.write(self._writing, unsent) :]
             except BlockingIOError:
-                if not self._outgoing.poll(_milliseconds(deadline)):
+                if not self._outgoing.poll(_compute_poll_timeout(deadline)):
                     raise TimeoutError from None
             except OSError:
                 raise PeerClosedError from None
@@ -195,9 +195,9 @@ class MessageChannel:
             ProtocolError: the data are not a valid message.
             TimeoutError: there is no message in time.
         """
-        received = self._read(self._view, deadline)
+        received = self._read_available_bytes(self._view, deadline)
         while received < _HEAD.size:
-            received += self._read(self._view[received:], deadline)
+            received += self._read_available_bytes(self._view[received:], deadline)
         kind, flags, size, length = _HEAD.unpack_from(self._buffer)
         if length > limit:
             raise ProtocolError(f"it sent {length} bytes at once, {limit} are allowed")
@@ -205,28 +205,28 @@ class MessageChannel:
             raise ProtocolError("it spoke without having been asked")
         received -= _HEAD.size
         if _HEAD.size + length > _BUFFER:
-            return Message(kind, flags, size, self._long(received, length, deadline))
+            return Message(kind, flags, size, self._read_long_body(received, length, deadline))
         body = self._view[_HEAD.size : _HEAD.size + length]
         while received < length:
-            received += self._read(body[received:], deadline)
+            received += self._read_available_bytes(body[received:], deadline)
         return Message(kind, flags, size, body)
 
-    def _long(self, received: int, length: int, deadline: float) -> memoryview:
+    def _read_long_body(self, received: int, length: int, deadline: float) -> memoryview:
         """Read a body that is longer than the buffer; memory grows only with the data received."""
         body = bytearray(self._view[_HEAD.size : _HEAD.size + received])
         while len(body) < length:
             part = self._view[: min(_BUFFER, length - len(body))]
-            body += part[: self._read(part, deadline)]
+            body += part[: self._read_available_bytes(part, deadline)]
         return memoryview(body)
 
-    def _read(self, into: memoryview, deadline: float) -> int:
+    def _read_available_bytes(self, into: memoryview, deadline: float) -> int:
         """Read the bytes that are available into `into`, at least one, and return their number.
 
         Raises TimeoutError if nothing arrives before the deadline, PeerClosedError if the pipe is
         closed.
         """
         # `poll` comes before `readv`, because a blocking read could not stop at the deadline.
-        if not self._incoming.poll(_milliseconds(deadline)):
+        if not self._incoming.poll(_compute_poll_timeout(deadline)):
             raise TimeoutError
         try:
             size = os.readv(self._reading, [into])
@@ -237,7 +237,7 @@ class MessageChannel:
         return size
 
 
-def _milliseconds(deadline: float) -> float | None:
+def _compute_poll_timeout(deadline: float) -> float | None:
     remaining = (deadline - perf_counter()) * 1e3
     # A larger timeout exceeds the range of `poll`, and is replaced by no timeout.
     return None if remaining > _LONGEST else max(0.0, remaining)
@@ -271,8 +271,8 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
         descriptions = json.loads(line)
         arrays, offset = {}, 0
         for name, kind, shape in descriptions[:_ARRAYS]:
-            array, offset = _array(rest, offset, kind, shape)
-            arrays[_name(name)] = array
+            array, offset = _read_array(rest, offset, kind, shape)
+            arrays[_check_array_name(name)] = array
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ProtocolError("it sent what are no arrays") from None
     if offset != len(rest) or not len(arrays) == len(descriptions) <= _ARRAYS:
@@ -280,7 +280,7 @@ def unpack_arrays(body: memoryview) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _name(name: object) -> str:
+def _check_array_name(name: object) -> str:
     """Check the name of an array, which is used as a name in a file.
 
     Raises:
@@ -295,7 +295,7 @@ _NAME_LENGTH = 500
 """Upper limit of the length of an array's name in characters."""
 
 
-def _array(
+def _read_array(
     data: memoryview, offset: int, kind: str, shape: Sequence[int]
 ) -> tuple[NDArray[Any], int]:
     """Read the array at a position.

@@ -37,7 +37,7 @@ def create_locked_folder() -> LockedFolder:
     remove_stale_folders()
     while True:
         path = tempfile.mkdtemp(prefix=_PREFIX)
-        lock = _locked(path, wait=True)
+        lock = _lock_folder(path, wait=True)
         # Between creation and lock another process may have removed the folder as unused.
         if lock is not None and os.path.isdir(path):
             return LockedFolder(path, lock)
@@ -46,12 +46,12 @@ def create_locked_folder() -> LockedFolder:
 def remove_stale_folders() -> None:
     """Delete the folders of processes that were killed."""
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        lock = _locked(str(path), wait=False)
+        lock = _lock_folder(str(path), wait=False)
         if lock is not None:
             LockedFolder(str(path), lock).remove()
 
 
-def _locked(path: str, wait: bool) -> int | None:
+def _lock_folder(path: str, wait: bool) -> int | None:
     """Lock a folder, and return the file descriptor.
 
     Args:

@@ -164,12 +164,14 @@ class BpfInstruction(NamedTuple):
     skip_if_false: int = 0
 
 
-def _when(opcode: int, operand: int, body: list[BpfInstruction]) -> list[BpfInstruction]:
+def _emit_conditional(
+    opcode: int, operand: int, body: list[BpfInstruction]
+) -> list[BpfInstruction]:
     """Return instructions that execute the body if a comparison with the operand holds."""
     return [BpfInstruction(opcode, operand, skip_if_false=len(body)), *body]
 
 
-def _apply(rule: int | ArgumentRule) -> list[BpfInstruction]:
+def _emit_rule(rule: int | ArgumentRule) -> list[BpfInstruction]:
     """Return the instructions of the filter program that decide about one system call.
 
     `rule` is the verdict itself, or a rule that depends on one argument of the call: it is loaded,
@@ -183,7 +185,7 @@ def _apply(rule: int | ArgumentRule) -> list[BpfInstruction]:
         *(
             instruction
             for value, verdict in rule.verdicts.items()
-            for instruction in _when(_EQUAL, value, _apply(verdict))
+            for instruction in _emit_conditional(_EQUAL, value, _emit_rule(verdict))
         ),
         BpfInstruction(_RETURN, rule.otherwise),
     ]
@@ -197,11 +199,14 @@ def build_filter(machine: str, rules: Mapping[str, int | ArgumentRule]) -> list[
         rules: verdict or rule by name of the call.
     """
     program = [BpfInstruction(_LOAD, _ARCHITECTURE_OFFSET)]
-    program += [BpfInstruction(_EQUAL, _ARCHITECTURES[machine], skip_if_true=1), *_apply(_KILL)]
-    program += [BpfInstruction(_LOAD, _NUMBER_OFFSET), *_when(_AT_LEAST, _X32, _apply(_ENOSYS))]
+    program += [BpfInstruction(_EQUAL, _ARCHITECTURES[machine], skip_if_true=1), *_emit_rule(_KILL)]
+    program += [
+        BpfInstruction(_LOAD, _NUMBER_OFFSET),
+        *_emit_conditional(_AT_LEAST, _X32, _emit_rule(_ENOSYS)),
+    ]
     for name, number in _NUMBERS[machine].items():
-        program += _when(_EQUAL, number, _apply(rules[name]))
-    return [*program, *_apply(_ALLOW)]
+        program += _emit_conditional(_EQUAL, number, _emit_rule(rules[name]))
+    return [*program, *_emit_rule(_ALLOW)]
 
 
 def install_syscall_filter(has_memory_limit: bool = False) -> None:

@@ -163,7 +163,7 @@ class IsolatedSteps:
             }
         )
         self._child.send(b"T", *parts, deadline=self._deadline)
-        return self._asked()
+        return self._receive_answer()
 
     def send(self, evaluation: Evaluation) -> Array | Proposal:
         """Send an evaluation to the tuner, and return its next proposal.
@@ -183,9 +183,9 @@ class IsolatedSteps:
             size=len(evaluation.losses),
             deadline=self._deadline,
         )
-        return self._asked()
+        return self._receive_answer()
 
-    def _asked(self) -> Array | Proposal:
+    def _receive_answer(self) -> Array | Proposal:
         """Receive the tuner's answer: points to simulate (A), or the end of its run (S).
 
         A message has n points (n, dim), after one recommended point (dim,) if its flags are 1.

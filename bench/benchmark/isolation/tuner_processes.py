@@ -74,7 +74,7 @@ class Written(NamedTuple):
 NOTHING_WRITTEN = Written(0, ())
 
 
-def _name(name: object) -> str:
+def _format_file_name(name: object) -> str:
     """Convert a file name to text that fits into one line."""
     return " ".join(to_printable(str(name)[:100]).split())
 
@@ -100,7 +100,7 @@ class ForkServerClient:
         self._process = subprocess.Popen(
             [sys.executable, "-c", code],
             pass_fds=[server_link.fileno()],
-            env=_environment(self._folder),
+            env=_make_environment(self._folder),
             cwd=self._folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -108,9 +108,9 @@ class ForkServerClient:
         )
         server_link.close()
         atexit.register(self.close)
-        self._send({}, _PRELOADED)
+        self._send_request({}, _PRELOADED)
 
-    def _send(
+    def _send_request(
         self, request: Mapping[str, Any], modules: Iterable[str], descriptors: tuple[int, ...] = ()
     ) -> None:
         """Send a request, with modules to be loaded that have not been loaded before."""
@@ -162,7 +162,7 @@ class ForkServerClient:
         control, child_control = socket.socketpair()
         descriptors = child_control.fileno(), child_reading, child_writing
         try:
-            self._send(request, modules, descriptors)
+            self._send_request(request, modules, descriptors)
         except KilledExternallyError:
             control.close()
             os.close(reading)
@@ -200,7 +200,7 @@ class ForkServerClient:
         scratch_folders.remove_stale_folders()
 
 
-def _environment(folder: str) -> dict[str, str]:
+def _make_environment(folder: str) -> dict[str, str]:
     """Return the environment variables of tuner processes.
 
     Only variables that numerical libraries and Python need are inherited, because others could pass
@@ -328,7 +328,7 @@ class IsolatedProcess:
         except ProtocolError as error:
             raise self.fail_with_protocol_error(str(error)) from None
         except PeerClosedError:
-            raise self._gone() from None
+            raise self._make_exit_error() from None
         if message.kind == b"D":
             raise RunEndedError("crashed", with_isolation(message.to_text()))
         return message
@@ -345,7 +345,9 @@ class IsolatedProcess:
             self.send(b"N", deadline=deadline)
             report = self.receive(deadline=deadline).to_document()
             count = max(0, min(int(report["count"]), _MAX_REPORTED_FILES))
-            return Written(count, tuple(map(_name, report["names"][:3])) if count else ())
+            return Written(
+                count, tuple(map(_format_file_name, report["names"][:3])) if count else ()
+            )
         except (RunEndedError, KilledExternallyError, ProtocolError):
             return NOTHING_WRITTEN
         except (TypeError, ValueError, LookupError, OverflowError):
@@ -370,14 +372,14 @@ class IsolatedProcess:
             self.end()
             raise RunEndedError("timeout", "") from None
         except PeerClosedError:
-            raise self._gone() from None
+            raise self._make_exit_error() from None
 
     def fail_with_protocol_error(self, violation: str) -> RunEndedError:
         """End a process that violated the protocol, and return the error to raise."""
         self.end()
         return RunEndedError("crashed", f"the tuner's process broke the pipe: {violation}")
 
-    def _gone(self) -> RunEndedError | KilledExternallyError:
+    def _make_exit_error(self) -> RunEndedError | KilledExternallyError:
         """Return the error for a process that has closed its pipe, after waiting for its exit code.
 
         A kill from outside by SIGKILL or SIGTERM, such as by the kernel when memory is exhausted,

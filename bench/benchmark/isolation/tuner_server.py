@@ -123,9 +123,9 @@ def _handle_message(channel: MessageChannel, message: Message, tuner: Tuner | No
         tuner.restore(unpack_arrays(message.body))
         channel.send(b"K")
     elif message.kind == b"T":
-        _tune(channel, message, tuner)
+        _run_tuner(channel, message, tuner)
     elif message.kind == b"F":
-        _fit(channel, message, tuner)
+        _train_tuner(channel, message, tuner)
     return tuner
 
 
@@ -175,7 +175,7 @@ def make_generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
     return np.random.default_rng(arrays["stream"].astype(np.uint32))
 
 
-def _tune(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
+def _run_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
     """Run the tuner on the task of a message, and exchange its proposals for evaluations.
 
     At the end it sends S with the tuner's reason for stopping, or K after the harness closed the
@@ -194,7 +194,7 @@ def _tune(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
     )
     steps = tuner.tune(task, make_generator(arrays))
     try:
-        _exchange(channel, steps, task)
+        _exchange_evaluations(channel, steps, task)
     except StopIteration as stop:
         reason = str(stop.value or "the tuner stopped")
         channel.send(b"S", reason.encode("utf-8", "replace")[: MAX_TEXT_BYTES // 2])
@@ -203,7 +203,7 @@ def _tune(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
         channel.send(b"K")
 
 
-def _exchange(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoReturn:
+def _exchange_evaluations(channel: MessageChannel, steps: TunerGenerator, task: Task) -> NoReturn:
     """Send proposals to the harness, and evaluations to the tuner.
 
     Raises:
@@ -323,7 +323,7 @@ class _RemoteTrainingCallback:
         self._channel.receive(_LIMIT)
 
 
-def _fit(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
+def _train_tuner(channel: MessageChannel, message: Message, tuner: Tuner) -> None:
     """Train the tuner on the harness's training simulator, and send its weights (message L).
 
     Progress is reported to the harness if the flags of the message ask for it.

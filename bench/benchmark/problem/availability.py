@@ -34,7 +34,7 @@ class Availability:
 def availability(experiment: Experiment) -> Availability:
     """Find what is missing for an experiment, or for all experiments that it names."""
     if experiment.experiments:
-        return _together(experiment)
+        return _combine_availability(experiment)
     data_set = _missing_data_set(experiment)
     missing_file = (
         "" if data_set else find_missing_model_file(experiment) or _missing_recording(experiment)
@@ -76,7 +76,7 @@ def leave_out_missing_problems(suite: Experiment) -> tuple[Experiment, dict[str,
     return suite.chosen(experiments=tuple(kept)), reasons
 
 
-def _together(experiment: Experiment) -> Availability:
+def _combine_availability(experiment: Experiment) -> Availability:
     """Combine what is missing for the experiments that this one names.
 
     Only the first missing data set is reported; the others follow when it has been downloaded.

@@ -67,8 +67,10 @@ class RandomisedSimulator:
         settings: dict[str, Any] = dict(experiment.settings)
         # The effects that the simulator was extended with are known, and keep their coefficients.
         known = settings.get("fixed", {})
-        ranges = {name: ends for name, ends in ranges.items() if _effect(name) not in known}
-        names = list(dict.fromkeys(_effect(name) for name in ranges))
+        ranges = {
+            name: ends for name, ends in ranges.items() if _get_effect_name(name) not in known
+        }
+        names = list(dict.fromkeys(_get_effect_name(name) for name in ranges))
         settings["effects"] = [*settings.get("effects", ()), *names]
         observe = [channel.name for channel in problem.channels]
         who = f"experiment {experiment.name}: nuisance"
@@ -120,7 +122,7 @@ class RandomisedSimulator:
         self._simulator.close()
 
 
-def _effect(name: str) -> str:
+def _get_effect_name(name: str) -> str:
     """Return a coefficient's effect: the coefficient's name, or its part before the last dot."""
     whole, several = name.partition("@")[0], name.rpartition(".")[0]
     return (

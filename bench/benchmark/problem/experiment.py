@@ -477,7 +477,9 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
     elif fields.get("free") or fields.get("actuators"):
         raise InputError(f'{path}: free and actuators are of a robot: expected model = "FILE"')
     if fields.get("experiments"):
-        fields["experiments"] = tuple(_beside(each, path) for each in fields["experiments"])
+        fields["experiments"] = tuple(
+            _resolve_experiment_path(each, path) for each in fields["experiments"]
+        )
     elif not fields.get("simulator") and not fields.get("diagnosis"):
         raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')
     # Paths are made absolute here: workers and result folders do not know this file's location.
@@ -489,7 +491,7 @@ def parse_experiment(name: str, document: Mapping[str, Any], path: Path) -> Expe
         experiment = Experiment(name=name, tuners=tuners, **fields)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    _expanded(experiment, path)  # an error in a swept value is an error of this file
+    _expand_combinations(experiment, path)  # an error in a swept value is an error of this file
     # The stored configuration of a result may select some of the questions.
     if experiment.suite and experiment.diagnosis and experiment.problem_hashes:
         found = compute_hash({k: document["diagnosis"].get(k) for k in ("seed", "questions")})
@@ -509,7 +511,7 @@ def expand_sweep(experiment: Experiment) -> list[Experiment]:
         return [
             expanded for name in experiment.experiments for expanded in _as_in(experiment, name)
         ]
-    return _expanded(experiment, Path(f"{experiment.name}.toml"))
+    return _expand_combinations(experiment, Path(f"{experiment.name}.toml"))
 
 
 SHARED_KEYS = (
@@ -553,13 +555,13 @@ def _as_in(together: Experiment, name: str) -> list[Experiment]:
     return expand_sweep(experiment.chosen(**shared))
 
 
-def _beside(name: str, experiment: Path) -> str:
+def _resolve_experiment_path(name: str, experiment: Path) -> str:
     """Return a name, or the path of an experiment file, made absolute if it is next to this one."""
     file = experiment.parent / name
     return str(file.resolve()) if name.endswith(".toml") and is_existing_file(file) else name
 
 
-def _expanded(experiment: Experiment, path: Path) -> list[Experiment]:
+def _expand_combinations(experiment: Experiment, path: Path) -> list[Experiment]:
     """Expand a sweep to one experiment for each combination of values.
 
     An experiment without a sweep is returned alone. Each combination is named

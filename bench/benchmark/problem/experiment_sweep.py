@@ -46,31 +46,31 @@ def expand_documents(
             f"found {count:.3g} combinations; sweep over fewer values, or divide the file"
         )
     for key, values in swept.items():
-        _check(path, f"sweep.{key}", values)
+        _check_sweep_values(path, f"sweep.{key}", values)
     for values in product(*swept.values()):
         # A copy is needed, because tables within the document are changed.
         changed = deepcopy(dict(document))
         parts = []
         for key, value in zip(swept, values, strict=True):
-            _put(path, changed, key, value)
-            parts.append(f"{key}={_text(path, key, value)}")
+            _insert_value(path, changed, key, value)
+            parts.append(f"{key}={_format_swept_value(path, key, value)}")
         yield ",".join(parts), changed
 
 
-def _check(path: Path, where: str, values: Sequence[Any]) -> None:
+def _check_sweep_values(path: Path, where: str, values: Sequence[Any]) -> None:
     """Raise an error for a key of a sweep that has no values, or the same value twice.
 
     `where` is the key in the file, for the message.
     """
     if not values:
         raise make_error(path, where, "at least one value", values)
-    texts = [_text(path, where, value) for value in values]
+    texts = [_format_swept_value(path, where, value) for value in values]
     for text in texts:
         if texts.count(text) > 1:  # two experiments would share one folder
             raise InputError(f"{path}: {where}: {text} stands twice")
 
 
-def _text(path: Path, where: str, value: Any) -> str:
+def _format_swept_value(path: Path, where: str, value: Any) -> str:
     """Return a swept value as text, for the name of its experiment and thus for its folder.
 
     Characters that do not fit into a folder name become hyphens.
@@ -81,26 +81,26 @@ def _text(path: Path, where: str, value: Any) -> str:
     if isinstance(value, dict):
         raise make_error(path, where, "texts, numbers, bools or lists of them", value)
     if isinstance(value, list | tuple):
-        return "_".join(_text(path, where, item) for item in value)
+        return "_".join(_format_swept_value(path, where, item) for item in value)
     if isinstance(value, bool):  # as TOML writes it
         return str(value).lower()
     return _UNFIT.sub("-", str(value))
 
 
-def _put(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
+def _insert_value(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
     """Insert a value at the position that a key such as ``noise.q`` names; tables are created.
 
     Names that contain dots themselves are recognised if the table has them already.
     """
     table, rest = document, key
-    while (name := _first(table, rest)) != rest:
+    while (name := _get_first_key(table, rest)) != rest:
         table, rest = table.setdefault(name, {}), rest[len(name) + 1 :]
         if not isinstance(table, dict):
             raise InputError(f"{path}: sweep.{key}: {name} is no table, and has nothing in it")
     table[rest] = value
 
 
-def _first(table: Mapping[str, Any], key: str) -> str:
+def _get_first_key(table: Mapping[str, Any], key: str) -> str:
     """Return the part of a key that names an entry of the table; effect names can contain dots."""
     there = [name for name in table if key == name or key.startswith(f"{name}.")]
     # A part that is not in the table is a new table, or a key that later checks refuse.

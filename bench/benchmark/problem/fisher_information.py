@@ -80,10 +80,10 @@ class InformationSpectrum:
             Root mean squares (k,) along stiff and along sloppy directions; NaN if there are none.
         """
         squares = (errors @ self.vectors) ** 2
-        return _rms(squares[:, self.is_stiff]), _rms(squares[:, ~self.is_stiff])
+        return _compute_rms(squares[:, self.is_stiff]), _compute_rms(squares[:, ~self.is_stiff])
 
 
-def _rms(squares: Array) -> Array:
+def _compute_rms(squares: Array) -> Array:
     """Return the root mean square (k,) over directions of squares (k, directions).
 
     NaN if there is no direction.

@@ -91,7 +91,7 @@ def find_model(path: str, name: str) -> Path:
         PartUnavailableError: the file is in none of these places.
     """
     if path.startswith(PACKAGE_SCHEME):
-        return _packaged(path, name)
+        return _find_packaged_model(path, name)
     if found := datasets.find("robot", path):
         return found
     if is_existing_file(Path(path)):
@@ -105,7 +105,7 @@ def find_model(path: str, name: str) -> Path:
     )
 
 
-def _packaged(path: str, name: str) -> Path:
+def _find_packaged_model(path: str, name: str) -> Path:
     """Find a model file inside an installed Python package, given as ``package://NAME/FILE``.
 
     `path` is this address, and `name` the experiment that needs the file.

@@ -55,13 +55,15 @@ def load_recorded_runs(path: str, simulator: Simulator) -> RecordedRuns:
     wanted = [channel.name for channel in simulator.channels]
     check_known_names(f"channel of {recording.path}", wanted, recording.runs[0].channels)
     return RecordedRuns(
-        _side(recording, recording.training(), simulator),
-        _side(recording, recording.held_out(), simulator),
+        _make_observed_runs(recording, recording.training(), simulator),
+        _make_observed_runs(recording, recording.held_out(), simulator),
         recording.noise,
     )
 
 
-def _side(recording: Recording, runs: tuple[Run, ...], simulator: Simulator) -> ObservedRuns:
+def _make_observed_runs(
+    recording: Recording, runs: tuple[Run, ...], simulator: Simulator
+) -> ObservedRuns:
     """Convert runs of a recording to scenarios and observations, for one side: fitting or held out.
 
     The observations of all runs are stacked to (T, C): T samples of all runs together, C channels

@@ -83,13 +83,13 @@ class TargetStreams:
 
     def get_stream(self, what: str) -> np.random.Generator:
         """Return the random generator of one quantity; public salts share one generator for all."""
-        return self._one if self._public else self._secret(what)
+        return self._one if self._public else self._make_salted_rng(what)
 
     def get_held_out_stream(self, scenario: int) -> np.random.Generator:
         """Return the random generator of a held-out scenario."""
         if self._public:
             return make_rng(*self._names, "held-out", scenario)
-        return self._secret("held-out", scenario)
+        return self._make_salted_rng("held-out", scenario)
 
-    def _secret(self, *what: str | int) -> np.random.Generator:
+    def _make_salted_rng(self, *what: str | int) -> np.random.Generator:
         return make_rng("salt", self._salt, *self._names, *what)

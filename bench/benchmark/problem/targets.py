@@ -124,10 +124,10 @@ def draw_target(problem: TargetProblem, kind: str, index: int) -> Target:
         InputError: all of `MAX_DRAWS` draws diverge.
     """
     for number in range(MAX_DRAWS):
-        target = _draw(problem, kind, index, number)
+        target = _draw_target(problem, kind, index, number)
         if target is not None:
             return target
-    raise _diverging(problem.experiment, MAX_DRAWS, MAX_DRAWS)
+    raise _make_divergence_error(problem.experiment, MAX_DRAWS, MAX_DRAWS)
 
 
 def redraws_of(experiment: Experiment, drawn: Sequence[Target]) -> Redraws:
@@ -143,11 +143,11 @@ def redraws_of(experiment: Experiment, drawn: Sequence[Target]) -> Redraws:
     failed = sum(target.redraws for target in drawn)
     draws = failed + len(drawn)
     if failed > MAX_FAILED_SHARE * draws:
-        raise _diverging(experiment, failed, draws)
+        raise _make_divergence_error(experiment, failed, draws)
     return Redraws(sum(target.redraws > 0 for target in drawn), draws)
 
 
-def _diverging(experiment: Experiment, failed: int, draws: int) -> InputError:
+def _make_divergence_error(experiment: Experiment, failed: int, draws: int) -> InputError:
     """Make the error for an experiment too many of whose targets diverge when they are simulated.
 
     `failed` of `draws` simulations diverged.
@@ -160,7 +160,7 @@ def _diverging(experiment: Experiment, failed: int, draws: int) -> InputError:
     )
 
 
-def _draw(problem: TargetProblem, kind: str, index: int, number: int) -> Target | None:
+def _draw_target(problem: TargetProblem, kind: str, index: int, number: int) -> Target | None:
     """Make one draw of a target; None if its simulation diverges.
 
     `kind` is the range of the target: ``wide`` draws from all bounds, others from the training
@@ -186,15 +186,15 @@ def _draw(problem: TargetProblem, kind: str, index: int, number: int) -> Target 
     theta = problem.cube.to_physical(truth[None])[:, : len(problem.world.parameters)]
     clean = problem.world.simulate(theta, scenarios[0])[0]
     observed = clean + problem.noise * streams.get_stream("noise").standard_normal(clean.shape)
-    fitting = ObservedRuns(scenarios, _quantise(observed, problem))
+    fitting = ObservedRuns(scenarios, _round_to_resolution(observed, problem))
     held_out = _held_out(problem, theta, streams)
-    if any(_diverges(each, problem.channels) for each in (clean, held_out.observed)):
+    if any(_is_divergent(each, problem.channels) for each in (clean, held_out.observed)):
         return None
     sealed = BlindedTarget(name, kind, start, fitting, held_out)
     return Target(sealed, problem.cube.to_physical(truth), number)
 
 
-def _quantise(observed: Array, problem: TargetProblem) -> Array:
+def _round_to_resolution(observed: Array, problem: TargetProblem) -> Array:
     """Round samples (T, C) to the resolution of the channels that have one."""
     steps = [problem.experiment.resolution.get(c.name, 0.0) for c in problem.channels]
     rounded = observed.copy()
@@ -204,7 +204,7 @@ def _quantise(observed: Array, problem: TargetProblem) -> Array:
     return rounded
 
 
-def _diverges(observed: Array, channels: Sequence[Channel]) -> bool:
+def _is_divergent(observed: Array, channels: Sequence[Channel]) -> bool:
     """Return whether a simulation (T, C) failed.
 
     It failed if a sample is infinite or beyond `DIVERGENCE_LIMIT`, or if a channel has no sample.
@@ -231,16 +231,16 @@ def draw_scenario(
         inputs: descriptions of the input signals.
     """
     sampling = experiment.sampling
-    start = {name: _drawn(rng, value) for name, value in initial.items()}
+    start = {name: _draw_value(rng, value) for name, value in initial.items()}
     times = np.arange(sampling.samples) / sampling.rate
     signals = {name: evaluate_signal(text, times, rng) for name, text in inputs.items()}
     # Constants that are equal in every scenario are set in the simulator.
     ranges = {name: v for name, v in experiment.constants.items() if isinstance(v, tuple)}
-    constants = {name: _drawn(rng, value) for name, value in ranges.items()}
+    constants = {name: _draw_value(rng, value) for name, value in ranges.items()}
     return Scenario(times, start, signals, constants)
 
 
-def _drawn(rng: np.random.Generator, value: FixedOrRange) -> float:
+def _draw_value(rng: np.random.Generator, value: FixedOrRange) -> float:
     return rng.uniform(*value) if isinstance(value, tuple) else value
 
 

@@ -48,12 +48,14 @@ def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
     """
     if isinstance(value, dict):
         tables = value.items()
-        return tuple(_entry(path, f"tuners.{label}", label, own) for label, own in tables)
+        return tuple(
+            _parse_tuner_table(path, f"tuners.{label}", label, own) for label, own in tables
+        )
     if not isinstance(value, list):
         raise make_error(path, "tuners", "a list of names or a table for each tuner", value)
     listed: list[TunerEntry] = []
     for place, item in enumerate(value):
-        entry = _listed(path, f"tuners[{place}]", item)
+        entry = _parse_list_item(path, f"tuners[{place}]", item)
         # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
         # can.
         if entry.label in [other.label for other in listed]:
@@ -63,7 +65,7 @@ def parse_entries(path: Path, value: Any) -> tuple[TunerEntry, ...]:
     return tuple(listed)
 
 
-def _listed(path: Path, where: str, item: Any) -> TunerEntry:
+def _parse_list_item(path: Path, where: str, item: Any) -> TunerEntry:
     """Parse one element of a list of tuners: a name, or a table with the key ``tuner``.
 
     The label, under which results are listed, is the key ``label``, or else the name of the tuner.
@@ -76,10 +78,10 @@ def _listed(path: Path, where: str, item: Any) -> TunerEntry:
     label = own.pop("label", own.get("tuner"))
     if not isinstance(label, str):
         raise make_error(path, where, 'a table with tuner = "NAME"', item)
-    return _entry(path, where, label, own)
+    return _parse_tuner_table(path, where, label, own)
 
 
-def _entry(path: Path, where: str, label: str, value: Any) -> TunerEntry:
+def _parse_tuner_table(path: Path, where: str, label: str, value: Any) -> TunerEntry:
     """Parse the table of one tuner; a table without the key ``tuner`` uses its label as the name.
 
     `path` and `where` (file and key) are for error messages, `value` is the table.

@@ -79,10 +79,10 @@ class TuningProblem:
 
         kind = get_simulator_class(experiment)
         observe = experiment.observe or tuple(c.name for c in kind.channels)
-        self.simulator = self._simulator(kind, observe, experiment.settings)
+        self.simulator = self._build_simulator(kind, observe, experiment.settings)
         self.world = self.simulator
         if experiment.world:
-            self.world = self._simulator(kind, observe, experiment.world)
+            self.world = self._build_simulator(kind, observe, experiment.world)
             self._check_world()
 
         self._check_constants()
@@ -90,12 +90,12 @@ class TuningProblem:
             apply_parameter_changes(self.simulator.parameters, experiment.parameters)
         )
         self.channels = self.simulator.channels
-        self.error_channel = self._channel(experiment.error_channel or self.channels[0].name)
+        self.error_channel = self._find_channel(experiment.error_channel or self.channels[0].name)
 
         self.recording: RecordedRuns | None = None
         noise = dict(experiment.noise)
         for name in (*noise, *experiment.resolution):
-            self._channel(name)
+            self._find_channel(name)
         if experiment.recording:
             self.recording = load_recorded_runs(experiment.recording.path, self.simulator)
             # Noise in the experiment file has priority over noise in the recording.
@@ -106,7 +106,7 @@ class TuningProblem:
         typical = [c.scale for c in self.channels]
         self.scale: Array = np.where(self.noise > 0, self.noise, typical)
 
-    def _simulator(
+    def _build_simulator(
         self, kind: type[Simulator], observe: Sequence[str], settings: Mapping[str, Any]
     ) -> Simulator:
         """Build a simulator; a setting that it does not accept becomes an error of the experiment.
@@ -151,7 +151,7 @@ class TuningProblem:
         self.simulator.close()
         self.world.close()
 
-    def _channel(self, name: str) -> int:
+    def _find_channel(self, name: str) -> int:
         """Return the index of an observed channel.
 
         Raises:

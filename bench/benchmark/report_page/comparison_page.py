@@ -62,11 +62,11 @@ def render_page(results: ComparisonReportData) -> str:
         stiff_threshold=f"{STIFF_SIGMA_THRESHOLD:g}",
         targets_per_training=TARGETS_PER_TRAINING,
         joined=joined,
-        separator=_separate,
+        separator=_make_list_separator,
     )
 
 
-def _separate(loop: object) -> Markup:
+def _make_list_separator(loop: object) -> Markup:
     """Return what follows an item of a list: a comma, ``and``, or nothing after the last one."""
     remaining = int(getattr(loop, "revindex0", 0))
     return Markup({0: "", 1: " and "}.get(remaining, ", "))

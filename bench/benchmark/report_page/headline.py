@@ -58,7 +58,7 @@ def standings(statistics: ComparisonStatistics, kind: str) -> list[Standing]:
     """
     ranking = _in_range(statistics, kind)
     return [
-        _standing(statistics, k, ranking[ranking["simulations"] == k])
+        _sort_by_verdict(statistics, k, ranking[ranking["simulations"] == k])
         for k in sorted(set(ranking["simulations"].astype(int)))
     ]
 
@@ -67,7 +67,7 @@ def _in_range(statistics: ComparisonStatistics, kind: str) -> pd.DataFrame:
     return statistics.ranking[statistics.ranking["range"] == kind]
 
 
-def _standing(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> Standing:
+def _sort_by_verdict(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> Standing:
     """Sort the tuners of one range by their verdict after `k` simulations.
 
     `part` are the rows of the ranking for this range and this number of simulations.
@@ -82,14 +82,14 @@ def _standing(statistics: ComparisonStatistics, k: int, part: pd.DataFrame) -> S
     return Standing(
         k,
         [str(name) for name in best],
-        _error(statistics, float(first["median"].iloc[0])) if len(first) else "",
-        [_worse(row) for row in named(WORSE).to_dict("records")],
+        _format_best_error(statistics, float(first["median"].iloc[0])) if len(first) else "",
+        [_format_worse_tuner(row) for row in named(WORSE).to_dict("records")],
         [str(name) for name in named(UNDECIDED)["tuner"]],
         [str(name) for name in named(FAILED)["tuner"]],
     )
 
 
-def _error(statistics: ComparisonStatistics, median: float) -> str:
+def _format_best_error(statistics: ComparisonStatistics, median: float) -> str:
     """Format the median error of the best tuner in the unit of the statistics.
 
     An error at or below the negligible error (`floor`) is given as an upper limit, because smaller
@@ -101,7 +101,7 @@ def _error(statistics: ComparisonStatistics, median: float) -> str:
     return f"at most {text}" if median <= statistics.floor * (1 + 1e-9) else text
 
 
-def _worse(row: dict[Any, Any]) -> str:
+def _format_worse_tuner(row: dict[Any, Any]) -> str:
     """Format a worse tuner, e.g. ``cma_es 5.8x (8/10)``."""
     ratio = float(row["error_ratio"])
     factor = f" {format_number(ratio, _DIGITS)}x" if ratio > 1.0 else ""
@@ -136,7 +136,7 @@ def how_decided(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    comparison_count = _others(statistics, kind)
+    comparison_count = _count_tested_tuners(statistics, kind)
     if not comparison_count:
         return ""
     return (
@@ -146,7 +146,7 @@ def how_decided(statistics: ComparisonStatistics, kind: str) -> str:
     )
 
 
-def _others(statistics: ComparisonStatistics, kind: str) -> int:
+def _count_tested_tuners(statistics: ComparisonStatistics, kind: str) -> int:
     """Return the number of tuners that the best one is tested against."""
     part = _in_range(statistics, kind)
     return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
@@ -159,7 +159,10 @@ def too_few(statistics: ComparisonStatistics, kind: str) -> str:
         statistics: Statistics of the comparison.
         kind: Range of the targets.
     """
-    ranked, comparison_count = _in_range(statistics, kind)["targets"], _others(statistics, kind)
+    ranked, comparison_count = (
+        _in_range(statistics, kind)["targets"],
+        _count_tested_tuners(statistics, kind),
+    )
     if not comparison_count or int(ranked.max()) >= (needed := targets_needed(comparison_count)):
         return ""
     targets = int(ranked.max())

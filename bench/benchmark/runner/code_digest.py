@@ -81,11 +81,11 @@ def compute_digest(*parts: Any, length: int = 10) -> str:
         parts: values to hash.
         length: number of hexadecimal digits.
     """
-    text = json.dumps(parts, sort_keys=True, default=_plainly)
+    text = json.dumps(parts, sort_keys=True, default=_convert_for_json)
     return hashlib.sha256(text.encode()).hexdigest()[:length]
 
 
-def _plainly(value: Any) -> Any:
+def _convert_for_json(value: Any) -> Any:
     if isinstance(value, bytes):
         return hashlib.sha256(value).hexdigest()
     return dict(value) if isinstance(value, Mapping) else str(value)
@@ -97,13 +97,13 @@ def hash_source_folders(which: tuple[str, ...] = ()) -> str:
     return compute_digest(
         __version__,
         [
-            _contents(PROJECT_ROOT / source_folder, PROJECT_ROOT)
+            _read_source_files(PROJECT_ROOT / source_folder, PROJECT_ROOT)
             for source_folder in which or COMPARISON_SOURCE_FOLDERS
         ],
     )
 
 
-def _contents(folder: Path, root: Path) -> list[tuple[str, bytes]]:
+def _read_source_files(folder: Path, root: Path) -> list[tuple[str, bytes]]:
     """Return relative path and content of each file in a folder, without compiled Python files.
 
     Args:
@@ -172,16 +172,18 @@ def hash_class_source(kind: type) -> str:
     Raises:
         InputError: the source of a class cannot be found.
     """
-    return compute_digest([(_name(part), _place(part)) for part in _parts(kind)])
+    return compute_digest(
+        [(_get_class_name(part), _represent_class(part)) for part in _list_source_classes(kind)]
+    )
 
 
-def _name(kind: type) -> str:
+def _get_class_name(kind: type) -> str:
     """Return the full name of a class; the changing module name of a plugin file is replaced."""
     plugin = kind.__module__.startswith(_PLUGIN)
     return f"{'plugin' if plugin else kind.__module__}.{kind.__qualname__}"
 
 
-def _parts(kind: type) -> list[type]:
+def _list_source_classes(kind: type) -> list[type]:
     """Return a class, its bases, and the classes that it lists in ``made_of``, recursively.
 
     Their sources together determine the behaviour of the class, so all of them are hashed.
@@ -201,11 +203,11 @@ def _parts(kind: type) -> list[type]:
 
 
 def _of_python(kind: type) -> bool:
-    top = _top(kind)
+    top = _get_top_level_package(kind)
     return top in sys.stdlib_module_names and top != "__main__"
 
 
-def _top(kind: type) -> str:
+def _get_top_level_package(kind: type) -> str:
     return kind.__module__.partition(".")[0]
 
 
@@ -222,7 +224,7 @@ def _under_its_name(kind: type) -> bool:
     return held is kind
 
 
-def _place(kind: type) -> Any:
+def _represent_class(kind: type) -> Any:
     """Return the representation of a class in a hash.
 
     It is empty if `hash_source_folders` covers the class; otherwise it is the source of the class.
@@ -236,7 +238,7 @@ def _place(kind: type) -> Any:
     if not _under_its_name(kind):
         raise _make_source_error(kind)
     if kind.__module__ == "__main__":
-        return _text(kind)
+        return _read_class_source(kind)
     file = getattr(sys.modules[kind.__module__], "__file__", None)
     if file is None:
         raise _make_source_error(kind)
@@ -246,10 +248,10 @@ def _place(kind: type) -> Any:
         for source_folder in COMPARISON_SOURCE_FOLDERS
     ):
         return ""
-    return _package(kind, path)
+    return _read_package_contents(kind, path)
 
 
-def _text(kind: type) -> str:
+def _read_class_source(kind: type) -> str:
     """Return the source of a class of a notebook cell or of the main script."""
     try:
         return inspect.getsource(kind)
@@ -262,11 +264,13 @@ def _text(kind: type) -> str:
     raise _make_source_error(kind)
 
 
-def _package(kind: type, path: Path) -> Any:
+def _read_package_contents(kind: type, path: Path) -> Any:
     """Return the contents of an installed plugin's package, or of the file with the class."""
-    top = sys.modules.get(_top(kind))
-    if _top(kind) in _installed() and (folders := getattr(top, "__path__", None)):
-        return [_contents(Path(folder), Path(folder)) for folder in folders]
+    top = sys.modules.get(_get_top_level_package(kind))
+    if _get_top_level_package(kind) in _list_plugin_packages() and (
+        folders := getattr(top, "__path__", None)
+    ):
+        return [_read_source_files(Path(folder), Path(folder)) for folder in folders]
     return path.name, path.read_bytes()
 
 
@@ -280,7 +284,7 @@ def _make_source_error(kind: type) -> InputError:
 
 
 @cache
-def _installed() -> frozenset[str]:
+def _list_plugin_packages() -> frozenset[str]:
     """Return the top-level packages of installed plugins, including this project's own."""
     entries = [entry for group in _GROUPS for entry in entry_points(group=group)]
     return frozenset(entry.module.partition(".")[0] for entry in entries)

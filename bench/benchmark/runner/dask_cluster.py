@@ -95,9 +95,9 @@ class ClusterPool:
             ) from None
         self._plugins: PluginContents = ()
         self._sent_files: dict[Path, Any] = {}
-        self._check()
+        self._check_workers()
 
-    def _check(self) -> None:
+    def _check_workers(self) -> None:
         """Raise an error unless there are workers, all with the code and packages of this process.
 
         Other code could give other results, and the id of a run states the code of this process.
@@ -109,7 +109,7 @@ class ClusterPool:
             )
         here = (hash_source_folders(), hash_package_versions())
         try:
-            there = self._identities()
+            there = self._hash_workers()
         except Exception as error:  # any error of a worker that lacks our modules
             raise InputError(
                 f"{self.address}: its workers lack simgap ({get_first_line(error)})"
@@ -121,14 +121,14 @@ class ClusterPool:
                 "process; install the same on both"
             )
 
-    def _identities(self) -> dict[str, Any]:
+    def _hash_workers(self) -> dict[str, Any]:
         """Return hashes of code and package versions by worker.
 
         Raises:
             Exception: a worker failed to compute them.
         """
         for _ in range(_WORKER_CHECK_ATTEMPTS):
-            there: dict[str, Any] = self._client.run(_identity, on_error="return")
+            there: dict[str, Any] = self._client.run(_hash_this_worker, on_error="return")
             # A worker that is lost during the call gives no information about its code.
             if not any(isinstance(answer, OSError) for answer in there.values()):
                 break
@@ -179,10 +179,10 @@ class ClusterPool:
                     len(waiting) < ahead
                     and (place := again.pop() if again else next(following, None)) is not None
                 ):
-                    waiting[self._submit(calls[place], seconds)] = place
+                    waiting[self._submit_call(calls[place], seconds)] = place
                 if not waiting:
                     return
-                for future in self._done(list(waiting)):
+                for future in self._wait_for_results(list(waiting)):
                     place = waiting.pop(future)
                     ended = future.status
                     error = future.exception() if ended in ("error", "cancelled") else None
@@ -197,7 +197,7 @@ class ClusterPool:
                             )
                         again.append(place)
                         continue
-                    result = error if error is not None else self._received(future.result())
+                    result = error if error is not None else self._receive_result(future.result())
                     # The cluster stores a result until its future is released.
                     future.release()
                     yield place, result
@@ -206,7 +206,7 @@ class ClusterPool:
                 f"cluster {self.address}: the scheduler is gone ({type(error).__name__})"
             ) from None
 
-    def _done(self, futures: list[Any]) -> list[Any]:
+    def _wait_for_results(self, futures: list[Any]) -> list[Any]:
         """Wait until at least one future is done, and return all that are.
 
         It checks regularly whether the scheduler still answers.
@@ -219,12 +219,12 @@ class ClusterPool:
                     wait(futures, timeout=2.0, return_when="FIRST_COMPLETED")
             # A cancelled future is done; its call is repeated if the scheduler is still running.
             except (TimeoutError, CancelledError):
-                self._there()
+                self._check_scheduler()
             if done := [future for future in futures if future.done()]:
-                self._there()
+                self._check_scheduler()
                 return done
 
-    def _there(self) -> None:
+    def _check_scheduler(self) -> None:
         """Raise an error unless the scheduler answers within `_SCHEDULER_TIMEOUT_SECONDS`."""
         if self._client.status != "running":
             raise OSError(f"connection {self._client.status}")
@@ -232,7 +232,7 @@ class ClusterPool:
             self._client.scheduler.identity, callback_timeout=_SCHEDULER_TIMEOUT_SECONDS
         )
 
-    def _submit(self, call: Call, seconds: float) -> Any:
+    def _submit_call(self, call: Call, seconds: float) -> Any:
         """Submit one call to the cluster, and return its future.
 
         The files that its arguments refer to are sent with it. The workers may have no common file
@@ -242,12 +242,12 @@ class ClusterPool:
         function, arguments = call
         travelling = [argument for argument in arguments if isinstance(argument, Transferable)]
         paths = [path for argument in travelling for path in argument.list_files()]
-        contents = [self._sent(path) for path in paths]
+        contents = [self._send_file(path) for path in paths]
         return self._client.submit(
             run_on_worker, function, arguments, seconds, self._plugins, paths, contents, pure=False
         )
 
-    def _sent(self, path: Path) -> Any:
+    def _send_file(self, path: Path) -> Any:
         """Send name and content of a file to the cluster, once for all calls.
 
         It is stored as the result of a task: scattered data would be lost with the worker that
@@ -255,10 +255,10 @@ class ClusterPool:
         """
         if path not in self._sent_files:
             content = (path.name, path.read_bytes())
-            self._sent_files[path] = self._client.submit(_itself, content, pure=False)
+            self._sent_files[path] = self._client.submit(_return_content, content, pure=False)
         return self._sent_files[path]
 
-    def _received(self, result: Any) -> Any:
+    def _receive_result(self, result: Any) -> Any:
         """Return the value of a worker's result; trained weights are written to the local cache."""
         kind, value, content = result
         if kind == "weights":
@@ -275,11 +275,11 @@ def _write_if_absent(path: Path, content: bytes) -> None:
         write_atomically(path, content)
 
 
-def _itself(content: tuple[str, bytes]) -> tuple[str, bytes]:
+def _return_content(content: tuple[str, bytes]) -> tuple[str, bytes]:
     return content
 
 
-def _identity() -> tuple[str, str]:
+def _hash_this_worker() -> tuple[str, str]:
     """Return hashes of a worker's code and package versions."""
     return hash_source_folders(), hash_package_versions()
 
@@ -311,7 +311,7 @@ def run_on_worker(
     """
     if paths:
         # All files are in one folder, because a recording's description must be next to its table.
-        folder_here = _unpacked(tuple(contents))
+        folder_here = _write_hashed_folder(tuple(contents))
         places = {path: folder_here / name for path, (name, _) in zip(paths, contents, strict=True)}
         arguments = tuple(
             argument.relocate(places) if isinstance(argument, Transferable) else argument
@@ -324,14 +324,16 @@ def run_on_worker(
         multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         _pools[key] = LocalPool(1)
         # Each plugin has its own folder, so that its path does not depend on other plugins.
-        _pools[key].load_plugins([_here(plugin, content) for plugin, content in plugins])
+        _pools[key].load_plugins(
+            [_write_plugin_file(plugin, content) for plugin, content in plugins]
+        )
     ((_, result),) = _pools[key].iterate_results([(function, arguments)], seconds)
     if function is train_or_load and isinstance(result, TrainingResult):
         return "weights", result, result.path.read_bytes()
     return "value", result, b""
 
 
-def _here(plugin: Plugin, content: bytes) -> Plugin:
+def _write_plugin_file(plugin: Plugin, content: bytes) -> Plugin:
     """Write a plugin file with this content on this worker's machine.
 
     Returns the plugin with the path of the new file; a plugin without a file is returned unchanged.
@@ -339,10 +341,10 @@ def _here(plugin: Plugin, content: bytes) -> Plugin:
     if not plugin.path:
         return plugin
     name = Path(plugin.path).name
-    return replace(plugin, path=str(_unpacked(((name, content),)) / name))
+    return replace(plugin, path=str(_write_hashed_folder(((name, content),)) / name))
 
 
-def _unpacked(files: FileContents) -> Path:
+def _write_hashed_folder(files: FileContents) -> Path:
     """Write files into a folder of this machine that is named by their hash; return the folder."""
     hashed = hashlib.sha256()
     for name, content in files:

@@ -262,13 +262,13 @@ def prepare_experiment(experiment: Experiment, salt: str | None = None) -> Exper
         results.tuned = {entry.label: make_tuner_spec(entry) for entry in entries}
     drawn = results.problem.draw_targets()
     results.redraws = redraws_of(experiment, drawn)
-    results.plan = list(_plan(experiment, entries, drawn))
+    results.plan = list(_iterate_planned_runs(experiment, entries, drawn))
     # Workers open their own simulators, and this process does not need one for now.
     results.problem.close()
     return results
 
 
-def _plan(
+def _iterate_planned_runs(
     experiment: Experiment, entries: list[TunerEntry], targets: list[Target]
 ) -> Iterator[PlannedRun]:
     """Iterate over all runs, target by target, so that the remaining time can be estimated."""
@@ -312,8 +312,8 @@ def run_experiment(
     with hidden, pool or make_pool(jobs) as workers:
         workers.load_plugins(describe_plugins(plugins, experiment))
         try:
-            _identify(results, progress)
-            failures = _train(workers, results, progress)
+            _compute_target_spectra(results, progress)
+            failures = _train_learned_entries(workers, results, progress)
             ready = _store_untrained_runs(results, failures, progress)
             # Each outcome is stored before the next one, so that a kill loses running calls only.
             calls = _LazyCalls(results, ready.places)
@@ -358,7 +358,7 @@ def _store_untrained_runs(
     return ready
 
 
-def _identify(results: ExperimentRun, progress: ProgressFactory) -> None:
+def _compute_target_spectra(results: ExperimentRun, progress: ProgressFactory) -> None:
     """Compute the Fisher-information spectrum of each target.
 
     Only the parent process can do this, because it needs the true parameters if there are any.
@@ -407,7 +407,7 @@ class _LazyCalls(Sequence[Call]):
         return execute_run, (results.problem.experiment, order)
 
 
-def _train(
+def _train_learned_entries(
     pool: Pool, results: ExperimentRun, progress: ProgressFactory
 ) -> dict[tuple[str, int], Exception]:
     """Train every learned entry with each of its seeds.

@@ -246,7 +246,7 @@ def must_build_isolated(entry: TunerEntry) -> bool:
             raise _make_untrusted_code_error(entry.label, file)
         return False
     try:
-        retry_if_killed(lambda: _build(entry))
+        retry_if_killed(lambda: _try_to_build(entry))
         return True
     except RunEndedError as ended:
         message = "".join(str(ended).strip().splitlines()[-1:])
@@ -255,7 +255,7 @@ def must_build_isolated(entry: TunerEntry) -> bool:
         raise InputError(f"tuner {entry.label}: {message}") from None
 
 
-def _build(entry: TunerEntry) -> None:
+def _try_to_build(entry: TunerEntry) -> None:
     with start_isolated_tuner(make_tuner_spec(entry), 0, "run"):
         return
 
@@ -280,7 +280,7 @@ def inspect_plugins(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]
         if path.endswith(".toml"):
             plugins.append(Plugin(path))
             continue
-        parts = _inspect({"file": path, "kind": "", "name": ""}, path)
+        parts = _ask_isolated_process({"file": path, "kind": "", "name": ""}, path)
         worlds = {part["name"] for part in parts if part["kind"] not in _ISOLATED_REGISTRIES}
         for part in parts:
             if part["name"] in needed_names and part["kind"] not in _ISOLATED_REGISTRIES:
@@ -320,7 +320,7 @@ def inspect_installed_part(name: str, kind: str = "tuner") -> Plugin:
         PartUnavailableError: it cannot be used here.
         InputError: it cannot be inspected.
     """
-    known = _inspect({"file": "", "kind": kind, "name": name}, name)
+    known = _ask_isolated_process({"file": "", "kind": kind, "name": name}, name)
     if known and "skipped" in known[0]:
         raise PartUnavailableError(kind, name, known[0]["skipped"])
     return Plugin("", False, *(tuple(known) if kind == k else () for k in _ISOLATED_REGISTRIES))
@@ -338,7 +338,7 @@ def is_external_part(name: str, registry: Registry[Any] = tuners) -> bool:
     return not known and not str(entry_point).startswith(_PROJECT_PACKAGES)
 
 
-def _inspect(question: dict[str, str], label: str) -> list[dict[str, Any]]:
+def _ask_isolated_process(question: dict[str, str], label: str) -> list[dict[str, Any]]:
     """Return the answer of an isolated process that has loaded the given plugin."""
     file = question["file"]
     if file and not Path(file).is_file():
@@ -402,14 +402,18 @@ def serve_inspection(
     channel.send_document(b"R", active_layers)
     question = channel.receive().to_document()
     try:
-        answer: Any = _parts(question["file"]) if question["file"] else [_one(question)]
+        answer: Any = (
+            _describe_plugin_file(question["file"])
+            if question["file"]
+            else [_describe_installed_part(question)]
+        )
     except InputError as error:
         answer = {"fault": str(error)}
     channel.send_document(b"K", answer)
     channel.receive()
 
 
-def _parts(file: str) -> list[dict[str, Any]]:
+def _describe_plugin_file(file: str) -> list[dict[str, Any]]:
     """Describe what a plugin file defines.
 
     Raises:
@@ -418,18 +422,18 @@ def _parts(file: str) -> list[dict[str, Any]]:
     load_plugins([file])
     path = Path(file).resolve()
     return [
-        _told(registry.kind, added.part)
+        _describe_class(registry.kind, added.part)
         for registry in REGISTRIES
         for added in registry.snapshot().values()
         if added.path == path
     ]
 
 
-def _one(question: dict[str, str]) -> dict[str, Any]:
+def _describe_installed_part(question: dict[str, str]) -> dict[str, Any]:
     """Describe an installed tuner or diagnoser."""
     kind, name = question["kind"], question["name"]
     try:
-        return _told(kind, _REGISTRY_OF[kind].get(name))
+        return _describe_class(kind, _REGISTRY_OF[kind].get(name))
     except PartUnavailableError as error:
         return {"kind": kind, "name": name, "skipped": error.reason}
 
@@ -437,7 +441,7 @@ def _one(question: dict[str, str]) -> dict[str, Any]:
 _REGISTRY_OF: dict[str, Registry[Any]] = {"tuner": tuners, "diagnoser": diagnosers}
 
 
-def _told(kind: str, part: Any) -> dict[str, Any]:
+def _describe_class(kind: str, part: Any) -> dict[str, Any]:
     """Describe a registered class by plain values, for the harness.
 
     `kind` is its kind, such as "tuner". The harness cannot load the code of a tuner or diagnoser,

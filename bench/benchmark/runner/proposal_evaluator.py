@@ -60,7 +60,7 @@ class ProposalEvaluator:
         single = observations.shape[0] == observations.shape[2] == 1
         if single and self._missing is None:
             return observations, self._one_loss(observations)
-        squares = self._squares(observations)
+        squares = self._sum_squared_errors(observations)
         self._seen.append(squares)
         losses: Array = np.sqrt(squares @ self._per_loss)  # (1)
         # The loss of a failed simulation is infinite, because comparisons with NaN are always
@@ -80,7 +80,7 @@ class ProposalEvaluator:
         loss = square * self._only_per_loss
         return np.array([math.sqrt(loss) if math.isfinite(loss) else math.inf])
 
-    def _squares(self, observations: Array) -> Array:
+    def _sum_squared_errors(self, observations: Array) -> Array:
         """Compute sums (n, C) of squared errors over present samples, in squared channel units."""
         difference = observations - self._observed
         if self._missing is not None:
@@ -103,16 +103,21 @@ class ProposalEvaluator:
         Returns:
             (k, C) root-mean-square errors.
         """
-        known = {point.tobytes(): row for point, row in zip(proposals, self._rows(), strict=True)}
+        known = {
+            point.tobytes(): row
+            for point, row in zip(proposals, self._stack_evaluated_rows(), strict=True)
+        }
         result = np.empty((len(recommendations), len(self._per_sample)))
         for i, point in enumerate(recommendations):
             # Points are compared by their bytes, so that only an identical point is looked up.
             key = point.tobytes()
             if key not in known:
-                known[key] = self._squares(self._problem.simulate(point[None], self._scenarios))[0]
+                known[key] = self._sum_squared_errors(
+                    self._problem.simulate(point[None], self._scenarios)
+                )[0]
             result[i] = known[key]
         errors: Array = np.sqrt(result * self._per_sample)  # (2)
         return errors
 
-    def _rows(self) -> Array:
+    def _stack_evaluated_rows(self) -> Array:
         return np.concatenate(self._seen) if self._seen else np.empty((0, len(self._per_sample)))

@@ -57,12 +57,12 @@ def train_remotely(
         try:
             if message.kind == b"L":
                 return unpack_arrays(message.body)
-            _serve(child, message, grounds, watch)
+            _handle_message(child, message, grounds, watch)
         except ProtocolError as error:
             raise RunEndedError("crashed", f"the tuner's process broke the pipe: {error}") from None
 
 
-def _serve(
+def _handle_message(
     child: IsolatedProcess, message: Message, grounds: list[Ground], watch: TrainingCallback | None
 ) -> None:
     """Handle one message of a tuner during its training.
@@ -106,7 +106,7 @@ def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) 
     result: dict[str, NDArray[Any]] = {}
     if message.flags & 2:
         try:
-            result = _simulated(message, ground)
+            result = _simulate_points(message, ground)
         except (ValueError, BudgetExceededError) as error:
             kind = "budget" if isinstance(error, BudgetExceededError) else "value"
             refusal = json.dumps({"kind": kind, "says": str(error)}).encode()
@@ -123,7 +123,7 @@ def _serve_simulation(child: IsolatedProcess, message: Message, ground: Ground) 
     child.send(b"O", *pack_arrays({**properties, **result}), deadline=_NO_DEADLINE)
 
 
-def _simulated(message: Message, ground: Ground) -> dict[str, NDArray[Any]]:
+def _simulate_points(message: Message, ground: Ground) -> dict[str, NDArray[Any]]:
     """Simulate the requested points.
 
     Returns:

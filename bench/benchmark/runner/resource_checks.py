@@ -70,7 +70,7 @@ class _Experiment:
         problem = TuningProblem(experiment)
         self.channels = len(problem.channels)
         self.dim = problem.cube.dim
-        self.samples, self.steps = _simulation(problem)
+        self.samples, self.steps = _count_simulated_samples(problem)
         problem.close()
         skipped = check_tuners(experiment)
         self.tuners = [e for e in experiment.tuners if e.label not in skipped]
@@ -87,7 +87,7 @@ class _Experiment:
         return MIN_SIMULATION_SECONDS + MIN_STEP_SECONDS * self.steps
 
 
-def _simulation(problem: TuningProblem) -> tuple[int, float]:
+def _count_simulated_samples(problem: TuningProblem) -> tuple[int, float]:
     """Return the numbers of samples and of time steps that one evaluation simulates."""
     experiment = problem.experiment
     step = min(map(get_max_step, (problem.simulator, problem.world)))
@@ -182,7 +182,7 @@ def estimate_comparison_need(
     made = ", ".join(f"{name} {count:.4g}" for name, count in counts.items() if count)
     return ResourceNeed(
         f"tuners {len(each)}, {made}",
-        _change(counts),
+        _suggest_reduction(counts),
         memory,
         rows * _ROW_DISK,
         runs / _PER_PART,
@@ -191,7 +191,7 @@ def estimate_comparison_need(
     )
 
 
-def _change(counts: Mapping[str, float]) -> str:
+def _suggest_reduction(counts: Mapping[str, float]) -> str:
     """Suggest a change: reduce the number that is largest compared with its typical value."""
     largest = max(counts, key=lambda name: counts[name] / _USUAL[name])
     if largest == "steps":
@@ -218,7 +218,7 @@ def check_training_size(
     need = ResourceNeed(
         f"{seeds} trainings of {entry.label} with {budget} simulations, each of {sizes.samples}"
         f" samples and {sizes.steps:.3g} steps,",
-        _change({"seeds": seeds, "training_budget": budget, "steps": sizes.steps}),
+        _suggest_reduction({"seeds": seeds, "training_budget": budget, "steps": sizes.steps}),
         memory=budget * sizes.observation + sizes.steps * BYTES_PER_STEP,
         files=seeds,
         steps=sizes.steps,

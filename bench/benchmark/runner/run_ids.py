@@ -86,7 +86,7 @@ def compute_fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[
         "plugins": hash_plugin_files(plugins),
         "code": hash_source_folders(_get_source_folders(experiment)),
         "package versions": hash_package_versions(),
-        "simulator and tuners": compute_digest(_classes(experiment)),
+        "simulator and tuners": compute_digest(_hash_class_sources(experiment)),
     }
 
 
@@ -97,7 +97,7 @@ def _get_source_folders(experiment: Experiment) -> tuple[str, ...]:
     return EXPLAIN_SOURCE_FOLDERS if experiment.calibration else ()
 
 
-def _classes(experiment: Experiment) -> list[str]:
+def _hash_class_sources(experiment: Experiment) -> list[str]:
     """Hash the sources of the simulator and the tuners, one hash each.
 
     This covers classes that a notebook defines, which are in no plugin file.
@@ -206,14 +206,14 @@ class RunIds:
                 entry.tuner, dict(entry.options), training, hash_class_source(kind), *over
             )
         if target.name not in self._targets:
-            self._targets[target.name] = _target(target)
+            self._targets[target.name] = _hash_target(target)
         what = compute_digest(
             self._world, self._entries[entry.label], self._targets[target.name], seed, budget
         )
         return f"{entry.label}/{target.name}/{seed}/{what}"
 
 
-def _target(target: BlindedTarget) -> str:
+def _hash_target(target: BlindedTarget) -> str:
     """Hash a target's scenarios, observations and start."""
     sides = [target.fitting, target.held_out]
     scenarios = [

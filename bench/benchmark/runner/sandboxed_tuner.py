@@ -144,7 +144,7 @@ def find_preloadable_packages(file: str) -> tuple[str, ...]:
     packages: dict[str, None] = {}
     files = [file]
     while files:
-        for name in _imported(files.pop()):
+        for name in _list_imported_modules(files.pop()):
             if name.partition(".")[0] in _PRELOADABLE_PACKAGES and name not in packages:
                 packages[name] = None
                 if name.startswith("methods."):
@@ -152,7 +152,7 @@ def find_preloadable_packages(file: str) -> tuple[str, ...]:
     return tuple(packages)
 
 
-def _imported(file: str) -> list[str]:
+def _list_imported_modules(file: str) -> list[str]:
     """List the modules that a source file imports anywhere, without executing it.
 
     Relative imports are left out. A file that cannot be read or parsed gives an empty list; its
@@ -201,7 +201,7 @@ def start_isolated_tuner(
     """
     is_reused = isolation == "tuner"
     # Weights are hashed only if an idle tuner could have different ones.
-    key = (repr(tuned), seed, hidden, memory, _digest(state or {})) if is_reused else None
+    key = (repr(tuned), seed, hidden, memory, _hash_state(state or {})) if is_reused else None
     tuner = _idle_tuners.pop(key, None)
     if tuner is not None:
         tuner.import_seconds = 0.0
@@ -232,5 +232,5 @@ def start_isolated_tuner(
             _idle_tuners.popitem(last=False)[1].child.end()
 
 
-def _digest(state: Mapping[str, NDArray[Any]]) -> int:
+def _hash_state(state: Mapping[str, NDArray[Any]]) -> int:
     return hash(tuple((name, array.tobytes()) for name, array in state.items()))

@@ -82,7 +82,7 @@ class _DivergenceError(Exception):
     """A tuner proposed or recommended a point that is not finite."""
 
 
-def _points(proposed: object, dim: int, label: str) -> Array:
+def _check_proposals(proposed: object, dim: int, label: str) -> Array:
     """Return proposals as a new (n, dim) array, clipped to the unit cube.
 
     `label` names them in messages: "proposals" or "recommendations".
@@ -136,7 +136,7 @@ class _RunRecord:
 
     def recommend(self, recommendation: Array) -> None:
         """Record what the tuner recommends after all evaluations so far."""
-        self._recommended[-1] = _points(recommendation, self._dim, "recommendations")[0]
+        self._recommended[-1] = _check_proposals(recommendation, self._dim, "recommendations")[0]
 
     def add(self, points: Array, losses: Array, stays: bool) -> None:
         """Add simulated points and their losses.
@@ -270,7 +270,7 @@ def _run_ask_tell_loop(
             asked, recommendation = asked
             if recommendation is not None:
                 record.recommend(recommendation)
-        points = _points(asked, task.dim, "proposals")
+        points = _check_proposals(asked, task.dim, "proposals")
         # The check comes here, so that the recommendation after the last simulation is recorded.
         left = task.budget - record.used
         if left <= 0:

@@ -212,10 +212,12 @@ def train_or_load(
         RunEndedError: the tuner failed in its process.
     """
     earlier_requests: list[str] = []
-    return retry_if_killed(lambda: _train(experiment, lesson, watch, anew, earlier_requests))
+    return retry_if_killed(
+        lambda: _train_or_read_weights(experiment, lesson, watch, anew, earlier_requests)
+    )
 
 
-def _train(
+def _train_or_read_weights(
     experiment: Experiment,
     lesson: TrainingRequest,
     watch: TrainingCallback | None,
@@ -256,7 +258,7 @@ def _train(
         _COST_ARRAY: np.array([practice.used, seconds]),
         _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
     }
-    _write(path, {**state, **about})
+    _write_atomically(path, {**state, **about})
     return TrainingResult(path, practice.used, seconds)
 
 
@@ -360,7 +362,7 @@ def _make_weights_error(path: Path, entry: TunerEntry, why: object) -> WeightsEr
     return WeightsError(f"{path}: not the weights of {entry.label}: {why}; {_REMEDY}")
 
 
-def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
+def _write_atomically(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
     """Write a file atomically, because several processes may train the same tuner."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_replacement(path) as partial, partial.open("wb") as file:

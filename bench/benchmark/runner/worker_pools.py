@@ -277,9 +277,9 @@ class _WorkerSlot:
         self._plugins = plugins
         self._futile = 0
         self.given: dict[Future[Any], _AssignedCall] = {}
-        self._start()
+        self._start_process()
 
-    def _start(self) -> None:
+    def _start_process(self) -> None:
         """Start a new process in its own pebble pool.
 
         `_births` is the pipe through which processes of this pool report that they have started,
@@ -324,7 +324,7 @@ class _WorkerSlot:
         try:
             future = self._pool.schedule(function, args=arguments, timeout=limit)
         except RuntimeError:  # the pool broke between two calls
-            self._renew()
+            self._replace_process()
             future = self._pool.schedule(function, args=arguments, timeout=limit)
         self.given[future] = call
 
@@ -352,7 +352,7 @@ class _WorkerSlot:
         if lost:
             self._futile = 0 if ended else self._futile
             waiting.extendleft(reversed(self.given.values()))
-            self._renew()
+            self._replace_process()
         return ended
 
     def _died_quietly(self) -> bool:
@@ -362,7 +362,7 @@ class _WorkerSlot:
             self._born += 1
         return self._born > 1 and any(future.running() for future in self.given)
 
-    def _renew(self) -> None:
+    def _replace_process(self) -> None:
         """Replace a lost worker process.
 
         Raises:
@@ -377,7 +377,7 @@ class _WorkerSlot:
         self.given.clear()
         self.stop()
         self._births.close()
-        self._start()
+        self._start_process()
 
 
 def _exit_code(error: BaseException | None) -> int | None:

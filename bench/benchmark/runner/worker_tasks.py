@@ -160,9 +160,9 @@ def execute_run(
     started = perf_counter()
     written, import_seconds = NOTHING_WRITTEN, 0.0
     if order.tuned is None:
-        rng = make_rng(*_names(experiment, order))
+        rng = make_rng(*_list_stream_names(experiment, order))
         with limited_memory(experiment.memory):
-            trace = drive_tuner(_build(order), task, evaluator, rng, experiment.timeout)
+            trace = drive_tuner(_build_tuner(order), task, evaluator, rng, experiment.timeout)
     else:
         repeated = _ReplayCheckedEvaluator(evaluator, [] if requests is None else requests)
         trace, written, import_seconds = _run_isolated(experiment, order, task, repeated)
@@ -214,12 +214,12 @@ class _ReplayCheckedEvaluator:
         return self._evaluate(points)
 
 
-def _names(experiment: Experiment, order: RunRequest) -> tuple[str | int, ...]:
+def _list_stream_names(experiment: Experiment, order: RunRequest) -> tuple[str | int, ...]:
     """Return the names that determine the random stream of the run."""
     return experiment.name, order.entry.tuner, order.target.name, order.seed
 
 
-def _build(order: RunRequest) -> Tuner:
+def _build_tuner(order: RunRequest) -> Tuner:
     """Build a tuner that works in this process, with its weights if it has been trained."""
     if order.weights is None:
         return build_tuner(order.entry)
@@ -236,7 +236,7 @@ def _run_isolated(
     """
     assert order.tuned is not None
     state = None if order.weights is None else read_weights(order.weights)
-    names = _names(experiment, order)
+    names = _list_stream_names(experiment, order)
     opened = start_isolated_tuner(
         order.tuned, order.seed, experiment.isolation, order.hidden, experiment.memory, state
     )

@@ -93,7 +93,7 @@ class ComparisonStatistics:
         Tuners without a run that has the deciding metric come last.
         """
         order = final_order(self.curves, self._budget, self.floor)
-        return [*order, *(t for t in self._all.keys["tuner"].unique() if t not in order)]
+        return [*order, *(t for t in self._all_runs.keys["tuner"].unique() if t not in order)]
 
     def order_in(self, kind: str) -> list[str]:
         """Return the tuners of one range after all simulations, the best first."""
@@ -103,7 +103,7 @@ class ComparisonStatistics:
 
     def sorted(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Sort rows that have the columns range and tuner: range by range, the best tuner first."""
-        kinds = [str(kind) for kind in dict.fromkeys(self._all.keys["range"])]
+        kinds = [str(kind) for kind in dict.fromkeys(self._all_runs.keys["range"])]
         order = [(kind, tuner) for kind in kinds for tuner in self.order_in(kind)]
         places = {key: place for place, key in enumerate(order)}
         # A tuner that could not be used has no range.
@@ -115,7 +115,7 @@ class ComparisonStatistics:
     @cached_property
     def notes(self) -> dict[str, str]:
         """Notes of legends and tables about tuners with failed runs, by tuner."""
-        failed = pd.Series(self._all.failed).groupby(self._all.keys["tuner"], sort=False)
+        failed = pd.Series(self._all_runs.failed).groupby(self._all_runs.keys["tuner"], sort=False)
         return failure_notes({str(t): (int(bad.sum()), len(bad)) for t, bad in failed})
 
     def coinciding(self, shown: Sequence[tuple[str, str]]) -> dict[str, str]:
@@ -181,12 +181,12 @@ class ComparisonStatistics:
         """Return the curves of a metric for all runs that have it, from a cache if possible."""
         if metric not in self._curves:
             there = self.all_runs[metric].notna()
-            rows = self._all if there.all() else self._laid_out(self.all_runs[there])
+            rows = self._all_runs if there.all() else self._laid_out(self.all_runs[there])
             self._curves[metric] = rows.build_curves(metric)
         return self._curves[metric]
 
     @cached_property
-    def _all(self) -> RunRowTable:
+    def _all_runs(self) -> RunRowTable:
         """Table of all runs; equal to the table of the deciding runs if these are all runs."""
         whole = len(self.runs) == len(self.all_runs)
         return self._rows if whole else self._laid_out(self.all_runs)
@@ -217,9 +217,11 @@ class ComparisonStatistics:
     @cached_property
     def tuning_costs(self) -> dict[float, dict[str, dict[str, TuningCost]]]:
         """Cost of every tuner by threshold (the first `PRICED_LEVEL_COUNT`), by range, by tuner."""
-        return {level: self._prices(level) for level in self.levels[:PRICED_LEVEL_COUNT]}
+        return {
+            level: self._compute_tuning_costs(level) for level in self.levels[:PRICED_LEVEL_COUNT]
+        }
 
-    def _prices(self, level: float) -> dict[str, dict[str, TuningCost]]:
+    def _compute_tuning_costs(self, level: float) -> dict[str, dict[str, TuningCost]]:
         """Compute what each tuner costs to reach an error threshold, by range and then by tuner.
 
         Costs are the simulations, the seconds in the tuner and in the simulator, and the training.
@@ -247,7 +249,7 @@ class ComparisonStatistics:
         It is the loosest threshold if there is no such threshold.
         """
         for level in sorted(self.tuning_costs):
-            if all(_half(by_tuner) for by_tuner in self.tuning_costs[level].values()):
+            if all(_reached_in_half(by_tuner) for by_tuner in self.tuning_costs[level].values()):
                 return level
         return max(self.tuning_costs)
 
@@ -261,6 +263,6 @@ def _least_median(curves: RunCurves) -> float:
     return min((m for m in medians if np.isfinite(m)), default=0.0)
 
 
-def _half(by_tuner: Mapping[str, TuningCost]) -> bool:
+def _reached_in_half(by_tuner: Mapping[str, TuningCost]) -> bool:
     reaching = sum(np.isfinite(price.effort.compute_ert()) for price in by_tuner.values())
     return bool(2 * reaching >= len(by_tuner))

@@ -78,7 +78,7 @@ def compute_median_curves(curves: RunCurves, metric: str, budget: int) -> pd.Dat
     parts = []
     for tuner in curves.list_tuners():
         lines = np.maximum(
-            _values(compute_target_curves(curves.select(tuner=tuner), points)), ERROR_FLOOR
+            _get_values(compute_target_curves(curves.select(tuner=tuner), points)), ERROR_FLOOR
         )
         # A target whose runs all failed has no curve; failures are counted in the table.
         lines = lines[np.isfinite(lines).all(axis=1)]
@@ -152,7 +152,7 @@ def compute_medians_by_distance(
         One row per number of simulations, tuner and group, columns `DISTANCE_COLUMNS`; `beyond` and
         `to` are the smallest and largest distance in the group.
     """
-    groups = _groups(distances)
+    groups = _group_by_distance(distances)
     points = select_distance_checkpoints(budget)
     errors = {
         t: compute_target_curves(curves.select(tuner=t), points) for t in curves.list_tuners()
@@ -171,11 +171,11 @@ def compute_medians_by_distance(
     return pd.DataFrame(lines, columns=DISTANCE_COLUMNS)
 
 
-def _values(frame: pd.DataFrame) -> Array:
+def _get_values(frame: pd.DataFrame) -> Array:
     return frame.to_numpy(dtype=np.float64)
 
 
-def _groups(distances: pd.Series[float]) -> dict[int, list[str]]:
+def _group_by_distance(distances: pd.Series[float]) -> dict[int, list[str]]:
     """Return the target names of each group: 0 inside the training range, then by distance."""
     inside = list(distances.index[distances <= 0])
     outside = list(distances[distances > 0].sort_values(kind="stable").index)

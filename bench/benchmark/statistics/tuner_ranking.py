@@ -97,8 +97,8 @@ def rank_tuners(curves: RunCurves, budget: int, floor: float) -> pd.DataFrame:
     parts = []
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
         part = curves.select(experiment=str(experiment), range=str(kind))
-        for k, ranking in _rankings(part, budget, floor).items():
-            parts.append(_verdicts(ranking, part, (str(experiment), str(kind), k)))
+        for k, ranking in _compute_rankings(part, budget, floor).items():
+            parts.append(_build_verdict_rows(ranking, part, (str(experiment), str(kind), k)))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=RANKING_COLUMNS)
 
 
@@ -112,7 +112,7 @@ def final_order(curves: RunCurves, budget: int, floor: float) -> list[str]:
         budget: largest number of simulations.
         floor: errors below this value count as equal to it.
     """
-    return list(_rankings(curves, budget, floor)[budget].order)
+    return list(_compute_rankings(curves, budget, floor)[budget].order)
 
 
 class _Ranking(NamedTuple):
@@ -129,7 +129,7 @@ class _Ranking(NamedTuple):
     order: Sequence[str]
 
 
-def _rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Ranking]:
+def _compute_rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Ranking]:
     """Compute the ranking of the tuners after each number of simulations of `ranked_after`.
 
     Tuners are ordered by median log error, then mean, then earlier ranks; those whose runs all
@@ -150,7 +150,9 @@ def _rankings(curves: RunCurves, budget: int, floor: float) -> dict[int, _Rankin
     return rankings
 
 
-def _verdicts(ranking: _Ranking, curves: RunCurves, key: tuple[str, str, int]) -> pd.DataFrame:
+def _build_verdict_rows(
+    ranking: _Ranking, curves: RunCurves, key: tuple[str, str, int]
+) -> pd.DataFrame:
     """Build the rows of one ranking, with each tuner tested against the first.
 
     The test is Wilcoxon's signed-rank test over targets with Holm's correction for several tests. A

@@ -100,7 +100,7 @@ def parse_parquet_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
             raise CellError(row, column.name, column.expected_text, "nothing")
         values = compute.fill_null(values, np.nan)
     try:
-        return values.cast(_arrow(column))
+        return values.cast(_get_arrow_type(column))
     except pa.ArrowInvalid:  # A number that is too large for the type.
         raise CellError(
             None, column.name, column.expected_text, f"numbers beyond it ({kind})"
@@ -122,13 +122,13 @@ def parse_csv_column(column: ColumnSpec, values: pa.Array) -> pa.Array:
     if column.kind is str:
         return values
     sound = compute.match_substring_regex(values, f"^({_TEXTS[column.kind]})$")
-    _refuse(
+    _raise_for_bad_row(
         column, to_numpy_mask(compute.invert(sound)), lambda row: format_value(values[row].as_py())
     )
     if column.kind is float:
         # An empty cell means NaN.
         values = compute.if_else(compute.equal(values, ""), "nan", values)
-    return values.cast(_arrow(column))
+    return values.cast(_get_arrow_type(column))
 
 
 def parse_json_column(column: ColumnSpec, values: Sequence[Any]) -> pa.Array:
@@ -147,18 +147,18 @@ def parse_json_column(column: ColumnSpec, values: Sequence[Any]) -> pa.Array:
     for row, value in enumerate(values):
         none = value is None and column.kind is float  # JSON has no NaN.
         mistaken = isinstance(value, bool) and column.kind is not bool
-        if not none and (mistaken or not isinstance(value, kinds) or _beyond(value)):
+        if not none and (mistaken or not isinstance(value, kinds) or _exceeds_int64(value)):
             raise CellError(row, column.name, column.expected_text, format_value(value))
     given = [np.nan if v is None else v for v in values]
-    return pa.array(given, type=_arrow(column))
+    return pa.array(given, type=_get_arrow_type(column))
 
 
-def _beyond(value: Any) -> bool:
+def _exceeds_int64(value: Any) -> bool:
     """Return whether an integer is too large for int64; integers in JSON are unlimited."""
     return isinstance(value, int) and abs(value) >= 2**63
 
 
-def _arrow(column: ColumnSpec) -> pa.DataType:
+def _get_arrow_type(column: ColumnSpec) -> pa.DataType:
     """Return the Arrow type in which the cells of a column are stored."""
     import pyarrow as pa
 
@@ -197,7 +197,7 @@ def check_cells(
     outside = ~empty & ~((numbers >= column.low) & (numbers <= column.high))
     if not column.infinite:
         outside |= np.isinf(numbers)
-    _refuse(column, outside, said)
+    _raise_for_bad_row(column, outside, said)
     wanted = {
         EmptyCellRule.NEVER: np.zeros(len(numbers), dtype=bool),
         EmptyCellRule.MAY: empty,
@@ -206,8 +206,8 @@ def check_cells(
     }[column.empty]
     if wanted is None:
         return
-    _refuse(column, empty & ~wanted, said)
-    _refuse(column, wanted & ~empty, said, f"nothing {column.empty.value}")
+    _raise_for_bad_row(column, empty & ~wanted, said)
+    _raise_for_bad_row(column, wanted & ~empty, said, f"nothing {column.empty.value}")
 
 
 def _check_texts(column: ColumnSpec, values: pa.Array) -> None:
@@ -225,7 +225,7 @@ def _check_texts(column: ColumnSpec, values: pa.Array) -> None:
         bad = compute.equal(values, "")
     else:
         return
-    _refuse(column, to_numpy_mask(bad), lambda row: format_value(values[row].as_py()))
+    _raise_for_bad_row(column, to_numpy_mask(bad), lambda row: format_value(values[row].as_py()))
 
 
 def to_numpy_mask(values: pa.Array) -> Mask:
@@ -234,7 +234,9 @@ def to_numpy_mask(values: pa.Array) -> Mask:
     return mask
 
 
-def _refuse(column: ColumnSpec, bad: Mask, said: Callable[[int], str], wanted: str = "") -> None:
+def _raise_for_bad_row(
+    column: ColumnSpec, bad: Mask, said: Callable[[int], str], wanted: str = ""
+) -> None:
     """Raise an error for the first bad row."""
     if bad.any():
         row = int(bad.argmax())

@@ -43,12 +43,12 @@ class CsvTable:
     def __init__(self, path: Path, columns: Columns | ColumnResolver, remedy: str) -> None:
         """Read and check the whole file; a wrong cell becomes an error that names its line."""
         self._path, self._remedy = path, remedy
-        self._text = self._read()
-        self._header = self._fields(next(self._records(), (1, ""))[1])
+        self._text = self._read_text()
+        self._header = self._split_record(next(self._iterate_records(), (1, ""))[1])
         declared = columns(self._header) if callable(columns) else columns
         try:
             there = select_declared_columns(self._header, declared)
-            self.table = self._checked(there)
+            self.table = self._convert_columns(there)
         except CellError as error:
             raise self.make_error(error.row, error.says) from None
 
@@ -59,10 +59,10 @@ class CsvTable:
             row: Row, or None for the file.
             says: What is wrong.
         """
-        place = "" if row is None else f", line {self._line(row)}"
+        place = "" if row is None else f", line {self._get_line_number(row)}"
         return InputError(f"{self._path}{place}: {says}; {self._remedy}")
 
-    def _read(self) -> str:
+    def _read_text(self) -> str:
         """Read the file as text, without the byte order mark that Excel writes at the beginning.
 
         Raises:
@@ -82,14 +82,14 @@ class CsvTable:
             says = f"expected UTF-8 text, found byte {data[error.start]:#04x}"
             raise InputError(f"{self._path}, line {line}: {says}; {self._remedy}") from None
 
-    def _checked(self, there: Columns) -> pa.Table:
+    def _convert_columns(self, there: Columns) -> pa.Table:
         """Convert the cells of the declared columns from text to their types, and check them.
 
         `there` are the declared columns that the file has.
         """
         import pyarrow as pa
 
-        texts = self._texts()
+        texts = self._read_cells()
         typed = {}
         for column in there:
             values = parse_csv_column(column, texts[column.name].combine_chunks())
@@ -97,7 +97,7 @@ class CsvTable:
             typed[column.name] = values
         return pa.table(typed)
 
-    def _texts(self) -> pa.Table:
+    def _read_cells(self) -> pa.Table:
         """Read every cell as text."""
         import pyarrow as pa
         from pyarrow import csv as arrow
@@ -120,13 +120,13 @@ class CsvTable:
 
     def _refuse_ragged(self) -> None:
         """Raise an error for the first line whose number of cells differs from the header's."""
-        for number, record in self._records():
-            cells = len(self._fields(record))
+        for number, record in self._iterate_records():
+            cells = len(self._split_record(record))
             if cells != len(self._header):
                 says = f"expected {len(self._header)} cells, found {cells}"
                 raise InputError(f"{self._path}, line {number}: {says}; {self._remedy}")
 
-    def _fields(self, record: str) -> list[str]:
+    def _split_record(self, record: str) -> list[str]:
         """Split one CSV record into its cells.
 
         A record is a line, or several lines if a quoted cell has line breaks.
@@ -138,7 +138,7 @@ class CsvTable:
                 None, f"expected cells, found {format_value(record)} ({error})"
             ) from None
 
-    def _records(self) -> Iterator[tuple[int, str]]:
+    def _iterate_records(self) -> Iterator[tuple[int, str]]:
         """Yield every record with its first line number; quoted text may span several lines."""
         first, inside = 1, False
         parts: list[str] = []
@@ -153,7 +153,9 @@ class CsvTable:
         if inside:
             yield first, "\n".join(parts)
 
-    def _line(self, row: int) -> int:
+    def _get_line_number(self, row: int) -> int:
         """Return the line number of a row; the first record is the header."""
-        lines = (number for place, (number, _) in enumerate(self._records()) if place == row + 1)
+        lines = (
+            number for place, (number, _) in enumerate(self._iterate_records()) if place == row + 1
+        )
         return next(lines, row + 2)

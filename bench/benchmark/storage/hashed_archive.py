@@ -81,16 +81,21 @@ def write_archive(
     try:
         archive.parent.mkdir(parents=True, exist_ok=True)
         with atomic_replacement(archive) as partial, zipfile.ZipFile(partial, "w") as packed:
-            packed.writestr(_entry(f"{name}/{MANIFEST_FILE}"), manifest, zipfile.ZIP_DEFLATED, 9)
+            packed.writestr(
+                _make_zip_header(f"{name}/{MANIFEST_FILE}"), manifest, zipfile.ZIP_DEFLATED, 9
+            )
             for path, place in sorted(files.items()):
-                with place.open("rb") as source, packed.open(_entry(f"{name}/{path}"), "w") as to:
+                with (
+                    place.open("rb") as source,
+                    packed.open(_make_zip_header(f"{name}/{path}"), "w") as to,
+                ):
                     while block := source.read(_BLOCK):
                         to.write(block)
     except OSError as error:
         raise InputError(f"{archive}: cannot be written ({error.strerror})") from None
 
 
-def _entry(path: str) -> zipfile.ZipInfo:
+def _make_zip_header(path: str) -> zipfile.ZipInfo:
     """Make the header of a file in the zip archive, with fixed time, permissions and system.
 
     The bytes of the archive then depend on the content of the files only.
@@ -125,25 +130,27 @@ def unpack_archive(archive: Path) -> Iterator[UnpackedArchive]:
     """
     try:
         with zipfile.ZipFile(archive) as packed, TemporaryDirectory(prefix="simgap-") as place:
-            entries = _sound(archive, packed)
-            top = _top(archive, entries)
-            manifest = _manifest(archive, packed, top)
+            entries = _check_entries(archive, packed)
+            top = _find_top_folder(archive, entries)
+            manifest = _read_manifest(archive, packed, top)
             found = {}
             for entry in entries:
                 path = Path(place, *PurePosixPath(entry.filename).parts)
                 path.parent.mkdir(parents=True, exist_ok=True)
-                found[entry.filename.removeprefix(f"{top}/")] = _written(
+                found[entry.filename.removeprefix(f"{top}/")] = _unpack_file(
                     archive, packed, entry, path
                 )
             del found[MANIFEST_FILE]
-            yield UnpackedArchive(Path(place, top), manifest, list(_unlike(manifest, found)))
+            yield UnpackedArchive(
+                Path(place, top), manifest, list(_compare_with_manifest(manifest, found))
+            )
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError) as error:
         raise InputError(f"{archive}: expected an archive of simgap bundle; {error}") from None
     except OSError as error:
         raise InputError(f"{archive}: cannot be read ({error.strerror or error})") from None
 
 
-def _sound(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+def _check_entries(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
     """Return the entries of an archive if all of them can be unpacked safely.
 
     Raises:
@@ -151,23 +158,23 @@ def _sound(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
     """
     entries = packed.infolist()
     if len(entries) > _MOST:
-        raise _refused(archive, f"{len(entries)} files, at most {_MOST} expected")
+        raise _make_refusal(archive, f"{len(entries)} files, at most {_MOST} expected")
     for entry in entries:
-        if wrong := _wrong(entry):
-            raise _refused(archive, f"{entry.filename[:80]!r} {wrong}")
+        if wrong := _find_entry_fault(entry):
+            raise _make_refusal(archive, f"{entry.filename[:80]!r} {wrong}")
     # Two names that a file system treats as equal would overwrite each other's file.
     twice = [name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1]
     if twice:
-        raise _refused(archive, f"{twice[0]!r} is in it twice")
+        raise _make_refusal(archive, f"{twice[0]!r} is in it twice")
     total, size = sum(entry.file_size for entry in entries), archive.stat().st_size
     if total > MAX_UNPACKED_BYTES or (total > _HARMLESS and total > MAX_COMPRESSION_RATIO * size):
-        raise _refused(archive, f"it would unpack from {size} bytes to {total}")
+        raise _make_refusal(archive, f"it would unpack from {size} bytes to {total}")
     if packed.comment or min((e.header_offset for e in entries), default=0) > 0:
-        raise _refused(archive, "there is something in it beside its files")
+        raise _make_refusal(archive, "there is something in it beside its files")
     return entries
 
 
-def _wrong(entry: zipfile.ZipInfo) -> str:
+def _find_entry_fault(entry: zipfile.ZipInfo) -> str:
     """Return why an entry of an archive must not be unpacked; empty if it may be.
 
     An archive of unknown origin could contain paths outside its folder, links or devices, which
@@ -189,11 +196,11 @@ def _wrong(entry: zipfile.ZipInfo) -> str:
     return ""
 
 
-def _refused(archive: Path, why: str) -> InputError:
+def _make_refusal(archive: Path, why: str) -> InputError:
     return InputError(f"{archive}: refused: {why}; nothing was unpacked")
 
 
-def _top(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
+def _find_top_folder(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
     """Return the single top-level folder of an archive, which contains the manifest.
 
     Raises:
@@ -210,7 +217,7 @@ def _top(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
     return top
 
 
-def _manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
+def _read_manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any]:
     """Read and validate the manifest of an archive, the list of its files with their hashes.
 
     `packed` is the opened archive, and `top` its only folder. The size is checked first, because an
@@ -221,7 +228,7 @@ def _manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any
     """
     entry = packed.getinfo(f"{top}/{MANIFEST_FILE}")
     if entry.file_size > _MANIFEST_BYTES:
-        raise _refused(archive, f"{MANIFEST_FILE} has {entry.file_size} bytes")
+        raise _make_refusal(archive, f"{MANIFEST_FILE} has {entry.file_size} bytes")
     try:
         manifest = json.loads(packed.read(entry))
     except (ValueError, RecursionError):
@@ -232,7 +239,7 @@ def _manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any
     return found
 
 
-def _written(
+def _unpack_file(
     archive: Path, packed: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path
 ) -> tuple[int, str]:
     """Unpack one file to `path`; return its size in bytes and its SHA-256.
@@ -242,21 +249,21 @@ def _written(
     """
     digest, size = hashlib.sha256(), 0
     with packed.open(entry) as source, path.open("wb") as to:
-        for block in _blocks(source):
+        for block in _read_blocks(source):
             size += len(block)
             if size > entry.file_size:
-                raise _refused(archive, f"{entry.filename!r} holds more than it says")
+                raise _make_refusal(archive, f"{entry.filename!r} holds more than it says")
             digest.update(block)
             to.write(block)
     return size, digest.hexdigest()
 
 
-def _blocks(source: IO[bytes]) -> Iterator[bytes]:
+def _read_blocks(source: IO[bytes]) -> Iterator[bytes]:
     while block := source.read(_BLOCK):
         yield block
 
 
-def _unlike(
+def _compare_with_manifest(
     manifest: dict[str, Any], found: Mapping[str, tuple[int, str]]
 ) -> Iterator[ArchiveFault]:
     """Yield files that are missing, added, or different from the manifest."""

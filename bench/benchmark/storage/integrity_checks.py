@@ -93,7 +93,9 @@ def check_files(
         training.make_error,
         lambda _: "tuner and seed: expected every training once, found one again",
     )
-    return CheckedFiles(runs, statuses, trainings, _spectra(folder, experiment, remedy))
+    return CheckedFiles(
+        runs, statuses, trainings, _read_identifiability_table(folder, experiment, remedy)
+    )
 
 
 def get_remedy(folder: Path, *, under_way: bool) -> str:
@@ -119,7 +121,9 @@ def check_table(folder: Path) -> None:
         CsvTable(path, ERROR_TABLE_COLUMNS, f"simgap plot {folder} writes it again")
 
 
-def _spectra(folder: Path, experiment: Experiment, remedy: str) -> pd.DataFrame | None:
+def _read_identifiability_table(
+    folder: Path, experiment: Experiment, remedy: str
+) -> pd.DataFrame | None:
     """Read and check identifiability.csv; None if the comparison has no such file.
 
     The file has the directions of the parameter space of each target, in order of number. Targets
@@ -128,7 +132,7 @@ def _spectra(folder: Path, experiment: Experiment, remedy: str) -> pd.DataFrame 
     path = folder / "identifiability.csv"
     if not path.exists():
         return None
-    file = CsvTable(path, _directions, remedy)
+    file = CsvTable(path, _list_identifiability_columns, remedy)
     spectra: pd.DataFrame = file.table.to_pandas()
     check_known(spectra["target"], list_target_names(experiment), "target", file.make_error)
     wanted = spectra.groupby("target").cumcount() + 1
@@ -140,7 +144,7 @@ def _spectra(folder: Path, experiment: Experiment, remedy: str) -> pd.DataFrame 
     return spectra
 
 
-def _directions(names: list[str]) -> list[ColumnSpec]:
+def _list_identifiability_columns(names: list[str]) -> list[ColumnSpec]:
     """Return the columns of identifiability.csv: all without a declared name are parameters."""
     fixed = [column.name for column in IDENTIFIABILITY_COLUMNS]
     return expand_columns(

@@ -80,7 +80,7 @@ def read_records(path: Path) -> Iterator[tuple[int, RunStatus, pa.Table, int]]:
             rows = pa.ipc.open_stream(payload).read_all()
             held = _statuses_of([json.loads(rows.schema.metadata[b"status"])])
         except _DAMAGE as error:
-            raise _damaged(path, f"a record of a run: {get_first_line(error)}") from None
+            raise _make_damage_error(path, f"a record of a run: {get_first_line(error)}") from None
         ((place, status),) = held.items()
         yield place, status, rows.replace_schema_metadata(), end
 
@@ -96,7 +96,7 @@ def read_part_statuses(path: Path) -> dict[int, RunStatus]:
     try:
         return _statuses_of(json.loads(parquet.read_schema(path).metadata[b"statuses"]))
     except _DAMAGE as error:
-        raise _damaged(
+        raise _make_damage_error(
             path, f"a part of a comparison, found damage: {get_first_line(error)}"
         ) from None
 
@@ -123,7 +123,7 @@ def _statuses_of(held: Any) -> dict[int, RunStatus]:
     }
 
 
-def _damaged(path: Path, expected: str) -> InputError:
+def _make_damage_error(path: Path, expected: str) -> InputError:
     return InputError(f"{path}: expected {expected}; {SEGMENT_REMEDY}")
 
 
@@ -139,7 +139,7 @@ def check_no_duplicate_runs(path: Path, places: Iterable[int], known: Container[
         InputError: A run is in both.
     """
     if double := [place for place in places if place in known]:
-        raise _damaged(
+        raise _make_damage_error(
             path, f"every run once, found that of line {double[0] + 1} of the plan again"
         )
 

@@ -84,7 +84,7 @@ def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableError
         mine = made[made["tuner"] == entry.label]
         if mine.empty:
             continue
-        seeds = range(_seeds(entry, experiment, mine["seed"].max()))
+        seeds = range(_count_seeds(entry, experiment, mine["seed"].max()))
         found = set(zip(mine["target"], mine["seed"].tolist(), strict=True))
         missing = next(((t, s) for t in targets for s in seeds if (t, s) not in found), None)
         if missing:
@@ -101,7 +101,7 @@ def check_complete(made: pd.DataFrame, experiment: Experiment, fault: TableError
             )
 
 
-def _seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
+def _count_seeds(entry: TunerEntry, experiment: Experiment, largest: int) -> int:
     """Return the number of seeds of an entry; `largest` is the largest seed in its planned runs.
 
     It equals `bench.benchmark.runner.experiment_runner.count_seeds` if the tuner is known.

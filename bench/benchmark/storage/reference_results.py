@@ -93,21 +93,23 @@ class ReferenceResult:
         Raises:
             InputError: It is of another problem, so the errors are not comparable.
         """
-        mine = _plain(experiment.document())
+        mine = _normalise_value(experiment.document())
         # Keys that were added in a later version cannot be compared with an older file.
         differing = [
             key
             for key in (*_SAME_PROBLEM, *_ALIKE)
-            if key in self.document and _plain(self.document[key]) != mine.get(key)
+            if key in self.document and _normalise_value(self.document[key]) != mine.get(key)
         ]
         for key in differing:
             if key in _SAME_PROBLEM:
                 raise InputError(
                     f"{self.name}: of another problem than experiment {experiment.name}: {key} is "
-                    f"{_said(self.document[key])}, expected {_said(mine.get(key))}"
+                    f"{_format_setting(self.document[key])}, "
+                    f"expected {_format_setting(mine.get(key))}"
                 )
         return [
-            f"{key}: {_said(self.document[key])}, here {_said(mine.get(key))}" for key in differing
+            f"{key}: {_format_setting(self.document[key])}, here {_format_setting(mine.get(key))}"
+            for key in differing
         ]
 
     def get_curve(self, tuner: str, kind: str, metric: str, budget: int) -> pd.DataFrame:
@@ -178,23 +180,23 @@ def find_reference(name: str) -> ReferenceResult:
     known = list_reference_names()
     endings = [each for each in known if each.endswith(f"/{name}")]
     if name in known:
-        return _read(name, _place(name))
+        return _read_reference(name, _find_reference_folder(name))
     if len(endings) == 1:
-        return _read(endings[0], _place(endings[0]))
+        return _read_reference(endings[0], _find_reference_folder(endings[0]))
     folder = Path(name)
     if (folder / CONFIGURATION_FILE).is_file():
-        return _read(folder.resolve().name, folder)
+        return _read_reference(folder.resolve().name, folder)
     if len(endings) > 1:
         raise InputError(f"reference {name}: expected one of {', '.join(endings)}")
     error = make_unknown_name_error("reference", name, known)
     raise InputError(f"{error} (or give the folder of a comparison)")
 
 
-def _place(name: str) -> Path:
+def _find_reference_folder(name: str) -> Path:
     return next(place / name for place in REFERENCE_FOLDERS if (place / name / _TABLE).is_file())
 
 
-def _read(name: str, folder: Path) -> ReferenceResult:
+def _read_reference(name: str, folder: Path) -> ReferenceResult:
     """Read the table, configuration and environment of a reference comparison from its folder.
 
     Raises:
@@ -213,20 +215,20 @@ def _read(name: str, folder: Path) -> ReferenceResult:
     return ReferenceResult(name, folder, table.to_pandas(), document, **made, revision=revision)
 
 
-def _plain(value: Any) -> Any:
+def _normalise_value(value: Any) -> Any:
     """Convert numbers to float and tuples to lists, so that TOML and experiments compare equal."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
+        return {str(key): _normalise_value(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [_normalise_value(inner) for inner in value]
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-def _said(value: Any) -> str:
+def _format_setting(value: Any) -> str:
     """Format a value of a configuration in one line, lists and tables cut off at 80 characters."""
     if isinstance(value, Mapping):
-        inside = ", ".join(f"{key} = {_said(inner)}" for key, inner in value.items())
+        inside = ", ".join(f"{key} = {_format_setting(inner)}" for key, inner in value.items())
         return f"{{{inside}}}"[:80]
     if isinstance(value, list | tuple):
-        return f"[{', '.join(_said(inner) for inner in value)}]"[:80]
+        return f"[{', '.join(_format_setting(inner) for inner in value)}]"[:80]
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -127,12 +127,12 @@ def create_folder(
             write_atomically(partial / "environment.json", json.dumps(environment, indent=1) + "\n")
             (partial / SEGMENTS_FOLDER).mkdir()
             if secret is not None:
-                _hide(partial / SEGMENTS_FOLDER / SALT_FILE, secret)
+                _write_private_file(partial / SEGMENTS_FOLDER / SALT_FILE, secret)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
 
 
-def _hide(path: Path, secret: str) -> None:
+def _write_private_file(path: Path, secret: str) -> None:
     """Write a file that only its owner can read."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
@@ -143,15 +143,17 @@ def write_configuration(folder: Path, experiment: Experiment) -> None:
     """Write experiment.toml completely or not at all."""
     import tomli_w
 
-    write_atomically(folder / CONFIGURATION_FILE, tomli_w.dumps(_plain(experiment.document())))
+    write_atomically(
+        folder / CONFIGURATION_FILE, tomli_w.dumps(_convert_for_toml(experiment.document()))
+    )
 
 
-def _plain(value: Any) -> Any:
+def _convert_for_toml(value: Any) -> Any:
     """Convert tuples to lists and mappings to dicts, the types that TOML supports."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): _convert_for_toml(v) for k, v in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
+        return [_convert_for_toml(v) for v in value]
     return value
 
 
@@ -293,7 +295,7 @@ def read_comparison(folder: Path, columns: Sequence[str] | None = None) -> Store
         experiment,
         _with_defaults(runs, RUN_COLUMNS, columns) if there else runs,
         _with_defaults(files.statuses, STATUS_COLUMNS),
-        _costs(files.training),
+        _compute_training_costs(files.training),
         files.spectra,
     )
 
@@ -326,7 +328,7 @@ def _with_defaults(
     return frame.assign(**missing)
 
 
-def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
+def _compute_training_costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
     """Compute simulations and seconds of one training, mean over seeds, by tuner."""
     means = training.groupby("tuner")[["simulations", "seconds"]].mean()
     values = means.to_numpy(dtype=float)

@@ -61,7 +61,7 @@ class RunJournal:
             raise InputError(
                 f"{self.folder}: expected a folder, found a file; move it elsewhere"
             ) from None
-        self._lock = _locked(self.folder / "lock")
+        self._lock = _lock_folder(self.folder / "lock")
         # An incomplete part of a process that was killed while it wrote; its journal still exists.
         for half in self.folder.glob("*.partial"):
             half.unlink()
@@ -79,7 +79,7 @@ class RunJournal:
                     path.unlink()
                 else:  # Numbers may be skipped if the user deleted a damaged part.
                     self._number = int(path.stem)
-            self._file = self._reopened(self._path("journal"))
+            self._file = self._reopen_journal(self._make_file_path("journal"))
         except InputError:
             self._lock.close()
             raise
@@ -96,10 +96,10 @@ class RunJournal:
             self.statuses |= statuses
             self._index[path] = sorted(statuses)
 
-    def _path(self, ending: str) -> Path:
+    def _make_file_path(self, ending: str) -> Path:
         return self.folder / f"{self._number:06d}.{ending}"
 
-    def _reopened(self, path: Path) -> IO[bytes]:
+    def _reopen_journal(self, path: Path) -> IO[bytes]:
         """Open a journal for appending: read its complete records and drop one that is cut off."""
         end = 0
         if path.exists():
@@ -143,18 +143,18 @@ class RunJournal:
         self._records.sort(key=lambda record: record[0])
         # The footer allows reading the statuses without reading the rows.
         statuses = json.dumps([[place, asdict(status)] for place, status, _ in self._records])
-        tables = [_placed(place, rows) for place, _, rows in self._records]
+        tables = [_add_place_column(place, rows) for place, _, rows in self._records]
         whole = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
-        path = self._path("parquet")
+        path = self._make_file_path("parquet")
         with atomic_replacement(path) as partial:
             parquet.write_table(whole, partial, compression="zstd")
         # Not earlier: until the part exists, the journal is the only copy of these runs.
         self._file.close()
-        self._path("journal").unlink()
+        self._make_file_path("journal").unlink()
         self._index[path] = [place for place, _, _ in self._records]
         self._records = []
         self._number += 1
-        self._file = self._reopened(self._path("journal"))
+        self._file = self._reopen_journal(self._make_file_path("journal"))
 
     def iterate_tables(self, runs: int = 2000) -> Iterator[pa.Table]:
         """Yield the rows of all finished runs in the order of the plan, chunk by chunk.
@@ -171,7 +171,9 @@ class RunJournal:
         for first in range(0, len(places), runs):
             chunk = places[first : first + runs]
             low, high = chunk[0], chunk[-1]
-            parts = [_placed(place, pending[place]) for place in chunk if place in pending]
+            parts = [
+                _add_place_column(place, pending[place]) for place in chunk if place in pending
+            ]
             for path, held in self._index.items():
                 if held[0] <= high and held[-1] >= low:
                     between = (compute.field("place") >= low) & (compute.field("place") <= high)
@@ -194,7 +196,7 @@ class RunJournal:
             yield path, {place: self.statuses[place] for place in places}, None
         if self._records:
             held = {place: status for place, status, _ in self._records}
-            yield self._path("journal"), held, [rows for _, _, rows in self._records]
+            yield self._make_file_path("journal"), held, [rows for _, _, rows in self._records]
 
     def close(self) -> None:
         """Close the journal and release the lock of the folder."""
@@ -214,7 +216,7 @@ class RunJournal:
         shutil.rmtree(gone)
 
 
-def _placed(place: int, rows: pa.Table) -> pa.Table:
+def _add_place_column(place: int, rows: pa.Table) -> pa.Table:
     """Add the column ``place``, the index of the run in the plan, by which rows are sorted."""
     import numpy as np
     import pyarrow as pa
@@ -222,7 +224,7 @@ def _placed(place: int, rows: pa.Table) -> pa.Table:
     return rows.append_column("place", pa.array(np.full(len(rows), place)))
 
 
-def _locked(path: Path) -> IO[str]:
+def _lock_folder(path: Path) -> IO[str]:
     """Lock the folder until this process ends in any way.
 
     Two processes that write to one journal would damage it.

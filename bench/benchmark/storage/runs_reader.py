@@ -73,7 +73,7 @@ class RunsTable(NamedTuple):
             return list(parquet.read_schema(self.path).names)
         # In a damaged file even the names of columns may be invalid text.
         except (OSError, ArrowException, UnicodeDecodeError) as error:
-            raise self._unreadable(error) from None
+            raise self._make_read_error(error) from None
 
     def read_runs(
         self, experiment: Experiment, records: Sequence[pa.Table] | None = None
@@ -94,15 +94,15 @@ class RunsTable(NamedTuple):
 
         try:
             if records is None:
-                return read_checked_runs(self._batches(), self.list_columns(), experiment)
+                return read_checked_runs(self._read_batches(), self.list_columns(), experiment)
             whole = pa.concat_tables(records)
             return read_checked_runs([whole], whole.column_names, experiment)
         except CellError as error:
             raise self.make_error(error.row, error.says) from None
         except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-            raise self._unreadable(error) from None
+            raise self._make_read_error(error) from None
 
-    def _batches(self) -> Iterator[pa.Table]:
+    def _read_batches(self) -> Iterator[pa.Table]:
         """Yield the rows of the Parquet file in batches of at most `_BATCH_ROWS` rows."""
         import pyarrow as pa
         from pyarrow import parquet
@@ -111,7 +111,7 @@ class RunsTable(NamedTuple):
             for batch in file.iter_batches(_BATCH_ROWS):
                 yield pa.Table.from_batches([batch])
 
-    def _unreadable(self, error: Exception) -> InputError:
+    def _make_read_error(self, error: Exception) -> InputError:
         """Make the one-line error for a file that is missing, or is not a Parquet file."""
         missing = isinstance(error, FileNotFoundError)
         what = (
@@ -159,7 +159,7 @@ def read_checked_runs(
     for batch in batches:
         if not len(batch):
             continue
-        rows = _checked(batch, there, before, offset)
+        rows = _convert_batch(batch, there, before, offset)
         summaries.append(_summarise_new_runs(rows, before is not None, offset))
         offset += len(batch)
         before = rows.slice(len(rows) - 1)
@@ -178,7 +178,7 @@ def read_checked_runs(
     return runs
 
 
-def _checked(
+def _convert_batch(
     batch: pa.Table, there: list[ColumnSpec], before: pa.Table | None, offset: int
 ) -> pa.Table:
     """Convert a batch to its declared types and prepend the last row of the previous batch.
@@ -197,28 +197,28 @@ def _checked(
             check_cells(column, typed[column.name], at_start, no_truth)
     except CellError as error:
         row = None if error.row is None else error.row + offset
-        raise _moved(error, row) from None
+        raise _shift_error_row(error, row) from None
     rows = pa.table(typed)
     rows = rows if before is None else pa.concat_tables([before, rows]).combine_chunks()
     try:
         _check_counts(rows, before is not None)
         _check_same(rows)
     except CellError as error:
-        raise _moved(error, (error.row or 0) + offset - (before is not None)) from None
+        raise _shift_error_row(error, (error.row or 0) + offset - (before is not None)) from None
     return rows
 
 
-def _moved(error: CellError, row: int | None) -> CellError:
+def _shift_error_row(error: CellError, row: int | None) -> CellError:
     error.row = row
     return error
 
 
-def _new(rows: pa.Table) -> Mask:
+def _find_run_starts(rows: pa.Table) -> Mask:
     """Return an (n,) mask of rows where a run begins, including the first row."""
-    return np.append(True, _changes(rows["run"]))
+    return np.append(True, _find_changes(rows["run"]))
 
 
-def _changes(values: pa.ChunkedArray) -> Mask:
+def _find_changes(values: pa.ChunkedArray) -> Mask:
     """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
     import pyarrow as pa
     from pyarrow import compute
@@ -244,7 +244,7 @@ def _check_counts(rows: pa.Table, goes_on: bool) -> None:
     """
     k: NDArray[np.int64] = rows["k"].to_numpy()
     wanted = np.append(0, k[:-1] + 1)
-    wanted[_new(rows)] = 0
+    wanted[_find_run_starts(rows)] = 0
     if goes_on:  # The first row was checked with the previous batch.
         wanted[0] = k[0]
     bad = k != wanted
@@ -254,7 +254,7 @@ def _check_counts(rows: pa.Table, goes_on: bool) -> None:
         raise CellError(row, "k", f"{wanted[row]}, the next of {run}", str(k[row]))
 
 
-def _described(rows: pa.Table) -> list[str]:
+def _list_constant_columns(rows: pa.Table) -> list[str]:
     """List the columns that are constant within a run."""
     names = rows.column_names
     return [name for name in names if name in RUN_CONSTANT_COLUMNS or name.startswith("true_")]
@@ -268,9 +268,9 @@ def _check_same(rows: pa.Table) -> None:
     Raises:
         CellError: a value differs from the row before.
     """
-    within = ~_new(rows)[1:]
-    for name in _described(rows):
-        bad = _changes(rows[name]) & within
+    within = ~_find_run_starts(rows)[1:]
+    for name in _list_constant_columns(rows):
+        bad = _find_changes(rows[name]) & within
         if bad.any():
             row = int(bad.argmax()) + 1
             values = rows[name].slice(row - 1, 2).to_pylist()
@@ -283,10 +283,10 @@ def _summarise_new_runs(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFr
     `goes_on` is True if the first row belongs to the last run of the batch before. `offset` is the
     number of rows before the batch, so that ``row`` is the row of the file at which the run begins.
     """
-    new = _new(rows)
+    new = _find_run_starts(rows)
     if goes_on:
         new[0] = False
     places = np.flatnonzero(new)
-    keys = rows.select(["run", *_described(rows)])
+    keys = rows.select(["run", *_list_constant_columns(rows)])
     summary: pd.DataFrame = keys.take(places).to_pandas()
     return summary.assign(row=places + offset - goes_on)

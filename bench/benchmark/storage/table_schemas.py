@@ -85,12 +85,14 @@ _LARGEST = 2.0**53
 """Upper limit of whole numbers that a float represents exactly."""
 
 
-def _size(name: str, empty: EmptyCellRule = EmptyCellRule.NEVER, **options: Any) -> ColumnSpec:
+def _declare_size_column(
+    name: str, empty: EmptyCellRule = EmptyCellRule.NEVER, **options: Any
+) -> ColumnSpec:
     """Declare a column of non-negative numbers."""
     return ColumnSpec(name, float, low=0.0, empty=empty, **options)
 
 
-def _count(name: str, low: int = 0, **options: Any) -> ColumnSpec:
+def _declare_count_column(name: str, low: int = 0, **options: Any) -> ColumnSpec:
     """Declare a column of whole numbers that are not negative."""
     return ColumnSpec(name, int, low=low, high=_LARGEST, **options)
 
@@ -100,25 +102,25 @@ _RANGE = ColumnSpec("range", str, words=RANGES)
 
 RUN_COLUMNS: Columns = (
     *(ColumnSpec(name, str) for name in ("run", "experiment", "tuner", "simulator", "target")),
-    _count("seed"),
+    _declare_count_column("seed"),
     _RANGE,
-    _count("k"),
-    _size("loss", EmptyCellRule.AT_START, infinite=True),
-    _size("param_error", EmptyCellRule.NO_TRUTH),
-    _size("param_abs_error", EmptyCellRule.NO_TRUTH, required=False),
-    _size("stiff_error", EmptyCellRule.MAY, required=False),
-    _size("sloppy_error", EmptyCellRule.MAY, required=False),
-    _size("outside", EmptyCellRule.NO_TRUTH),
+    _declare_count_column("k"),
+    _declare_size_column("loss", EmptyCellRule.AT_START, infinite=True),
+    _declare_size_column("param_error", EmptyCellRule.NO_TRUTH),
+    _declare_size_column("param_abs_error", EmptyCellRule.NO_TRUTH, required=False),
+    _declare_size_column("stiff_error", EmptyCellRule.MAY, required=False),
+    _declare_size_column("sloppy_error", EmptyCellRule.MAY, required=False),
+    _declare_size_column("outside", EmptyCellRule.NO_TRUTH),
     ColumnSpec("proposal_PARAMETER", float, empty=EmptyCellRule.AT_START),
     ColumnSpec("recommendation_PARAMETER", float),
     ColumnSpec("true_PARAMETER", float, empty=EmptyCellRule.NO_TRUTH),
-    _size("obs_error", EmptyCellRule.MAY, infinite=True),
-    _size("heldout_error", EmptyCellRule.MAY, infinite=True),
-    _size("obs_error_CHANNEL_in_noise", EmptyCellRule.MAY, infinite=True),
-    _size("obs_error_CHANNEL", EmptyCellRule.MAY, infinite=True),
-    _size("heldout_error_CHANNEL", EmptyCellRule.MAY, infinite=True),
-    _size("tuner_seconds", EmptyCellRule.AT_START),
-    _size("simulator_seconds", EmptyCellRule.AT_START),
+    _declare_size_column("obs_error", EmptyCellRule.MAY, infinite=True),
+    _declare_size_column("heldout_error", EmptyCellRule.MAY, infinite=True),
+    _declare_size_column("obs_error_CHANNEL_in_noise", EmptyCellRule.MAY, infinite=True),
+    _declare_size_column("obs_error_CHANNEL", EmptyCellRule.MAY, infinite=True),
+    _declare_size_column("heldout_error_CHANNEL", EmptyCellRule.MAY, infinite=True),
+    _declare_size_column("tuner_seconds", EmptyCellRule.AT_START),
+    _declare_size_column("simulator_seconds", EmptyCellRule.AT_START),
     _TRUSTED,
 )
 """Columns of runs.parquet, parts and records: one row per simulation."""
@@ -138,20 +140,20 @@ RUN_CONSTANT_COLUMNS = (
 STATUS_COLUMNS: Columns = (
     *(ColumnSpec(name, str) for name in ("run", "tuner", "simulator")),
     ColumnSpec("target", str, empty=EmptyCellRule.MAY),  # Of a tuner that was skipped.
-    _count("seed"),
+    _declare_count_column("seed"),
     ColumnSpec("status", str, words=STATUSES),
     ColumnSpec("reason", str, empty=EmptyCellRule.MAY),
-    _count("simulations"),
-    _size("seconds"),
+    _declare_count_column("simulations"),
+    _declare_size_column("seconds"),
     _TRUSTED,
 )
 """Columns of a comparison's status.csv and of stored statuses: one row per run."""
 
 TRAINING_COLUMNS: Columns = (
     ColumnSpec("tuner", str),
-    _count("seed"),
-    _count("simulations"),
-    _size("seconds"),
+    _declare_count_column("seed"),
+    _declare_count_column("simulations"),
+    _declare_size_column("seconds"),
     _TRUSTED,
 )
 """Columns of training.csv: one row per training."""
@@ -160,9 +162,9 @@ IDENTIFIABILITY_COLUMNS: Columns = (
     ColumnSpec("experiment", str),
     ColumnSpec("target", str),
     _RANGE,
-    _count("direction", low=1),
-    _size("eigenvalue", infinite=True),
-    _size("sigma", infinite=True),
+    _declare_count_column("direction", low=1),
+    _declare_size_column("eigenvalue", infinite=True),
+    _declare_size_column("sigma", infinite=True),
     ColumnSpec("stiff", bool),
     ColumnSpec("PARAMETER", float, low=-1.0 - 1e-9, high=1.0 + 1e-9),
 )
@@ -172,15 +174,18 @@ ERROR_TABLE_COLUMNS: Columns = (
     ColumnSpec("experiment", str),
     ColumnSpec("tuner", str),
     ColumnSpec("range", str, words=(*RANGES, "")),
-    _count("simulations"),
+    _declare_count_column("simulations"),
     ColumnSpec("metric", str, words=(*ERROR_METRICS, "")),
-    *(_size(name, EmptyCellRule.MAY, infinite=True) for name in ("median", "mean", "low", "high")),
-    _count("runs"),
-    _count("failures"),
-    _size("fit_simulations"),
-    _size("fit_seconds"),
-    _size("tuner_seconds", EmptyCellRule.MAY),
-    _size("simulator_seconds", EmptyCellRule.MAY),
+    *(
+        _declare_size_column(name, EmptyCellRule.MAY, infinite=True)
+        for name in ("median", "mean", "low", "high")
+    ),
+    _declare_count_column("runs"),
+    _declare_count_column("failures"),
+    _declare_size_column("fit_simulations"),
+    _declare_size_column("fit_seconds"),
+    _declare_size_column("tuner_seconds", EmptyCellRule.MAY),
+    _declare_size_column("simulator_seconds", EmptyCellRule.MAY),
     ColumnSpec("salt", str, words=("secret", "public"), required=False),
     _TRUSTED,
 )
@@ -195,9 +200,9 @@ MISSPECIFICATION_TABLE_COLUMNS: Columns = (
     ColumnSpec("parameter", str, empty=EmptyCellRule.MAY),
     ColumnSpec("unit", str),
     *(ColumnSpec(name, float, empty=EmptyCellRule.MAY) for name in ("mean", "low", "high")),
-    _count("targets"),
-    _count("runs"),
-    _count("failures"),
+    _declare_count_column("targets"),
+    _declare_count_column("runs"),
+    _declare_count_column("failures"),
     _TRUSTED,
 )
 """Columns of table.csv of a study of a missing effect; errors over all parameters name none."""
@@ -207,7 +212,7 @@ MISSPECIFICATION_RANK_COLUMNS: Columns = (
     ColumnSpec("experiment", str),
     _RANKED,
     ColumnSpec("tuner", str),
-    *(_size(name) for name in ("plain", "extended")),
+    *(_declare_size_column(name) for name in ("plain", "extended")),
     _TRUSTED,
 )
 """Columns of ranks.csv of a study of a missing effect: mean rank over targets by simulator."""
@@ -215,14 +220,14 @@ MISSPECIFICATION_RANK_COLUMNS: Columns = (
 RANK_AGREEMENT_COLUMNS: Columns = (
     ColumnSpec("experiment", str),
     _RANKED,
-    _count("tuners"),
-    _count("targets"),
+    _declare_count_column("tuners"),
+    _declare_count_column("targets"),
     *(
         ColumnSpec(name, float, empty=EmptyCellRule.MAY, low=-1.0, high=1.0)
         for name in ("tau", "low", "high", "tau_of_halves")
     ),
     *(
-        _size(name, EmptyCellRule.MAY, high=1.0)
+        _declare_size_column(name, EmptyCellRule.MAY, high=1.0)
         for name in ("p_value", "friedman_plain", "friedman_extended")
     ),
     _TRUSTED,
@@ -231,12 +236,12 @@ RANK_AGREEMENT_COLUMNS: Columns = (
 
 SHOT_MODEL_COLUMNS: Columns = (
     ColumnSpec("method", str),
-    _size("restitution", EmptyCellRule.MAY),
-    _count("simulations"),
-    _size("seconds", EmptyCellRule.MAY),
+    _declare_size_column("restitution", EmptyCellRule.MAY),
+    _declare_count_column("simulations"),
+    _declare_size_column("seconds", EmptyCellRule.MAY),
     ColumnSpec("status", str, words=SHOT_STATUSES),
     ColumnSpec("reason", str, empty=EmptyCellRule.MAY),
-    _size("height", EmptyCellRule.MAY),
+    _declare_size_column("height", EmptyCellRule.MAY),
     ColumnSpec("margin", float, empty=EmptyCellRule.MAY),
 )
 """Keys of a model in shots/NAME.json, in addition to its ``effects``."""
@@ -248,16 +253,16 @@ SHOT_COLUMNS: Columns = (
         ColumnSpec(name, float, empty=EmptyCellRule.MAY, infinite=True)
         for name in ("off", "margin", "planned_margin")
     ),
-    _size("prediction_error", EmptyCellRule.MAY),
-    _size("drop_height", EmptyCellRule.MAY),
-    _size("restitution", EmptyCellRule.MAY),
-    _size("true_restitution"),
+    _declare_size_column("prediction_error", EmptyCellRule.MAY),
+    _declare_size_column("drop_height", EmptyCellRule.MAY),
+    _declare_size_column("restitution", EmptyCellRule.MAY),
+    _declare_size_column("true_restitution"),
     ColumnSpec("effects", str, empty=EmptyCellRule.MAY),
-    _count("simulations"),
-    _size("seconds", EmptyCellRule.MAY),
+    _declare_count_column("simulations"),
+    _declare_size_column("seconds", EmptyCellRule.MAY),
     ColumnSpec("status", str, words=SHOT_STATUSES),
     ColumnSpec("reason", str, empty=EmptyCellRule.MAY),
-    _size("seen", high=1.0),
+    _declare_size_column("seen", high=1.0),
     _TRUSTED,
 )
 """Columns of a bounce shot's shots.csv; rows in shots/NAME.json lack the last column."""
@@ -275,14 +280,20 @@ SHOT_STATUS_COLUMNS: Columns = tuple(
 SHOT_TABLE_COLUMNS: Columns = (
     ColumnSpec("method", str),
     ColumnSpec("ball", str),
-    _count("shots", low=1),
-    _count("hits"),
-    *(_size(name, high=1.0) for name in ("rate", "low", "high")),
-    *(_size(name, EmptyCellRule.MAY, infinite=True) for name in ("off_median", "off_90")),
-    *(_size(f"prediction_error_{name}", EmptyCellRule.MAY) for name in ("median", "mean")),
-    _size("simulations"),
-    _size("seconds", EmptyCellRule.MAY),
-    _count("failures"),
+    _declare_count_column("shots", low=1),
+    _declare_count_column("hits"),
+    *(_declare_size_column(name, high=1.0) for name in ("rate", "low", "high")),
+    *(
+        _declare_size_column(name, EmptyCellRule.MAY, infinite=True)
+        for name in ("off_median", "off_90")
+    ),
+    *(
+        _declare_size_column(f"prediction_error_{name}", EmptyCellRule.MAY)
+        for name in ("median", "mean")
+    ),
+    _declare_size_column("simulations"),
+    _declare_size_column("seconds", EmptyCellRule.MAY),
+    _declare_count_column("failures"),
     _TRUSTED,
 )
 """Columns of a bounce shot's table.csv."""

@@ -23,10 +23,10 @@ _simgap_schemas() {{ compgen -W "{schemas}" -- "$1"; }}
 def add_completion_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap completion`."""
     parser.add_argument("shell", choices=SHELLS, help="shell that the script is for")
-    parser.set_defaults(command=_completion)
+    parser.set_defaults(command=_run_completion)
 
 
-def _completion(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_completion(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap completion`: print the completion script of the named shell."""
     from bench.cli.main import build_parser
 
@@ -51,7 +51,7 @@ def build_completion_script(parser: argparse.ArgumentParser, shell: str) -> str:
     (commands,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
     for name, command in commands.choices.items():
         for action in command._actions:
-            _complete(name, action, shtab)
+            _set_completion(name, action, shtab)
     words = {
         "experiments": experiment.list_experiment_names(),
         "parts": [name for registry in REGISTRIES for name in registry.names()],
@@ -72,7 +72,7 @@ _WORDS = {
 """Functions of bash that complete an argument, by command and argument."""
 
 
-def _complete(command: str, action: argparse.Action, shtab: Any) -> None:
+def _set_completion(command: str, action: argparse.Action, shtab: Any) -> None:
     """Set how the shell completes an argument: known names (in bash only), or a file.
 
     `shtab` is the library that builds the completion script.

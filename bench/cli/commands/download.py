@@ -40,10 +40,10 @@ def add_download(parser: argparse.ArgumentParser) -> None:
         help="write the data set's folder into this one (default: SIMGAP_DATA or SIMGAP_ROBOTS "
         "where set, else simgap/ in XDG_DATA_HOME or ~/.local/share)",
     )
-    parser.set_defaults(command=_download)
+    parser.set_defaults(command=_run_download)
 
 
-def _download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap download`: download the named data sets that are not on this machine yet.
 
     Without a name it lists all data sets and downloads nothing.
@@ -64,26 +64,28 @@ def _download(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     if not data_sets:
         every = [dataset_catalogue.get(name) for name in dataset_catalogue.names()]
         for data_set in every:
-            for line in _lines(data_set):
+            for line in _format_data_set(data_set):
                 say(line)
-        return CommandResult({"data_sets": [_document(each) for each in every], "downloaded": []})
+        return CommandResult(
+            {"data_sets": [_make_data_set_document(each) for each in every], "downloaded": []}
+        )
     downloaded = []
     for data_set in data_sets:
-        present = _present(data_set, options.out)
+        present = _find_present_folder(data_set, options.out)
         if present:
             say(f"{data_set.name}: already in {present}")
             continue
-        say(f"{data_set.name}: {_fetch(data_set, options.source, options.out)}")
+        say(f"{data_set.name}: {_download_data_set(data_set, options.source, options.out)}")
         downloaded.append(data_set.name)
         if options.out:
             say(_how_found(data_set, options.out))
-        for name in _experiments(data_set):
+        for name in _list_dependent_experiments(data_set):
             say(f"needed by: simgap compare {name}")
-    documents = [_document(each, options.out) for each in data_sets]
+    documents = [_make_data_set_document(each, options.out) for each in data_sets]
     return CommandResult({"data_sets": documents, "downloaded": downloaded})
 
 
-def _fetch(data_set: DataSet, source: str, out: Path | None) -> Path:
+def _download_data_set(data_set: DataSet, source: str, out: Path | None) -> Path:
     """Download one data set with a progress bar; return its folder."""
     import sys
 
@@ -108,7 +110,7 @@ def _fetch(data_set: DataSet, source: str, out: Path | None) -> Path:
         return download(data_set, out or next(search_folders(data_set.kind)), source, advance)
 
 
-def _present(data_set: DataSet, out: Path | None) -> Path | None:
+def _find_present_folder(data_set: DataSet, out: Path | None) -> Path | None:
     """Return the folder of a data set that is already present; None if it must be downloaded."""
     if out is None:
         return data_set.folder()
@@ -126,11 +128,11 @@ def _how_found(data_set: DataSet, out: Path) -> str:
     return f"{data_set.name}: experiments find it with {variable}={os.fspath(out.resolve())}"
 
 
-def _lines(data_set: DataSet) -> list[str]:
+def _format_data_set(data_set: DataSet) -> list[str]:
     """Format a data set for the list: size, licence, place, title, experiments and source."""
     folder = data_set.folder()
     state = f"in {folder}" if folder else f"not here: run `{data_set.command}`"
-    needed = ", ".join(_experiments(data_set))
+    needed = ", ".join(_list_dependent_experiments(data_set))
     return [
         f"{data_set.name:22} {data_set.size:>7}  {data_set.licence:11} {state}",
         f"  {data_set.title}",
@@ -139,7 +141,7 @@ def _lines(data_set: DataSet) -> list[str]:
     ]
 
 
-def _experiments(data_set: DataSet) -> list[str]:
+def _list_dependent_experiments(data_set: DataSet) -> list[str]:
     """Return the names of the project's experiments that need a data set."""
     from bench.benchmark.problem.experiment import list_experiment_names, load_experiment
     from bench.datasets.dataset_catalogue import providing
@@ -155,7 +157,7 @@ def _experiments(data_set: DataSet) -> list[str]:
     return names
 
 
-def _document(data_set: DataSet, out: Path | None = None) -> JsonDocument:
+def _make_data_set_document(data_set: DataSet, out: Path | None = None) -> JsonDocument:
     """Convert a data set to a JSON document, with the address and hash of each file.
 
     `out` is the folder that the user named for downloads; None for the default folder.
@@ -179,6 +181,6 @@ def _document(data_set: DataSet, out: Path | None = None) -> JsonDocument:
             for file in data_set.files
         ],
         "provides": list(data_set.provides),
-        "folder": _present(data_set, out),
-        "experiments": _experiments(data_set),
+        "folder": _find_present_folder(data_set, out),
+        "experiments": _list_dependent_experiments(data_set),
     }

@@ -29,10 +29,10 @@ def add_import_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_out_option(parser, "file to write, a new one", "NAME.toml", required=True)
     add_options(parser, ImportOptions)
-    parser.set_defaults(command=_import)
+    parser.set_defaults(command=_run_import)
 
 
-def _import(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_import(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap import`: write a description of log files, from which simgap reads them.
 
     Everything that was guessed is printed, because the user should confirm it. The log files

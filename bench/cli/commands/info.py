@@ -12,10 +12,10 @@ from bench.cli.output import CommandResult, JsonDocument, PrintLine
 
 def add_info_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap info`."""
-    parser.set_defaults(command=_info)
+    parser.set_defaults(command=_run_info)
 
 
-def _info(options: argparse.Namespace, say: PrintLine) -> CommandResult:  # noqa: ARG001
+def _run_info(options: argparse.Namespace, say: PrintLine) -> CommandResult:  # noqa: ARG001
     """Execute `simgap info`: print what a bug report should say about this machine."""
     information = collect_info()
     for line in _format_info(information):
@@ -32,22 +32,22 @@ def collect_info() -> JsonDocument:
 
     return {
         "simgap": __version__,
-        "revision": _revision(),
+        "revision": _read_git_revision(),
         "python": platform.python_version(),
         "implementation": platform.python_implementation(),
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "processors": _processors(),
-        "memory": _memory(),
+        "processors": _count_processors(),
+        "memory": _read_memory_size(),
         "paths": {
             "simgap": str(_HOME),
-            "cache": str(_cache()),
+            "cache": str(_get_cache_folder()),
             "data sets": str(_data_sets()),
             "SIMGAP_DATA": os.environ.get("SIMGAP_DATA"),
             "SIMGAP_ROBOTS": os.environ.get("SIMGAP_ROBOTS"),
         },
-        "engines": list(_engines()),
-        "packages": list(_packages()),
+        "engines": list(_describe_engines()),
+        "packages": list(_describe_packages()),
     }
 
 
@@ -55,7 +55,7 @@ _HOME = Path(__file__).resolve().parents[3]
 """Folder that contains simgap's packages."""
 
 
-def _cache() -> Path:
+def _get_cache_folder() -> Path:
     from bench.benchmark.runner.tuner_training import get_weights_folder
 
     return get_weights_folder()
@@ -67,7 +67,7 @@ def _data_sets() -> Path:
     return user_folder()
 
 
-def _revision() -> str | None:
+def _read_git_revision() -> str | None:
     """Return the commit of a checkout, with + if files were changed; None for a wheel."""
     import subprocess
 
@@ -81,7 +81,7 @@ def _revision() -> str | None:
     return process.stdout.strip() or None
 
 
-def _processors() -> int | None:
+def _count_processors() -> int | None:
     """Return the number of processors that this process may use; None if unknown.
 
     It can be smaller than that of the machine, for example in a job of a cluster.
@@ -93,7 +93,7 @@ def _processors() -> int | None:
     return os.cpu_count()
 
 
-def _memory() -> int | None:
+def _read_memory_size() -> int | None:
     """Return the memory of the machine in bytes; None if unknown."""
     import os
 
@@ -103,7 +103,7 @@ def _memory() -> int | None:
         return None
 
 
-def _engines() -> Iterator[JsonDocument]:
+def _describe_engines() -> Iterator[JsonDocument]:
     """List every engine; each package is imported, since an installed one may not work."""
     from bench import __version__
     from sims.engines.adapters import bullet_world, mujoco_bodies
@@ -111,10 +111,14 @@ def _engines() -> Iterator[JsonDocument]:
     loads = {"pybullet": bullet_world.import_pybullet, "mujoco": mujoco_bodies.import_mujoco}
     yield {"name": "batch", "version": __version__, "missing": None}
     for name, load in loads.items():
-        yield {"name": name, "version": _version(name), "missing": _missing(name, load)}
+        yield {
+            "name": name,
+            "version": _read_package_version(name),
+            "missing": _find_import_problem(name, load),
+        }
 
 
-def _packages() -> Iterator[JsonDocument]:
+def _describe_packages() -> Iterator[JsonDocument]:
     """List the packages that simgap and its extras require, by the installed metadata."""
     from importlib.metadata import PackageNotFoundError, requires
 
@@ -125,12 +129,12 @@ def _packages() -> Iterator[JsonDocument]:
     except PackageNotFoundError:  # Run from the source, without an installation.
         requirements = []
     for requirement in requirements:
-        extra = _extra(str(requirement.marker or ""))
+        extra = _parse_extra(str(requirement.marker or ""))
         if extra == "dev" or not (
             requirement.marker is None or requirement.marker.evaluate({"extra": extra})
         ):
             continue
-        version = _version(requirement.name)
+        version = _read_package_version(requirement.name)
         # simgap is in no package index, so its extras cannot be installed by name.
         remedy = f'pip install "{requirement.name}{requirement.specifier}"'
         missing = None if version else f"not installed ({remedy})"
@@ -139,13 +143,13 @@ def _packages() -> Iterator[JsonDocument]:
         yield {"name": requirement.name, "of": extra, "version": version, "missing": missing}
 
 
-def _extra(marker: str) -> str:
+def _parse_extra(marker: str) -> str:
     """Return the extra that a requirement belongs to; empty if it belongs to none."""
     _, _, behind = marker.partition("extra == ")
     return behind.split()[0].strip("\"')") if behind else ""
 
 
-def _version(package: str) -> str | None:
+def _read_package_version(package: str) -> str | None:
     """Return the version of an installed package; None if it is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
@@ -155,7 +159,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _missing(package: str, load: Callable[[], Any]) -> str | None:
+def _find_import_problem(package: str, load: Callable[[], Any]) -> str | None:
     """Return why a package cannot be used; None if it can."""
     try:
         load()
@@ -177,13 +181,13 @@ def _format_info(information: JsonDocument) -> Iterator[str]:
     for name, path in information["paths"].items():
         yield f"{name:14} {path or 'not set'}"
     yield ""
-    yield from (_line(engine, "engine ") for engine in information["engines"])
+    yield from (_format_part(engine, "engine ") for engine in information["engines"])
     yield ""
     for package in information["packages"]:
-        yield _line(package, f"[{package['of']}] " if package["of"] else "")
+        yield _format_part(package, f"[{package['of']}] " if package["of"] else "")
 
 
-def _line(each: JsonDocument, prefix: str) -> str:
+def _format_part(each: JsonDocument, prefix: str) -> str:
     version = each["version"] or ""
     missing = f"MISSING: {each['missing']}" if each["missing"] else ""
     return f"{prefix + each['name']:26} {'  '.join(filter(None, [version, missing]))}"

@@ -23,16 +23,16 @@ def add_list_arguments(listing: argparse.ArgumentParser) -> None:
     )
     add_model_option(listing, "whose places are listed: an MJCF or URDF")
     add_plugin_option(listing, "of them")
-    listing.set_defaults(command=_list)
+    listing.set_defaults(command=_run_list)
 
 
 def add_schema_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `simgap schema`."""
     parser.add_argument("name", metavar="NAME", help="a command, or see `simgap list schemas`")
-    parser.set_defaults(command=_schema)
+    parser.set_defaults(command=_run_schema)
 
 
-def _list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap list`: print one section of the catalogue, or the places of a robot.
 
     Args:
@@ -71,7 +71,7 @@ def _list(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     return CommandResult({options.what: found})
 
 
-def _schema(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_schema(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap schema`: print the JSON schema of a document that simgap writes."""
     from bench.schemas import load_schema
 

@@ -39,10 +39,10 @@ def add_plot_arguments(plot: argparse.ArgumentParser) -> None:
     )
     add_pdf(plot)
     add_plugin_option(plot, "simulators")
-    plot.set_defaults(command=_plot)
+    plot.set_defaults(command=_run_plot)
 
 
-def _plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_plot(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap plot`: write tables, figures and report of finished results again.
 
     Several comparisons together give one joint result, which needs the folder `options.out`.

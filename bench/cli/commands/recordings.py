@@ -110,7 +110,7 @@ def add_simulate_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(parser, SimulationSpec, runs={"type": parse_positive_int})
     add_out_option(parser, "file to write, a new one", "FILE.csv", required=True)
     add_plugin_option(parser, "systems")
-    parser.set_defaults(command=_simulate)
+    parser.set_defaults(command=_run_simulate)
 
 
 def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
@@ -148,10 +148,10 @@ def add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_pdf(parser)
     add_plugin_option(parser, "systems")
-    parser.set_defaults(command=_inspect)
+    parser.set_defaults(command=_run_inspect)
 
 
-def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap simulate`: simulate a recording, and write it with its true parameters.
 
     The true parameters are in a separate file, so that the recording can be explained without them.
@@ -203,7 +203,7 @@ def _simulate(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     )
 
 
-def _inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_inspect(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap inspect`: print what a recording contains, and what looks wrong in it.
 
     It checks times, data quality, drives that do nothing and sign or unit conventions. With

@@ -28,10 +28,10 @@ def add_status_arguments(status: argparse.ArgumentParser) -> None:
         "layers of tuners are active on this machine",
     )
     status.add_argument("--runs", action="store_true", help="list every run or shot")
-    status.set_defaults(command=_status)
+    status.set_defaults(command=_run_status)
 
 
-def _status(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_status(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap status`: print how far a study is, or without one the isolation layers.
 
     Args:
@@ -113,7 +113,7 @@ def _print_progress(study: Study, every: bool, say: PrintLine) -> JsonDocument:
     for line in _format_counts(groups):
         say(f"  {line}")
     for end in shown:
-        say(f"{end.status:10} {end.name}  {_reason(end)}".rstrip())
+        say(f"{end.status:10} {end.name}  {_get_last_line(end)}".rstrip())
     if len(standing.ends) > len(shown):
         say(f"({len(shown)} of {len(standing.ends)} listed; --runs lists all)")
     if resume:
@@ -161,6 +161,6 @@ def _select_notable_runs(standing: StudyProgress) -> tuple[RunEnd, ...]:
     return (telling or standing.ends)[:_MAX_LISTED_RUNS]
 
 
-def _reason(end: RunEnd) -> str:
+def _get_last_line(end: RunEnd) -> str:
     # The last line of a traceback names the error.
     return (end.reason.strip().splitlines() or [""])[-1]

@@ -59,10 +59,10 @@ def add_train_arguments(parser: argparse.ArgumentParser) -> None:
     add_plugin_option(parser, "of them")
     add_trust_option(parser)
     add_force_option(parser)
-    parser.set_defaults(command=_train)
+    parser.set_defaults(command=_run_train)
 
 
-def _train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_train(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap train`: train a learned tuner for each seed, before a comparison needs it.
 
     The weights are stored in the cache, where `simgap compare` finds them. The losses of each epoch

@@ -21,10 +21,10 @@ def add_verify_arguments(verify: argparse.ArgumentParser) -> None:
         "--all", action="store_true", help="make every simulation again, and not a share of them"
     )
     add_plugin_option(verify, "simulators")
-    verify.set_defaults(command=_verify)
+    verify.set_defaults(command=_run_verify)
 
 
-def _verify(options: argparse.Namespace, say: PrintLine) -> CommandResult:
+def _run_verify(options: argparse.Namespace, say: PrintLine) -> CommandResult:
     """Execute `simgap verify`: check that an archive, explanation or comparison is consistent.
 
     Args:

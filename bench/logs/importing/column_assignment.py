@@ -75,7 +75,7 @@ class ColumnAssigner:
         columns = self._with_role("position", None)
         self._find_normalised([column for column in columns if not column.unit])
         for column, joint, placement in self._signals.place_columns(columns):
-            self._add(
+            self._add_signal(
                 self._signals.channels,
                 f"q.{joint.name}",
                 column,
@@ -161,7 +161,7 @@ class ColumnAssigner:
             return None
         return Signal(column, guessed_unit, placement, f"; in {guessed_unit} by its range")
 
-    def _add(
+    def _add_signal(
         self, table: dict[str, Signal], name: str, column: LogColumn, signal: Signal | None
     ) -> bool:
         """Add a signal unless one with this name exists; return whether it was added."""
@@ -193,7 +193,7 @@ class ColumnAssigner:
         elif quantity in (None, "position"):
             name = f"m_{joint.name}"
             signal = self._position_signal(column, joint, placement)
-            if self._add(self._signals.inputs, f"u.{name}", column, signal):
+            if self._add_signal(self._signals.inputs, f"u.{name}", column, signal):
                 self._signals.added_servos[name] = joint
         else:
             self._result.leave_out(
@@ -209,7 +209,11 @@ class ColumnAssigner:
         """
         quantity = column_guessing.commanded_role(column)
         expected = COMMAND_QUANTITIES.get(actuator.kind)
-        if actuator.kind == "motor" and quantity is None and self._resembles(column, joint):
+        if (
+            actuator.kind == "motor"
+            and quantity is None
+            and self._resembles_position(column, joint)
+        ):
             quantity = "position"
         name = f"u.{actuator.name}"
         if expected is not None and quantity is not None and quantity != expected:
@@ -223,14 +227,14 @@ class ColumnAssigner:
             self._assign_force(column, joint, name, placement)
         elif actuator.kind == "position":
             signal = self._position_signal(column, joint, placement)
-            self._add(self._signals.inputs, name, column, signal)
+            self._add_signal(self._signals.inputs, name, column, signal)
         else:
             si = f"{joint.unit}/s"
             unit = column.unit if is_convertible(column.unit, si) else si
             signal = Signal(column, unit, placement, f"; in {unit}")
-            self._add(self._signals.inputs, name, column, signal)
+            self._add_signal(self._signals.inputs, name, column, signal)
 
-    def _resembles(self, column: LogColumn, joint: Joint) -> bool:
+    def _resembles_position(self, column: LogColumn, joint: Joint) -> bool:
         """Return whether a command is close to the position, and so a desired position."""
         position = self._signals.position_of(joint.name)
         if position is None:
@@ -257,7 +261,7 @@ class ColumnAssigner:
             return
         stated = "as its file states" if column.unit else "which no file states"
         signal = Signal(column, unit, placement, f"{origin}; in {unit}, {stated}")
-        self._add(self._signals.inputs, name, column, signal)
+        self._add_signal(self._signals.inputs, name, column, signal)
 
     def assign_efforts(self) -> None:
         """Assign measured torques to motors without a command and to undriven joints."""

@@ -112,7 +112,7 @@ def split_name(text: str) -> list[str]:
 
 def guess_role(column: LogColumn) -> Role | None:
     """Return the role of a column by its name and unit, else by its file's name, or None."""
-    column_words, file_words = _words(column)
+    column_words, file_words = _split_into_words(column)
     if column_words & ROLE_KEYWORDS["command"] or (
         file_words & ROLE_KEYWORDS["command"] and not column_words & ROLE_KEYWORDS["other"]
     ):
@@ -131,7 +131,7 @@ def commanded_role(column: LogColumn) -> Role | None:
         return _ROLE_OF_QUANTITY[column.quantity]
     if column.quantity in ("angle", "length"):
         return "position"
-    column_words, file_words = _words(column)
+    column_words, file_words = _split_into_words(column)
     # `joint_command` gives no more information than `command`; `joint_position_command` does.
     return _measured_role(column_words - _VAGUE) or _measured_role(file_words - _VAGUE)
 
@@ -141,7 +141,7 @@ def is_measured(column: LogColumn) -> bool:
     return bool(set(split_name(column.bare)) & _MEASURED)
 
 
-def _words(column: LogColumn) -> tuple[set[str], set[str]]:
+def _split_into_words(column: LogColumn) -> tuple[set[str], set[str]]:
     """Return the words of a column's name and those of its file's name."""
     # The name of a bag's topic has no file extension.
     stem = column.file.rpartition(".")[0] or column.file
@@ -170,19 +170,19 @@ def match_joint(column: LogColumn, joints: Sequence[Joint]) -> Joint | None:
     Returns:
         The joint, or None if no name matches.
     """
-    text = _plain(column.bare)
-    for names in ([joint.name for joint in joints], _stems(joints)):
+    text = _strip_punctuation(column.bare)
+    for names in ([joint.name for joint in joints], _strip_shared_words(joints)):
         named = [
             (len(name), joint)
             for name, joint in zip(names, joints, strict=True)
-            if _plain(name) and _plain(name) in text
+            if _strip_punctuation(name) and _strip_punctuation(name) in text
         ]
         if named:
             return max(named, key=lambda pair: pair[0])[1]
     return None
 
 
-def _stems(joints: Sequence[Joint]) -> list[str]:
+def _strip_shared_words(joints: Sequence[Joint]) -> list[str]:
     """Return joint names without words that all may share: ``elbow`` for ``elbow_joint``."""
     usual = {"joint", "motor", "link", "actuator", "dof"}
     stems = ["".join(w for w in split_name(joint.name) if w not in usual) for joint in joints]
@@ -231,7 +231,7 @@ def clocks(columns: Iterable[LogColumn]) -> list[LogColumn]:
     for place, column in enumerate(columns):
         words = set(split_name(column.bare))
         is_named = bool(words & TIME_COLUMN_NAMES) or column.quantity == "time"
-        if _increases(column.values, MAX_REPEATED if is_named else 0.0):
+        if _is_increasing(column.values, MAX_REPEATED if is_named else 0.0):
             rank = 0 if is_named and "header" in words else 1 if is_named else 2
             ranked_columns.append((rank, place, column))
     return [column for _, _, column in sorted(ranked_columns, key=lambda one: one[:2])]
@@ -272,12 +272,12 @@ def guess_position_unit(values: Array, joint: Joint) -> str | None:
             else small_unit
         )
     for unit, size_of_unit in ((si_unit, 1.0), (small_unit, size)):
-        if _within(ends / size_of_unit, joint.range):
+        if _is_within_limits(ends / size_of_unit, joint.range):
             return unit
     return None
 
 
-def _within(ends: Array, limits: tuple[float, float]) -> bool:
+def _is_within_limits(ends: Array, limits: tuple[float, float]) -> bool:
     """Return whether a lowest and a highest position lie within a joint's widened range."""
     slack = MAX_RANGE_EXCESS * (limits[1] - limits[0])
     return bool(limits[0] - slack <= ends[0] and ends[1] <= limits[1] + slack)
@@ -288,7 +288,7 @@ def is_constant(values: Array) -> bool:
     return bool(np.nanmax(values) == np.nanmin(values))
 
 
-def _increases(values: Array, repeated: float) -> bool:
+def _is_increasing(values: Array, repeated: float) -> bool:
     """Return whether a column increases from row to row, except for a share of repeated rows."""
     if values.size < 2 or not np.isfinite(values).all():
         return False
@@ -296,5 +296,5 @@ def _increases(values: Array, repeated: float) -> bool:
     return bool((steps >= 0).all() and steps.any() and (steps == 0).sum() <= repeated * values.size)
 
 
-def _plain(text: str) -> str:
+def _strip_punctuation(text: str) -> str:
     return re.sub(r"[^a-z0-9]", "", text.lower())

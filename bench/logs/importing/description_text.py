@@ -93,7 +93,7 @@ class DescriptionWriter:
             body += [*self._file_lines(column.file), f"column = {toml_text(column.name)}"]
             body += ['unit = "1"', ""]
         head = [*(f"# check: {line}" for line in self._result.checks)]
-        head += [f"model = {toml_text(self._relative(self._model))}"]
+        head += [f"model = {toml_text(self._make_relative(self._model))}"]
         free = [servo.name for servo in servos if servo.is_free]
         if free:
             places = ["*"] if len(free) == len(servos) else free
@@ -122,7 +122,7 @@ class DescriptionWriter:
                 path = files.paths[0] if files.alone else files.folder
                 key = "file" if files.alone else "folder"
                 yield f"[runs.{toml_key(run)}]"
-                yield f"{key} = {toml_text(self._relative(path))}"
+                yield f"{key} = {toml_text(self._make_relative(path))}"
                 if run in self._options.held_out:
                     yield "held_out = true"
                 yield ""
@@ -133,7 +133,7 @@ class DescriptionWriter:
         if next(iter(runs.values())).alone:
             return []
         if "" in runs:
-            file = self._relative(runs[""].folder / file)
+            file = self._make_relative(runs[""].folder / file)
         return [f"file = {toml_text(file)}"]
 
     def _signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
@@ -204,7 +204,7 @@ class DescriptionWriter:
             samples.append((times, u, position.convert(joint.unit, values)))
         return samples
 
-    def _relative(self, path: Path) -> str:
+    def _make_relative(self, path: Path) -> str:
         """Return a path relative to the folder of the description, with forward slashes.
 
         On another drive of Windows no relative path exists, so the path is absolute.

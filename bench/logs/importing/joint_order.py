@@ -34,7 +34,7 @@ def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> 
         For each command the index of the position that follows it; None if the present order
             follows about as well, or the motion is not informative.
     """
-    distances = _distances(commands, positions)
+    distances = _compute_square_distances(commands, positions)
     if distances is None:
         return None
     order = least_order(distances)
@@ -53,7 +53,7 @@ def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
         commands: (T,) command of each joint, SI units.
         positions: (T,) position of each joint at the same times, SI units.
     """
-    distances = _distances(commands, positions)
+    distances = _compute_square_distances(commands, positions)
     if distances is None:
         return False
     return bool((np.argmin(distances, axis=1) == np.arange(len(distances))).all())
@@ -73,7 +73,9 @@ def least_order(distances: Array) -> list[int]:
     return order
 
 
-def _distances(commands: Sequence[Array], positions: Sequence[Array]) -> Array | None:
+def _compute_square_distances(
+    commands: Sequence[Array], positions: Sequence[Array]
+) -> Array | None:
     """Return the (J, J) mean square distance of each command from each position.
 
     Returns None if the motion is too short, or of one joint only.

@@ -88,14 +88,16 @@ def preferred_order(
     inside = np.linspace(WINDOW, t.size - WINDOW - 1, min(INSTANTS, t.size - 2 * WINDOW))
     rows = np.unique(inside.astype(np.intp))
     residuals = {
-        order: _residual(robot, driven, u[list(order)][:, rows], motion[:, list(order)][:, :, rows])
-        for order in _orders([joint.name for joint, _ in driven])
+        order: _compute_order_residual(
+            robot, driven, u[list(order)][:, rows], motion[:, list(order)][:, :, rows]
+        )
+        for order in _iterate_orders([joint.name for joint, _ in driven])
     }
     best = min(residuals, key=lambda order: residuals[order])
     return PreferredOrder(best, residuals[best], residuals[tuple(range(len(driven)))])
 
 
-def _orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
+def _iterate_orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
     """Yield the orders of the columns that are tested, each as the column index of every joint.
 
     For few joints they are all permutations; otherwise the stated, the alphabetical and the
@@ -117,7 +119,7 @@ def _orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
             yield tuple(own)
 
 
-def _residual(
+def _compute_order_residual(
     robot: RobotModel, driven: Sequence[tuple[Joint, Actuator]], commands: Array, motion: Array
 ) -> float:
     """Compute R of (1) for an order; infinite if joints would be far beyond their ranges.

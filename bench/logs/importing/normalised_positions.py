@@ -105,7 +105,7 @@ def normalised_positions(
         )
     if calibration is None and is_within and not stated_unit:
         episode = split_episode_path(log)
-        folders = _folders(episode[0]) if episode else []
+        folders = _list_calibration_folders(episode[0]) if episode else []
         calibration = find_calibration(folders)
         is_requested = calibration is not None
     if not is_requested:
@@ -138,7 +138,7 @@ def may_be_normalised(recording: Recording) -> Iterator[Anomaly]:
         return
     meta = read_toml(description)
     channels = meta.get("channels")
-    if not isinstance(channels, dict) or not _episodes(description, meta):
+    if not isinstance(channels, dict) or not _has_dataset_episodes(description, meta):
         return
     names_in_degrees = [
         name
@@ -163,7 +163,7 @@ def may_be_normalised(recording: Recording) -> Iterator[Anomaly]:
         )
 
 
-def _episodes(description: Path, meta: Mapping[str, object]) -> bool:
+def _has_dataset_episodes(description: Path, meta: Mapping[str, object]) -> bool:
     """Return whether a description's runs are episodes of a dataset."""
     runs = meta.get("runs")
     tables = runs.values() if isinstance(runs, dict) else ()
@@ -175,6 +175,6 @@ def _episodes(description: Path, meta: Mapping[str, object]) -> bool:
     )
 
 
-def _folders(dataset: Path) -> Sequence[Path]:
+def _list_calibration_folders(dataset: Path) -> Sequence[Path]:
     """Return the folders that may contain the calibration of a dataset."""
     return [dataset, dataset / "meta", dataset / "calibration", dataset.parent]

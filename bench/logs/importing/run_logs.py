@@ -132,7 +132,7 @@ class RunLogs:
                     raise self._no_header(log)
             except InputError as error:
                 errors.append(error)
-                self._refuse(files.name(path), error, path)
+                self._leave_out_file(files.name(path), error, path)
                 continue
             logs[files.name(path)] = log
         if not logs:
@@ -148,7 +148,7 @@ class RunLogs:
             f"{len(log.list_columns())} columns, found numbers; put one above, such as {shown},..."
         )
 
-    def _refuse(self, file: str, error: InputError, path: Path) -> None:
+    def _leave_out_file(self, file: str, error: InputError, path: Path) -> None:
         """Leave out a file of a folder with a message.
 
         Raises:
@@ -190,7 +190,7 @@ class RunLogs:
                     f"{path}: its stamps are called {column.name} ({unit}), those of the files "
                     f"before {self.time_column} ({self.time_unit}); give them one name"
                 )
-                self._refuse(file, error, path)
+                self._leave_out_file(file, error, path)
                 continue
             # Robot clocks often count from 1970, and floats of that size resolve fractions of a
             # second coarsely, so the first stamp is subtracted before scaling.
@@ -237,7 +237,7 @@ class RunLogs:
                     "state the rate of the rows with --rate HZ if there is none"
                 )
             errors.append(error)
-            self._refuse(file, error, log.path)
+            self._leave_out_file(file, error, log.path)
         if not clocks:
             raise errors[0]
         return clocks

@@ -42,13 +42,13 @@ def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
     Returns:
         The recording, and a message for the user, which is empty if it is unchanged.
     """
-    rate = min((_rate(run) for run in recording.runs), default=0.0)
+    rate = min((_compute_sampling_rate(run) for run in recording.runs), default=0.0)
     if not kind.has_model or rate <= FASTEST:
         return recording, ""
-    every = next((k for k in range(round(rate / SLOWEST), 1, -1) if _holds(recording, k)), 1)
+    every = next((k for k in range(round(rate / SLOWEST), 1, -1) if _keeps_motion(recording, k)), 1)
     if every == 1:
         return recording, ""
-    runs = tuple(_thinned(run, every) for run in recording.runs)
+    runs = tuple(_thin_run(run, every) for run in recording.runs)
     note = (
         f"sampled at {rate:.4g} Hz, faster than it moves: each sample of {every} is used, "
         "and the mean of the inputs between them"
@@ -56,12 +56,12 @@ def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
     return replace(recording, runs=runs), note
 
 
-def _rate(run: Run) -> float:
+def _compute_sampling_rate(run: Run) -> float:
     """Return the sampling rate in Hz."""
     return float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
 
 
-def _holds(recording: Recording, every: int) -> bool:
+def _keeps_motion(recording: Recording, every: int) -> bool:
     """Return whether every k-th sample still shows the whole motion; k is `every`.
 
     The motion between the kept samples is interpolated by a spline. Its error may hardly be larger
@@ -96,7 +96,7 @@ def _interpolation_error(times: Array, values: Array, every: int) -> float:
     return float(np.sqrt(np.mean(np.square(missed))))
 
 
-def _thinned(run: Run, every: int) -> Run:
+def _thin_run(run: Run, every: int) -> Run:
     """Keep every k-th sample of a run, and average its inputs from each one to the next."""
     part = run.part(slice(None, None, every))
     first = np.arange(0, run.times.size, every)

@@ -48,7 +48,7 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     Returns:
         Frequency and damping; None if the position hardly moves or does not follow.
     """
-    clean = [_seen(*run) for run in runs]
+    clean = [_select_present_samples(*run) for run in runs]
     moving = [
         (t, u, q) for t, u, q in clean if t.size >= MIN_SAMPLES and np.std(u) > 0 and np.std(q) > 0
     ]
@@ -71,7 +71,9 @@ def estimate_servo_response(runs: Sequence[tuple[Array, Array, Array]]) -> Servo
     return best
 
 
-def _seen(times: Array, command: Array, position: Array) -> tuple[Array, Array, Array]:
+def _select_present_samples(
+    times: Array, command: Array, position: Array
+) -> tuple[Array, Array, Array]:
     """Return the samples that are not missing, at most the first `MAX_SAMPLES`."""
     seen = np.isfinite(position) & np.isfinite(command)
     return times[seen][:MAX_SAMPLES], command[seen][:MAX_SAMPLES], position[seen][:MAX_SAMPLES]

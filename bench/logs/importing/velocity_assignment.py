@@ -87,7 +87,7 @@ def assign_velocities(
         if position is None or position.column.file != column.file:
             result.leave_out(column, f"no position of {joint.name} in the same file shows its unit")
             continue
-        comparison = _compare(logs, column, position, joint)
+        comparison = _compare_with_derivative(logs, column, position, joint)
         unit = _confirmed_unit(comparison, column, joint)
         candidate = _Candidate(column, joint, placement, position, comparison, unit)
         kinds.setdefault(candidate.kind, []).append(candidate)
@@ -95,7 +95,7 @@ def assign_velocities(
         _assign_kind(candidates, signals, result)
 
 
-def _compare(
+def _compare_with_derivative(
     logs: RunLogs, column: LogColumn, position: Signal, joint: Joint
 ) -> VelocityComparison | None:
     """Compare a velocity column with the derivative of its joint's position, over the first runs.

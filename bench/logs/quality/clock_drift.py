@@ -87,14 +87,14 @@ def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     """
     found = [
         estimate
-        for command, position in _driven(kind)
+        for command, position in _list_driven_positions(kind)
         for run in recording.runs
         if command in run.inputs and position in run.channels
-        for estimate in _estimate(run, command, position)
+        for estimate in _estimate_run_drifts(run, command, position)
     ]
     if not found:
         return
-    drift, error = _pooled(found)
+    drift, error = _pool_estimates(found)
     if abs(drift) < max(MIN_REPORTED_DRIFT, SIGNIFICANCE_SIGMAS * error):
         return
     word = "fast" if drift > 0 else "slow"
@@ -106,7 +106,7 @@ def check_clock_drift(recording: Recording, kind: type[Simulator]) -> Iterator[Q
     )
 
 
-def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
+def _list_driven_positions(kind: type[Simulator]) -> list[tuple[str, str]]:
     """Return pairs of an input and a position that it drives, by channel name."""
     if not issubclass(kind, SystemSimulator):
         return []
@@ -116,7 +116,7 @@ def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
     return [(u.name, name) for u in kind.inputs for name in kind.system.coordinates]
 
 
-def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
+def _estimate_run_drifts(run: Run, command: str, position: str) -> Iterator[_Estimate]:
     """Estimate the drift of the sensors' clock against the commands' clock in one run, by eq. (2).
 
     The position is predicted by past commands, eq. (1); a drift makes the error of this prediction
@@ -129,7 +129,7 @@ def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
     step = max(float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_COMPARED_INSTANTS)
     grid = np.arange(t[0], t[-1], step)
     own = np.interp(grid, t[seen], y[seen])
-    memory = _memory(np.interp(grid, t, u))
+    memory = _average_over_intervals(np.interp(grid, t, u))
     inner = slice(LAG_BIN_EDGES[-1], len(grid) + LAG_BIN_EDGES[0])
     time = (grid - grid.mean())[inner]
     own, memory = own[inner], memory[inner]
@@ -158,7 +158,7 @@ def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
     yield _Estimate(drift, float(np.hypot(error, MODEL_ERROR_SHARE * drift)))
 
 
-def _memory(u: Array) -> Array:
+def _average_over_intervals(u: Array) -> Array:
     """Return the (N, K) means of a command over the intervals of equation (1)."""
     total = np.concatenate([[0.0], np.cumsum(u)])
     at = np.arange(u.size)
@@ -169,7 +169,7 @@ def _memory(u: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _pooled(found: list[_Estimate]) -> _Estimate:
+def _pool_estimates(found: list[_Estimate]) -> _Estimate:
     """Return the weighted mean; scale its error up if estimates scatter more than their errors."""
     drifts, errors = np.array(found).T
     weights = np.maximum(errors, 1e-12) ** -2.0

@@ -50,7 +50,7 @@ def estimate_noise(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
         signals: (times (T,), values (T,)) of each run; NaN values are missing.
     """
     runs = [(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()]
-    sigmas, step = [_sigma(runs, order) for order in (2, 3)], _step(runs)
+    sigmas, step = [_estimate_sigma(runs, order) for order in (2, 3)], _find_quantisation_step(runs)
     if not np.isfinite(sigmas).any():
         return NoiseEstimate(np.nan, step)
     # Rounding errors are uniform within half a step to either side: 1 sigma is step / sqrt(12).
@@ -69,10 +69,12 @@ def differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> flo
     Returns:
         Standard deviation; NaN if all runs are too short.
     """
-    return _sigma([(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()], order)
+    return _estimate_sigma(
+        [(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()], order
+    )
 
 
-def _sigma(runs: list[tuple[Array, Array]], order: int) -> float:
+def _estimate_sigma(runs: list[tuple[Array, Array]], order: int) -> float:
     """Return 1 sigma from differences of one order, over all runs; NaN if all are too short."""
     rests = [_compute_divided_differences(t, y, order) for t, y in runs if t.size > order + 1]
     pooled = np.concatenate(rests) if rests else np.empty(0)
@@ -97,7 +99,7 @@ def _compute_divided_differences(times: Array, values: Array, order: int) -> Arr
     return rests
 
 
-def _step(runs: list[tuple[Array, Array]]) -> float:
+def _find_quantisation_step(runs: list[tuple[Array, Array]]) -> float:
     """Return the smallest change of a signal that often does not change at all; 0 otherwise."""
     changes = np.abs(np.concatenate([np.empty(0), *(np.diff(y) for _, y in runs)]))
     # Computed values that should be equal may differ by rounding, so tiny changes count as none.

@@ -124,7 +124,7 @@ def compute_static_accelerations(run: Run, kind: type[Simulator]) -> Array:
     return np.array(
         [
             [data.qacc[joint.velocity] for joint in joints]
-            for data in _place(kind, run.channels, run.inputs)
+            for data in _iterate_poses(kind, run.channels, run.inputs)
         ]
     )
 
@@ -140,7 +140,7 @@ def find_contacts(
             initial position.
     """
     pairs: set[tuple[int, int]] = set()
-    for data in _place(kind, positions):
+    for data in _iterate_poses(kind, positions):
         pairs |= {(int(min(pair)), int(max(pair))) for pair in data.contact.geom[: data.ncon]}
     return frozenset(pairs)
 
@@ -162,7 +162,7 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
     depths: dict[tuple[str, str], list[float]] = {}
     count = 0
     for run in recording.training():
-        for data in _place(kind, run.channels):
+        for data in _iterate_poses(kind, run.channels):
             count += 1
             deepest: dict[tuple[str, str], float] = {}
             for contact in data.contact[: data.ncon]:
@@ -186,7 +186,7 @@ def find_overlaps(recording: Recording, kind: type[Simulator]) -> Iterator[Quali
             )
 
 
-def _place(
+def _iterate_poses(
     kind: type[Simulator], positions: Mapping[str, Array], inputs: Mapping[str, Array] | None = None
 ) -> Iterator[Any]:
     """Yield MuJoCo's data (mujoco.MjData) of a robot at rest at some of its recorded poses.
@@ -237,7 +237,7 @@ def _check_servos(recording: Recording, robot: Any) -> Iterator[Anomaly]:
         if a.kind == "position" and a.joint is not None and _has_both(recording, a)
     ]
     pairs = {
-        (command, position): _compare(recording, command, position)
+        (command, position): _compare_position_with_command(recording, command, position)
         for command, _ in servo_signals
         for _, position in servo_signals
     }
@@ -288,7 +288,7 @@ def _has_both(recording: Recording, actuator: Any) -> bool:
     return f"u.{actuator.name}" in first.inputs and f"q.{actuator.joint}" in first.channels
 
 
-def _compare(recording: Recording, command: str, position: str) -> _Pair:
+def _compare_position_with_command(recording: Recording, command: str, position: str) -> _Pair:
     """Compute slope and correlation of a position against a command, eq. (1), over all runs.
 
     The mean of each run is subtracted first.
@@ -298,14 +298,14 @@ def _compare(recording: Recording, command: str, position: str) -> _Pair:
         u, q = run.inputs[command], run.channels[position]
         is_finite = np.isfinite(u) & np.isfinite(q)
         if is_finite.sum() > 1:
-            squares += _products(u[is_finite], q[is_finite])
+            squares += _compute_centred_products(u[is_finite], q[is_finite])
     uu, uq, qq = squares
     if min(uu, qq) <= 0 or uq == 0:
         return _Pair(1.0, 0.0)  # One of the two is constant, so nothing can be concluded.
     return _Pair(float(uq / uu), float(uq / np.sqrt(uu * qq)))
 
 
-def _products(u: Array, q: Array) -> Array:
+def _compute_centred_products(u: Array, q: Array) -> Array:
     """Return the sums of squares and products (3,) of u and q about their means."""
     u, q = u - u.mean(), q - q.mean()
     return np.array([u @ u, u @ q, q @ q])

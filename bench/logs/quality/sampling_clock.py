@@ -79,10 +79,10 @@ def _select_timestamps(run: Run) -> Array:
     seen = [np.isfinite(values) for values in run.channels.values()]
     often = max(seen, key=lambda one: int(one.sum()), default=np.ones(run.times.size, np.bool_))
     own = run.times[often]
-    return run.times if _uneven(run.times) <= _uneven(own) else own
+    return run.times if _compute_uneven_share(run.times) <= _compute_uneven_share(own) else own
 
 
-def _uneven(times: Array) -> float:
+def _compute_uneven_share(times: Array) -> float:
     """Return the share of intervals that differ from the median interval by more than 1 %."""
     steps = np.diff(times)
     if not steps.size:

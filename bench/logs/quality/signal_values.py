@@ -42,7 +42,7 @@ def check_quantisation(recording: Recording, kind: type[Simulator]) -> Iterator[
     Returns:
         One finding for each such channel.
     """
-    for channel, signals in _signals(recording, kind):
+    for channel, signals in _iterate_channels(recording, kind):
         step = estimate_noise(signals).step
         values = np.concatenate([values for _, values in signals])
         spread = float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
@@ -76,16 +76,18 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
     Returns:
         One finding for each saturated end and each limited command.
     """
-    for channel, signals in _signals(recording, kind):
+    for channel, signals in _iterate_channels(recording, kind):
         for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
             values = [sign * own for _, own in signals if np.isfinite(own).any()]
             if not values:
                 continue
             end = max(float(np.nanmax(own)) for own in values)
             jump = CLIPPING_STEP_THRESHOLD * estimate_noise(signals).step
-            flat = sum(_flat(own, end, jump) for own in values)
+            flat = sum(_count_saturated_samples(own, end, jump) for own in values)
             total = sum(own.size for own in values)
-            if flat > MIN_SATURATED_SHARE * total and not all(_stands(own, end) for own in values):
+            if flat > MIN_SATURATED_SHARE * total and not all(
+                _is_resting_value(own, end) for own in values
+            ):
                 yield QualityFinding(
                     "saturation",
                     f"{channel.name} stays at its {word} value, {sign * end:.4g} {channel.unit}, "
@@ -93,10 +95,12 @@ def check_saturation(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
                     "a sensor or a joint at its end shows nothing: leave these samples empty, or "
                     "keep clear of the end",
                 )
-    yield from _commands(recording, kind)
+    yield from _find_saturated_commands(recording, kind)
 
 
-def _commands(recording: Recording, kind: type[Simulator]) -> Iterator[QualityFinding]:
+def _find_saturated_commands(
+    recording: Recording, kind: type[Simulator]
+) -> Iterator[QualityFinding]:
     """Find commands of a robot that are often at or beyond the range of their actuator."""
     if not kind.has_model:
         return
@@ -131,14 +135,14 @@ def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
         return
     never, seldom = [], []
     positions = set(kind.system.coordinates)
-    for channel, signals in _signals(recording, kind):
+    for channel, signals in _iterate_channels(recording, kind):
         if channel.name not in positions:
             continue
         noise = estimate_noise(signals)
         least = MOTION_THRESHOLD_SIGMAS * max(
             np.nan_to_num(noise.sigma), noise.step, 1e-9 * channel.scale
         )
-        moving = np.concatenate([_moving(values, least) for _, values in signals])
+        moving = np.concatenate([_find_moving_windows(values, least) for _, values in signals])
         share = 1.0 - float(moving.mean()) if moving.size else 0.0
         if share == 1.0:
             never.append(channel.name)
@@ -158,21 +162,23 @@ def check_standstill(recording: Recording, kind: type[Simulator]) -> Iterator[Qu
         )
 
 
-def _signals(
+def _iterate_channels(
     recording: Recording, kind: type[Simulator]
 ) -> Iterator[tuple[Channel, list[tuple[Array, Array]]]]:
     """Yield each recorded channel with its times and values in every run."""
     for channel in kind.channels:
-        signals = [(run.times, run.channels[channel.name]) for run in _with(recording, channel)]
+        signals = [
+            (run.times, run.channels[channel.name]) for run in _select_runs(recording, channel)
+        ]
         if signals:
             yield channel, signals
 
 
-def _with(recording: Recording, channel: Channel) -> list[Run]:
+def _select_runs(recording: Recording, channel: Channel) -> list[Run]:
     return [run for run in recording.runs if channel.name in run.channels]
 
 
-def _flat(values: Array, end: float, jump: float) -> int:
+def _count_saturated_samples(values: Array, end: float, jump: float) -> int:
     """Count samples in saturated stretches of at least `MIN_SATURATED_SAMPLES` samples.
 
     The signal must jump into or out of a stretch: a quantised signal that reverses at its end
@@ -187,13 +193,13 @@ def _flat(values: Array, end: float, jump: float) -> int:
     return int(lengths[(lengths >= MIN_SATURATED_SAMPLES) & (jumps > jump)].sum())
 
 
-def _stands(values: Array, end: float) -> bool:
+def _is_resting_value(values: Array, end: float) -> bool:
     """Return whether a run begins or ends at this value, or never takes it: it is at rest there."""
     seen = values[np.isfinite(values)]
     return bool(seen.size and (seen[0] == end or seen[-1] == end)) or not (values == end).any()
 
 
-def _moving(values: Array, least: float) -> Array:
+def _find_moving_windows(values: Array, least: float) -> Array:
     """Return for each window of a run whether the signal moves in it."""
     count = values.size // WINDOW_SAMPLES
     if not count:

@@ -134,7 +134,7 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
     if kind.has_model:
         accelerations = pose_check.compute_static_accelerations(run, kind)
     else:
-        accelerations = _accelerations(recording, run, system)
+        accelerations = _compute_rest_accelerations(recording, run, system)
     # A servo holds its position by force, so large forces at rest are normal.
     servo = kind.has_model and _has_inputs(run)
     sizes = {channel.name: channel.scale for channel in system.channels}
@@ -148,7 +148,7 @@ def _check_time_scale(recording: Recording, run: Run, kind: type[Simulator]) -> 
         if not (spread > MIN_MOTION_SHARE * sizes.get(name, 1.0) and pull > 0):
             continue
         expected_seconds = (spread / pull) ** 0.5  # Equation (2).
-        recorded_seconds = interval * _lag(x)
+        recorded_seconds = interval * _estimate_lag(x)
         ratio = recorded_seconds / expected_seconds
         if 0 < ratio < 1 / TIME_UNIT_RATIO_THRESHOLD:
             moves = (
@@ -177,7 +177,7 @@ def _has_inputs(run: Run) -> bool:
     return any(np.any(signal) for signal in run.inputs.values())
 
 
-def _accelerations(recording: Recording, run: Run, system: System) -> Array:
+def _compute_rest_accelerations(recording: Recording, run: Run, system: System) -> Array:
     """Compute the accelerations (T, D) that the system's forces cause at the recorded positions.
 
     The system is at rest, so drag and friction do not act; D is the number of coordinates.
@@ -201,7 +201,7 @@ def _accelerations(recording: Recording, run: Run, system: System) -> Array:
     return accelerations
 
 
-def _lag(x: Array) -> float:
+def _estimate_lag(x: Array) -> float:
     """Return the lag of (1) in samples.
 
     Returns 0 if the first lag exceeds the spread already, since motion between samples is not

@@ -256,7 +256,7 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
     if slope < 0:
         yield QualityFinding("contradiction", size, f"a sign is wrong: turn that of {rate}")
     elif slope > 1.0 + threshold or inverse_slope < 1.0 - threshold:
-        yield QualityFinding("contradiction", size, _remedy(abs(np.log(slope)), rate))
+        yield QualityFinding("contradiction", size, _recommend_correction(abs(np.log(slope)), rate))
     elif (delay := comparison.delay()) is not None:
         yield QualityFinding(
             "contradiction",
@@ -266,7 +266,7 @@ def _check_pair(runs: Sequence[Run], position: str, rate: str) -> Iterator[Quali
         )
 
 
-def _remedy(log_ratio: float, rate: str) -> str:
+def _recommend_correction(log_ratio: float, rate: str) -> str:
     """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm."""
     for factor, unit in _UNITS.items():
         if abs(log_ratio - np.log(factor)) < 0.1:

@@ -295,7 +295,9 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     import pyarrow as pa
     from pyarrow import parquet
 
-    columns = {f"{_ERROR_PREFIX}{k}": _round(suite.errors[:, k]) for k in range(suite.budget + 1)}
+    columns = {
+        f"{_ERROR_PREFIX}{k}": _round_values(suite.errors[:, k]) for k in range(suite.budget + 1)
+    }
     frame = pd.concat([suite.runs, pd.DataFrame(columns)], axis=1)
     table = pa.Table.from_pandas(frame, preserve_index=False)
     with atomic_replacement(folder / CURVES_FILE) as path:
@@ -306,7 +308,7 @@ def write_suite_runs(suite: SuiteRuns, folder: Path) -> list[Path]:
     return [folder / name for name in (CURVES_FILE, *texts)]
 
 
-def _round(values: Array) -> NDArray[np.float32]:
+def _round_values(values: Array) -> NDArray[np.float32]:
     """Round to `_STORED_DIGITS` significant digits, which compress well."""
     with np.errstate(divide="ignore", invalid="ignore"):
         size = np.floor(np.log10(np.abs(values)))

@@ -160,7 +160,7 @@ class SuiteTables:
         return {tuner for (_, tuner), cost in self._fit_simulations.items() if cost > 0}
 
     @cached_property
-    def _medians(self) -> dict[tuple[str, int], pd.DataFrame]:
+    def _median_log_errors(self) -> dict[tuple[str, int], pd.DataFrame]:
         """Median log errors over targets: a row per cell and a column per tuner.
 
         The key is (training, k): whether the simulations of a training are counted (COUNTED) or not
@@ -179,7 +179,7 @@ class SuiteTables:
 
     def get_medians(self, k: int, training: str = FREE) -> pd.DataFrame:
         """Return median log errors after k simulations: a row per cell, a column per tuner."""
-        return self._medians[training, k]
+        return self._median_log_errors[training, k]
 
     def get_ranks(self, k: int, training: str = FREE) -> pd.DataFrame:
         """Rank the tuners in each cell; 1 is best, NaN where a tuner has no such run."""
@@ -285,11 +285,19 @@ class SuiteTables:
                 share = self._share_of_training(cell, tuner)
                 for number, threshold in enumerate(levels, 1):
                     lines.append(
-                        (cell, tuner, number, threshold, *self._measure(curves, threshold, share))
+                        (
+                            cell,
+                            tuner,
+                            number,
+                            threshold,
+                            *self._compute_running_time(curves, threshold, share),
+                        )
                     )
         return pd.DataFrame(lines, columns=ERT_COLUMNS)
 
-    def _measure(self, curves: RunCurves, threshold: float, share: float) -> tuple[float, ...]:
+    def _compute_running_time(
+        self, curves: RunCurves, threshold: float, share: float
+    ) -> tuple[float, ...]:
         """Compute the expected running time (ERT) to an error threshold, with interval and cost.
 
         `share` is the part of the training cost that falls on one target, in simulations.

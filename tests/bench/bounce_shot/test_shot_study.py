@@ -197,7 +197,7 @@ def test_on_vision_a_tuner_learns_restitution_from_rows_and_never_where_the_came
         known = ShotInputs(dealt.name, path, dealt.scene, weights)
         recording = read_recording(path, Ball, whole=True)
         by_rows, by_metres = (
-            shot_planning._tuned(experiment, settings, entry, known, recording, {})
+            shot_planning._tune_model(experiment, settings, entry, known, recording, {})
             for entry in experiment.tuners
         )
         assert by_rows.restitution == pytest.approx(by_metres.restitution, abs=0.06)
@@ -243,7 +243,7 @@ def test_untuned_misses_where_restitution_differs_and_tuned_hits(experiment, tmp
     def broken(_):
         return TunedModel("explain", 0.5, {}, 0, 0.0, "crashed", "no"), {}
 
-    monkeypatch.setattr(shot_planning, "_explained", broken)
+    monkeypatch.setattr(shot_planning, "_explain_drop", broken)
     settings = read_shot_config(experiment)
     dealt = draw_shot(experiment, settings, "rubber", 1)
     path = tmp_path / "drop.csv"
@@ -357,7 +357,7 @@ def explained(_):
 @pytest.fixture
 def crashing(tmp_path, monkeypatch, fresh_registries):
     """Return the arguments of a study with a failing tuner; explain and figures are stubs."""
-    monkeypatch.setattr(shot_planning, "_explained", explained)
+    monkeypatch.setattr(shot_planning, "_explain_drop", explained)
     monkeypatch.setattr("bench.bounce_shot.shot_report.draw_figures", lambda *_: {})
     monkeypatch.setattr("bench.bounce_shot.shot_report.write_animation", lambda *_: "animation")
     path = tmp_path / "mine.toml"

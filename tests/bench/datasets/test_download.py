@@ -59,8 +59,8 @@ def repository(tmp_path, monkeypatch):
         for path, data in files.items()
     )
     made = replace(dataset_catalogue.get("pendulum_free_swing"), files=declared)
-    every = {**dataset_catalogue._catalogue(), made.name: made}
-    monkeypatch.setattr(dataset_catalogue, "_catalogue", lambda: every)
+    every = {**dataset_catalogue._read_catalogue(), made.name: made}
+    monkeypatch.setattr(dataset_catalogue, "_read_catalogue", lambda: every)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("SIMGAP_DATA", raising=False)
     monkeypatch.delenv("SIMGAP_ROBOTS", raising=False)

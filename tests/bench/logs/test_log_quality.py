@@ -155,7 +155,7 @@ def test_an_interval_of_drift_holds():
 
     inside = 0
     for seed in range(24):
-        (one,) = clock_drift._estimate(run_of(seed, seconds=12.0), "u.m_hip", "q.hip")
+        (one,) = clock_drift._estimate_run_drifts(run_of(seed, seconds=12.0), "u.m_hip", "q.hip")
         inside += abs(one.drift) < 2 * one.error
     assert inside >= 20
 
